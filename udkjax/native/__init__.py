@@ -3,22 +3,22 @@
 How the code of a run is made, and where to look:
 
 1. `udkjax.equations` writes a scene as programs: loops over its elements that read and write arrays of numbers. Accelerations,
-   projection, residuals and derivatives are such programs. Those of small scenes are unrolled, without loops and arrays.
+   projection, residuals and derivatives are such programs. Programs of small scenes are unrolled: no loops, no arrays.
 2. base/ is common to all modules. `loops` and `program` (unrolled) turn each program into one function of LLVM's text, with the
    values, branches and loops of `ir`. A function serves one member, or W members in the lanes of vectors. `layout` defines the
-   memory of a run, and `module` the text of all functions with access to it. `machine` compiles the text or finds it on disk;
-   `ffi` writes the entry point that XLA calls.
+   memory of a run, and `module` writes all functions that use this memory. `machine` compiles the text or finds its code on
+   disk; `ffi` writes the entry point that XLA calls.
 3. run/ integrates. `trajectory` has the algorithm: `runge_kutta` (stages and errors of a step), `manifold` (projection),
    `controller` (accept or reject, and the next step), `singular` and `fallback` (steps near singular configurations),
    `breakpoints` and `pieces` (where the motion is not smooth), `dense_output` (states between steps), `members` (loading lanes).
-   `dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination; `formulations` replaces the
-   Udwadia-Kalaba equation; `state_functions` evaluates single states, and `row_marks` finds independent rows.
+   `dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination; `formulations` has
+   alternatives to the Udwadia-Kalaba equation; `state_functions` evaluates single states, and `row_marks` finds independent rows.
 4. derivatives/ adds `tangents` (forward mode, to second order) and `backpropagation` (reverse mode) along a `record`.
 5. watching/ ends runs at zero crossings of conditions, the events of `udkjax.integrate`.
-6. closing/ finds positions: `closing` assembles a mechanism, with derivatives, `marching` follows its positions, and `positions`
-   computes batches of positions from the programs of equations/position_programs.py.
+6. closing/ computes positions: `closing` assembles a mechanism, with derivatives, `marching` follows its positions, and
+   `positions` computes batches of positions from the programs of equations/position_programs.py.
 7. `operations`, `runs` and `position_operations` list the modules with the shapes of their inputs and outputs; `primitive` makes
-   them a JAX primitive with its batching rule. `udkjax.integrate` calls it and has the rules of differentiation.
+   the operations a JAX primitive with a batching rule. `udkjax.integrate` calls this primitive and defines its derivatives.
 8. wasm/ compiles the same text for pages.
 """
 

@@ -1,8 +1,8 @@
 """The foundation of all machine code: text, memory and modules, and the way from text to an operation of XLA.
 
-A *member* is one run of a batch. A *lane* is one of the W positions of a vector, which all run the same instructions: a member
-occupies one lane. A *register* holds `vector` float64 numbers, several coordinates of one member or one of W members. A *slot*
-is a number of a loop's array: a base column of the table and an offset. The *call record* is the list of counts and addresses
-that `run` is called with. A *tangent* is the memory of one direction of a derivative, a *row* of samples the values of sampled
-numbers between two breakpoints.
+A *member* is one run of a batch. A *lane* is one of the W positions of a vector: all lanes execute the same instructions, and
+each holds one member. A *register* holds `vector` float64 numbers: several coordinates of one member, or one coordinate of W
+members. A *slot* addresses a number in a loop's array, by a base column of the table and an offset. The *call record* is the list
+of counts and addresses that is passed to `run`. A *tangent* is the memory of the derivatives along one direction. A *row* of
+samples holds the values of the sampled numbers between two breakpoints.
 """

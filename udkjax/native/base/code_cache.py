@@ -1,7 +1,7 @@
 """The cache of machine code on disk.
 
-It holds object code under a digest of the text, the processor and the compiler. Incomplete files are compiled again; the least
-recently used are deleted when they take too much space.
+Object code is stored under a digest of the text, the processor and the compiler. Incomplete files are ignored. The least recently
+used files are deleted when the total size exceeds a limit.
 """
 
 import hashlib
@@ -13,14 +13,14 @@ from pathlib import Path
 
 import platformdirs
 
-MAX_BYTES = 2**28  # limit of the stored code; a file has 10 to 75 KiB
-WRITES_OF_CHECK = 500  # writes of a process from one check of the limit to the next; listing thousands of files takes 20 ms
-TOUCH_AFTER = 86_400.0  # s: a file's time of last use is this accurate, so that reading rarely writes
+MAX_BYTES = 2**28  # maximum total size of the files; each has 10 to 75 KiB
+WRITES_OF_CHECK = 500  # number of writes between two checks of the limit, as listing thousands of files takes 20 ms
+TOUCH_AFTER = 86_400.0  # accuracy (s) of a file's time of last use: most reads need not update it
 _MAGIC = b"udkjax object 1\n"
 
 
 def cache_folder() -> Path | None:
-    """Return the folder of stored code, `UDKJAX_CACHE` or the user's cache folder; None if that is 0 or the user has no home."""
+    """Return the folder of stored code, `UDKJAX_CACHE` or the user's cache folder; None if it is 0, or without a home."""
     choice = os.environ.get("UDKJAX_CACHE", "").strip()
     if choice == "0":
         return None
@@ -42,16 +42,16 @@ def is_writable(folder: Path) -> bool:
 
 def cached_files() -> list[tuple[float, int, Path]]:
     """List the time of last use, the size in bytes and the path of each file."""
-    folder, found = cache_folder(), []
+    folder, files = cache_folder(), []
     try:
         for file in folder.iterdir() if folder else ():
             if file.is_dir():  # JAX's own cache
                 continue
             status = file.stat()
-            found.append((status.st_mtime, status.st_size, file))
+            files.append((status.st_mtime, status.st_size, file))
     except OSError:  # the folder does not exist yet, or another process has just removed a file
         pass
-    return found
+    return files
 
 
 def read(name: str) -> bytes | None:

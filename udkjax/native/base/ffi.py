@@ -1,11 +1,11 @@
-"""Generated code as an operation of a compiled JAX program, by XLA's typed foreign function interface without a C++ compiler.
+"""Generated code as an operation of compiled JAX programs, by XLA's typed foreign function interface, without a C++ compiler.
 
 XLA calls a handler with a frame whose layout is its stable C interface (jaxlib/include/xla/ffi/api/c_api.h). The handler is
 generated along with the code that it calls: it reads the buffers of the frame and writes the call record of `run`
 (trajectory.py).
 
-Large batches are shared with the threads of XLA's pool. A thread that starts too late finds the work closed and leaves. The
-handler only waits for threads that have started, so a pool whose threads are all busy cannot cause a deadlock.
+Threads of XLA's pool help with large batches. A thread that starts too late finds the work closed and returns. The handler waits
+only for threads that have started, so a pool whose threads are all busy cannot cause a deadlock.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
 CREATE_ERROR, DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 48, 64, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
-# In an extension that requests metadata: the pointer to the metadata; in the metadata: the version of the interface in use.
+# Offset of the address of the metadata in an extension that requests metadata; offsets of the interface version in the metadata.
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)  # major, minor
 # Words of the work that threads share: the number of threads that may still access the work, the number that have started (plus
@@ -39,7 +39,7 @@ NO_MEMORY = b"no memory for a computation by machine code"
 def handler(trajectory: Memory, name: str) -> list[Function]:
     """Write the handler `name(frame)` and its helpers; return the functions, with the handler last.
 
-    Every input is (1 or members, ...), of float64; outputs are (members, ...), with directions second.
+    Inputs are float64 arrays (1 or members, ...). Outputs are (members, ...); derivatives have the directions as the second axis.
     """
     f, fields = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), trajectory.call_fields
     inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
@@ -60,14 +60,14 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
         f.store(value, call, fields.index(field), base=base)
 
     buffers = [word(f.at(frame, start, "i8"), BUFFERS, POINTER) for start in (ARGUMENTS, RESULTS)]
-    found = {}
+    buffer_of = {}
     for pointers, names in zip(buffers, (inputs, outputs), strict=True):
         for k, field in enumerate(names):
-            found[field] = f.load(pointers, k, base=POINTER)
-            put(field, word(found[field], DATA, POINTER), POINTER)
+            buffer_of[field] = f.load(pointers, k, base=POINTER)
+            put(field, word(buffer_of[field], DATA, POINTER), POINTER)
 
     def dimension(field: str, k: int) -> Value:
-        return f.load(word(found[field], DIMS, POINTER), k, base=INT)
+        return f.load(word(buffer_of[field], DIMS, POINTER), k, base=INT)
 
     put("members", dimension(outputs[0], 0))
     put("times", dimension("ts", 1))
@@ -77,8 +77,8 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
         put(f"{field} length", dimension(field, 1))
     for field in inputs:
         length = f.variable(1, INT, 1)
-        with f.each(word(found[field], RANK), 1) as k:
-            length.value = length.value * f.load(word(found[field], DIMS, POINTER), k, base=INT)
+        with f.each(word(buffer_of[field], RANK), 1) as k:
+            length.value = length.value * f.load(word(buffer_of[field], DIMS, POINTER), k, base=INT)
         put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
     following = Value(f, f.reserve(INT, 2), POINTER)
     for k in range(2):
@@ -96,14 +96,14 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
     return [_help(), f]
 
 
-def _of_api(f: Function, frame: Value, function: int, *arguments: Value) -> Value:
+def _call_api(f: Function, frame: Value, function: int, *arguments: Value) -> Value:
     """Call one of XLA's functions; return its error, or null."""
-    given = Value(f, f.reserve(INT, 2 + len(arguments)), POINTER)
+    struct = Value(f, f.reserve(INT, 2 + len(arguments)), POINTER)
     for k, x in enumerate((f.const(8 * (2 + len(arguments)), INT), f.const(0, INT), *arguments)):
-        f.store(x, given, k, base=x.base)
+        f.store(x, struct, k, base=x.base)
     api = f.load(f.at(frame, API, "i8"), 0, base=POINTER)
     address = f.load(f.at(api, function, "i8"), 0, base=POINTER)
-    return f.op(f"call ptr {address.name}(ptr {given.name})", POINTER)
+    return f.op(f"call ptr {address.name}(ptr {struct.name})", POINTER)
 
 
 def _no_memory(f: Function, frame: Value) -> Value:
@@ -118,8 +118,8 @@ def _no_memory(f: Function, frame: Value) -> Value:
 def _thread_count(f: Function, frame: Value) -> Value:
     """Return the number of threads in XLA's pool, at most `UDKJAX_THREADS`; one if there is no pool.
 
-    The pool has a thread for each core that the process may use. The limit is a constant of the text, as XLA calls the handler
-    without Python.
+    The pool has a thread for each core that the process may use. The limit is a constant of the text, because XLA calls the
+    handler without Python.
     """
     count = Value(f, f.reserve(INT), POINTER)
     f.store(1, count, base=INT)

@@ -1,7 +1,7 @@
 """Python functions as operations of compiled JAX programs, on float64 arrays whose first axis is the batch.
 
-XLA calls a handler as it does for machine code (ffi.py); this one is a ctypes callback, and the function takes NumPy arrays. It
-must not call JAX, which may wait for the thread that it runs on.
+XLA calls a handler, as for machine code (ffi.py); this handler is a ctypes callback, and the function takes NumPy arrays. The
+function must not call JAX: JAX may wait for the thread that runs the function.
 """
 
 import ctypes
@@ -59,9 +59,9 @@ def call_host(function: HostFunction, inputs: Sequence[Any]) -> list[Array]:
 
 
 def call_seldom(function: Callable[..., Any], *given: Any) -> Any:
-    """Return function(*given), traced and, if a program reaches it, evaluated by NumPy instead of compiled, without derivatives.
+    """Return function(*given), evaluated by NumPy when a program reaches it, instead of compiled; without derivatives.
 
-    It serves rarely executed parts of programs that would take most of the time to compile.
+    For rarely executed parts of programs that would take most of the compile time.
 
     Args:
         function: a top-level function of trees, traced once for all calls of the same structure.
@@ -72,8 +72,8 @@ def call_seldom(function: Callable[..., Any], *given: Any) -> Any:
     program, leaves, out = trace_once(function, given)
     if not has_rules(program):  # JAX must not be called from a running program
         return function(*given)
-    found = call_host(_TracedFunction(program), [jnp.asarray(x)[None] for x in leaves])
-    return out.rebuild([x[0].astype(aval.dtype) for x, aval in zip(found, program.out_avals, strict=True)])
+    results = call_host(_TracedFunction(program), [jnp.asarray(x)[None] for x in leaves])
+    return out.rebuild([x[0].astype(aval.dtype) for x, aval in zip(results, program.out_avals, strict=True)])
 
 
 class _TracedFunction:
@@ -90,8 +90,8 @@ class _TracedFunction:
 
     def __call__(self, *inputs: Any) -> Sequence[Any]:
         members = max(len(x) for x in inputs)
-        found = [self._of_member([x[min(k, len(x) - 1)] for x in inputs]) for k in range(members)]
-        return [np.stack(x) for x in zip(*found, strict=True)]
+        results = [self._of_member([x[min(k, len(x) - 1)] for x in inputs]) for k in range(members)]
+        return [np.stack(x) for x in zip(*results, strict=True)]
 
     def shapes(self, members: int) -> Sequence[tuple[int, ...]]:
         """Return the shapes of the results."""
@@ -120,14 +120,14 @@ def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunc
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     members = max(x.shape[0] if axis is None else np.delete(x.shape, axis)[0] for x, axis in zip(inputs, axes, strict=True))
 
-    def each(x: Any, axis: int | None) -> Any:
+    def as_members(x: Any, axis: int | None) -> Any:
         if axis is None and x.shape[0] <= 1:
             return x
         x = x[None] if axis is None else jnp.moveaxis(x, axis, 0)
         return jnp.broadcast_to(x, (size, members, *x.shape[2:])).reshape(size * members, *x.shape[2:])
 
-    found = host_p.bind(*(each(x, axis) for x, axis in zip(inputs, axes, strict=True)), function=function)
-    return [x.reshape(size, members, *x.shape[1:]) for x in found], [0] * len(found)
+    results = host_p.bind(*(as_members(x, axis) for x, axis in zip(inputs, axes, strict=True)), function=function)
+    return [x.reshape(size, members, *x.shape[1:]) for x in results], [0] * len(results)
 
 
 def _lower(*inputs: Any, function: HostFunction) -> Sequence[Array]:
@@ -137,7 +137,7 @@ def _lower(*inputs: Any, function: HostFunction) -> Sequence[Array]:
 
 @lru_cache(maxsize=256)
 def _register(function: HostFunction) -> str:
-    """Register a function; return its name in XLA, unique to this process, as programs on disk must not call another one."""
+    """Register a function; return its name, unique to this process: stored programs must not call another process's function."""
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
     def handle(frame: int) -> int | None:
@@ -148,8 +148,8 @@ def _register(function: HostFunction) -> str:
             return None
         try:
             outputs = _buffers(frame + RESULTS)
-            for to, x in zip(outputs, function(*_buffers(frame + ARGUMENTS)), strict=True):
-                to[...] = x
+            for output, x in zip(outputs, function(*_buffers(frame + ARGUMENTS)), strict=True):
+                output[...] = x
         except Exception:  # exceptions must not propagate into C
             return _error(_word(frame + API), traceback.format_exc())
         return None
@@ -185,8 +185,8 @@ def _array(buffer: int) -> np.ndarray:
 def _error(api: int, text: str) -> int:
     create = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(_word(api + CREATE_ERROR))
     message = ctypes.create_string_buffer(text.encode())
-    given = (ctypes.c_int64 * 4)(32, 0, ctypes.addressof(message), INTERNAL)
-    return create(ctypes.addressof(given))
+    arguments = (ctypes.c_int64 * 4)(32, 0, ctypes.addressof(message), INTERNAL)
+    return create(ctypes.addressof(arguments))
 
 
 host_p = Primitive("host_function")

@@ -1,8 +1,8 @@
 """A thin layer over LLVM's text: values with operators, variables, loops and branches.
 
 A `Function` is written once for one state or for W states in SIMD lanes: wide values are vectors of W lanes, or plain numbers if
-W is one; numbers are broadcast to wide values. All lanes take the same branch: lanes differ by `select`, and a branch is taken if
-`any_of` the lanes needs it.
+W is one; numbers are broadcast to wide values. All lanes take the same branch, which is taken if
+`any_of` the lanes needs it; lanes differ only by `select`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -38,7 +38,7 @@ class Variable:
         self.f.line(f"store {new.type} {new.name}, ptr {self.place}")
 
     def where(self, mask: Value, new: Operand):
-        """Set it in some lanes."""
+        """Assign a value in the lanes of `mask`."""
         self.value = self.f.select(mask, self.f.like(new, self.base, self.width), self.value)
 
 
@@ -86,8 +86,8 @@ class Function:
     # --- values
 
     def const(self, number: Any, base: str = DOUBLE, width: int = 1) -> Value:
-        one = literal(number, base)
-        return Value(self, one if width == 1 else f"<{', '.join([f'{base} {one}'] * width)}>", base, width)
+        digits = literal(number, base)
+        return Value(self, digits if width == 1 else f"<{', '.join([f'{base} {digits}'] * width)}>", base, width)
 
     def like(self, x: Operand, base: str, width: int) -> Value:
         """Return a value or a number as `width` lanes of a type."""
@@ -96,8 +96,8 @@ class Function:
         if x.base == INT and base == DOUBLE:
             x = self.op(f"sitofp {x.type} {x.name} to {llvm_type(DOUBLE, x.width)}", DOUBLE, x.width)
         if x.base == BOOL and base != BOOL:
-            to = "uitofp" if base == DOUBLE else "zext"
-            x = self.op(f"{to} {x.type} {x.name} to {llvm_type(base, x.width)}", base, x.width)
+            cast = "uitofp" if base == DOUBLE else "zext"
+            x = self.op(f"{cast} {x.type} {x.name} to {llvm_type(base, x.width)}", base, x.width)
         if x.base != base:
             raise TypeError(f"{x.base} for {base}")
         return x if x.width == width else self.repeat(x, width)
@@ -107,8 +107,8 @@ class Function:
         if x.width != 1:
             raise TypeError(f"{x.width} lanes for {width}")
         kind = llvm_type(x.base, width)
-        one = self.op(f"insertelement {kind} poison, {x.base} {x.name}, i64 0", x.base, width)
-        return self.op(f"shufflevector {kind} {one.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)
+        first_lane = self.op(f"insertelement {kind} poison, {x.base} {x.name}, i64 0", x.base, width)
+        return self.op(f"shufflevector {kind} {first_lane.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)
 
     def both(self, a: Operand, b: Operand) -> tuple[Value, Value]:
         """Convert two operands to one type with the same number of lanes."""
@@ -122,7 +122,7 @@ class Function:
     def arithmetic(self, kind: str, a: Operand, b: Operand) -> Value:
         """Add, subtract, multiply or divide.
 
-        A product in a sum becomes a fused multiply-add here and not by LLVM, whose optimization levels would round differently.
+        A product in a sum is fused to a multiply-add here and not by LLVM, whose optimization levels would round differently.
         """
         x, y = self.both(a, b)
         if x.base != DOUBLE:
@@ -133,15 +133,15 @@ class Function:
             for product, other in ((x.product, y), (y.product, x)):
                 if product:
                     return self.fma(-product.a if product.is_negative else product.a, product.b, other)
-        found = self.op(f"f{kind} {x.type} {x.name}, {y.name}", DOUBLE, x.width)
+        result = self.op(f"f{kind} {x.type} {x.name}, {y.name}", DOUBLE, x.width)
         if kind == "mul":
-            found.product = Product(x, y)
-        return found
+            result.product = Product(x, y)
+        return result
 
     def compare(self, kind: str, a: Operand, b: Operand) -> Value:
         x, y = self.both(a, b)
-        real, whole = _COMPARE[kind]
-        name = f"fcmp {real}" if x.base == DOUBLE else f"icmp {whole}"
+        of_doubles, of_integers = _COMPARE[kind]
+        name = f"fcmp {of_doubles}" if x.base == DOUBLE else f"icmp {of_integers}"
         return self.op(f"{name} {x.type} {x.name}, {y.name}", BOOL, x.width)
 
     def logic(self, kind: str, a: Operand, b: Operand) -> Value:
@@ -149,9 +149,9 @@ class Function:
         return self.op(f"{kind} {x.type} {x.name}, {y.name}", x.base, x.width)
 
     def select(self, mask: Value, yes: Operand, no: Operand) -> Value:
-        given = [x for x in (yes, no) if isinstance(x, Value)]
-        base = given[0].base if given else DOUBLE
-        width = max(mask.width, *(x.width for x in given)) if given else mask.width
+        values = [x for x in (yes, no) if isinstance(x, Value)]
+        base = values[0].base if values else DOUBLE
+        width = max(mask.width, *(x.width for x in values)) if values else mask.width
         a, b = self.like(yes, base, width), self.like(no, base, width)
         mask = mask if mask.width in (width, 1) else self.repeat(mask, width)
         return self.op(f"select {mask.type} {mask.name}, {a.type} {a.name}, {b.type} {b.name}", base, width)
@@ -166,19 +166,19 @@ class Function:
         return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
 
     def fma(self, a: Operand, b: Operand, c: Operand) -> Value:
-        """Return a b + c, rounded once if the processor has an instruction for it; never a library call."""
+        """Return a b + c, rounded once if the processor has such an instruction; never by a library call."""
         return self.intrinsic("fmuladd", a, b, c)
 
     def abs(self, a: Value) -> Value:
         return self.intrinsic("fabs", a)
 
     def max(self, a: Operand, b: Operand) -> Value:
-        """Return the larger of two numbers, or b if one is NaN: one instruction."""
+        """Return the larger of two numbers, or b if either is NaN; a single instruction."""
         x, y = self.both(a, b)
         return self.select(x > y, x, y)
 
     def min(self, a: Operand, b: Operand) -> Value:
-        """Return the smaller of two numbers, or b if one is NaN."""
+        """Return the smaller of two numbers, or b if either is NaN."""
         x, y = self.both(a, b)
         return self.select(x < y, x, y)
 
@@ -189,9 +189,9 @@ class Function:
         """Return the maximum over lanes; NaN is not allowed."""
         while x.width > 1:
             half, lanes = x.width // 2, range(x.width)
-            take = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"
-            parts = [", ".join(f"i32 {k}" for k in some) for some in (lanes[:half], lanes[half:])]
-            halves = [f"{take} <{part}>" for part in parts]
+            shuffle = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"
+            parts = [", ".join(f"i32 {k}" for k in half_of_lanes) for half_of_lanes in (lanes[:half], lanes[half:])]
+            halves = [f"{shuffle} <{part}>" for part in parts]
             if half == 1:
                 halves = [f"extractelement {x.type} {x.name}, i64 {k}" for k in lanes]
             x = self.max(*(self.op(text, x.base, half) for text in halves))
@@ -226,7 +226,7 @@ class Function:
         return self.op(f"extractelement {x.type} {x.name}, i64 {k.name}", x.base)
 
     def only(self, k: Value) -> Value:
-        """Return the mask of one lane alone."""
+        """Return the mask that selects only lane k."""
         if self.width == 1:
             return self.const(True, BOOL)
         lanes = Value(self, f"<{', '.join(f'i64 {j}' for j in range(self.width))}>", INT, self.width)
@@ -235,7 +235,7 @@ class Function:
     # --- memory
 
     def at(self, pointer: Value | str, k: Operand, base: str = DOUBLE) -> Value:
-        """Return the address of the k-th number from a pointer; pointers take 8 bytes on all targets."""
+        """Return the address of the k-th number from a pointer; stored pointers occupy 8 bytes on all targets."""
         name = pointer.name if isinstance(pointer, Value) else pointer
         index, stored = self.like(k, INT, 1), INT if base == POINTER else base
         return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
@@ -250,9 +250,9 @@ class Function:
         self.line(f"store {x.type} {x.name}, ptr {place.name}, align 8")
 
     def variable(self, start: Operand, base: str = DOUBLE, width: int | None = None) -> Variable:
-        found = Variable(self, base, self.width if width is None else width)
-        found.value = start
-        return found
+        variable = Variable(self, base, self.width if width is None else width)
+        variable.value = start
+        return variable
 
     def call(self, name: str, *arguments: Value):
         self.line(f"call void @{name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")

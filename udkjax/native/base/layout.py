@@ -3,7 +3,7 @@
 Arrays of coordinates in the memory of a run; q, v, a are positions, velocities and accelerations, dq and dv tangents:
 
     state q ...          the state at which programs are evaluated
-    result v, a ...      their results; `corrected q` is q after a Newton step
+    result v, a ...      results of programs; `corrected q` is q after a Newton step
     point0 q ...         accepted states, from the oldest to the latest, point3, at the times point0_t ...
     stage1 a ...         accelerations of the stages of a step
     difference0 ...      divided differences: the coefficients of the interpolating polynomial
@@ -13,7 +13,8 @@ Arrays of coordinates in the memory of a run; q, v, a are positions, velocities 
 
 `constants` and the arrays of the scene's programs have the names of the programs; "stage1 linearization" etc. hold the
 intermediate results that derivatives need. `bar constants` are the cotangents of one program, `total bar constants` their sums
-over a run. A tangent, the memory of one direction, has arrays of the same names for the tangents of their values.
+over a run. A tangent, the memory of one direction, has arrays of the same names, with the derivatives of their values along this
+direction.
 """
 
 from dataclasses import dataclass, field
@@ -31,7 +32,7 @@ FORMULATION_SETTINGS = (
 SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps", "method", "drift_tol")
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
-SHARE = 32  # minimum number of members of a thread: waking it takes 50 us, and the shortest runs take one or two each
+SHARE = 32  # minimum number of members of a thread: waking a thread takes 50 us, the shortest runs take 1 or 2 us each
 INFO = ("code", "t", "tried", "accepted", "evaluations", "written", "lost")  # then the last q and v
 
 
@@ -95,14 +96,14 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "row": "index of the row of samples in the constants",
     "steps": "accepted steps since the run began anew",
     "error": "error of the attempted step, relative to the tolerance",
-    "rate": "error of the previous step over its length to the power of the order",
+    "rate": "error of the previous step, divided by (length of the step)^order",
     "ok": "whether all pivots of the attempted step were safe",
     "safe": "whether all pivots of the latest program were safe",
     "fallback": "whether this attempt is made by the fallback",
     "fallback_due": "whether the next attempt must be made by the fallback",
     "retries": "number of successive attempts that were shortened because of a pivot",
     "distance": "distance from singular configurations: root of the smallest pivot relative to its diagonal entry",
-    **{f"distance{k}": "the same of the previous accepted states; distance2 is the latest" for k in range(POINTS - 1)},
+    **{f"distance{k}": "distance of the previous accepted states; distance2 is the latest" for k in range(POINTS - 1)},
     "tolerance": "tolerance of the fastest velocity, in its unit",
     "rank": "rank of D found by the fallback",
     "wanted": "whether a rank-revealing method is requested",
@@ -114,20 +115,20 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "due": "whether the called function applies to the lane",
     "tried": "attempts so far",
     "accepted": "accepted steps so far",
-    "evaluations": "accelerations so far",
+    "evaluations": "evaluations of accelerations so far",
     "written": "outputs so far",
     "lost": "index of the first output at which Psi is violated by more than `drift_tol`; infinite if none",
     "crossing": "time at which a piece of the state is expected to end (s)",
     "aim": "where the attempt ends relative to the crossing: before, beyond, or across it",
     "tries": "number of successive attempts to end at the crossing",
-    "share": "fraction of the attempted step, upper bound of the end of the piece",
-    "low": "lower bound of the same fraction",
+    "share": "upper bound of the end of the piece, as a fraction of the attempted step",
+    "low": "lower bound of the end of the piece, as a fraction of the attempted step",
     "again": "whether the step is repeated to end at the crossing",
 }
 
 
 class Lane:
-    """The `LANE_NUMBERS` as attributes of `s`: reading loads and assigning stores a number of all lanes (`where`: of some)."""
+    """The `LANE_NUMBERS` as attributes: reading one loads it from all lanes; assigning, or `where` for some lanes, stores it."""
 
     def __init__(self, f: Function, layout: Layout):
         self.__dict__.update(_f=f, _layout=layout)

@@ -28,7 +28,7 @@ class LoopWriter:
             program: The program.
             name: The function's name.
             pointers: The names of its arguments.
-            at: Place where each array begins: a pointer and an index relative to it.
+            at: The beginning of each array: a pointer and an index relative to it.
             width: The number of lanes; by default that of the module.
         """
         width = width or self.width
@@ -67,9 +67,9 @@ class LoopWriter:
                 if slot.base is None:
                     return f.given[slot.array], slot.offset * width
                 if (slot.array, slot.base) not in bases:
-                    place = f.op(f"load i32, ptr {f.at(row, slot.base, 'i32').name}, align 4", "i32")
-                    whole = f.op(f"sext i32 {place.name} to i64", INT)
-                    bases[slot.array, slot.base] = f.at(f.given[slot.array], whole * width)
+                    base32 = f.op(f"load i32, ptr {f.at(row, slot.base, 'i32').name}, align 4", "i32")
+                    base = f.op(f"sext i32 {base32.name} to i64", INT)
+                    bases[slot.array, slot.base] = f.at(f.given[slot.array], base * width)
                 return bases[slot.array, slot.base], slot.offset * width
 
             writer = Writer(f, kernel.program)
