@@ -20,7 +20,7 @@ from udkjax.threads import thread_limit
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, then the arguments and the results, 40 bytes each:
 # size, extensions, count, types, buffers.
 EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
-# Functions of XLA_FFI_Api, each taking a struct of its arguments: size, extensions, then the argument words.
+# Functions of XLA_FFI_Api. The only argument of each is the address of a struct: size, extensions, then the actual arguments.
 CREATE_ERROR, DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 48, 64, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
@@ -80,17 +80,17 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
         with f.each(word(buffer_of[field], RANK), 1) as k:
             length.value = length.value * f.load(word(buffer_of[field], DIMS, POINTER), k, base=INT)
         put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
-    following = Value(f, f.reserve(INT, 2), POINTER)
+    progress = Value(f, f.reserve(INT, 2), POINTER)
     for k in range(2):
-        f.store(0, following, k, base=INT)
-    put("next", following, POINTER)
+        f.store(0, progress, k, base=INT)
+    put("next", progress, POINTER)
     shares = f.arithmetic("div", dimension(outputs[0], 0), SHARE)
     threads = f.variable(1, INT, 1)
     with f.if_(shares > 1):
         threads.value = _thread_count(f, frame)
     helpers = f.select(threads.value < shares, threads.value, shares) - 1
     f.choose(helpers > 0, lambda: _run_shared(f, frame, call, len(fields), helpers), lambda: f.call("run", call))
-    with f.if_(f.load(following, 1, base=INT).is_not(0)):
+    with f.if_(f.load(progress, 1, base=INT).is_not(0)):
         f.leave(f"ptr {_no_memory(f, frame).name}")
     f.line("ret ptr null")
     return [_help(), f]
@@ -112,7 +112,7 @@ def _no_memory(f: Function, frame: Value) -> Value:
     text = Value(f, f.reserve(INT, len(words)), POINTER)
     for k, word in enumerate(words):
         f.store(int(word), text, k, base=INT)
-    return _of_api(f, frame, CREATE_ERROR, text, f.const(RESOURCE_EXHAUSTED, INT))
+    return _call_api(f, frame, CREATE_ERROR, text, f.const(RESOURCE_EXHAUSTED, INT))
 
 
 def _thread_count(f: Function, frame: Value) -> Value:
@@ -123,11 +123,11 @@ def _thread_count(f: Function, frame: Value) -> Value:
     """
     count = Value(f, f.reserve(INT), POINTER)
     f.store(1, count, base=INT)
-    error = _of_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)
+    error = _call_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)
     with f.if_(~f.is_null(error)):
-        _of_api(f, frame, DESTROY_ERROR, error)
-    found, limit = f.load(count, base=INT), thread_limit()
-    return found if limit is None else f.select(found < limit, found, f.const(limit, INT))
+        _call_api(f, frame, DESTROY_ERROR, error)
+    available, limit = f.load(count, base=INT), thread_limit()
+    return available if limit is None else f.select(available < limit, available, f.const(limit, INT))
 
 
 def _add(f: Function, work: Value, word: int, number: Value | int) -> Value:
@@ -169,9 +169,9 @@ def _share(f: Function, frame: Value, call: Value, count: int, helpers: Value, w
     f.store(f.at(work, NEXT, "i64"), work, CALL + count - 1, base=POINTER)
     context, task = f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)
     with f.each(helpers):
-        error = _of_api(f, frame, SCHEDULE, context, task, work)
+        error = _call_api(f, frame, SCHEDULE, context, task, work)
         with f.if_(~f.is_null(error)):
-            _of_api(f, frame, DESTROY_ERROR, error)
+            _call_api(f, frame, DESTROY_ERROR, error)
             _add(f, work, USERS, -1)
     f.call("run", f.at(work, CALL, "i64"))
     begun = _add(f, work, BEGUN, CLOSED)
