@@ -1,6 +1,6 @@
 """Four-bars that were designed for a straight line, the letter D and a walking foot.
 
-A drawing gives the links and their joints, a goal in a file the places of a point: `udk.design` finds the pins. The foot moves.
+A drawing gives the links and their joints, and a goal file the targets of a point. `udk.design` finds the pins; the foot moves.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ def make():
         mech, places = search(results=1)[0].mechanism, search.problem.goal.targets
         path = np.asarray(udk.path(mech, udk.simulate(mech, np.linspace(0.0, TURN, 7201)), "P"))
         off = np.linalg.norm(path[:, None] - places, axis=2).min(axis=0).max()
-        facts[f"{name}: greatest distance of a given place from the path of the run (mm)"] = 1e3 * float(off)
+        facts[f"{name}: largest distance of a target from the path (mm)"] = 1e3 * float(off)
         panel.plot(*(1e3 * path.T))
         panel.plot(*(1e3 * places.T), "k.")
         panel.set(title=name, aspect="equal", xlabel="x, mm", ylabel="y, mm")

@@ -36,8 +36,8 @@ def make():
     calm = np.hypot(*np.meshgrid(angles, angles)) < 1.0
     facts = {
         "members": float(turns.size),
-        "part that has gone over": float((turns > 1).mean()),
-        "part of those that were let go within a radian that has": float((turns[calm] > 1).mean()),
+        "fraction of members that turned over": float((turns > 1).mean()),
+        "the same fraction of those released within a radian of rest": float((turns[calm] > 1).mean()),
         "members that failed": float((data["result"].values != 0).sum()),
     }
     ts = np.linspace(0.0, 10.0, 301)

@@ -1,6 +1,6 @@
 """A cam that lets its follower rest for a third of each turn, as a Geneva drive does.
 
-The profile is a closed cubic spline; a motor turns the cam, and the joint holds the follower on it: no spring is needed.
+The profile is a closed cubic spline; a motor turns the cam, and the joint holds the follower on the cam without a spring.
 """
 
 import numpy as np
@@ -47,9 +47,9 @@ def make():
     axes.legend(frameon=False)
     rests = lift < LOW + 1e-4
     facts = {
-        "part of a turn in which the follower rests": float(rests.mean()),
+        "fraction of a turn during which the follower rests": float(rests.mean()),
         "lift (m)": float(np.ptp(lift)),
-        "largest difference from the law that was meant (m)": float(np.abs(lift - radius(np.pi / 2 - turned)).max()),
+        "largest difference from the intended law (m)": float(np.abs(lift - radius(np.pi / 2 - turned)).max()),
     }
     return facts, {"motion": udk.animate(mech, sol, measures={"radius (m)": lift}, traces=(), live=LIVE), "lift": figure}
 

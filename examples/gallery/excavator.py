@@ -18,7 +18,7 @@ def make():
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     plots.draw_reactions(figure.subplots(), sol.ts, loads)
     energy = np.asarray(udk.energy(mech, sol).total)
-    facts = {"energy that the dampers took (J)": float(energy[0] - energy[-1])}
+    facts = {"energy dissipated by the dampers (J)": float(energy[0] - energy[-1])}
     return facts, {"motion": udk.animate(mech, sol, measures=("energy",), reactions=True, live=True), "forces": figure}
 
 

@@ -1,7 +1,7 @@
-"""The paper's five-bar linkage, side by side: projected, and not stabilized.
+"""The paper's five-bar linkage, side by side: with projection, and without stabilization.
 
-Three parallel links carry a coupler: one constraint is redundant. Without stabilization it drifts, until the pseudoinverse takes
-it for independent; then no degree of freedom is left, and the linkage stops in the air.
+Three parallel links carry a coupler: one constraint is redundant. Without stabilization this constraint drifts until the
+pseudoinverse treats it as independent; then no degree of freedom is left, and the linkage stops in mid-air.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ def make():
     projected = udk.simulate(mech, ts, rtol=1e-9, atol=1e-9)
     drifting = udk.simulate(mech, ts, rtol=1e-4, atol=1e-4, stabilization=None, method=udk.SVD(rank_tol=1e-6), drift_tol=np.inf)
     facts = {
-        "largest violation when projected (m)": float(np.abs(udk.violation(mech, projected)).max()),
-        "rate of the links at the end, not stabilized (rad/s)": float(abs(drifting.v[-1, 0, 2])),
+        "largest violation with projection (m)": float(np.abs(udk.violation(mech, projected)).max()),
+        "angular velocity of the links at the end, without stabilization (rad/s)": float(abs(drifting.v[-1, 0, 2])),
     }
     return facts, {"motion": udk.animate(mech, {"projected": projected, "not stabilized": drifting})}
 

@@ -1,6 +1,6 @@
-"""A four-bar linkage of five pins, live: sliders for its pins and the speed of its motor; its bodies can be dragged.
+"""A live four-bar linkage of five pins: sliders change its pins and the speed of its motor, and its bodies can be dragged.
 
-The drawing is that of the README. If the loops cannot be closed, or the motor cannot go on, the page says so.
+The drawing is the same as in the README. If the loops cannot be closed, or the motor cannot turn on, the page says so.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ def make():
     sol = udk.simulate(mech, np.linspace(0.0, 2.0, 201))
     facts = {
         "largest torque of the motor (N m)": float(np.abs(udk.efforts(mech, sol)["motor"]).max()),
-        "after a turn the coupler is where it was, within (m)": float(np.abs(sol.q[100, 1, :2] - sol.q[0, 1, :2]).max()),
+        "distance of the coupler from its start after a turn (m)": float(np.abs(sol.q[100, 1, :2] - sol.q[0, 1, :2]).max()),
     }
     turn = udk.simulate(mech, np.linspace(0.0, 1.0, 101))
     film = udk.animate(mech, turn, traces=["A", "B", "P"], measures=())

@@ -1,7 +1,7 @@
-"""A hammer falls on its anvil, rebounds and comes to rest: each blow is an event, in its live page, too.
+"""A hammer falls on its anvil, rebounds and comes to rest: each blow is an event, also in the live page.
 
-A spring drives it; the head hits a contact of restitution 0.6. Events are ticks on the timeline; after weaker and weaker blows it
-comes to rest.
+A spring drives the hammer, and its head hits a contact of restitution 0.6. Blows are ticks on the timeline; they become weaker
+and weaker until the hammer is at rest.
 """
 
 import numpy as np
@@ -38,9 +38,9 @@ def make():
     blows = np.flatnonzero(np.asarray(events.index) == 0)
     before, after = (abs(np.asarray(v)[blows, 0, 2]) for v in (events.v_before, events.v_after))
     facts = {
-        "blows until it rests": len(blows),
-        "rate after a blow over that before it": float(np.median(after / before)),
-        "rate before the second blow over that after the first": float(before[1] / after[0]),
+        "number of blows before the hammer is at rest": len(blows),
+        "angular velocity after a blow, relative to the one before it": float(np.median(after / before)),
+        "angular velocity before the second blow, relative to the one after the first": float(before[1] / after[0]),
     }
     return facts, {"motion": udk.animate(mech, sol, traces=["H"], live=LIVE, events=[anvil])}
 

@@ -1,6 +1,6 @@
 """Two masses of a four-bar, identified from its motion: the guess and the result.
 
-The measurements are made here, with noise of a hundredth of a radian, so that the true values are known.
+The measurements are simulated, with noise of a hundredth of a radian, so that the true values are known.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def make():
     plots.draw_fit(figure.subplots(), data, str(data["channel"].values[0]))
     off = np.abs(values - list(TRUE.values())) / errors
     facts = {
-        "largest error (standard errors)": float(off.max()),
+        "largest error (in standard errors)": float(off.max()),
         "coupler (kg)": float(values[0]),
         "rocker (kg)": float(values[1]),
     }

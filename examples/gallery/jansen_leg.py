@@ -1,6 +1,6 @@
 """Theo Jansen's leg in a batch: how the path of its foot depends on the length of its crank.
 
-Seven links, eight pins, and his "eleven holy numbers". The legs of a batch are computed together.
+The seven links are sized by Jansen's "eleven holy numbers". The legs of a batch are computed together.
 """
 
 import jax
@@ -68,9 +68,9 @@ def make():
     walk = paths[f"crank {1e3 * M:g} mm"]
     low = walk[:, 1] < walk[:, 1].min() + 0.02
     facts = {
-        "part of a turn in which the foot is on the ground": float(low.mean()),
+        "fraction of a turn during which the foot is on the ground": float(low.mean()),
         "length of a step (m)": float(np.ptp(walk[low, 0])),
-        "the foot comes back to where it was within (m)": float(np.abs(walk[-1] - walk[0]).max()),
+        "distance of the foot from its start after a turn (m)": float(np.abs(walk[-1] - walk[0]).max()),
     }
     sol = udk.simulate(mech, ts)
     animation = udk.animate(mech, sol, measures={"height of the foot (m)": walk[:, 1]}, traces=("F", "E"), live=True)

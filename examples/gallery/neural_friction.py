@@ -77,9 +77,9 @@ def make():
     axes.set(xlabel="angular velocity (rad/s)", ylabel="torque (N m)")
     axes.legend(frameon=False)
     facts = {
-        "error of the angle, root mean square (rad)": losses[-1] ** 0.5,
-        "error of the angle before (rad)": losses[0] ** 0.5,
-        "error of the law, root mean square (N m)": float(np.sqrt(np.mean((found - true) ** 2))),
+        "root-mean-square error of the angle (rad)": losses[-1] ** 0.5,
+        "root-mean-square error of the angle before training (rad)": losses[0] ** 0.5,
+        "root-mean-square error of the law (N m)": float(np.sqrt(np.mean((found - true) ** 2))),
     }
     untrained = udk.simulate(network, TS, rtol=1e-6, atol=1e-6)
     runs = {"measured": measured, "learned": udk.simulate(learned, TS, rtol=1e-6, atol=1e-6), "before": untrained}

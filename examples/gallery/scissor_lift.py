@@ -1,6 +1,6 @@
 """A scissor lift comes down under its platform, with two redundant constraints.
 
-Its platform's guide is overconstrained; it moves with one degree of freedom, and its energy is constant.
+The guide of the platform is overconstrained; the lift has one degree of freedom, and its energy is constant.
 """
 
 import numpy as np

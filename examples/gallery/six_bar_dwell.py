@@ -26,7 +26,7 @@ def make():
     sol = udk.simulate(mech, np.linspace(0.0, 2 * TURN, 721))
     angle = np.rad2deg(np.asarray(sol.q)[:, mech.body_names.index("output"), 2])
     rest = min(np.ptp(angle[k : k + STILL]) for k in range(361))
-    facts = {"swing of the output (deg)": float(np.ptp(angle)), "within a third of a turn (deg)": float(rest)}
+    facts = {"swing of the output (deg)": float(np.ptp(angle)), "motion of the output during the dwell (deg)": float(rest)}
     figure, panel = plt.subplots(figsize=(6, 3), layout="constrained")
     panel.plot(np.asarray(sol.ts), angle)
     panel.set(xlabel="time, s", ylabel="angle of the output, deg")
