@@ -1,4 +1,4 @@
-"""Questions asked of trajectories."""
+"""Studies: accuracy, diagnosis, identification, sweeps and other analyses of mechanisms and their motions."""
 
 from udkjax.lazy_names import lazy_names
 

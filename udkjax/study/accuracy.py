@@ -19,11 +19,11 @@ N_SAMPLES = 5  # times at which drivers and potentials are checked for change
 class Accuracy(NamedTuple):
     """Errors of a run: maxima over the output times that it reached."""
 
-    violation: float  # of any constraint, m or rad
-    energy_change: float  # of the total energy since the start, J
+    violation: float  # largest violation of a constraint (m or rad)
+    energy_change: float  # largest change of the total energy since the start (J)
     kinetic_energy: float  # J
-    error: float | None  # of any coordinate against the exact solution, m or rad; None if no exact solution is known
-    work: float | None  # of drivers, dampers, loads and impacts up to the end, J; None if the mechanism conserves energy
+    error: float | None  # largest difference of a coordinate from the exact solution (m or rad); None if none is known
+    work: float | None  # work of drivers, dampers, loads and impacts up to the end (J); None if energy is conserved
     length: float  # characteristic length, m
 
 
@@ -32,7 +32,7 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 
     Args:
         mechanism: mechanism that was simulated.
-        solution: one run, no batch.
+        solution: a single run, not a batch.
 
     Returns:
         An `Accuracy`: the largest violation, energies and error.
@@ -54,11 +54,11 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 
 
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
-    """Return True if only errors change the total energy: drivers are at rest, and all forces have constant potentials."""
+    """Return True if only errors can change the total energy: drivers are at rest, and all forces have constant potentials."""
     from udkjax.integrate.events.conditions import frames_of  # imports the code of events, which other studies do not need
 
     frames = frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())
-    ts = np.asarray(ts)  # the minimum of a JAX array would compile a program
+    ts = np.asarray(ts)  # in NumPy, since the minimum of a JAX array would compile a program
     times = np.linspace(np.min(ts), np.max(ts), N_SAMPLES)
     for element in mechanism.forces.values():
         attached = [frames[name] for name in mechanism.frames_of(element)]
@@ -77,15 +77,16 @@ def largest_violation(violated: Float[ArrayLike, "T m"]) -> Float[np.ndarray, " 
 class Parallelogram(NamedTuple):
     """A parallelogram linkage in its initial configuration, in ground axes.
 
-    Equal and parallel links, pinned to the ground and to one coupler at the same spacing, rotate together; the coupler only
+    Equal and parallel links, pinned to the ground and to a coupler at the same spacing, rotate together, and the coupler only
     translates. With c_i the centre of mass of link i relative to its ground pivot, p the arm from the pivot to the coupler's pin,
     and R(theta) the rotation since the start, the energies are
 
         T = J theta'^2 / 2,     J = sum(I_i + m_i |c_i|^2) + m_c |p|^2
         V = -g . R(theta) w,    w = sum(m_i c_i) + m_c p
 
-    so J phi'' = -|g| |w| sin(phi), phi the angle from g to R w: a pendulum, solved by Jacobi's elliptic functions. The linkage of
-    de Falco, Pennestri and Vita (2005), section 6, is one: 3.05 theta'' = -3.5 g cos(theta), theta the angle of its links.
+    so J phi'' = -|g| |w| sin(phi), where phi is the angle from g to R w. This is a pendulum, solved by Jacobi's elliptic
+    functions. The linkage of de Falco, Pennestri and Vita (2005), section 6, is a parallelogram: with theta the angle of its
+    links, 3.05 theta'' = -3.5 g cos(theta).
     """
 
     links: list[int]  # body indices
@@ -130,10 +131,10 @@ def as_pendulum(mech: Mechanism, linkage: Parallelogram) -> tuple[float, float]:
 
 
 def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, " T"]:
-    """Return the change of phi (rad) at `ts`, where phi'' = -omega^2 sin(phi) starts from `angle` with `rate` (rad/s).
+    """Return the change of phi (rad) at `ts`: the solution of phi'' = -omega^2 sin(phi) from `angle` and `rate` (rad/s).
 
     Oscillation (k <= 1): sin(phi / 2) = k sn(omega t + u, k). Rotation (k > 1): phi / 2 = am(k omega t + u, 1 / k). The first
-    amplitude comes from atan2: asin would lose half of the digits at a release from rest.
+    amplitude is computed by atan2, since asin would lose half of the digits at a release from rest.
     """
     from scipy.special import ellipj, ellipkinc  # importing SciPy takes longer than a run
 
@@ -167,15 +168,15 @@ def parallelogram(mech: Mechanism, q0, tol: float) -> Parallelogram | None:
     if set(above) != set(below):
         return None
 
-    place = {name: number for number, name in enumerate(mech.bodies)}
-    angle = {name: q0[number, 2] for name, number in place.items()}
+    index = {name: number for number, name in enumerate(mech.bodies)}
+    angle = {name: q0[number, 2] for name, number in index.items()}
     pivots = np.array([pin[GROUND] for pin in below.values()])
     arms = np.array([_rotate(above[link][link] - below[link][link], angle[link]) for link in below])
     spacing = np.array([_rotate(above[link][coupler], angle[coupler]) for link in below]) - pivots
     if np.abs(arms - arms[0]).max() + np.abs(spacing - spacing[0]).max() > tol * np.hypot(*arms[0]):
         return None
     centres = np.array([_rotate(-below[link][link], angle[link]) for link in below])
-    return Parallelogram([place[link] for link in below], place[coupler], pivots, centres, arms[0])
+    return Parallelogram([index[link] for link in below], index[coupler], pivots, centres, arms[0])
 
 
 def _rotate(vector, angle):

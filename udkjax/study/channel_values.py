@@ -30,8 +30,8 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
 
         lambda = -(D^+)^T D^+ b,    M a = F - Psi_q^T lambda,
 
-    of minimum norm where constraints are redundant, by `SVD` whatever the method of the run, since a batch would compute both
-    sides of a branch. They are computed only if a channel needs them.
+    of minimum norm where constraints are redundant. They are computed only if a channel needs them, and by `SVD`, independently
+    of the run's method, because a batch would execute both sides of a branch.
 
     Args:
         mechanism: the mechanism that moved.
@@ -39,8 +39,8 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
         channels: channels to measure.
 
     Returns:
-        Values (T, C) in SI units, one column per channel; NaN where the state is NaN, after a run has failed. At a toggle only
-        velocities are NaN: positions, angles and distances are finite. Derivatives of NaN values are zero.
+        Values (T, C) in SI units, one column per channel; NaN where the state is NaN, after a run has failed. At a toggle,
+        positions, angles and distances are finite, and velocities are NaN. Derivatives of NaN values are zero.
     """
     motion, placed, reached = _fill(mechanism, solution)
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
@@ -57,27 +57,29 @@ def path(
 ) -> Float[Array, "T 2"]:
     """Return the path of a point of a body, or of a pin, over a motion; or the point's velocities or accelerations.
 
-    Pure, jittable, batched by `vmap`, and differentiable by every number of the mechanism, the point and the motion.
+    The function is pure, jittable, batched by `vmap`, and differentiable by every number of the mechanism, the point and the
+    motion.
 
     Args:
         mechanism: the mechanism that moved.
         solution: a `Solution`, a `Kinematics`, or another motion with ts (T,), q and v (T, bodies, 3).
-        of: a body; or a pin, by the name of its joint or in the drawing. A joint with two points stands for its second body's.
-        point: a point in the body's own frame (m); by default its centre of mass.
-        derivative: 0 for positions (m), 1 for velocities (m/s), 2 for accelerations (m/s^2): the motion's own, if it has them
-            as a `Kinematics` does, or those of the equations of motion, a = a_F + M^(-1/2) D^+ b.
+        of: a body; or a pin, by the name of its joint or in the drawing. A joint with two points denotes that of its second body.
+        point: a point in the body's frame (m); by default its centre of mass.
+        derivative: 0 for positions (m), 1 for velocities (m/s), 2 for accelerations (m/s^2). These are read from the
+            motion if it has them, as a `Kinematics` does; else they follow from the equations of motion, a = a_F + M^(-1/2) D^+
+            b.
 
     Returns:
-        x and y (T, 2) in ground axes; NaN where the motion is NaN. At a toggle only positions are finite.
+        x and y (T, 2) in ground axes; NaN where the motion is NaN. At a toggle, only positions are finite.
 
     Raises:
         ValueError: the body or pin is unknown.
     """
     body, local = locate(mechanism, of, point)
-    given = getattr(solution, "a", None)
-    analysis = analyse(mechanism) if derivative == 2 and given is None else None
+    accelerations = getattr(solution, "a", None)
+    analysis = analyse(mechanism) if derivative == 2 and accelerations is None else None
     motion = jnp.asarray(solution.ts), jnp.asarray(solution.q), jnp.asarray(solution.v)
-    return _path(mechanism.without_origin, analysis, *motion, given if derivative == 2 else None, local, body, derivative)
+    return _path(mechanism.without_origin, analysis, *motion, accelerations if derivative == 2 else None, local, body, derivative)
 
 
 @deferred
@@ -89,9 +91,9 @@ def _path(mechanism, analysis, ts, q, v, a, local, body, derivative):
 def _fill(
     mechanism: Mechanism, solution: StateHistory | SimpleNamespace, analysis: Analysis | None = None
 ) -> tuple["_Motion", Bool[Array, "T"], Bool[Array, "T"]]:
-    """Return a motion with its NaN states replaced by the scene's guess, so that all derivatives are finite.
+    """Return a motion whose NaN states are replaced by the scene's guess, to keep all derivatives finite, and two masks.
 
-    Returned with it are masks of the times at which positions are finite, and at which velocities are finite, too.
+    The masks are of the times at which positions are finite, and of those at which velocities are finite too.
     """
     placed = jnp.all(jnp.isfinite(solution.q), axis=(1, 2))
     reached = placed & jnp.all(jnp.isfinite(solution.v), axis=(1, 2))
@@ -123,7 +125,7 @@ class _Motion:
     ts: Float[Array, "T"]
     q: Float[Array, "T bodies 3"]
     v: Float[Array, "T bodies 3"]
-    a: Float[Array, "T bodies 3"] | None  # the motion's own accelerations, if it has them
+    a: Float[Array, "T bodies 3"] | None  # accelerations of the motion, if it has them
     analysis: Analysis | None
 
     @cached_property
@@ -142,20 +144,20 @@ class _Motion:
 
     @cached_property
     def frames(self) -> dict[str, Frame]:
-        """The frame of each body and of the ground, each of its entries (T,)."""
-        found = {}
+        """The frames of bodies and of the ground; their entries have the shape (T,)."""
+        frames = {}
         for body in (*self.mechanism.body_names, GROUND):
             (x, y, angle), (vx, vy, omega) = self._entries(self.q, body), self._entries(self.v, body)
-            found[body] = Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
-        return found
+            frames[body] = Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
+        return frames
 
     @cached_property
     def loads(self) -> dict[str, Float[Array, "T bodies 3"]]:
-        """Forces and torques of each constraint on all bodies, -Psi_q^T lambda of its rows."""
+        """Forces and torques of each constraint on all bodies: -Psi_q^T lambda of the constraint's rows."""
         psi_q, multipliers, owners, _ = self.dynamics
         by_row = -multipliers[..., None, None] * psi_q
-        rows = {owner: [k for k, name in enumerate(owners) if name == owner] for owner in owners}
-        return {owner: by_row[:, own[0] : own[-1] + 1].sum(1) for owner, own in rows.items()}
+        rows_by_owner = {owner: [k for k, name in enumerate(owners) if name == owner] for owner in owners}
+        return {owner: by_row[:, indices[0] : indices[-1] + 1].sum(1) for owner, indices in rows_by_owner.items()}
 
     def acceleration(self, body: str) -> list[Array]:
         """Return ax, ay and alpha of a body, each (T,)."""
@@ -173,7 +175,7 @@ class _Motion:
         return Point(ax - alpha * arm.y - square * arm.x, ay + alpha * arm.x - square * arm.y)
 
     def load(self, owner: str, body: str) -> tuple[Array, Array, Array]:
-        """Return force and torque of a constraint on a body; on the ground, the opposite of those on the other bodies."""
+        """Return force and torque of a constraint on a body; for the ground, minus the sum over the other bodies."""
         loads = self.loads[owner]
         if body != GROUND:
             fx, fy, torque = self._entries(loads, body)
@@ -183,8 +185,8 @@ class _Motion:
         return -fx.sum(1), -fy.sum(1), -about_origin.sum(1)
 
     def _entries(self, x: Array, body: str) -> list[Array]:
-        place = None if body == GROUND else self.mechanism.body_names.index(body)
-        return [jnp.zeros(len(x)) if place is None else x[:, place, k] for k in range(3)]
+        index = None if body == GROUND else self.mechanism.body_names.index(body)
+        return [jnp.zeros(len(x)) if index is None else x[:, index, k] for k in range(3)]
 
 
 def _measure_body(channel: Channel, motion: _Motion) -> Array:
@@ -199,8 +201,8 @@ def _measure_body(channel: Channel, motion: _Motion) -> Array:
 
 def _component(motion: _Motion, body: str, point: Float[Array, "2"] | LocalPoint, quantity: str) -> Array:
     """Return x or y of the position, velocity (vx, vy) or acceleration (ax, ay) of a point."""
-    found = motion.point(body, point, DERIVATIVE[quantity[:-1]])
-    return jnp.broadcast_to(getattr(found, quantity[-1]), motion.ts.shape)
+    values = motion.point(body, point, DERIVATIVE[quantity[:-1]])
+    return jnp.broadcast_to(getattr(values, quantity[-1]), motion.ts.shape)
 
 
 def _measure_pin(channel: Channel, motion: _Motion) -> Array:
@@ -213,10 +215,10 @@ def _measure_joint(channel: Channel, motion: _Motion) -> Array:
     if channel.quantity in POINT_UNITS:
         return _measure_pin(channel, motion)
     if channel.quantity == "alpha":
-        one, two = (motion.acceleration(body)[2] for body in channel.bodies)
+        first, second = (motion.acceleration(body)[2] for body in channel.bodies)
     else:
-        one, two = (getattr(motion.frames[body], channel.quantity) for body in channel.bodies)
-    return two - one
+        first, second = (getattr(motion.frames[body], channel.quantity) for body in channel.bodies)
+    return second - first
 
 
 def _measure_driver(channel: Channel, motion: _Motion) -> Array:

@@ -46,7 +46,7 @@ CHOICES = {"method": METHODS, "formulation": FORMULATIONS, "stabilization": STAB
 
 
 def choice(setting: str, given: str | Mapping[str, str | float]) -> Choice:
-    """Return the object for a setting ("method") from its name ("svd"), or from a table of its `type` and arguments.
+    """Return the object for a setting ("method") from its name ("svd"), or from a table with its `type` and arguments.
 
     Raises:
         ValueError: the name or an argument is unknown; the message lists the valid ones.
@@ -56,9 +56,9 @@ def choice(setting: str, given: str | Mapping[str, str | float]) -> Choice:
     name, numbers = table.get("type"), {key: value for key, value in table.items() if key != "type"}
     if not isinstance(name, str) or name not in options:
         raise ValueError(f"no {setting} {abbreviate(name)}{suggestion(name, options) or '; one of ' + ', '.join(options)}")
-    make = options[name]
-    expected = [] if setting == "solver" else list(inspect.signature(make).parameters)
+    constructor = options[name]
+    expected = [] if setting == "solver" else list(inspect.signature(constructor).parameters)
     for key in numbers:
         if key not in expected:
             raise ValueError(f"{quote(name)} has no {quote(key)}{suggestion(key, expected)}")
-    return make(**numbers)
+    return constructor(**numbers)

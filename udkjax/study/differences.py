@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-STEP_RATIO = 4.0  # from one step of differences to the next
-DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # of dimensionless unknowns: 0.1 to 4e-7
-RICHARDSON = STEP_RATIO**2  # ratio of the errors, of second order, of one step and the next
-NEXT_STEPS = 2  # smaller steps whose truncation is negligible relative to that of one; two, since one may agree by chance
-LEAST_CHANGE = 1e-2  # relative to the observed size: a step that changes less is small, whatever the derivative predicts
-TOO_LARGE = 0.5  # relative to a difference: a step is too large if smaller steps disagree by more
+STEP_RATIO = 4.0  # ratio of successive steps of differences
+DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # changes of dimensionless unknowns, from 0.1 to 4e-7
+RICHARDSON = STEP_RATIO**2  # ratio of the errors of successive steps, which are of second order
+NEXT_STEPS = 2  # number of smaller steps to compare a step with; a single one may agree by chance
+LEAST_CHANGE = 1e-2  # a step is small if values change by less than this, relative to their size
+TOO_LARGE = 0.5  # a step is too large if smaller steps disagree by more than this, relative to the difference
 
 
 class Differences(NamedTuple):
-    """Differences R(h) at all steps but the last two, and their errors in each of S series; NaN where unknown."""
+    """Differences R(h) at all steps except the last two, and their errors in each of S series; NaN where unknown."""
 
     steps: Float[np.ndarray, "H"]
     values: Float[np.ndarray, "H R"]
@@ -37,11 +37,12 @@ def differences(
     Two errors are estimated, without a derivative to compare with:
 
         noise        |e(h) - e(-h)| / 2h, from the integration error e. Unlike rounding, e jumps where the step controller takes
-                     other steps, and changes smoothly with the parameters in between, so that differences converge, as h
-                     decreases, to a wrong value. So e is measured at each step, by the same run at another tolerance, not
-                     estimated from the roughness of y (as by J. J. More and S. M. Wild, Estimating computational noise, 2011).
-        truncation   ~ h^4: the disagreement with smaller steps, beyond their own errors; where these hide it, extrapolated from
-                     larger steps. Steps at which it is a large part of the difference are discarded.
+                     other steps, and changes smoothly with the parameters in between; differences therefore converge to a
+                     wrong value as h decreases. For this reason e is measured at each step, by the same run at another
+                     tolerance, and not estimated from the roughness of y (as by J. J. More and S. M. Wild, Estimating
+                     computational noise, 2011).
+        truncation   ~ h^4: the disagreement with smaller steps beyond the errors of these steps; where these errors are larger,
+                     it is extrapolated from larger steps. Steps with a large relative truncation error are discarded.
 
     Args:
         y: values at +-steps; NaN where a run has failed, which excludes its step.
@@ -56,7 +57,7 @@ def differences(
     R = (RICHARDSON * D[1:] - D[:-1]) / (RICHARDSON - 1)
     rounding = np.finfo(float).eps * sizes(y[:, 0], series)
     jumps = sizes(errors[:, 0] - errors[:, 1], series) / 2 + rounding
-    # An error smaller than at smaller steps is so only by chance.
+    # Errors do not decrease with the step size; smaller values at large steps are chance.
     off = np.fmax.accumulate(jumps[::-1])[::-1] / h
     noise = (RICHARDSON * off[1:] + off[:-1]) / (RICHARDSON - 1)
     noise = np.where(np.isfinite(sizes(R, series)), noise, np.nan)
@@ -65,25 +66,25 @@ def differences(
 
 
 def _truncation(R: np.ndarray, noise: np.ndarray, series: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the truncation error at all steps but the last."""
+    """Return the truncation error at all steps except the last."""
     count = len(R) - 1
-    found = np.full((count, len(series)), np.nan)
+    error = np.full((count, len(series)), np.nan)
     for k in reversed(range(count)):
         near = [sizes(R[k] - R[j], series) - noise[j] for j in range(k + 1, min(k + NEXT_STEPS, count) + 1)]
-        far = [sizes(R[k] - R[j], series) - noise[j] - found[j] for j in range(k + 1 + NEXT_STEPS, count)]
+        far = [sizes(R[k] - R[j], series) - noise[j] - error[j] for j in range(k + 1 + NEXT_STEPS, count)]
         excess = np.stack([*near, *far])
-        found[k] = np.fmax.reduce(np.where(np.isfinite(excess), np.maximum(excess, 0.0), np.nan))
+        error[k] = np.fmax.reduce(np.where(np.isfinite(excess), np.maximum(excess, 0.0), np.nan))
     for k in range(1, count):
-        found[k] = np.where(found[k] < found[k - 1] / STEP_RATIO**4, found[k - 1] / STEP_RATIO**4, found[k])
-    whole = sizes(R, series)
-    return np.where(found > TOO_LARGE * np.fmax(whole[:-1], whole[1:]), np.nan, found)
+        error[k] = np.where(error[k] < error[k - 1] / STEP_RATIO**4, error[k - 1] / STEP_RATIO**4, error[k])
+    size = sizes(R, series)
+    return np.where(error > TOO_LARGE * np.fmax(size[:-1], size[1:]), np.nan, error)
 
 
-def leave_out_far_steps(found: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
+def leave_out_far_steps(differences: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
     """Exclude differences whose steps lead to an entirely different motion; `size` is the derivative's size in each series."""
-    h = found.steps[:, None]
-    far = (h * size > found.largest) & (h * sizes(found.values, series) > LEAST_CHANGE * found.largest)
-    return found._replace(truncation=np.where(far, np.nan, found.truncation))
+    h = differences.steps[:, None]
+    far = (h * size > differences.largest) & (h * sizes(differences.values, series) > LEAST_CHANGE * differences.largest)
+    return differences._replace(truncation=np.where(far, np.nan, differences.truncation))
 
 
 def best_steps(errors: Float[np.ndarray, "... H"]) -> Int[np.ndarray, "..."]:

@@ -1,6 +1,6 @@
 """The derivation of the accelerations for one state, with the paper's symbols and numbers: `explain`.
 
-Everything comes from the textbook functions (equations/constraints.py, loads.py, udwadia_kalaba.py), one symbol each. The
+Each symbol is computed by a textbook function (equations/constraints.py, loads.py, udwadia_kalaba.py). The
 equations of motion, the constraints, Penrose's four conditions and Gauss's principle are checked.
 """
 
@@ -20,7 +20,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.explanation import Explanation, Gauss
 
-N_RIVALS = 200  # random feasible accelerations to compare a with
+N_RIVALS = 200  # number of random feasible accelerations to compare a with
 
 
 @checked
@@ -33,7 +33,7 @@ def explain(
         mechanism: mechanism with concrete numbers.
         t: time (s), for drivers and loads.
         state: the state; it is closed first. By default the initial guess.
-        stabilization: Baumgarte's terms in b, if any.
+        stabilization: adds Baumgarte's terms to b; by default there are none.
 
     Returns:
         The `Explanation`: Psi, Psi_q, M, gamma, F, D, D^+, a_F, b, a, lambda, and the checks.

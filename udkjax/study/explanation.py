@@ -12,9 +12,9 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.report import plain, row_label
 from udkjax.wording import plural
 
-MOST_MATRIX_COLUMNS = 18  # columns of a matrix on one line
-SMALLEST_PRINTED = 1e-12  # relative to the largest entry of an array; smaller ones are printed as 0
-SMALLEST_TERM = 1e-9  # relative to the largest coefficient of a combination of rows; smaller ones are rounding
+MOST_MATRIX_COLUMNS = 18  # largest number of columns of a matrix on one line
+SMALLEST_PRINTED = 1e-12  # smallest entry that is not printed as 0, relative to the largest of the array
+SMALLEST_TERM = 1e-9  # smallest coefficient of a combination of rows that is not rounding, relative to the largest
 
 
 class Gauss(NamedTuple):
@@ -25,10 +25,10 @@ class Gauss(NamedTuple):
     """
 
     at_a: float  # G(a), kg m^2/s^4
-    free: int  # columns of V
+    free: int  # number of columns of V
     slope: float  # the largest of |V^T M (a - a_F)|, relative to |M^(1/2) (a - a_F)|: zero up to rounding
     least_rival: float  # the least G of random feasible accelerations
-    rivals: int  # their number
+    rivals: int  # number of random accelerations
 
 
 class Explanation(NamedTuple):
@@ -41,17 +41,17 @@ class Explanation(NamedTuple):
         v: velocities.
         row_names: joint and number of each row.
         psi: Psi.
-        psi_dot: its rate.
-        psi_q: its Jacobian.
+        psi_dot: the rate of Psi.
+        psi_q: the Jacobian of Psi.
         gamma: the right-hand side of Psi_q a = gamma.
         D: Psi_q M^(-1/2), with weighted rows.
-        rank: of D.
-        D_plus: its pseudoinverse.
+        rank: the rank of D.
+        D_plus: the pseudoinverse of D.
         a_F: M^(-1) F.
         b: gamma - Psi_q a_F, with weighted rows.
         a: accelerations.
         multipliers: lambda.
-        gauss: Gauss's principle, checked.
+        gauss: the check of Gauss's principle.
     """
 
     mechanism: Mechanism
@@ -65,17 +65,17 @@ class Explanation(NamedTuple):
     gamma: Float[np.ndarray, "m"]
     mass: Float[np.ndarray, "n"]  # the diagonal of M
     force: Float[np.ndarray, "n"]  # F
-    weights: Float[np.ndarray, "m"]  # of the rows of D and b
+    weights: Float[np.ndarray, "m"]  # weights of the rows of D and b
     D: Float[np.ndarray, "m n"]
-    singular_values: Float[np.ndarray, "k"]  # of D
+    singular_values: Float[np.ndarray, "k"]  # singular values of D
     rank: int
     D_plus: Float[np.ndarray, "n m"]
     a_F: Float[np.ndarray, "n"]
     b: Float[np.ndarray, "m"]
     a: Float[np.ndarray, "n"]
     multipliers: Float[np.ndarray, "m"]
-    unique: Bool[np.ndarray, "m"]  # of the multipliers
-    null_rows: Float[np.ndarray, "m k"]  # N: combinations of rows of Psi_q that vanish
+    unique: Bool[np.ndarray, "m"]  # mask of the unique multipliers
+    null_rows: Float[np.ndarray, "m k"]  # N, whose columns are combinations of rows of Psi_q that vanish
     constraint_force: Float[np.ndarray, "n"]  # -Psi_q^T lambda
     gauss: Gauss
     checks: dict[str, float]  # residuals of the identities, relative to their terms
@@ -107,7 +107,7 @@ class Explanation(NamedTuple):
         return f"<pre>{html.escape(str(self))}</pre>"
 
 
-# --- as text: the lines of each section
+# --- lines of each section, as text
 
 
 def _columns(mechanism: Mechanism) -> list[str]:
@@ -195,7 +195,7 @@ def _multipliers(e: Explanation, rows: list[str]) -> list[str]:
 
 
 def _directions(e: Explanation) -> list[tuple[str, float]]:
-    """Return the pins and welds whose force is unique in one direction only, with that direction (rad)."""
+    """Return the pins and welds whose force is unique in one direction only, with this direction (rad)."""
     found, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
     for name, joint in e.mechanism.joints.items():
         own = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
@@ -236,7 +236,7 @@ def _width(names: list[str]) -> int:
 
 
 def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]:
-    """Format a matrix with names of its rows and columns; a wide one in blocks below each other."""
+    """Format a matrix with names of its rows and columns; wide matrices are split into blocks."""
     width, lines = _width(rows), []
     sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
     cells = [[_number(x, size) for x, size in zip(row, np.broadcast_to(sizes, row.shape), strict=True)] for row in values]
@@ -250,5 +250,5 @@ def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]
 
 
 def _number(x: float, size: float) -> str:
-    """Format a number with four digits; as 0 if it is rounding relative to `size`."""
+    """Format a number with four digits; as 0 if it is a rounding error relative to `size`."""
     return "0" if abs(x) <= SMALLEST_PRINTED * size else f"{x:.4g}"

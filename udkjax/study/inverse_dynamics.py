@@ -7,8 +7,8 @@ the joints' rows J and the drivers' rows C of Psi_q, the equation of motion is
 
 The joints carry any force in the range of J^T; the drivers must supply the rest. With N a basis of the null space of J,
 N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. If there are more drivers than degrees of freedom, f is the
-solution of least weighted norm, sum_i w_i f_i^2. Where branches meet, N has another column, along the other branch, in which the
-joints carry load, too: with one degree of freedom, the direction v of the motion replaces N.
+solution with the least sum_i w_i f_i^2. Where branches meet, N has another column, along the other branch, in which the joints
+carry load too; with one degree of freedom, N is therefore replaced by the direction v of the motion.
 """
 
 import math
@@ -46,16 +46,16 @@ from udkjax.wording import quote
 class InverseDynamics(PrintsTable):
     """Efforts (torques or forces) of drivers along their coordinates for a prescribed motion; NaN where undetermined.
 
-    They are undetermined where the motion is not possible or its velocities are undetermined, and where branches meet in a
+    They are undetermined where the motion is impossible, where its velocities are undetermined, and where branches meet in a
     mechanism with more than one degree of freedom.
     """
 
     ts: Float[Array, "T"]  # s
     motion: Kinematics | None  # None if the motion was given
     efforts: dict[str, Float[Array, "T"]]  # by driver: torque (N m) along an angle, force (N) along a length
-    powers: dict[str, Float[Array, "T"]]  # W: effort times the coordinate's rate
+    powers: dict[str, Float[Array, "T"]]  # effort times the coordinate's rate (W)
     residual: Float[Array, "T"]  # largest part of M a - F that neither joints nor drivers exert, relative to M a and the loads
-    effort_units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())  # by driver
+    effort_units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())  # unit of each driver's effort
 
     _units = units(ts="s", efforts="N m or N", powers="W")
 
@@ -72,7 +72,7 @@ class InverseDynamics(PrintsTable):
             power = np.asarray(self.powers[name])
             span = " to ".join(format_number(end(power)) for end in (np.nanmin, np.nanmax))
             unit, largest = dict(self.effort_units).get(name, "N m or N"), float(np.nanmax(np.abs(power))) * float(np.ptp(ts))
-            energies = (format_number(one[name], "J", largest) for one in (self.works, self.swings))
+            energies = (format_number(work[name], "J", largest) for work in (self.works, self.swings))
             peak, mean = format_number(x[k], unit), format_number(math.sqrt(mean_square), unit)
             rows.append((name, f"{peak} at {ts[k]:.6g} s", mean, f"{span} W", *energies))
         unbalanced = float(np.nanmax(np.asarray(self.residual), initial=0.0))
@@ -94,8 +94,8 @@ class InverseDynamics(PrintsTable):
     def swings(self) -> dict[str, Float[Array, ""]]:
         """Range (J) of each driver's work minus the work of its mean power, by the trapezoidal rule.
 
-        Over whole cycles it is the energy that a flywheel must store: an inertia of swing / (k w^2) keeps the variation of the
-        speed w within k w.
+        Over whole cycles, this is the energy that a flywheel must store: an inertia of swing / (k w^2) limits the variation of
+        the speed w to k w.
         """
         steps, swings = jnp.diff(self.ts), {}
         for name, power in self.powers.items():
@@ -120,14 +120,14 @@ class AcceleratedTrajectory(StateHistory, Protocol):
 
 
 class Effort(ForceElement):
-    """A torque (N m) or force (N) along a coordinate of two bodies: its power is the effort times the coordinate's rate.
+    """A torque (N m) or force (N) along a coordinate of two bodies; its power is the effort times the coordinate's rate.
 
     Args:
         bodies: the names of the two bodies.
         coordinate: kind of the coordinate: "angle", "x", "y" or "distance".
         law: the torque or force as a function of time (s).
-        points: attachment points, each in its own body's frame (m); by default the origins.
-        axis: for x and y, the direction of x in body 1's frame (rad); by default the frame's own.
+        points: attachment points, each in the frame of its body (m); by default the origins.
+        axis: for x and y, the direction of x in body 1's frame (rad); by default that of the frame's x axis.
     """
 
     coordinate: Literal["angle", "x", "y", "distance"] = eqx.field(static=True)
@@ -153,14 +153,15 @@ def inverse_dynamics(
 ) -> InverseDynamics:
     """Compute the efforts of drivers at the times ts (s) for a prescribed motion: M a - F = J^T mu + C^T f.
 
-    Pure and batched by `vmap`, with exact derivatives by every number of the mechanism, including those of the motion.
+    The function is pure and batched by `vmap`, with exact derivatives by every number of the mechanism, including those of the
+    motion.
 
     Args:
         mechanism: mechanism whose drivers prescribe the motion unless `motion` does; F are its force elements and gravity.
         ts: times (s).
         motion: a trajectory with q, v and a (T, bodies, 3); by default that of all drivers, by `kinematics`.
         drivers: drivers or coordinates that exert efforts, each a name (`motor`, `body.crank.angle`) or a `Coordinate`; by
-            default the scene's drivers. If there are more than degrees of freedom, their efforts have least weighted norm.
+            default the scene's drivers. If there are more drivers than degrees of freedom, the efforts have least weighted norm.
         weights: weight w_i > 0 of each driver's squared effort, by name; by default 1.
 
     Returns:
@@ -171,9 +172,9 @@ def inverse_dynamics(
         ValueError: the number of states of `motion` differs from that of `ts`.
     """
     ts = number(ts)
-    found = None
+    computed = None
     if motion is None:
-        motion = found = kinematics(mechanism, None, ts)
+        motion = computed = kinematics(mechanism, None, ts)
     chosen = list(mechanism.driver_names) if drivers is None else list(drivers)
     if not chosen:
         raise SceneError(["drivers: the scene has none; name coordinates to drive, such as body.crank.angle"], mechanism.name)
@@ -192,15 +193,16 @@ def inverse_dynamics(
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
     effort_units = tuple((name, value.effort_unit) for name, value in zip(named, values, strict=True))
-    return InverseDynamics(ts, found, columns, powers, residual, effort_units)
+    return InverseDynamics(ts, computed, columns, powers, residual, effort_units)
 
 
 @checked
 def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     """Return the mechanism with its drivers replaced by force elements that exert these efforts as natural cubic splines.
 
-    Simulated from a state of the prescribed motion, it follows that motion. The splines' errors are O(h^4) in the time h between
-    knots, and O(h^2) near their ends: begin the times a dozen knots before the run, and end them a dozen after it.
+    Simulated from a state of the prescribed motion, the mechanism follows this motion. Errors of the splines are O(h^4) in the
+    time h between knots, and O(h^2) near their ends. Therefore begin the times a dozen knots before the run, and end them a
+    dozen knots after it.
 
     Args:
         mechanism: the mechanism of `found`.
@@ -240,7 +242,7 @@ def _efforts(
         J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
         free, determined = _free_part(J), jnp.asarray(True)
         missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))
-        if analysis.rank is not None:  # else the number of degrees of freedom is unknown
+        if analysis.rank is not None:  # otherwise the number of degrees of freedom is unknown
             deficient = SVD(RANK_TOL).plus(J).rank < analysis.rank if len(J) else jnp.asarray(False)
             u = v / units
             speed = jnp.linalg.norm(jnp.where(deficient, u, 1.0))
@@ -249,7 +251,7 @@ def _efforts(
             free = lambda x: jnp.where(deficient, jnp.tensordot(u, u @ x, 0), everywhere(x))  # noqa: E731
         required, A = free(missing), free((C * units).T * share)
         f = share * (SVD(RANK_TOL).plus(A) @ required)
-        # Relative to the single terms, which may balance: their sum is then rounding.
+        # Relative to the single terms, since their sum may be a rounding error.
         parts = units * (loads.mass(mechanism) * jnp.abs(a) + load_sizes(mechanism, t, q, v))
         size = jnp.maximum(jnp.max(parts), scales.mass * (scales.length * scales.rate) ** 2)
         residual = jnp.max(jnp.abs(required - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)

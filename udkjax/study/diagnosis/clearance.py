@@ -1,11 +1,11 @@
 """Distance from a configuration to the next one where the rank of the constraints changes.
 
-The smallest nonzero singular value, sigma, is the distance of J to the nearest matrix of lower rank. Its slope along the
-displacements V that the constraints allow gives the distance within the mechanism's own motion to first order: sigma / |sigma_V|,
-where sigma_V = u^T (J_q V) w. A mechanism with one degree of freedom, or a driven one, is also followed along its path in both
-directions. Where sigma vanishes it has a kink; with its sign reversed beyond the kink, it passes through zero as smoothly as the
-path, so that the configuration is a root of a polynomial through closed positions on both sides. These positions are not close to
-the root, where closing is slow.
+The smallest nonzero singular value, sigma, is the distance of J to the nearest matrix of lower rank. With its slope sigma_V =
+u^T (J_q V) w along the displacements V that the constraints allow, the distance along the mechanism's motion is sigma / |sigma_V|
+to first order. A mechanism with one degree of freedom, or a driven one, is also followed along its path in both directions. Where
+sigma vanishes, it has a kink; with its sign reversed beyond the kink, sigma passes through zero as smoothly as the path. The
+configuration is therefore computed as a root of a polynomial through closed positions on both sides, not close to the root, where
+closing is slow.
 """
 
 from itertools import pairwise
@@ -17,9 +17,9 @@ from scipy.optimize import brentq
 
 from udkjax.study.diagnosis.configuration import NEIGHBOUR_STEP, Configuration, RankedPositions
 
-SLOPE_STEP = 1e-5  # relative to the characteristic length, and rad: the cube root of rounding, for central differences
-WALK_STEPS = 160  # steps along the path in each direction: about one turn of the mechanism, or more
-POINTS_PER_SIDE = 4  # positions on each side of a root that the polynomial interpolates: its error is O(step^8)
+SLOPE_STEP = 1e-5  # step of central differences, about the cube root of rounding; relative to the characteristic length, and rad
+WALK_STEPS = 160  # largest number of steps in each direction along the path: about a turn of the mechanism, or more
+POINTS_PER_SIDE = 4  # positions on each side of a root that the polynomial interpolates; its error is O(step^8)
 
 
 class RankChange(NamedTuple):
@@ -28,7 +28,7 @@ class RankChange(NamedTuple):
     t: float  # s
     q: np.ndarray  # (bodies, 3)
     rank: int
-    distance: float  # along the path: norm of the displacement, rad and lengths over the characteristic length
+    distance: float  # length of the path to it: norm of displacements in rad, and in characteristic lengths
     forward: bool  # direction along the path, or in time
 
 
@@ -37,7 +37,7 @@ class Clearance(NamedTuple):
 
     smallest: float  # the smallest nonzero singular value, relative to the largest
     estimate: float  # distance estimated from its slope, as in `RankChange`; infinite if the slope is zero
-    nearest: RankChange | None  # the change found on the path; only a single degree of freedom has a path
+    nearest: RankChange | None  # the change on the path; None if there is no path, or no change on it
     searched: float  # length of the path that was searched
 
 
@@ -64,23 +64,26 @@ def _search(positions: RankedPositions, start: Configuration, rank: int) -> tupl
     onward, around = _walk(positions, start, rank, 1.0)
     back = [] if around else _walk(positions, start, rank, -1.0)[0]
     path = [*reversed(back), start, *onward]
-    way = np.concatenate([[0.0], np.cumsum([positions.distance(a, b) for a, b in pairwise(path)])])
-    way -= way[len(back)]
+    distances = np.concatenate([[0.0], np.cumsum([positions.distance(a, b) for a, b in pairwise(path)])])
+    distances -= distances[len(back)]
     sigma = np.array([c.sigma[rank - 1] for c in path])
-    found = [
-        _root(positions, path, way, sigma, k, rank) for k in range(1, len(path) - 1) if sigma[k - 1] >= sigma[k] <= sigma[k + 1]
+    roots = [
+        _root(positions, path, distances, sigma, k, rank)
+        for k in range(1, len(path) - 1)
+        if sigma[k - 1] >= sigma[k] <= sigma[k + 1]
     ]
-    nearest = min((change for change in found if change is not None), key=lambda change: change.distance, default=None)
-    return nearest, float(np.max(np.abs(way)))
+    nearest = min((change for change in roots if change is not None), key=lambda change: change.distance, default=None)
+    return nearest, float(np.max(np.abs(distances)))
 
 
 def _walk(positions: RankedPositions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
-    """Return closed positions along the path to beyond the first minimum of sigma, and True if they returned to the start."""
+    """Return closed positions along the path, past the first minimum of sigma, and True if they return to the start."""
     path, more = [start], WALK_STEPS
     heading = side * start.right[:, 0] if start.right.shape[1] else np.zeros(len(start.q))
     while more:
         last, more = path[-1], more - 1
-        moved = next(filter(None, (_step(positions, last, heading, part * NEIGHBOUR_STEP, side) for part in (1.0, 0.7))), None)
+        tried = (_step(positions, last, heading, fraction * NEIGHBOUR_STEP, side) for fraction in (1.0, 0.7))
+        moved = next(filter(None, tried), None)
         if moved is None or moved.rank > rank or (heading.any() and positions.distance(last, moved) < NEIGHBOUR_STEP / 4):
             break
         path.append(moved)
@@ -94,14 +97,14 @@ def _walk(positions: RankedPositions, start: Configuration, rank: int, side: flo
 
 
 def _onward(places: list[np.ndarray]) -> np.ndarray:
-    """Return the direction onward from the last of two or three points of a path; that of their parabola, if three."""
+    """Return the direction of a path at the last of two or three points; with three points, the direction of their parabola."""
     *before, last = np.diff(places, axis=0)
     onward = 2 * last - before[0] * np.linalg.norm(last) / np.linalg.norm(before[0]) if before else last
     return onward / np.linalg.norm(onward)
 
 
 def _has_kink(sigma: list[float]) -> bool:
-    """Return True if three values have a minimum that may be zero: not above the rise on one of its sides."""
+    """Return True if three values have a minimum that may be zero: at most as large as the rise to one of its neighbours."""
     return sigma[1] <= min(sigma[0], sigma[2]) and sigma[1] <= max(sigma[0], sigma[2]) - sigma[1]
 
 
@@ -110,18 +113,20 @@ def _step(positions: RankedPositions, at: Configuration, heading: np.ndarray, st
     return positions.displace(at, heading, step, t)
 
 
-def _root(positions: RankedPositions, path: list, way: np.ndarray, sigma: np.ndarray, k: int, rank: int) -> RankChange | None:
-    """Return the configuration near the k-th position where sigma vanishes, if it does."""
+def _root(
+    positions: RankedPositions, path: list, distances: np.ndarray, sigma: np.ndarray, k: int, rank: int
+) -> RankChange | None:
+    """Return the configuration near the k-th position where sigma vanishes, if there is one."""
     if not _has_kink(sigma[k - 1 : k + 2].tolist()):
         return None
     near = slice(max(0, k - POINTS_PER_SIDE), k + POINTS_PER_SIDE + 1)
-    for turned in (k, k + 1):  # the first position beyond the root, where the sign of sigma is reversed
+    for turned in (k, k + 1):  # index of the first position beyond the root, from which sigma is negated
         signed = np.where(np.arange(len(sigma)) < turned, sigma, -sigma)
-        smooth = BarycentricInterpolator(way[near], signed[near])
-        low, high = (way[k - 1], way[k]) if turned == k else (way[k], way[k + 1])
+        smooth = BarycentricInterpolator(distances[near], signed[near])
+        low, high = (distances[k - 1], distances[k]) if turned == k else (distances[k], distances[k + 1])
         root = float(np.asarray(brentq(lambda s: float(smooth(s)), low, high, xtol=1e-14)))  # noqa: B023
-        q = BarycentricInterpolator(way[near], np.array([c.q for c in path[near]]))(root)
-        t = float(BarycentricInterpolator(way[near], np.array([c.t for c in path[near]]))(root))
+        q = BarycentricInterpolator(distances[near], np.array([c.q for c in path[near]]))(root)
+        t = float(BarycentricInterpolator(distances[near], np.array([c.t for c in path[near]]))(root))
         position = positions.at(t, np.asarray(q))
         if position.rank < rank and np.max(np.abs(positions.rows.residual(t, position.q))) < positions.rank_tol:
             return RankChange(t, position.q.reshape(-1, 3), position.rank, abs(root), root > 0)

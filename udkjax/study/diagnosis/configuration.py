@@ -1,6 +1,6 @@
 """A closed position of a mechanism, its scaled Jacobian with null spaces, and nearby closed positions.
 
-Everything is NumPy on the scene's programs, without compilation. Rows and columns are scaled as in determinacy.py.
+All of this is NumPy on the scene's programs, without compilation. Rows and columns are scaled as in determinacy.py.
 """
 
 from functools import cached_property
@@ -13,13 +13,13 @@ from udkjax.equations.position_closure import LONGEST_STEP, close_position, is_c
 from udkjax.equations.redundancy import PositionRows, kinematic_rows
 from udkjax.scene.mechanism import Mechanism
 
-NEIGHBOUR_STEP = 0.1  # relative to the characteristic length, and rad: from one neighbour to the next
+NEIGHBOUR_STEP = 0.1  # step from one neighbour to the next, relative to the characteristic length, and rad
 N_NEIGHBOURS = 12
-SMALLEST_MOVE = 0.01  # relative to a step: positions closer to each other are the same
+SMALLEST_MOVE = 0.01  # distance, relative to a step, below which positions are the same
 
 
 class Configuration:
-    """A closed position and its scaled Jacobian J = U S V^T, decomposed only as far as needed.
+    """A closed position and its scaled Jacobian J = U S V^T; the factors are computed when they are used.
 
     Args:
         t: time (s).
@@ -33,7 +33,7 @@ class Configuration:
 
     @cached_property
     def sigma(self) -> np.ndarray:
-        """The singular values, without the vectors, which take several times as long."""
+        """The singular values, without the vectors, whose computation takes several times as long."""
         return singular_values(self.J)
 
     @cached_property
@@ -78,7 +78,7 @@ class Configuration:
 
 
 class RankedPositions:
-    """Closed positions of one mechanism with concrete numbers."""
+    """Closed positions of a mechanism with concrete numbers."""
 
     def __init__(self, mechanism: Mechanism, rank_tol: float):
         rows = self.rows = KinematicRows(mechanism)
@@ -105,19 +105,19 @@ class RankedPositions:
         return self.at(t, q) if is_closed(self.rows.scales, q, 0 * q, psi, 0 * psi, np) else None
 
     def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
-        """Return the closed position nearest to `start` displaced by a step along a direction in scaled coordinates, or None."""
+        """Displace `start` by a step along a direction in scaled coordinates; return the nearest closed position, or None."""
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
-    def distance(self, one: Configuration, two: Configuration, turns: bool = True) -> float:
-        """Return the distance of two positions: the norm of the scaled displacement, modulo whole turns unless `turns`."""
-        way = (two.q - one.q) / self.unit
+    def distance(self, first: Configuration, second: Configuration, turns: bool = True) -> float:
+        """Return the distance of two positions: the norm of the scaled displacement; whole turns count only with `turns`."""
+        displacement = (second.q - first.q) / self.unit
         if not turns:
-            way[2::3] = np.remainder(way[2::3] + np.pi, 2 * np.pi) - np.pi
-        return float(np.linalg.norm(way))
+            displacement[2::3] = np.remainder(displacement[2::3] + np.pi, 2 * np.pi) - np.pi
+        return float(np.linalg.norm(displacement))
 
     def around(self, start: Configuration) -> list[Configuration]:
-        """Return closed positions along a random motion from `start`, with drivers in motion; empty if it cannot move."""
-        random, found, last = np.random.default_rng(0), [], start
+        """Return closed positions along a random motion from `start`, with moving drivers; empty if the mechanism cannot move."""
+        random, neighbours, last = np.random.default_rng(0), [], start
         heading, t = random.standard_normal(len(start.q)), start.t
         for _ in range(N_NEIGHBOURS if self.rows.count else 0):
             heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(len(heading)) / np.sqrt(len(heading))
@@ -130,15 +130,15 @@ class RankedPositions:
                 heading = random.standard_normal(len(heading))
                 continue
             heading, last = (allowed if size > 0.0 else heading), moved
-            found.append(moved)
-        return found
+            neighbours.append(moved)
+        return neighbours
 
 
 class JointForces(NamedTuple):
     """Uniqueness of the multipliers of a constraint."""
 
     unique: tuple[bool, ...]  # row by row
-    share: tuple[float, ...]  # norm of each row of N: 0 unique, 1 arbitrary
+    share: tuple[float, ...]  # norm of each row of N: from 0 (unique) to 1 (arbitrary)
     direction: float | None  # for a joint at a point: the only direction (rad) in which its force is unique, if any
 
 

@@ -2,8 +2,8 @@
 
 N spans the null space of J^T. The rows of a set S of constraints are dependent if and only if a combination y of the columns of N
 vanishes outside S, N[outside] y = 0; the number of redundant rows is nullity(N[outside]). S is minimal if no constraint can be
-removed from it. One set is found around each constraint; the smallest are taken until their combinations y span all of N. Further
-combinations are searched for after leaving out one row of each that was found.
+removed from it. A set is searched for around each constraint; the smallest sets are collected until their combinations y span all
+of N. To reach further combinations, one row is excluded for each combination already collected.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 
 from udkjax.pinv.row_spaces import null_space
 
-DEPENDS = 1e-6  # norm of a row of N, whose columns are orthonormal, from which it is nonzero: far above rounding
+DEPENDS = 1e-6  # norm above which a row of N, whose columns are orthonormal, is nonzero; well above rounding errors
 
 
 class Dependency(NamedTuple):
@@ -24,53 +24,54 @@ class Dependency(NamedTuple):
 
 
 def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple[str, ...]]) -> list[Dependency]:
-    """Return minimal dependent sets whose combinations together span N (m, k), the smallest first.
+    """Return minimal dependent sets whose combinations span N (m, k), the smallest sets first.
 
-    `owners` is the constraint of each row, `attached` the bodies of each constraint: neighbouring constraints are preferred.
+    `owners` is the constraint of each row, `attached` the bodies of each constraint; sets of neighbouring constraints are
+    preferred.
     """
-    owner, found = np.array(owners), []
-    spanned = np.zeros((N.shape[1], 0))  # basis of the combinations of columns of the sets found so far
+    owner, collected = np.array(owners), []
+    spanned = np.zeros((N.shape[1], 0))  # basis of the combinations of the collected sets
     remaining = N
     while spanned.shape[1] < N.shape[1]:
         involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDS].tolist()))
         candidates = [_minimal_set_around(seed, involved, remaining, owner, attached) for seed in involved]
         for members in sorted(candidates, key=len):
-            own = null_space(N[~np.isin(owner, members)], DEPENDS).T
-            both = np.linalg.svd(np.concatenate([spanned, own], axis=1), full_matrices=False)
-            rank = int(np.sum(both[1] > DEPENDS))
+            combinations = null_space(N[~np.isin(owner, members)], DEPENDS).T
+            svd = np.linalg.svd(np.concatenate([spanned, combinations], axis=1), full_matrices=False)
+            rank = int(np.sum(svd[1] > DEPENDS))
             if rank > spanned.shape[1]:
-                found.append(Dependency(tuple(members), rank - spanned.shape[1]))
-                spanned = both[0][:, :rank]
-        # Combinations that no set accounts for yet: those that vanish in one row for each combination already spanned.
+                collected.append(Dependency(tuple(members), rank - spanned.shape[1]))
+                spanned = svd[0][:, :rank]
+        # The remaining combinations: those that vanish in one row for each combination already spanned.
         remaining = N
-        rest = N @ spanned
-        while rest.shape[1]:
-            row = int(np.argmax(np.linalg.norm(rest, axis=1)))
+        unexcluded = N @ spanned
+        while unexcluded.shape[1]:
+            row = int(np.argmax(np.linalg.norm(unexcluded, axis=1)))
             remaining = remaining @ np.linalg.svd(remaining[row : row + 1])[2][1:].T
-            rest = rest @ np.linalg.svd(rest[row : row + 1])[2][1:].T
-    return sorted(found, key=lambda dependency: len(dependency.constraints))
+            unexcluded = unexcluded @ np.linalg.svd(unexcluded[row : row + 1])[2][1:].T
+    return sorted(collected, key=lambda dependency: len(dependency.constraints))
 
 
 def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> int:
-    """Return the number of redundant rows of a set of constraints on its own."""
+    """Return the number of redundant rows of a set of constraints, without all others."""
     return len(null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS))
 
 
 def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
-    """Return combinations of a set's rows that vanish, (m, redundancy): its states of self-stress."""
+    """Return the combinations of a set's rows that vanish, (m, redundancy): the states of self-stress of the set."""
     return N @ null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS).T
 
 
 def _minimal_set_around(
     seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]
 ) -> list[str]:
-    """Return a minimal dependent set around one constraint: starting from all, the farthest are removed first."""
+    """Return a minimal dependent set around a constraint: all others are removed if possible, the farthest first."""
     far = _distances(seed, involved, attached)
     members = list(involved)
     for name in sorted(involved, key=lambda name: -far[name]):
-        rest = [other for other in members if other != name]
-        if redundant_by(N, owner.tolist(), rest):
-            members = rest
+        others = [other for other in members if other != name]
+        if redundant_by(N, owner.tolist(), others):
+            members = others
     return members
 
 

@@ -17,7 +17,7 @@ from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fixes_of
 from udkjax.study.diagnosis.second_order import branches
 from udkjax.study.diagnosis.timeline import timeline
 
-MOST_FIXES = 64  # fixes of a cure, applied in sequence
+MOST_FIXES = 64  # largest number of fixes of a cure, which are applied in sequence
 
 
 @checked
@@ -31,10 +31,10 @@ def diagnose(
     fixes: bool = True,
     walk: bool = True,
 ) -> Diagnosis:
-    """Find dependent constraints, changes that remove them, and configurations where the rank changes.
+    """Find dependent constraints, changes that make them independent, and configurations where the rank changes.
 
     The rank is that of the scaled Jacobian J of Psi: lengths are divided by the characteristic length, angles are in radians, and
-    rows are scaled, so that a mechanism of a micrometre and one of a kilometre get the same diagnosis.
+    rows are scaled; a mechanism of a micrometre therefore gets the same diagnosis as one of a kilometre.
 
     Args:
         mechanism: mechanism with concrete numbers.
@@ -68,10 +68,10 @@ def diagnose(
     generic = [c for c in [current, *neighbours] if c.rank == generic_rank]
     owners = [name for name, _ in rows.names]
     permanent, momentary = _dependencies(mechanism, current, generic, owners)
-    if not neighbours and current.right.size:  # it moves to first order only, because of dependence in this configuration
+    if not neighbours and current.right.size:  # moves to first order only: rows are dependent here
         permanent, momentary = [], [*permanent, *momentary]
-    found = _with_fixes(mechanism, positions, generic if fixes else [], permanent)
-    found += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
+    redundancies = _with_fixes(mechanism, positions, generic if fixes else [], permanent)
+    redundancies += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
     of_joints = [k for k, name in enumerate(owners) if name in mechanism.joints]
     return Diagnosis(
         mechanism=mechanism,
@@ -84,8 +84,8 @@ def diagnose(
         joint_rank=count_rank(singular_values(current.J[of_joints]), rank_tol),
         joint_rows=len(of_joints),
         can_move=bool(neighbours),
-        redundancies=tuple(found),
-        cure=_cure(mechanism, positions, generic, found) if fixes else (),
+        redundancies=tuple(redundancies),
+        cure=_cure(mechanism, positions, generic, redundancies) if fixes else (),
         branches=tuple(branches(mechanism, positions, current)),
         forces=_forces(mechanism, current, owners),
         singular_values=current.sigma,
@@ -97,13 +97,13 @@ def diagnose(
 def _dependencies(
     mechanism: Mechanism, here: Configuration, generic: list[Configuration], owners: list[str]
 ) -> tuple[list[Dependency], list[Dependency]]:
-    """Return the sets of constraints that are dependent in all generic configurations, and those that are dependent only here."""
+    """Return the sets of constraints that are dependent in all generic configurations, and those dependent in `here` only."""
     attached = {name: mechanism.frames_of(element) for name, element in mechanism.constraints.items()}
     best = max(generic, key=lambda c: c.smallest)
     permanent = dependencies(best.left, owners, attached)
     if here.rank == best.rank:
         return permanent, []
-    # Combinations of rows that vanish here, without those that vanish everywhere: each of the latter gives up one row.
+    # Combinations of rows that vanish here, without those that vanish everywhere: one row is excluded for each of the latter.
     spared = choose_dispensable([best.left])
     N = here.left
     for row in spared:
@@ -115,42 +115,45 @@ def _dependencies(
 def _with_fixes(
     mechanism: Mechanism, positions: RankedPositions, generic: list[Configuration], sets: list[Dependency]
 ) -> list[Redundancy]:
-    """Return permanently dependent sets with the fixes that help in all of some positions; without fixes if there are none."""
+    """Return permanently dependent sets with the fixes that help in all `generic` positions; without fixes if there are none."""
     owners = [name for name, _ in positions.rows.names]
-    at = sorted(generic, key=lambda c: -c.smallest)  # the first one determines the stress of a set
-    fixes = [fixes_of(mechanism, positions, at, owners, one) if at else [] for one in sets]
-    return [Redundancy(one.constraints, one.redundancy, True, tuple(own)) for one, own in zip(sets, fixes, strict=True)]
+    configurations = sorted(generic, key=lambda c: -c.smallest)  # the first position determines the stress of a set
+    fixes = [fixes_of(mechanism, positions, configurations, owners, dependency) if configurations else [] for dependency in sets]
+    return [
+        Redundancy(dependency.constraints, dependency.redundancy, True, tuple(of_set))
+        for dependency, of_set in zip(sets, fixes, strict=True)
+    ]
 
 
 def _cure(
     mechanism: Mechanism, positions: RankedPositions, generic: list[Configuration], found: list[Redundancy]
 ) -> tuple[Fix, ...]:
-    """Return the best fixes in sequence, each found after applying the previous one, until nothing is redundant."""
+    """Return the best fixes in sequence, each determined after applying the previous one, until nothing is redundant."""
     done: list[Fix] = []
     sets = [r for r in found if r.permanent]
     best = max((r.fixes[0] for r in sets if r.fixes), key=lambda fix: (fix.removes, fix.conditioning), default=None)
-    at = generic
+    configurations = generic
     while best is not None:
         done.append(best)
         ranked = RankedPositions(best.mechanism, positions.rank_tol)
-        at, owners = [ranked.at(c.t, c.q) for c in at], [name for name, _ in ranked.rows.names]
-        left = _dependencies(best.mechanism, at[0], at, owners)[0]
+        configurations, owners = [ranked.at(c.t, c.q) for c in configurations], [name for name, _ in ranked.rows.names]
+        left = _dependencies(best.mechanism, configurations[0], configurations, owners)[0]
         if not left or len(done) == MOST_FIXES:
             return tuple(done)
-        order = sorted(at, key=lambda c: -c.smallest)  # the first one determines the stress of a set
+        order = sorted(configurations, key=lambda c: -c.smallest)  # the first position determines the stress of a set
         best = best_fix(best.mechanism, ranked, order, owners, left)
     return ()
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
-    """Return which multipliers are unique, from N, and for a pin the only direction in which its force is unique, if any."""
-    found = {}
+    """Return which multipliers are unique, from N, and for a pin the only direction in which the force is unique, if any."""
+    forces = {}
     for name, element in mechanism.constraints.items():
-        own = [k for k, owner in enumerate(owners) if owner == name]
-        N = here.left[own]
+        indices = [k for k, owner in enumerate(owners) if owner == name]
+        N = here.left[indices]
         share = np.linalg.norm(N, axis=1)
         direction = None
         if isinstance(element, Revolute | Weld):
             direction = determinacy.unique_direction(N[:2])
-        found[name] = JointForces(tuple((share <= determinacy.UNIQUE_TOL).tolist()), tuple(share.tolist()), direction)
-    return found
+        forces[name] = JointForces(tuple((share <= determinacy.UNIQUE_TOL).tolist()), tuple(share.tolist()), direction)
+    return forces

@@ -1,4 +1,4 @@
-"""Result of `diagnose`, as numbers and as text."""
+"""The result of `diagnose`, as numbers and as text."""
 
 from typing import Any, NamedTuple
 
@@ -14,9 +14,9 @@ from udkjax.study.diagnosis.timeline import Timeline
 from udkjax.study.report import plain, row_label
 from udkjax.wording import plural
 
-LABEL_WIDTH = 14  # characters of a section's title
-MOST_FIXES_SHOWN = 8  # printed fixes of one set
-SMALLEST_POSE_NUMBER = 1e-9  # rad, and relative to the length: smaller numbers of a pose are rounding
+LABEL_WIDTH = 14  # width of a section's title in characters
+MOST_FIXES_SHOWN = 8  # largest number of printed fixes of a set
+SMALLEST_POSE_NUMBER = 1e-9  # smallest number of a pose that is not rounding, in rad and relative to the length
 
 
 class Diagnosis(NamedTuple):
@@ -39,34 +39,34 @@ class Diagnosis(NamedTuple):
     q: np.ndarray  # (bodies, 3)
     coordinates: int
     rows: int
-    rank: int  # of Psi_q in this configuration
-    ordinary_rank: int  # in nearby closed positions: the generic rank
-    joint_rank: int  # of the rows of joints alone, in this configuration
+    rank: int  # rank of Psi_q in this configuration
+    ordinary_rank: int  # rank in nearby closed positions: the generic rank
+    joint_rank: int  # rank of the rows of joints alone, in this configuration
     joint_rows: int
     can_move: bool  # True if closed positions nearby were found
     redundancies: tuple[Redundancy, ...]
-    cure: tuple[Fix, ...]  # fixes to apply in sequence, after which nothing is redundant; empty if no fix helps or is needed
+    cure: tuple[Fix, ...]  # fixes to apply in sequence, after which nothing is redundant; empty if none helps or is needed
     branches: tuple[Branch, ...]
     forces: dict[str, JointForces]
-    singular_values: np.ndarray  # of the scaled Jacobian
+    singular_values: np.ndarray  # singular values of the scaled Jacobian
     clearance: Clearance
     timeline: Timeline | None
 
     @property
     def gruebler(self) -> int:
-        """Gruebler's count: coordinates minus rows, as if all rows were independent."""
+        """Gruebler's count, coordinates minus rows, as if all rows were independent."""
         return self.coordinates - self.rows
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Number of degrees of freedom with drivers held, on the branch that has the most."""
+        """Number of degrees of freedom with locked drivers, on the branch with the most."""
         if self.is_singular or not self.can_move:
             return max((branch.degrees_of_freedom for branch in self.branches if branch.followed), default=0)
         return self.coordinates - self.ordinary_rank
 
     @property
     def mobility(self) -> int:
-        """First-order mobility with drivers held: coordinates minus the rank here."""
+        """First-order mobility with locked drivers: coordinates minus the rank in this configuration."""
         return self.coordinates - self.rank
 
     @property
@@ -76,7 +76,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def is_singular(self) -> bool:
-        """True if the rank is lower here than nearby, or the mechanism moves to first order only."""
+        """True if the rank is lower in this configuration than nearby, or the mechanism moves to first order only."""
         return self.rank < self.ordinary_rank or (self.mobility > 0 and not any(branch.followed for branch in self.branches))
 
     @property
@@ -86,12 +86,12 @@ class Diagnosis(NamedTuple):
 
     @property
     def conditioning(self) -> float:
-        """Condition number of the scaled Jacobian: its largest over its smallest nonzero singular value."""
+        """Condition number of the scaled Jacobian: the ratio of its largest to its smallest nonzero singular value."""
         return float(self.singular_values[0] / self.singular_values[self.rank - 1]) if self.rank else 1.0
 
     @property
     def cured(self) -> Mechanism | None:
-        """The mechanism after the fixes of `cure`: the same motion, nothing redundant. None if `cure` is empty."""
+        """The mechanism after the fixes of `cure`, with the same motion and without redundancy; None if `cure` is empty."""
         return self.cure[-1].mechanism if self.cure else None
 
     def to_dict(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class Diagnosis(NamedTuple):
 
 
 def _sections(found: Diagnosis) -> list[tuple[str, list[str]]]:
-    """Return the title and the lines of each section that has any."""
+    """Return the title and the lines of each section that is not empty."""
     parts = [
         ("mobility", _mobility(found)),
         ("redundancy", [line for r in found.redundancies for line in _redundancy(r)]),
@@ -207,7 +207,7 @@ def _branches(found: Diagnosis) -> list[str]:
 
 
 def _forces(found: Diagnosis) -> list[str]:
-    """Name the multipliers that are not unique, constraints with the same direction together."""
+    """Name the multipliers that are not unique; constraints with the same direction share a line."""
     groups: dict[str, list[str]] = {}
     for name, forces in found.forces.items():
         if all(forces.unique):

@@ -1,8 +1,8 @@
-"""Changes that remove redundant constraints: each is tried on the Jacobian, and the best on the mechanism itself.
+"""Changes that remove redundancy of constraints: all are tried on the Jacobian, and the best also on the mechanism.
 
-A revolute is relaxed in one direction (it becomes a slot, in either of its bodies), a weld or a prismatic joint in its angle or
-its direction, and any constraint can be removed. A change removes redundancy if the rows given up carry part of the self-stress
-of a dependent set; it keeps the mobility, since other constraints block the same motion.
+A revolute is relaxed in one direction (it becomes a slot in one of its bodies), a weld or a prismatic joint in its angle or its
+direction, and any constraint can be removed. A change removes redundancy if the removed rows carry part of the self-stress of a
+dependent set; it preserves the mobility, since other constraints block the same motion.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,15 +17,15 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions, count_rank, singular_values
 from udkjax.study.diagnosis.dependence import Dependency, stress_of
 
-SMALLEST_PIVOT = 1e-3  # smallest nonzero singular value that a fix may leave, relative to the smallest before it
+SMALLEST_PIVOT = 1e-3  # least ratio of the smallest nonzero singular values after and before a fix
 
 
 class JointChange(NamedTuple):
-    """One way to relax a constraint: its replacement, and its remaining rows."""
+    """A way to relax a constraint: its replacement, and its remaining rows."""
 
     text: str
-    element: Constraint | None  # None: the constraint is removed
-    slides: tuple[int, float] | None = None  # for a revolute made a slot: number of the slotted body, and axis in its frame (rad)
+    element: Constraint | None  # None if the constraint is removed
+    slides: tuple[int, float] | None = None  # for a slot: index of the slotted body, and axis in its frame (rad)
     rows: tuple[int, ...] = ()  # remaining rows, if the change is not a slot
 
     def remaining_rows(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
@@ -36,7 +36,7 @@ class JointChange(NamedTuple):
         return np.array([[-sin, cos]]) @ rows
 
     def alignment(self, force: np.ndarray, q: np.ndarray, places: list[int | None]) -> float:
-        """Return the fraction of the stress (rows, redundancy) that a slot gives up, 0 to 1; 1 for any other change."""
+        """Return the fraction of the stress (rows, redundancy) that a slot removes, from 0 to 1; 1 for any other change."""
         if self.slides is None:
             return 1.0
         return float(np.linalg.norm(self._direction(q, places) @ force[:2]) / np.linalg.norm(force[:2], 2))
@@ -50,7 +50,7 @@ class JointChange(NamedTuple):
 
 
 class Fix(NamedTuple):
-    """A verified change of one constraint: it removes `removes` redundant rows, and keeps the mobility."""
+    """A verified change of a constraint: it removes `removes` redundant rows, and preserves the mobility."""
 
     constraint: str
     change: str  # in words
@@ -60,16 +60,16 @@ class Fix(NamedTuple):
 
 
 class Redundancy(NamedTuple):
-    """A minimal set of dependent constraints: without any one of them, the others are independent."""
+    """A minimal set of dependent constraints: if any one is removed, the others are independent."""
 
     constraints: tuple[str, ...]
     count: int  # number of their redundant rows
-    permanent: bool  # True: in every position; False: in this configuration only
-    fixes: tuple[Fix, ...]  # verified: each removes redundancy and keeps the mobility; empty if not permanent
+    permanent: bool  # True if dependent in every position, False if in this configuration only
+    fixes: tuple[Fix, ...]  # verified changes; empty if not permanent
 
 
 class _ChangesOfConstraint(NamedTuple):
-    """The changes of one constraint that help according to the Jacobian, the best first."""
+    """The changes of a constraint that help according to the Jacobian, the best first."""
 
     constraint: str
     changes: list[tuple[int, float, JointChange]]  # redundant rows removed, conditioning after the change, and the change
@@ -78,48 +78,48 @@ class _ChangesOfConstraint(NamedTuple):
 def fixes_of(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], dependency: Dependency
 ) -> list[Fix]:
-    """Return the best verified change of each constraint of a dependent set, the best conditioned first.
+    """Return the best verified change of each constraint of a dependent set, sorted by removed rows and conditioning.
 
     `at` are generic configurations; a change must help in all of them.
     """
     candidates = _candidates(mechanism, positions, at, owners, dependency)
-    found = [_verify(mechanism, positions, at, one) for one in candidates]
-    return sorted((fix for fix in found if fix), key=lambda fix: (-fix.removes, -fix.conditioning))
+    fixes = [_verify(mechanism, positions, at, candidate) for candidate in candidates]
+    return sorted((fix for fix in fixes if fix), key=lambda fix: (-fix.removes, -fix.conditioning))
 
 
 def best_fix(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], sets: Sequence[Dependency]
 ) -> Fix | None:
-    """Return the best fix of all sets, or None; only the best is verified, since that builds a mechanism."""
-    candidates = [one for dependency in sets for one in _candidates(mechanism, positions, at, owners, dependency)]
-    candidates.sort(key=lambda one: one.changes[0][:2], reverse=True)
-    return next((fix for one in candidates if (fix := _verify(mechanism, positions, at, one))), None)
+    """Return the best fix of all sets, or None. Candidates are verified one by one, since this builds a mechanism."""
+    candidates = [candidate for dependency in sets for candidate in _candidates(mechanism, positions, at, owners, dependency)]
+    candidates.sort(key=lambda candidate: candidate.changes[0][:2], reverse=True)
+    return next((fix for candidate in candidates if (fix := _verify(mechanism, positions, at, candidate))), None)
 
 
 def _candidates(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], owners: list[str], dependency: Dependency
 ) -> list[_ChangesOfConstraint]:
-    found, stresses = [], [stress_of(position.left, owners, dependency.constraints) for position in at]
+    helpful, stresses = [], [stress_of(position.left, owners, dependency.constraints) for position in at]
     for name in dependency.constraints:
-        options, own, places = [], _rows_of(owners, name), _body_indices(mechanism, name)
-        forces = [stress[own] / positions.row_unit[own, None] for stress in stresses]
+        options, indices, places = [], _rows_of(owners, name), _body_indices(mechanism, name)
+        forces = [stress[indices] / positions.row_unit[indices, None] for stress in stresses]
         for change in changes_of(mechanism, name, at[0], forces[0]):
-            removes, conditioning = _effect(own, places, change, at, positions.rank_tol)
+            removes, conditioning = _effect(indices, places, change, at, positions.rank_tol)
             if removes > 0 and conditioning > SMALLEST_PIVOT * min(c.smallest for c in at):
                 aligned = min(change.alignment(force, c.q, places) for force, c in zip(forces, at, strict=True))
                 options.append((removes, round(aligned, 6), round(conditioning, 12), change))
         options.sort(key=lambda option: option[:3], reverse=True)
         if options:
-            found.append(
+            helpful.append(
                 _ChangesOfConstraint(name, [(removes, conditioning, change) for removes, _, conditioning, change in options])
             )
-    return found
+    return helpful
 
 
 def _verify(
     mechanism: Mechanism, positions: RankedPositions, at: list[Configuration], candidates: _ChangesOfConstraint
 ) -> Fix | None:
-    """Return the first of a constraint's changes that has the same effect on the mechanism as on the Jacobian."""
+    """Return the first of a constraint's changes whose effect on the mechanism is the same as on the Jacobian."""
     for removes, conditioning, change in candidates.changes:
         changed = apply_change(mechanism, candidates.constraint, change)
         if changed is not None and _removes_redundancy(changed, removes, at, positions.rank_tol):
@@ -128,7 +128,7 @@ def _verify(
 
 
 def apply_change(mechanism: Mechanism, name: str, change: JointChange) -> Mechanism | None:
-    """Return the mechanism with a constraint changed, or None if another element needs it, such as friction in a revolute."""
+    """Return the mechanism with a changed constraint; None if another element needs the original, such as friction."""
     joints, drivers = dict(mechanism.joints), dict(mechanism.drivers)
     if change.element is not None:
         joints[name] = change.element
@@ -152,15 +152,15 @@ def _body_indices(mechanism: Mechanism, name: str) -> list[int | None]:
 
 
 def changes_of(mechanism: Mechanism, name: str, at: Configuration, force: np.ndarray) -> Iterator[JointChange]:
-    """Iterate over the ways to relax a constraint that carries the multipliers `force` (rows, redundancy) of the stress."""
+    """Iterate over the ways to relax a constraint with the multipliers `force` (rows, redundancy) of the stress."""
     element = mechanism.constraints[name]
     yield JointChange("remove it", None)
     if isinstance(element, Revolute):
-        most = np.linalg.svd(force)[0][:, 0]  # the direction that carries most
-        along = np.arctan2(most[1], most[0])
+        largest = np.linalg.svd(force)[0][:, 0]  # direction of the largest force
+        direction = np.arctan2(largest[1], largest[0])
         for k, body in enumerate(element.bodies):
             angle = 0.0 if body == GROUND else at.q[3 * mechanism.body_names.index(body) + 2]
-            axis = _half_turn(along - angle)
+            axis = _half_turn(direction - angle)
             other = element.bodies[1 - k]
             slot = Slot((body, other), (element.points[k], element.points[1 - k]), axis=axis)
             text = f'make it a slot along {np.rad2deg(axis):.4g} degrees of the frame of "{body}", for a pin of "{other}"'
@@ -174,7 +174,7 @@ def changes_of(mechanism: Mechanism, name: str, at: Configuration, force: np.nda
 
 
 def _half_turn(angle: float) -> float:
-    """Return the direction of the same line in (-90, 90] degrees, with rounding removed from multiples of 90 degrees."""
+    """Return the direction of the same line in (-90, 90] degrees, without rounding errors of multiples of 90 degrees."""
     angle = float(np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2)
     near = round(angle / (np.pi / 2)) * np.pi / 2
     angle = near if abs(angle - near) < 1e-9 else angle
@@ -191,8 +191,8 @@ def _effect(
     """
     falls, conditioning = -1, np.inf
     for k, position in enumerate(at):
-        rest = np.delete(position.J, own, axis=0)
-        remaining = np.concatenate([rest, change.remaining_rows(position.J[own], position.q, places)])
+        other_rows = np.delete(position.J, own, axis=0)
+        remaining = np.concatenate([other_rows, change.remaining_rows(position.J[own], position.q, places)])
         sigma = singular_values(remaining)
         rank = count_rank(sigma, rank_tol)
         fall = position.redundancy - (len(remaining) - rank)
@@ -202,9 +202,9 @@ def _effect(
     return falls, float(conditioning)
 
 
-def _removes_redundancy(after: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
-    """Return True if in all positions the changed mechanism is closed, as mobile as before, and has fewer redundant rows."""
-    positions = RankedPositions(after, rank_tol)
+def _removes_redundancy(changed: Mechanism, removes: int, at: list[Configuration], rank_tol: float) -> bool:
+    """Return True if in all positions the changed mechanism is closed, has the same mobility, and fewer redundant rows."""
+    positions = RankedPositions(changed, rank_tol)
     ranked = [positions.at(position.t, position.q) for position in at]
     closed = all(
         np.max(np.abs(positions.rows.residual(c.t, c.q)), initial=0.0) < rank_tol * max(1.0, positions.rows.scales.size(c.q, np))

@@ -1,8 +1,8 @@
-"""The branches that meet at a singular configuration: directions that the constraints allow to second order.
+"""The branches that meet at a singular configuration, as directions that the constraints allow to second order.
 
-Along a curve q(s) with q' = V x, V spanning the null space of J, Psi = 0 requires J q'' = -H(V x, V x). This has a solution if
+Along a curve q(s) with q' = V x, where V spans the null space of J, Psi = 0 requires J q'' = -H(V x, V x). This has a solution if
 and only if N^T H(V x, V x) = 0: one quadratic form x^T A_i x for each column of N. The common zeros of the forms are the tangents
-of the branches, found by Gauss-Newton from many directions at once. A step along each verifies that it is a motion.
+of the branches, computed by the Gauss-Newton method from many directions at once. A step along each tangent verifies a motion.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,14 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 
-N_DIRECTIONS = 400  # initial directions
-GAUSS_NEWTON_STEPS = 60  # at double zeros each halves the error, to 1e-18
+N_DIRECTIONS = 400  # number of initial directions
+GAUSS_NEWTON_STEPS = 60  # at double zeros each step halves the error, down to 1e-18
 ZERO_FORM = 1e-10  # tolerance on the forms, whose coefficients are at most one
 DOUBLE_ZERO = 1e-7  # tolerance on a tangent: a double zero is accurate to the square root of rounding
-SAME_DIRECTION = 1e-4  # rad: closer directions are the same
-SEARCH_ANGLE = 0.1  # rad: distance from a zero at which others are searched for
-STEP_LENGTH = 0.02  # relative to the characteristic length, and rad: step along a branch
-TANGENT_TOL = 0.2  # relative to the step: distance of its end from the tangent, which grows as the step squared
+SAME_DIRECTION = 1e-4  # directions that differ by less (rad) are the same
+SEARCH_ANGLE = 0.1  # distance from a zero at which others are searched for (rad)
+STEP_LENGTH = 0.02  # step along a branch, relative to the characteristic length, and rad
+TANGENT_TOL = 0.2  # largest distance of a step's end from the tangent, relative to the step; it grows as the step squared
 
 
 class Branch(NamedTuple):
@@ -31,12 +31,12 @@ class Branch(NamedTuple):
 
     tangent: np.ndarray  # (bodies, 3): m, m, rad; scaled so that the largest rotation, or displacement over L, of a body is one
     degrees_of_freedom: int  # dimension of this branch
-    rank: int  # on the branch, next to the configuration
-    followed: bool  # True if a closed position was found along it, on both sides
+    rank: int  # rank on the branch, next to the configuration
+    followed: bool  # True if closed positions were found along it on both sides
 
 
 def branches(mechanism: Mechanism, positions: RankedPositions, at: Configuration) -> list[Branch]:
-    """Return the branches that meet at a configuration; if it is not singular, the directions in which it moves."""
+    """Return the branches that meet at a configuration; if it is not singular, the directions of its motion."""
     A, N, V = quadratic_forms(mechanism, positions, at), at.left, at.right
     if not V.shape[1]:
         return []
@@ -59,10 +59,10 @@ def _hessian(mechanism, t, q, unit, weights):
 
 
 class Zeros(NamedTuple):
-    """Directions in which all forms vanish: a linear space, or one line of a nonlinear cone."""
+    """Directions in which all forms vanish: a linear space, or a line of a nonlinear cone."""
 
     space: np.ndarray  # (d, g), orthonormal
-    dimension: int  # of the space, or of the cone
+    dimension: int  # dimension of the space, or of the cone
 
     @property
     def is_cone(self) -> bool:
@@ -70,7 +70,7 @@ class Zeros(NamedTuple):
 
 
 def zeros_of(A: np.ndarray) -> list[Zeros]:
-    """Return the directions x where all forms x^T A_i x vanish: isolated lines, linear spaces, and one line of each cone."""
+    """Return the directions x where all forms x^T A_i x vanish: isolated lines, linear spaces, and a line of each cone."""
     d, size = A.shape[1], np.abs(A).max(initial=0.0)
     if size < ZERO_FORM:
         return [Zeros(np.eye(d), d)]
@@ -81,7 +81,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
         if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME_DIRECTION for z in found):
             continue
         zeros = _zeros_around(A, direction)
-        if zeros.is_cone and any(z.is_cone and z.dimension == zeros.dimension for z in found):  # one line is enough
+        if zeros.is_cone and any(z.is_cone and z.dimension == zeros.dimension for z in found):  # one line of each cone is enough
             continue
         found = [z for z in found if not _inside(z.space, zeros.space)] + [zeros]
     return found
@@ -92,14 +92,14 @@ def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     for _ in range(GAUSS_NEWTON_STEPS):
         residual = np.einsum("kij,si,sj->sk", A, x, x)
-        matrix = np.concatenate([2 * np.einsum("kij,sj->ski", A, x), x[:, None, :]], axis=1)  # the last row: a step normal to x
+        matrix = np.concatenate([2 * np.einsum("kij,sj->ski", A, x), x[:, None, :]], axis=1)  # last row: normal to x
         x = x - np.einsum("sij,sj->si", np.linalg.pinv(matrix, rcond=1e-9), np.pad(residual, ((0, 0), (0, 1))))
         x = x / np.linalg.norm(x, axis=1, keepdims=True)
     return x[np.abs(np.einsum("kij,si,sj->sk", A, x, x)).max(axis=1) < ZERO_FORM]
 
 
 def _zeros_around(A: np.ndarray, x: np.ndarray) -> Zeros:
-    """Return the zeros around x: the null space of all A_i x if all forms vanish on it; a cone if others are near; or x alone."""
+    """Return the zeros around x: the null space of all A_i x if all forms vanish on it, a cone if zeros are near, or x."""
     sigma, vt = np.linalg.svd(2 * np.einsum("kij,j->ki", A, x))[1:]
     kernel = vt[int(np.sum(sigma > SAME_DIRECTION)) :].T
     if kernel.shape[1] > 1:

@@ -25,25 +25,25 @@ from udkjax.positions.channels import StateHistory
 from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 
-SAMPLES_PER_OUTPUT = 4  # samples from one output time to the next, to look for minima
-PARTS_OF_INTERVAL = 8  # parts of an interval that is integrated again
-PARTS_OF_BRACKET = 16  # parts of a bracket, of which each refinement keeps two
-KINK_RATIO = 2.0  # a minimum may be zero if it is at most this many times the rise to its neighbours
+SAMPLES_PER_OUTPUT = 4  # samples per output interval, to look for minima
+PARTS_OF_INTERVAL = 8  # number of parts of an interval that is integrated again
+PARTS_OF_BRACKET = 16  # number of parts of a bracket; two of them are the next bracket
+KINK_RATIO = 2.0  # a minimum may be zero if its value is at most this many times the rise to its neighbours
 RENEWED_TOL = 1e-12  # rtol and atol of an interval that is integrated again
 
 
 class TimedRankChange(NamedTuple):
-    """An instant at which the rank is lower than before and after."""
+    """An instant at which the rank is lower than before and after it."""
 
     time: float  # s
     earliest: float  # start of the bracket (s)
-    latest: float  # its end (s)
-    rank: int  # at the instant
-    smallest: float  # the singular value that vanishes, at `time`, relative to the largest
+    latest: float  # end of the bracket (s)
+    rank: int  # rank at `time`
+    smallest: float  # singular value that vanishes: its value at `time`, relative to the largest
 
 
 class Timeline(NamedTuple):
-    """Singular values of the scaled Jacobian along a trajectory, and where the rank changes."""
+    """Singular values of the scaled Jacobian along a trajectory, and rank changes."""
 
     ts: Float[np.ndarray, "T"]
     singular_values: Float[np.ndarray, "T k"]
@@ -53,7 +53,7 @@ class Timeline(NamedTuple):
 
     @property
     def smallest(self) -> Float[np.ndarray, "T"]:
-        """The smallest singular value that is nonzero at the generic rank, relative to the largest."""
+        """The smallest singular value among those that are nonzero at the generic rank, relative to the largest."""
         return self.singular_values[:, max(int(self.rank.max()) - 1, 0)] / self.singular_values[:, 0]
 
 
@@ -67,7 +67,7 @@ def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol:
         tol: half-width of the brackets around rank changes (s); by default 1e-9 of the scene's characteristic time.
 
     Returns:
-        The `Timeline`. Its brackets do not include the errors of the trajectory.
+        The `Timeline`. The brackets of rank changes do not account for errors of the trajectory.
     """
     analysis = analyse(mechanism)
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
@@ -106,7 +106,7 @@ def _kinks(sigma: np.ndarray) -> list[int]:
 
 
 def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> TimedRankChange | None:
-    """Return the minimum of a singular value in a bracket, or None if the rank is not lower there."""
+    """Return the minimum of a singular value in a bracket, or None if the rank does not change in it."""
     start, end, at, values = low, high, low, np.zeros(0)
     while True:
         grid = np.linspace(low, high, PARTS_OF_BRACKET + 1)
@@ -127,7 +127,7 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
 def _renew(
     mechanism: Mechanism, analysis: Analysis, solution: StateHistory, ts: np.ndarray, low: float, high: float
 ) -> "_Path | None":
-    """Integrate the trajectory between two times again, from the previous output time."""
+    """Integrate the trajectory between two times again, starting from the output time before these."""
     if not isinstance(solution, Solution):
         return None
     first = int(np.searchsorted(ts, low, side="right")) - 1
@@ -140,7 +140,7 @@ def _renew(
 
 
 class _Path:
-    """Singular values at any time, from quintics through q, v and a of neighbouring states."""
+    """Singular values at any time, by quintics through q, v and a of neighbouring states."""
 
     def __init__(self, mechanism: Mechanism, analysis: Analysis, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
         self.mechanism, self.analysis = mechanism.without_origin, analysis
