@@ -15,7 +15,7 @@ NumberLike = TypeAliasType("NumberLike", ArrayLike)  # one number of Python, Num
 Numbers = TypeAliasType("Numbers", ArrayLike | Sequence[object])  # a number, an array, or nested lists of numbers
 
 NumericArray: TypeAlias = Array | np.ndarray
-AnyArray = TypeVar("AnyArray", Array, np.ndarray)  # the same of the two throughout a signature
+AnyArray = TypeVar("AnyArray", Array, np.ndarray)  # the same type throughout a signature
 
 Time: TypeAlias = Float[ArrayLike, ""]  # s
 Vector: TypeAlias = Float[Array, "n"]  # flat coordinates, velocities or states

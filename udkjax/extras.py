@@ -50,7 +50,7 @@ def require(*packages: str) -> None:
 
 
 def cure(error: ModuleNotFoundError) -> str:
-    """Return the command that installs a missing package; an empty text if no extra contains it."""
+    """Return the command that installs a missing package; an empty string if no extra contains it."""
     missing = (error.name or "").partition(".")[0]
     if missing not in EXTRAS:
         return ""

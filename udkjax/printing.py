@@ -12,10 +12,10 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-MOST_ROWS = 14  # of a table as text, so that it fits on a screen with title and remarks; further rows are counted
-MOST_HTML_ROWS = 30  # of a table in a notebook, which can be scrolled
+MOST_ROWS = 14  # rows of a table as text, which fit on a screen with title and remarks; further rows are only counted
+MOST_HTML_ROWS = 30  # rows of a table in a notebook, which can be scrolled
 MOST_NUMBERS = 6  # entries of an array that are printed; larger arrays print their shape and range
-MOST_CHARACTERS = 96  # in a cell
+MOST_CHARACTERS = 96  # of a cell
 MOST_LINE = 400  # characters of an object that prints on one line
 DIGITS = 6  # significant digits in tables, enough to compare runs by eye
 PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # relative to the largest nearby number: accumulated rounding errors print as 0
@@ -36,7 +36,7 @@ class PrintedTable(NamedTuple):
 
 
 def text_table(table: PrintedTable, most: int = MOST_ROWS) -> str:
-    """Return a table as text with aligned columns; of many rows, the first ones and the number of the others."""
+    """Return a table as text with aligned columns: the first `most` rows, and the number of further rows."""
     cells = [[_shorten(str(cell)) for cell in row] for row in table.rows[:most]]
     lines = align_columns([list(table.heads), *cells] if table.heads else cells)
     if len(table.rows) > most:
@@ -51,7 +51,7 @@ def align_columns(cells: Sequence[Sequence[str]]) -> list[str]:
 
 
 def html_table(table: PrintedTable) -> str:
-    """Return a table as HTML, with escaped cells; of many rows, the first ones and the number of the others."""
+    """Return a table as HTML, with escaped cells: the first rows, and the number of further rows."""
     heads, rows = table.heads, table.rows
     head = "".join(f"<th>{escape(name)}</th>" for name in heads)
     body = "".join(
@@ -82,7 +82,7 @@ def units(**by_field: str) -> Mapping[str, str]:
 
 
 def has_numbers(value: object) -> bool:
-    """Return True if all numbers have values: none is traced or only a shape."""
+    """Return True if all numbers have values, so that no number is traced or only a shape."""
     return all(isinstance(leaf, Plain | str) or _is_stored(leaf) for leaf in _leaves(value))
 
 
@@ -104,7 +104,7 @@ def format_number(value: Any, unit: str = "", scale: float = 0.0) -> str:
 
 
 def format_numbers(value: Any, unit: str = "") -> str:
-    """Return a number or an array with its unit as text: a few entries, or the shape and range of many.
+    """Return a number or an array with its unit as text: the entries if they are few, else the shape and the range.
 
     Args:
         value: an array, a number, a boolean, or None. Traced numbers are marked as such, with their shape.
@@ -192,9 +192,9 @@ class PrintsLine(eqx.Module):
 
 
 class PrintsTable(eqx.Module):
-    """A module that prints as a table: of `_table` if all of its numbers have values, else of their shapes."""
+    """A module that prints as a table: `_table()` if all of its numbers have values, else `_shapes()`."""
 
-    _units: ClassVar[Mapping[str, str]] = units()  # by field
+    _units: ClassVar[Mapping[str, str]] = units()  # unit of each field
 
     def _table(self) -> PrintedTable:
         """Return the table to print, by default with a row for each field."""
@@ -242,7 +242,7 @@ def prints_table(cls: Class) -> Class:
 def _table_of(record: Any) -> PrintedTable:
     make_table = getattr(record, "_table" if has_numbers(record) else "_shapes", None)
     try:
-        with jax.ensure_compile_time_eval():  # concrete numbers stay concrete while something else is traced
+        with jax.ensure_compile_time_eval():  # concrete numbers stay concrete even while something else is traced
             return fields_table(record, getattr(record, "_units", {})) if make_table is None else make_table()
-    except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError):  # JAX replaces numbers by other objects
+    except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError):  # JAX has replaced numbers by other objects
         return fields_table(record, getattr(record, "_units", {}))

@@ -1,4 +1,4 @@
-"""Progress of a long computation, reported alike by all functions with a `progress` argument."""
+"""Progress of a long computation, reported in the same way by all functions with a `progress` argument."""
 
 import sys
 import threading
@@ -74,7 +74,7 @@ def report_progress(
         total: amount to do, in any unit; None if unknown.
         what: name of the computation, at the beginning of the line.
         patience: time (s) after which a line appears by default.
-        interval: time (s) between updates of the line; the default depends on whether it goes to a terminal or a file.
+        interval: time (s) between updates of the line; the default depends on whether stderr is a terminal or a file.
 
     Returns:
         The function `report(done, message="")`, to be called as the computation proceeds.
@@ -97,7 +97,7 @@ def report_progress(
 
 
 class _Line:
-    """A tqdm bar on stderr, made by a timer, so that it also appears while the first part of the work compiles."""
+    """A tqdm bar on stderr, shown by a timer, so that it also appears while the first part of the work is compiled."""
 
     def __init__(self, what: str, total: float | None, patience: float, interval: float | None):
         self.what, self.total, self.begun = what, total, time.time()

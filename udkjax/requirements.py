@@ -41,7 +41,7 @@ def describe(value: Any) -> str:
 
 
 def array(name: str, value: Any) -> "np.ndarray | Tracer":
-    """Return real numbers as an array, a traced one unchanged; raise a `TypeError` that names the argument for anything else."""
+    """Return real numbers as an array; for anything else raise a `TypeError` that names the argument. Tracers are unchanged."""
     if isinstance(value, Tracer):
         numbers: Any = value
     elif not isinstance(value, np.ndarray | float) and is_traced(value):
@@ -62,7 +62,7 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
 
 
 def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: GivenArguments = NOTHING) -> None:
-    """Require one real number of a sign, finite unless `infinite`; of a traced one, only shape and dtype are checked."""
+    """Require one real number of a sign, finite unless `infinite`; of a traced number, only shape and dtype are checked."""
     number = array(name, value)
     if number.shape != ():
         cure = "a batch is for jax.vmap, or for udk.sweep"
@@ -77,7 +77,7 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
 
 
 def require_count(name: str, value: Any, least: int = 1, given: GivenArguments = NOTHING) -> None:
-    """Require an integer, at least `least`; of a traced one, only shape and dtype are checked."""
+    """Require an integer, at least `least`; of a traced number, only shape and dtype are checked."""
     number = None if isinstance(value, bool | np.bool_) else array(name, value)
     if number is None or number.shape != () or not jnp.issubdtype(number.dtype, jnp.integer):
         raise ArgumentTypeError(f"{name} must be a whole number, {describe(value)}")
@@ -96,7 +96,7 @@ def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *in
 
 
 def require_times(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
-    """Require a vector of finite times; of a traced one, only the shape is checked."""
+    """Require a vector of finite times; of a traced vector, only the shape is checked."""
     times = array(name, value)
     if times.ndim != 1 or not len(times):
         raise ArgumentError(f"{name} must be a vector of times in s; its shape is {times.shape}")
@@ -104,7 +104,7 @@ def require_times(name: str, value: Any, given: GivenArguments = NOTHING) -> Non
 
 
 def require_output_times(name: str, value: Any) -> None:
-    """Require at least two finite, increasing times; of traced ones, only the shape is checked."""
+    """Require at least two finite, increasing times; of traced times, only the shape is checked."""
     times = array(name, value)
     if times.ndim != 1 or len(times) < 2:
         what = "a vector of at least two output times, from the start on"

@@ -1,4 +1,4 @@
-"""The number of threads that computations use: the cores of this process, or fewer by `UDKJAX_THREADS`."""
+"""The number of threads that computations use: the cores of this process, or fewer as set by `UDKJAX_THREADS`."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Names, values and counts in sentences: of errors, reports and pages."""
+"""Names, values and counts in the sentences of errors, reports and pages."""
 
 import difflib
 from collections.abc import Iterable, Sequence
@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 from jax.core import Tracer
 
 LONGEST_QUOTE = 60  # characters of a value or a name in a message
-MOST_LISTED = 8  # most names in one sentence
+MOST_LISTED = 8  # names listed in one sentence
 
 
 def suggestion(name: object, choices: Iterable[str]) -> str:
-    """Return '; did you mean "..."?' if one of the choices is similar, else an empty text."""
+    """Return '; did you mean "..."?' if one of the choices is similar, else an empty string."""
     if not isinstance(name, str):
         return ""
     lowered = {choice.lower(): choice for choice in choices}

@@ -31,7 +31,9 @@ COMMANDS = (
     "doctor",
 )
 
-GARBAGE_EVERY = 50_000  # objects: most of a command's objects live to its end, and scanning them takes a tenth of a second
+GARBAGE_EVERY = (
+    50_000  # new objects between garbage collections: most objects live to the end of a command, and scanning them takes 0.1 s
+)
 PROGRAM_CACHE_BYTES = 200_000_000  # limit of stored JAX programs; the least recently used are removed
 
 

@@ -13,8 +13,8 @@ A command is a function of its options that imports what it needs when it runs:
         from udkjax.show.summary import table
         from udkjax.statics.modes import modes as compute
 
-        found = compute(mech)
-        show({"frequencies": found.frequencies}, table(mech.name, {...}), json)
+        result = compute(mech)
+        show({"frequencies": result.frequencies}, table(mech.name, {...}), json)
 
 Wrong input ends with `refuse("--count 0: must be positive")`, a failed run with `fail(...)` after `show(...)`. Exceptions of
 udkjax (`SceneError`, `SimulationError`, ...) need no handling: see `exits.exit_codes`.
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from udkjax import Mechanism
     from udkjax.positions.channels import Channel, StateHistory
 
-    Columns = dict[str, tuple[np.ndarray, str]]  # by name: values over time, and their unit
+    Columns = dict[str, tuple[np.ndarray, str]]  # values over time, and their unit, by name
 
 __all__ = ["BAD_INPUT", "BAD_RUN", "INTERRUPTED", "Json", "Quiet", "Scene"]
 __all__ += ["channels_of", "choose_driver", "fail", "load", "measure_channels", "output_times", "refuse", "say", "show"]
@@ -79,14 +79,14 @@ def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> 
 
 
 def is_of_library(scene: Path) -> bool:
-    """Return whether no file has this name, and a mechanism of `udkjax.library` has it."""
+    """Return True if a mechanism of `udkjax.library`, and no file, has this name."""
     from udkjax.scene import library
 
     return str(scene) in library.__all__ and not scene.exists()
 
 
 def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":
-    """Return the times from t0 in steps of dt, including t1 if it is one up to rounding; exit if the options are invalid."""
+    """Return the times from t0 in steps of dt, including t1 if it is a step up to rounding; exit if the options are invalid."""
     if not 0 < dt <= t1 - t0 < math.inf:
         refuse(f"--dt {dt:g} must be positive, and at most the time from --t0 {t0:g} to --t1 {t1:g}")
     if (t1 - t0) / dt > MOST_TIMES:
@@ -101,7 +101,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
 
     Args:
         results: results by stable names; arrays become lists, numbers that are not finite become null.
-        text: the same for people.
+        text: the results as text for people.
         json: True for JSON.
     """
     if json:

@@ -9,12 +9,12 @@ from typing import NoReturn
 from udkjax.extras import MissingExtraError
 
 BAD_RUN = 1  # the command ran, and failed
-BAD_INPUT = 2  # it did not run: wrong options, an unreadable file, a missing package; tyro's own code
+BAD_INPUT = 2  # the command did not run: wrong options, an unreadable file, a missing package; tyro uses the same code
 INTERRUPTED = 130  # Ctrl-C, as in a shell
 
 
 def say(text: str) -> None:
-    """Write a message to stderr, where everything goes that is not a result."""
+    """Write a message to stderr; only results are written to stdout."""
     print(f"udkjax: {text}", file=sys.stderr)
 
 
@@ -48,7 +48,7 @@ def exit_codes() -> Iterator[None]:
         print(file=sys.stderr)  # after the ^C that the terminal prints
         say("stopped")
         sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # the reader of the output, such as `head`, has closed the pipe
+    except BrokenPipeError:  # the program that reads the output, such as `head`, has closed the pipe
         sys.stderr.close()
         sys.exit(BAD_RUN)
     except OSError as error:  # no such folder, no permission, no space

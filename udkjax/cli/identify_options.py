@@ -17,7 +17,7 @@ Found = TypeVar("Found")
 
 
 class IdentifyOptions:
-    """Parameters by name, with texts such as NAME=VALUE for the arguments of `Parameter` named by the keys of `options`.
+    """Parameters by name; `options` maps arguments of `Parameter` to strings from the command line, such as NAME=VALUE.
 
     Mistakes are collected in `problems`.
     """

@@ -1,4 +1,4 @@
-"""Scenes: bodies, joints, drivers, force elements, the mechanism of them all, and its files. No equations."""
+"""Scenes: mechanisms of bodies, joints, drivers and force elements, and their files. The equations are in `udkjax.equations`."""
 
 from udkjax.lazy_names import lazy_names
 

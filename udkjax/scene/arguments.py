@@ -1,8 +1,8 @@
-"""The one door: arguments of public functions are checked before anything is computed.
+"""Checks of the arguments of public functions, before anything is computed.
 
-`@checked` reads the annotations and names of a function's parameters. Classes in an annotation must match, a `Literal` lists the
-choices, and arrays are recognized by their names (named_arguments.py): shapes must fit the mechanism, numbers must be real,
-finite and of the right sign. For traced values only shapes and dtypes are checked.
+`@checked` reads the annotations and names of a function's parameters. An argument must be an instance of an annotated class, or a
+choice of a `Literal`. Arrays are recognized by their names (named_arguments.py): shapes must fit the mechanism, numbers must be
+real, finite and of the right sign. For traced values only shapes and dtypes are checked.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,7 +37,7 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
     """Return a function that checks its arguments.
 
     Args:
-        function: Its parameters are checked by their annotations and names; see the module.
+        function: A function with annotated parameters.
 
     Returns:
         The function with checks. It raises `TypeError` if an argument has the wrong type, `ValueError` if it has the wrong shape
@@ -59,7 +59,7 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 
 
 def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str, Any]], tuple[GivenArguments, GivenArguments]]:
-    """Return a function that maps a call to its arguments by name: the given ones, and all including defaults."""
+    """Return a function that maps the arguments of a call to two dicts by name: without and with the defaults."""
     parameters = signature(function)
     defaults = {name: p.default for name, p in parameters.parameters.items() if p.default is not p.empty}
     kinds = {p.kind for p in parameters.parameters.values()}
@@ -73,7 +73,7 @@ def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str
         given = dict(zip(names, args, strict=False)) | kwargs
         bound = defaults | given
         is_valid = len(given) == len(args) + len(kwargs) and required <= given.keys() and len(bound) == len(parameters.parameters)
-        if not (is_fixed and is_valid):  # `bind` raises the error
+        if not (is_fixed and is_valid):  # raises the error, or collects variadic arguments
             given = bind_arguments(function.__name__, parameters, args, kwargs).arguments
             bound = defaults | given
         return given, bound
@@ -91,7 +91,7 @@ def bind_arguments(name: str, parameters: Signature, args: Sequence[Any], kwargs
 
 
 def argument_problems(function: Callable[..., object], given: GivenArguments) -> list[str]:
-    """Return the mistakes in some arguments of a function; `given` must include the mechanism."""
+    """Return the mistakes in the arguments `given` by name, which must include the mechanism."""
     problems: list[str] = []
     for name, check, if_none in _checks_of(function):
         try:
@@ -103,7 +103,7 @@ def argument_problems(function: Callable[..., object], given: GivenArguments) ->
 
 
 class ParameterCheck(NamedTuple):
-    """One check of a parameter; `if_none` tells whether it is applied to None, skipped for None, or refuses None."""
+    """A check of a parameter; for None, `if_none` tells whether the check is applied, passes, or fails."""
 
     name: str
     check: ArgumentCheck

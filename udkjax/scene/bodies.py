@@ -1,4 +1,4 @@
-"""A rigid body, and its frame: the arguments of joints and force elements."""
+"""Rigid bodies, and their frames, which are the arguments of joints and force elements."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from udkjax.printing import PrintsLine, one_line
 from udkjax.scene.fields import POSITIVE, given_number
 
 GROUND = "ground"
-COORDINATES = ("x", "y", "angle")  # of a body, in their order in q and v
+COORDINATES = ("x", "y", "angle")  # of each body, in the order of q and v
 PlaneVector = Float[Array, "2"] | Sequence[Number]  # two components
 
 
@@ -63,7 +63,7 @@ class Point(NamedTuple):
         return self.x * other.x + self.y * other.y
 
     def norm(self, least: Number = 0.0) -> Array:
-        """Return the length of the vector; the derivative at the zero vector, where it has a kink, is set to zero.
+        """Return the length of the vector. Its derivative at the zero vector, where the length has a kink, is set to zero.
 
         Args:
             least: Length up to which a vector counts as zero.
@@ -76,12 +76,12 @@ class Point(NamedTuple):
 class Frame(NamedTuple):
     """Position and velocity of a body as scalars: the argument of joints and force elements.
 
-    In joints `vx`, `vy` and `omega` are None: ideal joints constrain positions. The ground is `GROUND_FRAME`.
+    In joints `vx`, `vy` and `omega` are None, because ideal joints constrain positions only. The ground is `GROUND_FRAME`.
 
     Attributes:
         x: x coordinate of the centre of mass (m).
         y: y coordinate of the centre of mass (m).
-        angle: anticlockwise from the x axis (rad), not wrapped; the relative angle of two bodies is the difference.
+        angle: anticlockwise from the x axis (rad), not wrapped; relative angles of bodies are differences of angles.
         cos: cosine of the angle.
         sin: sine of the angle.
         vx: x velocity of the centre of mass (m/s).
@@ -103,7 +103,7 @@ class Frame(NamedTuple):
 
     @classmethod
     def at(cls, position: PlaneVector, angle: Number) -> "Frame":
-        """Return the frame of a body at a position (m) and an angle (rad), as joints see it."""
+        """Return the frame of a body at a position (m) and an angle (rad), without velocities."""
         xp = array_namespace(angle)
         return cls(position[0], position[1], angle, xp.cos(angle), xp.sin(angle))
 
@@ -131,7 +131,7 @@ GROUND_FRAME_AT_REST = Frame(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # for forc
 
 
 def frame_over_time(names: Sequence[str], q: Float[Array, "T bodies 3"], v: Float[Array, "T bodies 3"], body: str) -> Frame:
-    """Return the frame of a body over time, each of its numbers (T,).
+    """Return the frame of a body over time: each of its numbers is an array (T,).
 
     Args:
         names: The bodies, in the order of q and v.
@@ -143,7 +143,7 @@ def frame_over_time(names: Sequence[str], q: Float[Array, "T bodies 3"], v: Floa
         The frame, with its velocities.
 
     Raises:
-        ValueError: No such body.
+        ValueError: There is no body of this name.
     """
     if body == GROUND:
         zero = jnp.zeros_like(q[..., 0, 0])

@@ -1,4 +1,4 @@
-"""Checks of a scene from a file or from Python, which find all mistakes at once."""
+"""Checks of scenes from files and from Python; they find all mistakes, not only the first."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,9 +25,9 @@ KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements,
 
 
 class Mistakes(ValueError):
-    """A list of mistakes: `problems`, and the file that has them, `source`, or empty."""
+    """An error that lists mistakes, `problems`, and the file that contains them, `source` (empty if there is no file)."""
 
-    subject = ""  # noun for the thing that has the mistakes, in the message
+    subject = ""  # noun for the message: "2 mistakes in the scene"
 
     def __init__(self, problems: Sequence[str], source: str = ""):
         self.problems, self.source = list(problems), source
@@ -40,10 +40,10 @@ class Mistakes(ValueError):
 
 
 class SceneError(Mistakes):
-    """A scene is wrong. `problems` lists every mistake, each with the path of the offending entry.
+    """A scene contains mistakes. `problems` lists all of them, each with the path of its entry.
 
     Attributes:
-        problems: every mistake, each with its place.
+        problems: all mistakes, each with the path of its entry.
         source: the name of the mechanism or of the file.
     """
 
@@ -138,7 +138,7 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
 
 
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
-    """Iterate over the mistakes in one value. `sizes` collects the lengths of the table's named dimensions."""
+    """Iterate over the mistakes in one value. `sizes` collects the lengths of the named dimensions."""
     if get_origin(annotation) is UnionType:  # a number, or samples of it
         annotation, sampled_class = get_args(annotation)
         if isinstance(value, sampled_class | dict):
@@ -235,7 +235,7 @@ def _check_entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -
 
 
 def _as_array(value: object) -> np.ndarray | None:
-    """Return a number or nested lists of numbers as an array; None for anything else, including booleans and text."""
+    """Return a number or nested lists of numbers as an array; None for anything else, including booleans and strings."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         array = np.asarray(value)
         return array if array.dtype.kind in "iuf" else None
@@ -250,7 +250,7 @@ def _as_array(value: object) -> np.ndarray | None:
 
 def _check_references(path: str, kind: str | None, value: object, known: KnownNames) -> Iterator[str]:
     """Iterate over the mistakes in names of bodies and joints."""
-    if kind is None or kind not in known:  # in a nested module, whose names need not exist in the scene
+    if kind is None or kind not in known:  # the field holds no name, or belongs to a nested module
         return
     named = known[kind]
     single = isinstance(value, str)

@@ -37,7 +37,7 @@ def count_marks(mechanism: Sections) -> int:
 
 
 def marks_by_name(mechanism: Marked) -> dict[str, Any]:
-    """Return the marks of a mechanism by the names of its numbers, in their shapes."""
+    """Return the marks of a mechanism by the name of the number, in the shape of the number."""
     if mechanism.changed is None:
         return {}
     fields, marks = _present(groups_of(mechanism)), mechanism.changed
@@ -48,11 +48,11 @@ def marks_by_name(mechanism: Marked) -> dict[str, Any]:
 
 
 def mark_changes(mechanism: Marked, groups: ElementGroups, names: Collection[str]) -> Float[Array, "K"]:
-    """Return the marks of elements with new values of the named numbers, or entries of numbers; older marks are kept."""
+    """Return the marks after changes of the named numbers, or entries of numbers; older marks stay set."""
     old_marks, marks = marks_by_name(mechanism), {}
     for name, field in _present(groups).items():
         mark, shape = old_marks.get(name), np.shape(field.value)
-        marks[name] = np.ones(shape) if mark is None or mark.shape != shape else mark  # new samples count as set
+        marks[name] = np.ones(shape) if mark is None or mark.shape != shape else mark  # new samples count as changed
     for full_name in names:
         name, index = split_index(full_name, marks)
         if name in marks:
@@ -69,11 +69,11 @@ def directly_changed(mechanism: Marked, redrawn: Sections) -> dict[str, Any]:
     changed = {name: value_of(known, name, groups_of(mechanism)) for name in sampled}
     for name, mark in marks_by_name(mechanism).items():
         if not any(name.startswith(f"{x}.") for x in sampled):
-            changed |= _kept(name, mark, known[name].value, drawn[name].value if name in drawn else None)
+            changed |= _without_unchanged(name, mark, known[name].value, drawn[name].value if name in drawn else None)
     return changed
 
 
-def _kept(name: str, mark: Any, value: Any, drawn: Any) -> dict[str, Any]:
+def _without_unchanged(name: str, mark: Any, value: Any, drawn: Any) -> dict[str, Any]:
     if drawn is None or np.shape(drawn) != np.shape(value):
         return {name: value}
     if not is_traced(mark) and (mark.all() or not mark.any()):

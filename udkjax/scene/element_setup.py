@@ -32,7 +32,7 @@ def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | No
 
 
 def attached_bodies(element: Constraint | ForceElement, joints: Mapping[str, Joint]) -> tuple[str, ...]:
-    """Return the names of the bodies whose frames an element takes, in order; `joints` are the joints of its mechanism."""
+    """Return the names of the bodies whose frames an element needs, in order; `joints` are the joints of its mechanism."""
     if isinstance(element, Friction):
         return joints[element.joint].frame_names
     return element.frame_names if isinstance(element, Constraint) else element.bodies
@@ -89,13 +89,13 @@ def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstr
     its_own = type(constraint).complete
     filled = getattr(its_own, "fills", None)
     if its_own is Constraint.complete or (filled and getattr(constraint, filled) is not None):
-        return constraint  # the usual case, which skips the sines and cosines of the bodies
+        return constraint  # the usual case; the sines and cosines of the bodies are not needed
     places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
     is_concrete = not is_traced((constraint, places))
     if is_concrete:  # NumPy compiles nothing
         constraint, places = jax.tree.map(np.asarray, (constraint, places))
     frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
-    eager = jax.ensure_compile_time_eval() if is_concrete else nullcontext()  # while something else is traced
+    eager = jax.ensure_compile_time_eval() if is_concrete else nullcontext()  # concrete even while something else is traced
     with eager, np.errstate(all="ignore"):
         completed = constraint.complete(*frames)
         return jax.tree.map(number, completed) if is_concrete else completed

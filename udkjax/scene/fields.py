@@ -1,7 +1,7 @@
 """Fields of the classes of a scene: converters, and requirements on values.
 
 Each class of a scene is its own schema: its fields are the keys of the scene format, annotations state the shapes of numbers, and
-the metadata below all other requirements. Files and Python are checked by the same declarations (`checks.py`).
+the metadata below state all other requirements. Files and Python are checked by the same declarations (`checks.py`).
 """
 
 import math
@@ -111,8 +111,8 @@ class StaticValue:
 class Requirement(NamedTuple):
     """A condition on each entry of a number: `holds` maps a NumPy or JAX array to a boolean array of the same shape.
 
-    If it is `strict`, numbers that violate it are meaningless, and a run whose traced numbers do ends with
-    `Result.invalid_argument`. If not, as for a negative damping, they are meaningful: finite differences around zero need them.
+    Numbers that violate a `strict` requirement are meaningless; if traced numbers violate it, the run ends with
+    `Result.invalid_argument`. Other numbers, such as a negative damping, are valid: finite differences around zero need them.
     """
 
     text: str
@@ -124,7 +124,7 @@ class FieldMetadata(TypedDict, total=False):
     """Conditions on the value of a field beyond its annotation."""
 
     require: tuple[Requirement, ...]
-    at_least: int  # entries
+    at_least: int  # number of entries
     called: bool  # the field holds a function of time, used only by calling it
     names: Literal["body", "revolute", "pin", "link", "slide"]  # kind of the names that the field holds
 

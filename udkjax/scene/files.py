@@ -12,7 +12,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import is_xml, parse_toml
 from udkjax.wording import abbreviate
 
-DRAWN_VERSION = 2  # of the format of drawings, with pins and links
+DRAWN_VERSION = 2  # version of the format of drawings, with pins and links
 
 
 def load(path: str | os.PathLike[str]) -> Mechanism:

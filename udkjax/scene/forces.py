@@ -21,22 +21,22 @@ from udkjax.scene.held import Held, given_sampled, value_at
 
 Wrench = tuple[Number, Number, Number]  # force x, force y (N, ground axes), torque about the centre of mass (N m)
 
-# Fraction of a spring's length. Nearer than this, its ends count as coincident: the closer they are, the more digits the
-# derivatives of the force's direction lose; all of them between pins that a joint holds together, up to rounding.
+# Fraction of a spring's length. Ends that are closer count as coincident, because the derivatives of the force's direction lose
+# more digits the closer the ends are: all digits between pins that a joint holds together.
 NEAREST = float(np.sqrt(np.finfo(float).eps))
 
 
 class ForceElement(PrintsLine):
-    """A force element. Subclass it and write `potential`, `loads` or both; one that is not written costs nothing.
+    """A force element. Subclass it and write `potential`, `loads` or both; a method that is not written costs nothing.
 
     If its loads are piecewise smooth in time, `breakpoints` lists the times where the pieces meet; loads may jump there.
 
     Args:
-        bodies: the names of the bodies whose frames `potential` and `loads` get.
+        bodies: the names of the bodies whose frames `potential` and `loads` receive.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
-    n_bodies: ClassVar[int] = 2  # number of `bodies` of a type of the scene format
+    n_bodies: ClassVar[int] = 2  # number of `bodies`, for types of the scene format
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
         """Return the potential energy V (J), or None; its generalized force is -dV/dq."""
@@ -145,7 +145,7 @@ class Force(ForceElement):
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")
 
     def __post_init__(self):
-        self.bodies = (self.body,) if isinstance(self.body, str) else ()  # the check of `body` refuses anything else
+        self.bodies = (self.body,) if isinstance(self.body, str) else ()  # anything else is refused by the check of `body`
 
     def loads(self, t, *frames):
         (body,) = frames

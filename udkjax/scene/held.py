@@ -26,7 +26,7 @@ from udkjax.scene.splines import spline_pieces
 class Held(PrintsLine):
     """A number or vector that is held between samples (zero-order hold): values[k] from t0 + k dt to t0 + (k + 1) dt.
 
-    It is the first value before t0 and the last value after the last sample. Steps of the integrator end at the samples. The
+    The value is the first one before t0, and the last one after the last sample. Steps of the integrator end at the samples. The
     values may be traced and differentiated; code and time per step do not depend on their number. Any field of a force element
     may hold one; in this package, `torque.value`, `force.vector` and `torsion_spring.angle` accept it.
 
@@ -50,7 +50,7 @@ class Held(PrintsLine):
 
     def __call__(self, t: Number) -> Array:
         """Return the value at time t (s)."""
-        if len(self.values) == 1:  # also a single interval in place of all samples: no operation
+        if len(self.values) == 1:  # programs contain a single interval: no operation is needed
             return self.values[0]
         return self.values[jnp.searchsorted(jnp.asarray(self.breakpoints), t, side="right")]
 
@@ -92,7 +92,7 @@ Sampled = Held | Spline
 
 
 def sampled_fields(elements: Sequence[eqx.Module]) -> list[tuple[int, str]]:
-    """Return index and field of the sampled numbers of elements: fields with a `Held`, or with a spline that is only called."""
+    """Return index and field of the sampled numbers of elements: a `Held`, or a spline that is used only by calling it."""
     return [
         (k, name)
         for k, e in enumerate(elements)
@@ -119,7 +119,7 @@ def rows_of(x: Sampled, xp: ModuleType) -> Any:
 
 
 def with_row(x: Sampled, row: Any) -> Any:
-    """Return the samples of one interval from a row of numbers; a mark, or None, may stand in place of the row."""
+    """Return the `Held` or spline of a single interval, from its row of numbers; the row may also be a mark, or None."""
     if isinstance(x, Spline):
         return make_module(SplinePiece, row=row)
     return make_module(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)

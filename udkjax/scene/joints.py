@@ -40,7 +40,7 @@ class Constraint(PrintsLine):
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
-    n_bodies: ClassVar[int] = 2  # number of `bodies` of a type of the scene format
+    n_bodies: ClassVar[int] = 2  # number of `bodies`, for types of the scene format
 
     @abstractmethod
     def residual(self, t: Number, *frames: Frame) -> Sequence[Number]:
@@ -73,7 +73,7 @@ Completion = TypeVar("Completion", bound=Callable)
 
 
 def fills(name: str) -> Callable[[Completion], Completion]:
-    """Mark a `complete` that only sets the number `name` if it is absent, so that it need not be called otherwise."""
+    """Decorate a `complete` that only sets the number `name`: it is called only if that number is absent."""
 
     def mark(complete: Completion) -> Completion:
         complete.fills = name  # pyright: ignore[reportFunctionMemberAccess]

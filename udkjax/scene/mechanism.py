@@ -91,7 +91,7 @@ class AbstractDrawing(PrintsTable):
 class Mechanism(PrintsTable):
     """Bodies, joints, drivers and force elements by name, and gravity.
 
-    It is data only; `udkjax.analyse` finds its properties, such as redundant rows. All numbers are leaves of the pytree; names,
+    It is only data; `udkjax.analyse` finds its properties, such as redundant rows. All numbers are leaves of the pytree; names,
     topology and types are static. The user's order is kept: `constraints` are the joints in their order, then the drivers.
     `forces` may be a list: unnamed elements are numbered by type, TYPE1, TYPE2, ... Numbers that a joint leaves to the initial
     guess are filled in here.
@@ -105,9 +105,9 @@ class Mechanism(PrintsTable):
         forces: a force element by name, or a list of them.
         gravity: in m/s^2.
         name: of the mechanism, for titles and files.
-        origin: for internal use: the concrete mechanism behind traced numbers.
+        origin: for internal use: the concrete mechanism from which one with traced numbers was made.
         drawing: the `Drawing` from which it is made, if any.
-        changed: for internal use: one for each entry of a number that no longer follows from the drawing, zero for others.
+        changed: for internal use: 1 for each entry of a number that no longer follows from the drawing, 0 for other entries.
     """
 
     name: str = eqx.field(static=True)
@@ -116,14 +116,14 @@ class Mechanism(PrintsTable):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     driver_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
-    origin: Origin | None = eqx.field(static=True)  # the concrete mechanism behind traced numbers
+    origin: Origin | None = eqx.field(static=True)  # from which a mechanism with traced numbers was made
     # JAX sorts the keys of a dict: tuples keep the user's order.
     _bodies: tuple[Body, ...]
     _joints: tuple[Joint, ...]
     _drivers: tuple[Driver, ...]
     _forces: tuple[ForceElement, ...]
     drawing: AbstractDrawing | None = None
-    # In a drawn mechanism: one for each entry of a number that was changed directly, zero if it follows from the drawing. These
+    # In a drawn mechanism: 1 for each entry of a number that was changed directly, 0 if it follows from the drawing. These
     # marks are numbers, so that mechanisms with and without changes have the same structure and share programs.
     changed: Float[Array, "K"] | None = None
 
@@ -187,7 +187,7 @@ class Mechanism(PrintsTable):
         return _by_name(self.joint_names + self.driver_names, self._joints + self._drivers)
 
     def frames_of(self, element: Constraint | ForceElement) -> tuple[str, ...]:
-        """Return the names of the bodies whose frames an element takes, in order."""
+        """Return the names of the bodies whose frames an element needs, in order."""
         return attached_bodies(element, self.joints if isinstance(element, Friction) else {})
 
     @property
@@ -202,14 +202,14 @@ class Mechanism(PrintsTable):
 
     @property
     def breakpoints(self) -> Float[Array, "k"] | None:
-        """The times (s) where the motion is not smooth, collected from the elements, unsorted; None if there are none."""
+        """The times (s) where the motion is not smooth, collected from the elements, unsorted; None if the motion is smooth."""
         named = [number(e.breakpoints).reshape(-1) for e in (*self.constraints.values(), *self._forces) if len(e.breakpoints)]
         sample_times = [x.breakpoints for x in self.samples.values() if isinstance(x, Held)]
         if any(map(len, sample_times)):
             named.append(number(np.unique(np.concatenate(sample_times))))
         if not named:
             return None
-        concrete = not is_traced(named)  # and must stay concrete while something else is traced
+        concrete = not is_traced(named)  # the times stay concrete even while something else is traced
         return number(np.concatenate(named)) if concrete else jnp.concatenate(named)
 
     @property
@@ -230,11 +230,11 @@ class Mechanism(PrintsTable):
 
     @property
     def without_samples(self) -> "Mechanism":
-        """The mechanism from which programs are made: with a single interval of zeros in place of all samples."""
+        """The mechanism from which programs are made: its samples are a single interval of zeros."""
         return self.with_samples({location: with_row(x, np.zeros(row_size(x))) for location, x in self.samples.items()})
 
     def at(self, t: NumberLike) -> "Mechanism":
-        """Return the mechanism with only the interval at time t (s) in place of all samples."""
+        """Return the mechanism with the samples of a single interval, the one at time t (s)."""
         samples = self.samples
         traced = is_traced((t, samples))
         xp, eager = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
@@ -243,7 +243,7 @@ class Mechanism(PrintsTable):
 
     @property
     def without_origin(self) -> "Mechanism":
-        """The mechanism without `origin` and `drawing`: one compiled program serves all mechanisms that agree without them."""
+        """The mechanism without `origin` and `drawing`: one program serves all mechanisms that agree apart from these."""
         if self.origin is None and self.drawing is None:
             return self
         return _copy(self, {"origin": None, "drawing": None, "changed": None})
@@ -255,7 +255,7 @@ class Mechanism(PrintsTable):
 
     @property
     def numbers(self) -> list[Array]:
-        """All numbers of the equations, in the order in which programs take them: the leaves without those of the drawing."""
+        """All numbers of the equations, in the order of the arguments of programs: the leaves without those of the drawing."""
         return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
 
     @property
@@ -266,14 +266,14 @@ class Mechanism(PrintsTable):
     def _table(self) -> PrintedTable:
         return mechanism_table(self, self.frames_of)
 
-    _shapes = _table  # it marks traced numbers as such
+    _shapes = _table  # the table marks traced numbers
 
     def parameters(self) -> dict[str, Array]:
-        """Return every number of the scene by name, such as `body.link1.mass`, without absent ones (an optional damping)."""
+        """Return all numbers of the scene by name, such as `body.link1.mass`, except absent ones, such as an optional damping."""
         return {name: p.value for name, p in parameters_of(self).items() if p.value is not None}
 
     def with_parameters(self, values: Mapping[str, Numbers | Held]) -> "Mechanism":
-        """Return the mechanism with some of its numbers replaced; pure, and values may be traced.
+        """Return the mechanism with new values of some numbers. The function is pure, and values may be traced.
 
         `values` maps names as in `parameters`, or names of entries (`joint.A.points[1][0]`), to values of exactly the same shape:
         use `vmap` for a batch of values. Absent numbers may be set. A number that may be sampled may be given as a `Held`. A
@@ -306,13 +306,13 @@ class Mechanism(PrintsTable):
         return [name for name, mark in marks_by_name(self).items() if np.any(np.asarray(mark))]
 
     def _redraw(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], list[str]]:
-        """Return the mechanism redrawn with the drawing's values, all direct changes, and the names of the new ones."""
+        """Return the redrawn mechanism, its directly changed numbers, and the names of those that are changed now."""
         drawn, known = parameters_in(drawing.groups), parameters_of(self)
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}
         new_values = {name: value for name, value in values.items() if name not in of_drawing}
         if not of_drawing:
             return self, new_values, list(new_values)
-        replace_numbers(groups_of(self), self.gravity, new_values, known, self.name)  # raises all mistakes in names first
+        replace_numbers(groups_of(self), self.gravity, new_values, known, self.name)  # raises an error if names are wrong
         drawn["gravity"] = known["gravity"]
         groups, gravity = replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name)
         redrawn = drawing.with_groups(groups, gravity).mechanism()
@@ -320,7 +320,7 @@ class Mechanism(PrintsTable):
 
 
 def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
-    concrete = not is_traced((vectors, numbers))  # by NumPy, as jnp is slow for many small arrays
+    concrete = not is_traced((vectors, numbers))  # NumPy is faster for many small arrays
     if concrete:
         return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
     return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])

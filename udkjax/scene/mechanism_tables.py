@@ -18,7 +18,7 @@ from udkjax.scene.number_fields import groups_of
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
 from udkjax.wording import abbreviate, unknown_key
 
-FORMAT_VERSION = 1  # of the format of scenes with bodies and joints
+FORMAT_VERSION = 1  # version of the format of scenes with bodies and joints
 
 
 def mechanism_text(mechanism: Mechanism) -> str:
@@ -77,7 +77,7 @@ def read_section(
 ) -> Iterator[SceneEntry]:
     """Iterate over the entries of one section; add to the problems if it is not a list of tables.
 
-    Their class is `cls`, or follows from their `type`. If `counted`, unnamed ones are numbered, as SECTION1.
+    The class of an entry is `cls`, or follows from its `type`. If `counted`, unnamed entries are numbered: SECTION1, ...
     """
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         problems.append(f"{section}: must be a list of tables; write [[{section}]] above each")
@@ -116,7 +116,7 @@ def key_lines(table: TomlTable) -> list[str]:
 
 
 def toml(value: object) -> str:
-    """Return a value as TOML, with the shortest text of a float that reads back as the same float."""
+    """Return a value as TOML; floats are as short as possible, but read back as the same floats."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

@@ -1,6 +1,6 @@
-"""Requirements on arguments by their names, the same in every public function, whatever the annotations.
+"""Requirements on arguments by their names, which are the same in every public function, whatever the annotations.
 
-They are never applied to None: it passes where a parameter may be None, and is refused elsewhere (arguments.py).
+None is not checked here: it is accepted where a parameter may be None, and refused elsewhere (arguments.py).
 """
 
 import dataclasses
@@ -103,7 +103,7 @@ def _check_analysis(name: str, value: Any, given: GivenArguments) -> None:
 
 def _of_diffrax(kind: str, example: str) -> ArgumentCheck:
     def check(name: str, value: Any, given: GivenArguments):
-        diffrax = sys.modules.get("diffrax")  # imported if an instance of its classes exists
+        diffrax = sys.modules.get("diffrax")  # no instance of its classes exists before it is imported
         if not (diffrax and isinstance(value, getattr(diffrax, kind))):
             meant = f"an instance of diffrax's, such as {name}={example}, or None"
             raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")

@@ -1,4 +1,4 @@
-"""Names of all numbers of a mechanism: the path in a scene file, with the element's name in place of its index."""
+"""Names of all numbers of a mechanism: the path in a scene file, with the element's name instead of its index."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -61,7 +61,7 @@ def parameters_of(mechanism: Sections) -> dict[str, NumberField]:
 
 
 def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
-    """Return every number of some elements by name; the position of a pin has the name of the pin, `pin.A`."""
+    """Return all numbers of elements by name; the position of a pin has the pin's name, `pin.A`."""
     fields = {}
     for section, elements in groups.items():
         for owner, element in elements.items():
@@ -114,7 +114,7 @@ def replace_numbers(
     """
     groups, problems, scene = {section: dict(elements) for section, elements in groups.items()}, [], name
     sampled = {held_name: _field_of_held(known[f"{held_name}.values"]) for held_name in held_names(known)}
-    # Whole arrays before single entries, whatever the order of the keys, which jit sorts.
+    # Arrays are replaced before single entries. The order of `values` is ignored, because jit sorts the keys.
     for given in sorted(values, key=lambda name: name not in known and name.count("[")):
         name, index = split_index(given, known)
         if name in sampled or isinstance(values[given], Held):  # replaces a plain number by a sampled one, or the reverse

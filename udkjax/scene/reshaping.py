@@ -23,7 +23,7 @@ from udkjax.wording import quote, suggestion
 
 @checked
 def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: NumberLike, as_rod: bool = False) -> Mechanism:
-    """Return the mechanism with another length of some bodies: the largest distance between two attachment points of a body.
+    """Return the mechanism with another length of bodies: the largest distance between two attachment points of a body.
 
     All attachment points of these bodies, to joints, drivers and forces, are scaled about the centre of mass. Angles do not
     change; positions and velocities of the initial guess follow along the pins. The function is pure and differentiable.
@@ -68,7 +68,7 @@ def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
 def with_angle(
     mechanism: Mechanism, bodies: Sequence[str] | str, angle: NumberLike, angular_velocity: NumberLike | None = None
 ) -> Mechanism:
-    """Return the mechanism with another initial angle, and angular velocity, of some bodies.
+    """Return the mechanism with another initial angle, and angular velocity, of bodies.
 
     Positions and velocities of the initial guess follow along the pins: a parallelogram stays closed if all its links are named.
     The function is pure and differentiable.

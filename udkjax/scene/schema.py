@@ -41,7 +41,7 @@ CLASSES_BY_TYPE: dict[str, dict[str, type]] = {
     "force": _by_type(forces, forces.ForceElement),
     "motion": _by_type(drivers, drivers.Motion),
 }
-# Tables without a `type`.
+# Classes whose tables have no `type`.
 CLASSES_WITHOUT_TYPE: dict[str, type] = {"body": Body, "driver": drivers.Driver, "profile": joints.Profile, "held": Held}
 
 

@@ -11,8 +11,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.reshaping import attachments
 from udkjax.wording import quote
 
-# Relative to the size of the largest body. A point farther from its own body is probably in the wrong unit (mm). The size of a
-# body is the distance to its other points, or twice its radius of gyration.
+# A point farther from its body's centre of mass than this many sizes of the largest body is probably in a wrong unit (mm).
+# The size of a body is the largest distance of its other points, or twice its radius of gyration.
 FAR_OUT = 50.0
 ANGLES = ("angle", "axis", "phase")  # fields in radians
 
@@ -24,7 +24,7 @@ def suspicions(mechanism: Mechanism) -> list[str]:
 
 def body_sizes(mechanism: Mechanism) -> dict[str, float]:
     """Return the size of each body (m): the distance of its farthest point from its centre, or twice its radius of gyration."""
-    mechanism = jax.tree.map(np.asarray, mechanism)  # JAX would trace concrete numbers while something else is traced
+    mechanism = jax.tree.map(np.asarray, mechanism)  # in a traced function, JAX would trace concrete numbers, too
     return {
         name: max(2 * _gyration(body), *(_length(p) for _, p in attachments(mechanism, name)), 0.0)
         for name, body in mechanism.bodies.items()

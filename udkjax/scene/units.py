@@ -67,7 +67,7 @@ FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the 
 
 
 def units_of(mechanism: Sections, name: str) -> str:
-    """Return the unit of a parameter or of a setting; an empty text if unknown."""
+    """Return the unit of a parameter or of a setting; an empty string if unknown."""
     if name in NUMBERS:
         return NUMBERS[name]
     known = parameters_of(mechanism)

@@ -106,7 +106,7 @@ def _answering(action: Callable[[JsonObject], JsonObject]) -> Callable[[Request]
     async def answer(request: Request) -> Response:
         try:
             given = json.loads(await request.body())
-            json.dumps(given, ensure_ascii=False).encode()  # raises for half a surrogate pair, which no answer can hold
+            json.dumps(given, ensure_ascii=False).encode()  # raises for an unpaired surrogate, which no answer can contain
         except (ValueError, RecursionError):
             given = None
         if not isinstance(given, dict):
@@ -120,7 +120,7 @@ def _answering(action: Callable[[JsonObject], JsonObject]) -> Callable[[Request]
 
 
 async def _page_file(request: Request) -> Response:
-    content = page_files().get(request.path_params["path"] or "index.html")  # the package's own files only
+    content = page_files().get(request.path_params["path"] or "index.html")  # only files of the package
     if content is None:
         return JSONResponse({"problem": "there is no such file"}, 404)
     data, media_type = content

@@ -90,7 +90,7 @@ class _Draft:
         return np.array([x + c * px - s * py, y + s * px + c * py])
 
     def pin(self, name: str, bodies: Sequence[str], position: np.ndarray) -> str:
-        """Return the pin of bodies at a place: one that they share there already, or a new one."""
+        """Return the pin of bodies at a position: a pin that one of them already has at this position, or else a new pin."""
         for pin, pin_position in self.places.items():
             if np.abs(position - pin_position).max() <= self.near and set(bodies) & set(self.members[pin]):
                 self.members[pin] += [body for body in bodies if body not in self.members[pin]]

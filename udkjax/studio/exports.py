@@ -29,7 +29,7 @@ print(sol)
 udk.animate(mech, sol).save("motion.html")
 '''
 
-FORMULA = ("=", "+", "-", "@", "\t")  # a spreadsheet computes a cell that begins so, unless an apostrophe precedes it
+FORMULA = ("=", "+", "-", "@", "\t")  # a spreadsheet evaluates cells that begin like this, unless an apostrophe comes first
 
 
 def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
@@ -53,7 +53,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
 
 
 def shown(mechanism: Mechanism, run: Solution, suffix: str) -> Animation:
-    """Return a run as an animation: for a page a live one, if machine code can express the mechanism."""
+    """Return a run as an animation; a page is live if machine code can express the mechanism."""
     if suffix == ".html":
         with contextlib.suppress(ValueError, UnsupportedError):
             return animate(mechanism, run, live=True)

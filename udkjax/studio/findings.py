@@ -21,7 +21,7 @@ from udkjax.study.diagnosis.fixes import Fix
 from udkjax.wording import plural
 
 MOST_FIXES = 8  # fixes listed for one redundancy
-IN_LINE = 1e-4  # rad: a dead point is found to rounding, and its angle to the square root of rounding
+IN_LINE = 1e-4  # rad: the error of an angle at a dead point is the square root of the rounding error
 
 
 def examine(mechanism: Mechanism, about: str) -> JsonObject:
@@ -74,7 +74,7 @@ def structure(mechanism: Mechanism) -> JsonObject:
 
 
 def drawn_change(fix: Fix) -> JsonObject | None:
-    """Return a fix as a change of the drawing: a removed constraint, or a slot in place of a pin; None if it is neither."""
+    """Return a fix as a change of the drawing: a removed constraint, or a slot instead of a pin; None for any other fix."""
     joint = fix.mechanism.joints.get(fix.constraint)
     if joint is None:
         return {"kind": "remove"}
@@ -109,7 +109,7 @@ def _freedom(count: int) -> str:
 
 
 def rest(mechanism: Mechanism) -> JsonObject:
-    """Return the stable equilibrium next to the drawn position, and its natural frequencies (Hz)."""
+    """Return the stable equilibrium near the drawn position, and its natural frequencies (Hz)."""
     balance = equilibrium(mechanism, stable=True)
     rates = [float(x) for x in np.asarray(balance.omega2)]
     return {
@@ -140,7 +140,7 @@ def motor_travel(mechanism: Mechanism) -> JsonObject:
 
 
 def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
-    """Return lines of pins in a position: each has the pins of two links that share one, and further pins on that line."""
+    """Return the lines of pins in a position: each contains the pins of two links with a common pin, and further pins."""
     frames = dict(zip(mechanism.bodies, q, strict=True))
     pins = {name: joint for name, joint in mechanism.joints.items() if isinstance(joint, Revolute)}
     places = {}
@@ -166,7 +166,7 @@ def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
 
 
 def _add_to_line(lines: list[list[str]], pins: list[str], places: dict[str, np.ndarray]) -> None:
-    """Add three pins in line to the line that has two of their places already, or as a new line; each place once."""
+    """Add three collinear pins to the line that contains two of their positions, or as a new line, without coincident pins."""
     near = IN_LINE * np.ptp(list(places.values()), axis=0).max()
     for line in lines:
         new = [pin for pin in pins if all(np.linalg.norm(places[pin] - places[other]) > near for other in line)]

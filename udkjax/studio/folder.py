@@ -14,7 +14,7 @@ MOST_CHARACTERS_OF_A_PATH = 200  # file systems allow 255 per name
 
 
 class Folder:
-    """The folder in which the studio was started. No path leads out of it, neither through `..` nor through a link.
+    """The folder in which the studio was started. No path leads out of it, neither through `..` nor through a symbolic link.
 
     Args:
         root: the folder.

@@ -17,7 +17,7 @@ from udkjax.studio.limits import MOST_BODY_BYTES, RefusedError
 
 TOKEN_HEADER = "x-studio-token"
 INTERFACE = "/api/"
-NAMES = ("127.0.0.1", "localhost")  # of this machine
+NAMES = ("127.0.0.1", "localhost")  # names of this machine
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"

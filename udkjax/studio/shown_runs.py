@@ -27,7 +27,7 @@ TOLERANCE = 1e-8  # rtol and atol of a run
 
 
 def duration_of(mechanism: Mechanism) -> float:
-    """Return the duration of a run (s): turns of the slowest motor, a slide's way across the mechanism, or else some swings."""
+    """Return the duration of a run (s): turns of the slowest motor, travel of a slide across the mechanism, or else swings."""
     scales, durations = analyse(mechanism), []
     for name, driver in mechanism.drivers.items():
         if (speed := constant_speed(mechanism, name)) != 0:
@@ -44,7 +44,7 @@ def shown_run(mechanism: Mechanism) -> Solution:
 
 
 def recorded_motion(mechanism: Mechanism) -> JsonObject:
-    """Return the run as plain numbers: `q` and `v` of all bodies at `times`, and `cause`, the reason of an early end."""
+    """Return the run as plain numbers: `q` and `v` of all bodies at `times`, and `cause`, the reason for an early end."""
     run = shown_run(mechanism)
     q, v = np.asarray(run.q), np.asarray(run.v)
     alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
@@ -69,7 +69,7 @@ def force_curves(mechanism: Mechanism) -> JsonObject:
 
 
 def holding_curves(mechanism: Mechanism) -> JsonObject:
-    """Return curves of the torques, forces and forces at pins that hold a mechanism at rest in each position of its run.
+    """Return curves of the efforts of motors, and of forces at pins, that hold a mechanism at rest in each position of its run.
 
     Raises:
         SceneError: motors do not hold the whole mechanism.
@@ -84,7 +84,7 @@ def holding_curves(mechanism: Mechanism) -> JsonObject:
 
 
 def mobility_of(mechanism: Mechanism) -> int:
-    """Return the number of degrees of freedom that motors leave."""
+    """Return the number of degrees of freedom that no motor drives."""
     return 3 * len(mechanism.bodies) - int(close(mechanism, 0.0).rank)
 
 
@@ -102,7 +102,7 @@ def _efforts(mechanism: Mechanism, run: StateHistory, kind: str) -> list[JsonObj
 
 
 def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[JsonObject]:
-    """Return curves of the forces at pins; forces that are not unique are marked, and have the least norm."""
+    """Return curves of the forces at pins; forces that are not unique are marked; these are minimum-norm values."""
     unique = unique_pin_forces(mechanism, run)
     return [
         _curve(f"{pin}: force on {body}", "N", np.hypot(*np.asarray(load)[:, :2].T), unique[pin][body])

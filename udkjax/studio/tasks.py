@@ -22,7 +22,7 @@ from udkjax.studio.shown_runs import duration_of, effort_name, recorded_motion
 from udkjax.studio.text_edits import merge_document, read_document
 
 Maker = Callable[[], Mechanism]
-# Drawings that one may start from: mechanisms of the library, drawn anew.
+# Templates for new drawings: mechanisms of the library, as drawings.
 TEMPLATES: Mapping[str, tuple[str, Maker]] = {
     "four_bar": ("Four-bar linkage", library.four_bar),
     "slider_crank": ("Slider-crank", library.slider_crank),
@@ -99,7 +99,7 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
 
 
 def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
-    """Return the page's engine of a drawing and, for pulling, one without motors (`hand`); or `why` there is none."""
+    """Return the page's engine of a drawing and, for pulling, an engine without motors (`hand`); or the reason `why` not."""
     pins = list(document.get("pins", {}))
     names = [f"pin.{pin}" for pin in pins]
     try:
@@ -113,7 +113,7 @@ def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
 
 
 def _undriven(document: JsonObject) -> JsonObject:
-    """Return a drawing without driven motions; dampers without damping keep the pins of cylinders in use."""
+    """Return a drawing without driven motions; cylinders become dampers without damping, which keep their pins in use."""
     motors = document.get("motor", [])
     idle = [{"between": motor["between"], "damping": 0} for motor in motors if "between" in motor]
     torques = [motor for motor in motors if "torque" in motor]

@@ -1,6 +1,6 @@
 """A worker process that reads, compiles and diagnoses drawings.
 
-A request that takes too long is ended with its process, while the server keeps running. Requests and answers are JSON, so that
+If a request takes too long, its process is killed, and the server keeps running. Requests and answers are JSON, so that
 nothing from a scene is ever unpickled.
 """
 
@@ -20,7 +20,7 @@ END_SECONDS = 5.0  # time to wait for a killed process
 
 
 class Worker:
-    """Runs the functions of `tasks.py` one at a time in a process of its own, which is replaced if one takes too long."""
+    """Runs the functions of `tasks.py` one at a time in a separate process, which is replaced if a function takes too long."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -73,7 +73,7 @@ class Worker:
 
 
 def _serve(connection: Connection) -> None:
-    """Answer requests until the other side ends."""
+    """Answer requests until the connection is closed."""
     tasks = import_module(TASKS)
     while True:
         try:

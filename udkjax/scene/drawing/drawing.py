@@ -41,18 +41,18 @@ class Drawing(AbstractDrawing):
 
     A pin shared by k links, including the ground, becomes k - 1 revolutes named after the pin: `B`, and `B-2` for a third link.
     Links become bodies of the same name. A body's frame has its origin at the centre of mass, and its x axis points from the
-    first pin towards the second. All numbers are leaves, as in a mechanism, and parameters, such as `pin.A`.
+    first pin towards the second. As in a mechanism, all numbers are leaves, and have names, such as `pin.A`.
 
     Args:
         pins: World coordinates of each pin (m).
         links: The links: `Link`s, or tables of their keys.
         ground: The pins that are fixed.
-        slides: Links that slide along a line without turning on it. Like all elements below, they are given by name or as a
-            list: as tables with the keys of files, such as `{"pin": "O2", "speed": 6.28}`, or elements of `udkjax.scene.drawing`.
+        slides: Links that slide along a line without turning on it. Like all elements below, a mapping from names, or a list;
+            each is a table with the keys of a file, such as `{"pin": "O2", "speed": 6.28}`, or from `udkjax.scene.drawing`.
         slots: Pins that are guided by a line.
         gears: Pairs of links that mesh.
         cams: Pins that stay on the profile of a link.
-        motors: Motions, or torques, of a link on another one.
+        motors: Prescribed motions of a link relative to another one, or torques between them.
         springs: Springs between pins, or torsion springs at pins.
         dampers: Dampers between pins, or rotational dampers at pins.
         loads: Constant forces and torques on links.
@@ -60,7 +60,7 @@ class Drawing(AbstractDrawing):
         joints: More joints, as in a `Mechanism`. They may name links; points are then in the frame of the link.
         drivers: More drivers, as in a `Mechanism`.
         forces: More force elements, as in a `Mechanism`.
-        velocities: Initial velocities of pins (m/s); the others are at rest. A link moves as its first two pins do.
+        velocities: Initial velocities of pins (m/s); other pins are at rest. The first two pins of a link determine its motion.
         gravity: The acceleration of gravity, by default 9.81 m/s^2 along -y.
         name: The name of the mechanism.
         units: Units of plain numbers, such as `{"length": "mm"}`; by default SI units and radians. A number may be a string with
@@ -158,7 +158,7 @@ class Drawing(AbstractDrawing):
         return shapes
 
     def free_pins(self) -> dict[str, tuple[str, Array]]:
-        """Return the pins that belong to a single link: the link, and the position in its frame (m)."""
+        """Return the pins that belong to a single link, by name: the link, and the position in its frame (m)."""
         placement, free = placement_of(concrete_elements(self.groups), self.ground), {}
         for pin, position in placement.places.items():
             members = placement.members(pin)
@@ -169,7 +169,7 @@ class Drawing(AbstractDrawing):
     def _table(self) -> PrintedTable:
         return drawing_table(self.name, self.groups, self.ground)
 
-    _shapes = _table  # it marks traced numbers as such
+    _shapes = _table  # the table marks traced numbers
 
     @deferred_if_traced
     def mechanism(self) -> Mechanism:
@@ -236,6 +236,6 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
 
 
 def _with_link(problem: str, links: Iterable[str]) -> str:
-    """Return a mistake; if its body is a link, name the link from which the body's numbers follow."""
+    """Return a mistake; if it is in the body of a link, add that the body's numbers follow from the link."""
     name = next((name for name in links if problem.startswith(f"body {abbreviate(name)} ")), None)
     return problem if name is None else f"{problem}; it follows from the mass or density, pins and width of link {quote(name)}"

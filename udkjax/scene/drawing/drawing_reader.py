@@ -64,7 +64,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
     ]
     groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWN, *BY_HAND)}
     for section in groups:
-        if section == "body":  # elements that name joints come last: if pins and links are valid, joints are known now
+        if section == "body":  # the pins and links, which determine the joints, have been read
             layout = PinLayout(groups["link"], fixed, groups["slide"])
             known["revolute"] = dict.fromkeys(joint_names(layout, list(groups["pin"])), Revolute)
             known["revolute"] |= named["joint"]

@@ -18,16 +18,18 @@ from udkjax.wording import quote
 
 
 class Motor(DrawnElement):
-    """A motor turns the second of two links at a `pin` against the first, moves a `slide`, or is a cylinder `between` two pins.
+    """A motor turns the second of two links at a `pin` relative to the first, moves a `slide`, or is a cylinder `between` pins.
 
     It prescribes a `speed` or a `motion`, or applies a `torque` at a pin, anticlockwise positive on the second link. Speed and
-    motion are relative to the drawn position; for a cylinder they are those of the distance between its pins.
+    motion are relative to the drawn position; for a cylinder they refer to the distance between its pins.
     """
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     slide: str | None = eqx.field(static=True, default=None, metadata=SLIDE)
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
-    of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
+    of: tuple[str, ...] = eqx.field(
+        static=True, converter=given_names, default=(), metadata=LINK
+    )  # the two links, if more than two meet
     speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad/s; m/s for a slide or a cylinder
     motion: Motion | None = None  # rad or m, relative to the drawn position
     torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m
@@ -81,7 +83,9 @@ class PinSpring(DrawnElement):
     stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N/m; N m/rad in torsion
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
-    of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
+    of: tuple[str, ...] = eqx.field(
+        static=True, converter=given_names, default=(), metadata=LINK
+    )  # the two links, if more than two meet
     damping: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
     length: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)  # m
     angle: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # rad
@@ -116,7 +120,9 @@ class PinDamper(DrawnElement):
     damping: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)  # N s/m; N m s/rad in rotation
     between: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
-    of: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # if more than two meet
+    of: tuple[str, ...] = eqx.field(
+        static=True, converter=given_names, default=(), metadata=LINK
+    )  # the two links, if more than two meet
 
     @property
     def measured_as(self):
@@ -141,7 +147,7 @@ class Load(DrawnElement):
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)
     link: str | None = eqx.field(static=True, default=None, metadata=LINK)  # the link that is loaded, if the pin has several
     force: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # N
-    torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m, from the ground
+    torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None)  # N m, with its reaction on the ground
     frame: Literal["ground", "body"] = eqx.field(static=True, default="ground")  # the axes of the force
 
     def mistakes(self, layout):
@@ -163,7 +169,7 @@ class Load(DrawnElement):
         assert self.force is not None
         point = (0.0, 0.0) if self.pin is None else placement.local(body, placement.places[self.pin])
         vector = self.force
-        if self.frame == "body":  # given in world coordinates as drawn, and turning with the body
+        if self.frame == "body":  # the vector is drawn in world coordinates, and turns with the body
             vector = _turn_back(self.force, placement.angle(body))
         return Parts(force=Force(body, vector, point, self.frame))
 
@@ -219,7 +225,7 @@ def _points_of(placement: Placement, between: tuple[str, ...]) -> Array:
 
 
 def _mistakes_of_ends(layout: PinLayout, between: tuple[str, ...], pin: str | None, of: tuple[str, ...]) -> Iterator[str]:
-    """Iterate over the mistakes in an element between two pins, or at one."""
+    """Iterate over the mistakes in an element between two pins, or at one pin."""
     if bool(between) == (pin is not None):
         yield "between: give two pins, or one pin to turn at"
     elif pin is not None:

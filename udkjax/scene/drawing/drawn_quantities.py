@@ -1,4 +1,4 @@
-"""Numbers with units in tables: texts such as "12 mm", and plain numbers in the units of the file."""
+"""Numbers with units in tables: strings such as "12 mm", and plain numbers in the units of the file."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -41,8 +41,9 @@ VECTORS = ("axis", "direction")  # angles that may also be vectors
 class Units:
     """The units of plain numbers in a file.
 
-    A quantity whose unit the file does not choose is in SI units. But if a part of its unit is another one (a stiffness in a file
-    in millimetres), a plain number is ambiguous and is refused: it needs a unit. Densities are in kg/m^3, as in tables.
+    A quantity is in SI units unless the file chooses another unit for it. If the file changes only a part of its unit (of a
+    stiffness, in a file in millimetres), a plain number is ambiguous and is refused: it needs a unit. Densities are in kg/m^3
+    unless the file chooses their unit.
     """
 
     def __init__(self, chosen: object = None):
@@ -67,7 +68,7 @@ class Units:
                     self.problems.append(f"units.{kind}: {problem}")
 
     def convert(self, path: str, value: object, unit: str, problems: list[str]) -> object:
-        """Convert a number, a string with its unit, or nested lists of them, to SI units; None if it is added to the problems."""
+        """Convert a number, a string with its unit, or nested lists of them, to SI units; None, with a problem, on failure."""
         if isinstance(value, list | tuple):
             converted = [self.convert(f"{path}[{i}]", item, unit, problems) for i, item in enumerate(value)]
             return None if any(x is None for x in converted) else converted
@@ -99,7 +100,7 @@ class Units:
         return None if kind != "density" and self._changed(unit) else 1.0
 
     def _changed(self, unit: str) -> dict[str, str]:
-        """Return the units of the file that differ from parts of an SI unit."""
+        """Return the units of the file, by quantity, that differ from the SI units of which `unit` consists."""
         kinds = [_KIND_OF.get(symbol, "") for symbol in re.findall(r"[A-Za-z]+", unit)]
         return {
             k: self.chosen[k] for k in kinds if k in self.chosen and conversion_factor(self.chosen[k], QUANTITY_KINDS[k]) != 1.0
@@ -107,16 +108,16 @@ class Units:
 
     @staticmethod
     def sizes(unit: str) -> dict[str, float]:
-        """Return the sizes, in an SI unit, of all single units of its dimension by all their spellings."""
+        """Return the size, in an SI unit, of each single unit with the same dimension, by all its spellings."""
         return unit_sizes(unit)
 
     def shown(self, unit: str) -> str:
-        """Return the unit of the file, or one made of its units, in which numbers of an SI unit are shown."""
+        """Return the unit in which numbers with an SI unit are shown: the file's unit, or a combination of its units."""
         of_parts = {"m/s": f"{self.chosen.get('length', 'm')}/s", "rad/s": "rpm" if self.chosen.get("angle") == "deg" else unit}
         return self.chosen.get(_KIND_OF.get(unit, ""), of_parts.get(unit, unit))
 
     def write(self, value: float, unit: str) -> float | str:
-        """Return a number in SI units in the form in which it is written, so that reading it gives bitwise the same number."""
+        """Return a number in SI units as written to the file; reading it back gives bitwise the same number."""
         factor = self._factor(unit) if unit else 1.0
         if factor == 1.0 or value == 0.0:
             return value
@@ -148,7 +149,7 @@ class Units:
     ) -> dict[str, Any]:
         """Convert the table of an element of a class to SI units; mistakes in numbers are added to the problems.
 
-        `variant` is the name under which the units of its fields are listed, by default the class; `law` is that of a motion.
+        `variant` is the name under which the units of its fields are listed, by default the class; `law` is that of a motion law.
         """
         expected, converted = keys(cls), {}
         for name, value in table.items():
@@ -180,7 +181,7 @@ class Units:
 
 
 def without_failed(mistakes: Iterable[str], failed: Iterable[str]) -> list[str]:
-    """Return the mistakes in tables without those of numbers already reported."""
+    """Return the mistakes in tables, except those in numbers for which `failed` has a mistake already."""
     fields = {_field(problem) for problem in failed}
     return [problem for problem in mistakes if _field(problem) not in fields]
 

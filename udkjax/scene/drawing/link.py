@@ -33,12 +33,12 @@ def bar(start: PointArray, end: PointArray, width: Number) -> Shape:
     """Return a bar of a width (m) between two points, with half-round ends about them.
 
     It is a rectangle between the points and two half discs of radius r = width / 2, whose second moments about the middle are
-    l w (l^2 + w^2) / 12 and, for both together, pi r^4 / 2 + pi r^2 l^2 / 4 + 4 r^3 l / 3. With zero width it is a thin rod.
+    l w (l^2 + w^2) / 12 and, for both half discs, pi r^4 / 2 + pi r^2 l^2 / 4 + 4 r^3 l / 3. A bar of zero width is a thin rod.
     """
     xp = array_namespace(start, end, width)
     axis = end - start
     length, w = xp.sqrt(axis @ axis), width
-    # Both divided by the width, which may be zero.
+    # Area and moment divided by the width, which may be zero.
     area = length + np.pi * w / 4
     moment = length * (length**2 + w**2) / 12 + np.pi * w**3 / 32 + np.pi * w * length**2 / 16 + w**2 * length / 6
     return Shape(w * area, 0.5 * (start + end), moment / area)
@@ -116,7 +116,7 @@ class Link(PrintsLine):
 
     @property
     def kind(self) -> str:
-        """Kind of its shape: an outline, a disc, a bar, or a plate."""
+        """The kind of the link's shape: an outline, a disc, a bar, or a plate."""
         if self.outline is not None:
             return "outline"
         if len(self.pins) == 1:
@@ -124,7 +124,7 @@ class Link(PrintsLine):
         return "bar" if len(self.pins) == 2 or self.width is not None else "plate"
 
     def shape(self, places: Places) -> Shape:
-        """Return its shape, given the positions of the pins. A disc needs a width; a bar without one is a thin rod."""
+        """Return the link's shape, given the positions of the pins. A disc needs a width; a bar without one is a thin rod."""
         width = 0.0 if self.width is None else self.width
         if self.outline is not None:
             return polygon(self.outline)
@@ -136,7 +136,7 @@ class Link(PrintsLine):
         return polygon(array_namespace(*points).stack(points))
 
     def body(self, places: Places, velocities: Places) -> "DrawnBody":
-        """Return its mass properties, position and velocity, given the positions (m) and velocities (m/s) of the pins."""
+        """Return the link's mass properties, position and velocity, given the positions (m) and velocities (m/s) of the pins."""
         if self.inertia is not None and self.centre is not None and self.mass is not None:
             shape = Shape(0.0, self.centre, 0.0)
         else:
@@ -174,5 +174,5 @@ class DrawnBody(NamedTuple):
 
 
 def with_concrete_numbers(tree):
-    """Return a tree with NumPy arrays in place of concrete ones, so that results of concrete numbers only stay concrete."""
+    """Return a tree with its concrete numbers as NumPy arrays: numbers computed from these alone stay concrete."""
     return jax.tree.map(lambda x: x if isinstance(x, Tracer) else np.asarray(x), tree)

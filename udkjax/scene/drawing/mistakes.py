@@ -14,12 +14,12 @@ from udkjax.wording import quote
 
 DrawnGroups = Mapping[str, Mapping[str, Any]]  # elements by section and name
 
-# Relative to the largest distance between two pins: nearer points count as coincident, smaller areas as zero.
+# Tolerance relative to the largest distance between two pins. Closer points count as coincident, smaller areas as zero.
 SAME_PLACE = 1e-9
-# Relative to the distances between the other pins: a pin farther away is probably in another unit. Usual units of length differ
-# by ten (cm and mm), which a drawing does not show, or by 25 (mm and inches) to 1,000, more than pins of a mechanism do.
+# A pin that is farther from the other pins than this many times their largest distance is probably in another unit, such as
+# millimetres in a file in metres (1,000). Smaller factors, such as 10 (cm and mm), are not recognized.
 FAR_POINT_RATIO = 100.0
-# Relative to the largest distance between two pins: a gap of this size, as left by drawing to scale, is closed by assembly.
+# Tolerance relative to the largest distance between two pins. Smaller gaps are usual in drawings to scale; assembly closes them.
 DRAWN_GAP = 0.01
 
 
@@ -29,7 +29,7 @@ def where(section: str, index: int, name: str) -> str:
 
 
 def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """Return pin and two links of each revolute, by name: a pin shared by k links has k - 1 revolutes."""
+    """Return the pin and the two links of each revolute, by name: a pin shared by k links has k - 1 revolutes."""
     joints = {}
     for pin in pins:
         first, *others = layout.members(pin) or ("",)
@@ -41,7 +41,7 @@ def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, 
 def layout_mistakes(layout: PinLayout, groups: DrawnGroups, ground: Sequence[str], all_read: bool) -> Iterator[str]:
     """Iterate over the mistakes in the connections of pins, links and other elements; all names are known.
 
-    If some elements could not be read (not `all_read`), unconnected links are not reported: these elements may hold them.
+    Unconnected links are reported only if `all_read`, because an element that could not be read may connect them.
     """
     elements = {s: g for s, g in groups.items() if g and isinstance(next(iter(g.values())), DrawnElement)}
     yield from _taken_names(layout, groups)
@@ -188,7 +188,7 @@ def _crosses_itself(corners: np.ndarray) -> bool:
 
 
 def _reaches(corners: np.ndarray, point: PointArray) -> bool:
-    """Return True if a point is within a polygon, or as near to it as in a drawing to scale."""
+    """Return True if a point is inside a polygon, or outside by no more than the gaps of a drawing to scale."""
     tolerance = DRAWN_GAP * extent(list(corners))
     inside = False
     for a, b in [*pairwise(corners), (corners[-1], corners[0])]:

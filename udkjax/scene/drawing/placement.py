@@ -42,7 +42,7 @@ class PinLayout:
         return tuple(of) or self.members(pin)
 
     def ends(self, between: Sequence[str]) -> tuple[str, ...]:
-        """Return the first member of each of two pins: a force at a pin acts alike on all of its links."""
+        """Return the first member of each of two pins: a force at a pin has the same effect on each of its links."""
         return tuple(self.members(pin)[0] for pin in between)
 
     def centre(self, wheel: str, carrier: str) -> str | None:
@@ -71,7 +71,7 @@ class Placement(PinLayout):
         return self.angle(body2) - self.angle(body1)
 
     def local(self, body: str, position: PointArray) -> Float[Array, "2"]:
-        """Return a position in the frame of a body (m)."""
+        """Transform a position (m) from world coordinates to the frame of a body."""
         frame = self._frames[body]
         x, y = frame.local((position[0] - frame.x, position[1] - frame.y))
         return array_namespace(x, y).stack([x, y])
@@ -91,12 +91,12 @@ class Placement(PinLayout):
         if along:
             line = self.places[along[1]] - self.places[along[0]]
             direction = array_namespace(line).arctan2(line[1], line[0])
-        assert direction is not None  # one of them is given
+        assert direction is not None  # given, because `along` is not
         return direction - self.angle(on)
 
 
 class Parts(NamedTuple):
-    """The parts of the mechanism that an element of a drawing becomes, with its name."""
+    """The joint, driver or force element that an element of a drawing becomes, under the same name."""
 
     joint: Joint | None = None
     driver: Driver | None = None
@@ -112,20 +112,20 @@ class DrawnElement(PrintsLine):
 
     @abstractmethod
     def mistakes(self, layout: PinLayout) -> Iterator[str]:
-        """Iterate over its mistakes in a layout, each a key and a message; all names exist."""
+        """Iterate over the element's mistakes in a layout, each with its key ("key: message"); all names exist."""
 
     @abstractmethod
     def parts(self, placement: Placement) -> Parts:
-        """Return the parts of the mechanism that it becomes."""
+        """Return the parts of the mechanism that the element becomes."""
 
     @property
     def measured_as(self) -> str:
-        """The name of the class under which the units of its numbers are listed."""
+        """The name of the class under which the units of the element's numbers are listed."""
         return type(self).__name__
 
     @property
     def anchors(self) -> tuple[str, ...]:
-        """The pins that it needs; these may be on the ground without a link."""
+        """The pins that the element needs; if fixed to the ground, they may have no link."""
         return ()
 
 

@@ -1,4 +1,4 @@
-"""Mechanisms from literature and practice, ready to use: every number is an argument."""
+"""Mechanisms from the literature and from practice, ready to use; every number is an argument."""
 
 from udkjax.lazy_names import lazy_names
 

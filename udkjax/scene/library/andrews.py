@@ -16,7 +16,7 @@ from udkjax.scene.mechanism import Mechanism
 # Masses (kg) and inertias (kg m^2) of K1 to K7.
 MASSES = (0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498)
 INERTIAS = (2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5)
-# Points and lengths (m), as the sources name them.
+# Points and lengths (m), with the names of the sources.
 A, B, C = (-0.06934, -0.00227), (-0.03635, 0.03273), (0.014, 0.072)
 D, DA, E, EA, FA = 0.028, 0.0115, 0.02, 0.01421, 0.01421
 RR, RA, SS, SA, SB, SC, SD = 0.007, 0.00092, 0.035, 0.01874, 0.01043, 0.018, 0.02
@@ -41,7 +41,7 @@ def andrews_squeezer(
     """Return Andrews' squeezing mechanism: seven bodies in three loops, driven by a constant torque against a stiff spring.
 
     The bodies K1 (the crank) to K7 start at rest; their angles are beta, beta + theta, gamma, phi + delta, delta, omega +
-    epsilon and epsilon of the source. Torque in N m, stiffness in N/m. It is so fast that 0.03 s is a long run.
+    epsilon and epsilon of the source. Torque in N m, stiffness in N/m. The motion is so fast that 0.03 s is a long run.
 
     Source: Schiehlen (ed.), Multibody Systems Handbook, 1990; Hairer and Wanner, Solving Ordinary Differential Equations II,
     section VII.7; the state at 0.03 s is published in the Test Set for Initial Value Problem Solvers.

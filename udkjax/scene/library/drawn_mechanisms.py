@@ -36,7 +36,8 @@ def four_bar(
 ) -> Mechanism:
     """Return a four-bar, by default a crank-rocker: crank, coupler and rocker of `lengths`, uniform, `density` in kg/m.
 
-    The crank turns on the origin at `angle`, the rocker on (`ground`, 0); the coupler's far pin is above their line.
+    The crank, at `angle`, turns about the origin, and the rocker about D = (`ground`, 0). The pin of coupler and rocker is to the
+    left of the line from the pin of the crank to D.
     """
     a, b, c = lengths
 
@@ -61,7 +62,7 @@ def slider_crank(
     gravity: ArrayLike = 9.81,
     spring: Sequence[ArrayLike] | None = None,
 ) -> Mechanism:
-    """Return a slider-crank on the x axis: crank of length `crank` on the origin, connecting rod, slider in a guide.
+    """Return a slider-crank on the x axis: crank of length `crank` about the origin, connecting rod, slider in a guide.
 
     `driven`: a motor turns the crank at constant `angular_velocity` from `angle`; otherwise these are its initial state.
     `masses` are those of crank, rod (both uniform) and slider. `spring`: stiffness (N/m), length (m) and damping (N s/m) of a

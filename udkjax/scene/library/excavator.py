@@ -23,7 +23,7 @@ from udkjax.scene.library.posed_bodies import (
 )
 from udkjax.scene.mechanism import Mechanism
 
-# Points of each body in units of its length; origin at its first pin, x axis towards its last.
+# Points of each body in units of its length; the origin is its first pin, and the x axis points towards its last pin.
 BOOM = {"centre": (0.44, 0.09), "foot": (0.0, 0.0), "tip": (1.0, 0.0), "cylinder": (0.44, 0.12), "stick cylinder": (0.52, 0.20)}
 STICK = {"centre": (0.35, 0.05), "tip": (0.0, 0.0), "rocker": (0.855, 0.02), "bucket": (1.0, 0.0)}
 STICK |= {"cylinder": (-0.22, 0.10), "bucket cylinder": (0.05, 0.20)}
@@ -50,9 +50,9 @@ def excavator(
     determines their angles. `lengths` (m) and `masses` (kg) are in the order of the bodies; the bucket's length is from its pin
     to its teeth, and attachment points of cylinders scale with the lengths. Inertias are those of rods.
 
-    By default valves have shut while the arm moves at `angular_velocities`: the oil in the cylinders of boom, stick and bucket
+    By default valves were shut while the arm moved at `angular_velocities`: the oil in the cylinders of boom, stick and bucket
     acts as springs of `stiffness` (N/m) and `damping` (N s/m), with lengths that put the arm in equilibrium at `angles`.
-    `driven`: the cylinders, from rest, extend by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces are
+    `driven`: cylinders at rest begin to extend by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces are
     reactions. With the default numbers neither motion meets a singular configuration within 20 s.
     """
     boom, stick, rocker, link, bucket = lengths
@@ -66,9 +66,9 @@ def excavator(
     }
 
     def pose(s):
-        arm = _held(on_boom["foot"], np.zeros(2), s[0])
-        fore = _held(on_stick["tip"], _spot(arm, on_boom["tip"]), s[1])
-        shovel = _held(on_bucket["bucket"], _spot(fore, on_stick["bucket"]), s[2])
+        arm = _pose_from_point(on_boom["foot"], np.zeros(2), s[0])
+        fore = _pose_from_point(on_stick["tip"], _spot(arm, on_boom["tip"]), s[1])
+        shovel = _pose_from_point(on_bucket["bucket"], _spot(fore, on_stick["bucket"]), s[2])
         start, end = _spot(fore, on_stick["rocker"]), _spot(shovel, on_bucket["link"])
         knee = apex(start, end, rocker, link)
         return [arm, fore, bar_pose(start, knee), bar_pose(knee, end), shovel]
@@ -126,6 +126,6 @@ def _spot(placed, local):
     return as_array(Frame.at(*placed).point(local))
 
 
-def _held(local, spot, angle):
+def _pose_from_point(local, spot, angle):
     """Return position and angle of a body, given the position of one of its points."""
     return spot - as_array(Frame.at((0.0, 0.0), angle).vector(local)), angle

@@ -28,7 +28,7 @@ def parallelogram(
 ) -> Mechanism:
     """Return the paper's five-bar parallelogram: three parallel links carry a coupler. 12 rows, rank 11, one degree of freedom.
 
-    Ground pivots at (0, 0), (1, 0), (2, 0); `angle` and `angular_velocity` are the links'. Bodies link1, link2, link3,
+    Ground pivots at (0, 0), (1, 0), (2, 0); `angle` and `angular_velocity` are those of the links. Bodies link1, link2, link3,
     coupler; rows A1, A2, A3 (link minus ground), then B1, B2, B3 (link minus coupler). The paper does not print the initial
     state: release from rest at -45 degrees is inferred from its tables.
     """
@@ -84,7 +84,7 @@ def elliptic_trammel(
 ) -> Mechanism:
     """Return a uniform rod whose end A slides on the y axis and whose end B slides on the x axis.
 
-    The centre of mass is at length / 2 (cos `angle`, sin `angle`); the rod's own angle is minus that.
+    The centre of mass is at length / 2 (cos `angle`, sin `angle`); the angle of the rod is -`angle`.
     """
     half = 0.5 * length
 

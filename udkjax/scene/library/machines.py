@@ -34,8 +34,8 @@ def peaucellier(
     """Return the Peaucellier-Lipkin linkage, which converts a rotation to an exact straight line.
 
     Two arms from O = (0, 0) hold the corners A and B of a rhombus of `side`; the crank, pivoted at Q = (`crank`, 0), moves its
-    corner C on a circle through O; the opposite corner D then moves on the line x = (arm^2 - side^2) / (2 crank). Pins of three
-    bars are two revolutes. Bars are uniform, `density` in kg/m; `gravity` acts along +x, so that the linkage hangs. Arms and
+    corner C on a circle through O; the opposite corner D then moves on the line x = (arm^2 - side^2) / (2 crank). A pin of three
+    bars is two revolutes. Bars are uniform, `density` in kg/m; `gravity` acts along +x, so that the linkage hangs. Arms and
     sides are collinear, a singular configuration, at |angle| = 2 acos((arm - side) / (2 crank)): 96 degrees by default.
     """
     r, a, b = crank, arm, side
@@ -90,7 +90,7 @@ def planetary_gear(
     angles = [2 * np.pi * i / planets for i in range(planets)]
 
     def pose(s):
-        carrier_angle = s * r / (r + ring)  # the carrier
+        carrier_angle = s * r / (r + ring)
         spin = carrier_angle - (s - carrier_angle) * r / p
         centres = [(reach * unit_vector(carrier_angle + angle), spin) for angle in angles]
         return [(np.zeros(2), s), *centres, (np.zeros(2), carrier_angle)]

@@ -65,7 +65,7 @@ def double_pendulum(
     masses: Sequence[ArrayLike] = (1.0, 1.0),
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return two uniform rods in a chain, chaotic; `angles` are measured from hanging straight down."""
+    """Return a double pendulum of two uniform rods, which is chaotic; `angles` are measured from hanging straight down."""
     a, b = (0.5 * length for length in lengths)
 
     def pose(s):

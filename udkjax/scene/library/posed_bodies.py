@@ -1,8 +1,8 @@
 """Poses, and bodies that move with them, for the mechanisms of the library.
 
 Each mechanism starts closed, with velocities that satisfy its constraints: its pose q(s) is a function of one coordinate s, and
-the velocity is the derivative of the pose times the rate of s. NumPy computes it, without compiling anything, or JAX if a number
-of the pose is traced. Poses are therefore written with the functions of `array_namespace` of their numbers.
+the velocity is the derivative of the pose times the rate of s. It is computed by NumPy, without compiling anything, or by JAX if
+a number of the pose is traced. Therefore poses use the functions of `array_namespace` of their numbers.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,11 +25,11 @@ from udkjax.scene.mechanism import Mechanism
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))  # the centres of mass of two bodies, as points of a joint
 P = ParamSpec("P")
 OneOrMore: TypeAlias = ArrayLike | Sequence[ArrayLike]  # one number or several
-COMPLEX_STEP = 1e-100  # its square is negligible relative to 1, and its product with a rate is not denormal
+COMPLEX_STEP = 1e-100  # the square is negligible relative to 1, and products with a rate are not denormal
 
 
 def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
-    """Pass concrete numbers to a function of the library as NumPy arrays, so that results of only these stay concrete."""
+    """Decorate a function of the library to receive concrete numbers as NumPy arrays, which JAX does not trace."""
     parameters, build_deferred = signature(build), deferred_if_traced(build)
 
     @wraps(build)

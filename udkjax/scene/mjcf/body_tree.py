@@ -81,7 +81,7 @@ class BodyTree:
         return self.find(read, attribute, self._index, "body", default) or 0
 
     def find(self, read: AttributeReader, attribute: str, known: dict, what: str, default: str = ""):
-        """Return the object that an attribute names; if there is none, refuse the attribute and return None."""
+        """Return the object that an attribute names; if it does not exist, refuse the attribute and return None."""
         name = read.text(attribute, default)
         if name not in known:
             read.refuse(f"{attribute}={quote(name)}: no {what} has this name{suggestion(name, known)}")

@@ -8,13 +8,13 @@ from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneModel, gap_of
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
-EVEN = 1e-12  # rounding of angles that cancel, relative to the largest term
+EVEN = 1e-12  # relative to the largest term: smaller sums of angles are rounding errors
 
 
 class CoupledLength(NamedTuple):
     """A coordinate on which springs, motors and equalities act: a joint coordinate or a tendon length.
 
-    It is a sum of angles of bodies with factors, a slide, or the distance between two points. Negative indices of bodies stand
+    It is a weighted sum of angles of bodies, a slide, or the distance between two points. Negative indices of bodies stand
     for massless rods, whose angles are not coordinates.
     """
 

@@ -12,7 +12,7 @@ from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneMotion
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 from udkjax.wording import quote
 
-MESHED = 1e-9  # rad; rounding between gears
+MESHED = 1e-9  # rad, times the largest factor: rounding error of the angles of gears that mesh in the initial state
 
 
 class EqualityReader:
@@ -109,7 +109,7 @@ class EqualityReader:
                 read.refuse(
                     "is not satisfied in the initial state, and gears start in mesh: change the ref or the key of a joint"
                 )
-            # The three factors add up to zero, so that any body may be the carrier: the ground, or that with the largest factor.
+            # The three factors add up to zero, and any body may be the carrier: choose the ground, or the largest factor.
             carrier = 0 if 0 in angles else max(angles, key=lambda body: abs(angles[body]))
             body1, body2 = (body for body in angles if body != carrier)
             radii, internal = (abs(angles[body1]), abs(angles[body2])), angles[body1] * angles[body2] < 0

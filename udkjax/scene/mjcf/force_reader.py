@@ -1,4 +1,4 @@
-"""Springs, dampers and actuators of an MJCF model as force elements; unsupported parts are refused, or left out by name."""
+"""Springs, dampers and actuators of an MJCF model as force elements; unsupported parts are refused, or left out on demand."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -14,11 +14,13 @@ from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 from udkjax.wording import quote
 
 LEFT_OUT = ("limits", "frictionloss", "forceranges", "contacts")  # parts of a model that a caller may leave out
-FAR_AWAY = 16.0  # times the size of a model: a point that a slide cannot reach, but not so far that the number looks mistyped
+FAR_AWAY = (
+    16.0  # sizes of a model: the distance of a point that a slide cannot reach, but not so large that it looks like a mistake
+)
 
 
 class LinearForce(NamedTuple):
-    """The force -stiffness (length - at_rest) - damping rate + constant along a coordinate; without a motor constant is None."""
+    """The force -stiffness (length - at_rest) - damping rate + constant along a coordinate; `constant` is None without motor."""
 
     stiffness: float = 0.0
     damping: float = 0.0
@@ -141,11 +143,11 @@ class ForceReader:
             return
         owner, other, axis = (slider, holder, -axis) if kinds == "hs" else (holder, slider, axis)
         bodies, end = self.model.names((owner, other)), self.model.local(other, pin)
-        if stiffness:  # with zero length, from the rest position: linear along the slide in both directions
+        if stiffness:  # of zero length, attached at the rest position: linear in both directions of the slide
             self._put(
                 name, Spring(bodies, [self.model.local(owner, pin + axis * (at_rest - length.length)), end], stiffness, 0.0)
             )
-        if damping:  # from a point far along the slide that cannot be reached
+        if damping:  # attached to a point on the line of the slide that is too far to be reached
             self._put(
                 name, Spring(bodies, [self.model.local(owner, pin - FAR_AWAY * self.model.size * axis), end], 0.0, 0.0, damping)
             )
@@ -156,8 +158,10 @@ class ForceReader:
             self._put(name, Force(bodies[1], (push.real, push.imag), end))
         elif kinds == "s":
             for body, sign in ((other, 1), (owner, -1)):
-                turned = sign * push * np.exp(-1j * self.model.bodies[body].angle)
-                pushed = Force(self.model.bodies[body].name, (turned.real, turned.imag), self.model.local(body, pin), "body")
+                local_push = sign * push * np.exp(-1j * self.model.bodies[body].angle)
+                pushed = Force(
+                    self.model.bodies[body].name, (local_push.real, local_push.imag), self.model.local(body, pin), "body"
+                )
                 self._put(name, pushed)
         else:
             read.refuse("acts on a slide between two moving bodies that turn against each other: not taken over")

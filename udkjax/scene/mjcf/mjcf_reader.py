@@ -24,8 +24,8 @@ from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
 from udkjax.wording import abbreviate, suggestion
 
 INITIAL = "initial"  # the keyframe with velocities and controls that `mjcf_text` writes
-OPEN_LOOP = 1e-9  # relative to the size of the model: rounding of a closed loop
-ROTOR_MASS = 0.01  # relative to the mass of the body that carries it
+OPEN_LOOP = 1e-9  # relative to the size of the model: smaller gaps are rounding errors
+ROTOR_MASS = 0.01  # mass of a rotor relative to the body that carries it
 
 
 class MjcfWarning(UserWarning):
@@ -64,7 +64,7 @@ def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), k
 def mechanism_of_text(
     text: str, source: str, leave_out: Collection[str] = (), key: str | None = None, stacklevel: int = 3
 ) -> Mechanism:
-    """Return the mechanism of the text of a model, as `read_mjcf`; warnings go to the caller `stacklevel` levels up."""
+    """Return the mechanism of the text of a model, as `read_mjcf`; warnings point to the caller `stacklevel` levels up."""
     root = parse_xml(text, source)
     problems = unknown_parts(root)
     unknown = len(problems)
@@ -171,7 +171,8 @@ def _add_armature(
 
         1/2 J (w1 + N (w2 - w1))^2 = 1/2 A (w2 - w1)^2 - 1/2 (A / N) w1^2 + 1/2 (A / (N - 1)) w2^2,
 
-    so body 1 gets A / N of inertia, and body 2 gives up A / (N - 1), half of its own. Its mass is taken from body 1.
+    so A / N is added to the inertia of body 1, and A / (N - 1), half of the inertia of body 2, is subtracted from that of body 2.
+    The rotor's mass is taken from body 1.
     """
     armature, holder = joint.read.number("armature"), model.holder(number)
     if not armature:

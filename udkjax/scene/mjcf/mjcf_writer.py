@@ -26,8 +26,8 @@ from udkjax.scene.suspicions import body_sizes
 from udkjax.wording import quote
 
 IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # joints that no equality can express come first
-NORMAL = "0 -1 0"  # of the x-z plane: angles are anticlockwise about it, with x to the right and z up
-THICKNESS = 0.04  # of the drawn bars, relative to the size of the largest body
+NORMAL = "0 -1 0"  # normal of the x-z plane: angles are anticlockwise about it, with x to the right and z up
+THICKNESS = 0.04  # thickness of the drawn bars, relative to the size of the largest body
 
 Attributes = dict[str, str]
 
@@ -268,7 +268,7 @@ class _Writer:
         return {hinge: weight for hinge, weight in hinges.items() if abs(weight) > threshold}
 
     def _add_fixed(self, name: str, hinges: dict[str, float], kind: str, **attributes: str) -> str:
-        """Add a tendon that is a sum of hinges; return its name, or an empty text if the sum is empty."""
+        """Add a tendon that is a sum of hinges; return its name, or an empty string if the sum is empty."""
         if not hinges:
             self.problems.append(
                 f"{kind} {quote(name)}: its bodies do not turn against each other, and MJCF knows angles of hinges alone"

@@ -27,7 +27,7 @@ class ModelSettings:
             self.sequence = "xyz"
         self.autolimits = read.choice("autolimits", ("true", "false"), "true") == "true"
         self.mass_from_geoms = read.choice("inertiafromgeom", ("true", "false", "auto"), "auto")
-        self.total_mass = read.number("settotalmass", -1.0)  # kg; unchanged if not positive
+        self.total_mass = read.number("settotalmass", -1.0)  # kg; masses are not scaled if it is not positive
         self.mass_groups = read.numbers("inertiagrouprange", (0, 5))
         read = AttributeReader(flags, flags.attributes, problems)
         off = {name for name in _STANDARD if read.choice(name, ("enable", "disable"), "enable") == "disable"}
@@ -74,7 +74,7 @@ class ModelSettings:
         return frame_of(read, self.radians, self.sequence)
 
     def is_limited(self, read: AttributeReader, limited: str, range_name: str) -> bool:
-        """Return True if a range is active, by its attribute or because the range is given."""
+        """Return True if a range is active: an attribute says so, or the range is given."""
         word = read.choice(limited, ("true", "false", "auto"), "auto")
         return word == "true" or (word == "auto" and self.autolimits and range_name in read)
 

@@ -20,7 +20,7 @@ class SpaceFrame(NamedTuple):
         return self.origin + self.axes @ local
 
     def within(self, child: "SpaceFrame") -> "SpaceFrame":
-        """Return the frame in the world of a frame that is given in this one."""
+        """Return the frame in the world of a frame that is given relative to this one."""
         return SpaceFrame(self.axes @ child.axes, self.point(child.origin))
 
 
@@ -80,14 +80,14 @@ def _from_quaternion(value: np.ndarray) -> np.ndarray:
 
 
 def turn_about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation about an axis, of any length, by an angle (rad)."""
+    """Return the rotation about an axis, a vector of any length, by an angle (rad)."""
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def shortest_turn_of_z(direction: np.ndarray) -> np.ndarray:
-    """Return the shortest rotation that turns the z axis into a direction, of any length."""
+    """Return the shortest rotation that turns the z axis into a direction, a vector of any length."""
     z = direction / np.linalg.norm(direction)
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))

@@ -1,4 +1,4 @@
-"""An MJCF model in its plane: moving bodies, and their motions for values of the joints, as complex numbers x + iy."""
+"""An MJCF model in its plane: moving bodies, and their motions for values of the joints. Points are complex numbers x + iy."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
@@ -12,7 +12,7 @@ from udkjax.scene.mjcf.geom_masses import sum_masses
 from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.xml_tree import XmlElement
 
-AXES_TOL = 1e-6  # rad; deviation of axes from the plane's normal: files have seven digits
+AXES_TOL = 1e-6  # rad; tolerance of axes relative to the plane's normal, because files have seven digits
 
 
 class MotionPlane(NamedTuple):
@@ -40,7 +40,7 @@ class PlaneMotion(NamedTuple):
         return np.exp(1j * self.angle) * z + self.shift
 
     def velocity(self, z: complex) -> complex:
-        """Return the velocity (m/s) of the body at a current position."""
+        """Return the velocity (m/s) of the body at its point whose current position is z."""
         return self.rate + 1j * self.omega * z
 
     def turn(self, anchor: complex, angle: float, rate: float) -> "PlaneMotion":
@@ -58,7 +58,8 @@ class PlaneMotion(NamedTuple):
 def plane_of(joints: Sequence[TreeJoint], gravity: np.ndarray) -> MotionPlane:
     """Return the plane in which all joints move, and refuse joints that leave it.
 
-    Its y is the world's z, or the world's y if it is horizontal; its x has a positive component along the world's x, or else y.
+    Its y axis is the world's z axis, or the y axis if the plane is horizontal; its x axis has a positive component along the
+    world's x axis, or else along y.
     """
     hinges, slides = ([joint.axis for joint in joints if joint.kind == kind] for kind in ("hinge", "slide"))
     across = (
@@ -162,7 +163,7 @@ class PlaneModel:
         return self.names(ends.bodies), [self.local(body, point) for body, point in zip(*ends, strict=True)]
 
     def relative_angle(self, body1: int, body2: int) -> float:
-        """Return the angle (rad) of body two relative to body one."""
+        """Return the angle (rad) of body 2 relative to body 1."""
         return self.bodies[body2].angle - self.bodies[body1].angle
 
     def sign(self, joint: TreeJoint) -> float:

@@ -9,8 +9,17 @@ from typing import NamedTuple
 from udkjax.scene.mjcf.xml_tree import XmlElement
 from udkjax.wording import quote
 
-WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")  # on motions
-TOLD_BY_PARENT = ("equality", "spatial", "fixed")  # parents whose children have the tags of other elements
+WITHOUT_EFFECT = (
+    "visual",
+    "statistic",
+    "asset",
+    "sensor",
+    "custom",
+    "size",
+    "light",
+    "camera",
+)  # elements without effect on motions
+CONTEXTS = ("equality", "spatial", "fixed")  # parents that determine the meaning of the tags of their children
 ACTUATORS = ("motor", "position", "velocity", "general")
 SHAPELESS = ("material", "mesh", "texture", "pair")  # only in defaults
 
@@ -116,7 +125,7 @@ def unknown_parts(root: XmlElement) -> list[str]:
             skipped.add(id(element))
             continue
         path = f"{parent.tag}/{element.tag}"
-        key = path if parent.tag in TOLD_BY_PARENT and element.tag in ("joint", "tendon", "site", "geom") else element.tag
+        key = path if parent.tag in CONTEXTS and element.tag in ("joint", "tendon", "site", "geom") else element.tag
         if key not in _KNOWN:
             skipped.add(id(element))
             problems.append(f"{element.where}: not taken over{_cure(element.tag)}")
@@ -124,7 +133,7 @@ def unknown_parts(root: XmlElement) -> list[str]:
         known = _KNOWN[key]
         words = {*known.used.split(), *known.idle.split()}
         for name, value in element.attributes.items():
-            if name not in words and not _says_nothing(value, known.nothing.get(name)):
+            if name not in words and not _is_without_effect(value, known.nothing.get(name)):
                 problems.append(f"{element.where}: {name}={quote(value)} is not taken over{_cure(name)}")
     return problems
 
@@ -133,7 +142,7 @@ def _cure(name: str) -> str:
     return f": {_CURES[name]}" if name in _CURES else ""
 
 
-def _says_nothing(value: str, nothing: str | None) -> bool:
+def _is_without_effect(value: str, nothing: str | None) -> bool:
     if nothing is None or value == nothing:
         return nothing is not None
     try:
