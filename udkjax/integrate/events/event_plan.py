@@ -20,10 +20,10 @@ class EventPlan:
     """The part of a run's events and phases that does not depend on numbers; runs with equal plans share their code."""
 
     tables: Tables
-    directions: tuple[int, ...]  # of each event
+    directions: tuple[int, ...]  # for each event
     by_velocity: tuple[bool, ...]  # whether its condition depends on velocities
     actions: tuple[type[Action], ...]
-    at_rest: tuple[str, ...]  # of impacts
+    at_rest: tuple[str, ...]  # consequence of rest, for impacts
     max_steps: int
     max_events: int
 
@@ -34,7 +34,7 @@ class EventPlan:
 
     @cached_property
     def both_directions(self) -> Int[np.ndarray, "2E"]:
-        """The directions in which the zeros of conditions count, and those of contact forces: they fall below it."""
+        """The directions in which zeros count: of conditions, then of contact forces, which fall below zero."""
         return np.array([*self.directions, *[-1] * self.count])
 
     @cached_property
@@ -79,7 +79,7 @@ class EventPlan:
 
     @cached_property
     def free(self) -> Int[np.ndarray, "phases"]:
-        """The phase that follows when all contacts at rest let go."""
+        """The phase that follows when all contacts at rest open."""
         free = np.arange(len(self.tables.held))
         for k in np.flatnonzero(self.impacts):
             free = np.array(self.tables.freed)[free, k]
@@ -105,7 +105,7 @@ def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_even
         phases: the phases.
         events: all events.
         max_steps: the largest number of steps that are tried.
-        max_events: most events that may happen.
+        max_events: the largest number of events.
     """
     return EventPlan(
         tables=phases.tables,

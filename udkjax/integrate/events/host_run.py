@@ -40,19 +40,19 @@ SHARED, NUMBERS = 9, 5  # number of arrays before those of the phases, and index
 class PlainForm:
     """A run in its plain form as a function of arrays: the fallback for members that machine code cannot resolve."""
 
-    tree: TreeDef  # of the system
-    others: tuple[Any, ...]  # its leaves that are no arrays, None for each that is one
-    shapes: tuple[tuple[tuple[int, ...], np.dtype], ...]  # of the arrays, and their types
+    tree: TreeDef  # structure of the system
+    others: tuple[Any, ...]  # leaves of the system that are not arrays, None in place of arrays
+    shapes: tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and types of the arrays
 
     def run(self, *arrays: Array) -> EventRun:
-        """Return the run of some arrays."""
-        given = iter(arrays)
-        return run_plain(jax.tree.unflatten(self.tree, [next(given) if x is None else x for x in self.others]))
+        """Run the system with these arrays."""
+        remaining = iter(arrays)
+        return run_plain(jax.tree.unflatten(self.tree, [next(remaining) if x is None else x for x in self.others]))
 
     def __call__(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-        given = [x.astype(dtype) for x, (_, dtype) in zip(arrays, self.shapes, strict=True)]
+        inputs = [x.astype(dtype) for x, (_, dtype) in zip(arrays, self.shapes, strict=True)]
         with np.errstate(all="ignore"):
-            return numpy_program(_plain_program(self))(Meter(math.inf), given)
+            return numpy_program(_plain_program(self))(Meter(math.inf), inputs)
 
 
 @lru_cache(maxsize=64)
@@ -61,7 +61,7 @@ def _plain_program(plain: PlainForm) -> Any:
 
 
 def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
-    """Run a system with events by machine code, within a program that is traced; `conditions` are those of all events."""
+    """Run a system with events by machine code, within a traced program; `conditions` are those of all events."""
     start = hybrid.first_state()
     problems = [hybrid.problem(k, hybrid.ts, start) for k in range(len(hybrid.plans))]
     plan = machine_plan(hybrid.plan, hybrid.phases, [problem.compiled for problem in problems], conditions)
@@ -73,10 +73,10 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
         *event_arrays(plan, hybrid.events, hybrid.phases, problems, hybrid.code, hybrid.drift_tol),
         *(x[None] for x in arrays),
     ]
-    found = EventRun(*(x[0] for x in call_host(HostRun(plan, len(hybrid.ts), len(hybrid.q), plain), stop_gradients(inputs))))
-    whole = ("event_index", "event_phase", "closed", "count", "code", "totals")
-    found = found._replace(**{name: getattr(found, name).astype(int) for name in whole})
-    return found._replace(together=found.together > 0.5, undefined=found.undefined > 0.5)
+    run = EventRun(*(x[0] for x in call_host(HostRun(plan, len(hybrid.ts), len(hybrid.q), plain), stop_gradients(inputs))))
+    integers = ("event_index", "event_phase", "closed", "count", "code", "totals")
+    run = run._replace(**{name: getattr(run, name).astype(int) for name in integers})
+    return run._replace(together=run.together > 0.5, undefined=run.undefined > 0.5)
 
 
 @dataclass(frozen=True)
@@ -96,30 +96,30 @@ class HostRun:
     plain: PlainForm | None = None
 
     def shapes(self, members: int) -> list[tuple[int, ...]]:
-        """Return the shapes of the fields of `EventRun`, with the members in front."""
+        """Return the shapes of the fields of `EventRun`, with a leading axis of members."""
         plan = self.plan.events
         return [(members, *shape) for shape in shapes_of_run(plan, self.times, self.coordinates, plan.max_events)]
 
     def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
         B, plan = max(len(x) for x in inputs), self.plan
-        numbers, rest, phases = inputs[NUMBERS], list(inputs[SHARED:]), []
+        numbers, further, phases = inputs[NUMBERS], list(inputs[SHARED:]), []
         joints = [np.full((B, len(joint.program.outputs)), np.nan) for joint in plan.added]
         shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED])
         ts, q, v, code, units, _, restitution, inverse_mass, of_joints = shared
         for phase in plan.phases:
-            phases.append(PhaseCode(phase, rest[: phase.count], numbers, inverse_mass, B, joints))
-            rest = rest[phase.count :]
+            phases.append(PhaseCode(phase, further[: phase.count], numbers, inverse_mass, B, joints))
+            further = further[phase.count :]
         system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), restitution, inverse_mass, of_joints)
         state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.zeros(B, int), joints)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))
-        found = results(plan.events, runs, ts, np.full(runs.scale.shape, np.inf), np)
-        for b in np.flatnonzero(system.unresolved):
+        outputs = results(plan.events, runs, ts, np.full(runs.scale.shape, np.inf), np)
+        for member in np.flatnonzero(system.unresolved):
             if self.plain is None:
-                found.code[b] = -1
+                outputs.code[member] = -1
             else:
-                for to, x in zip(found, self.plain([x[b if len(x) > 1 else 0] for x in rest]), strict=True):
-                    to[b] = x
-        return list(found)
+                for array, x in zip(outputs, self.plain([x[member if len(x) > 1 else 0] for x in further]), strict=True):
+                    array[member] = x
+        return list(outputs)
 
 
 def machine_plan(plan: EventPlan, phases: Phases, compiled: Sequence[CompiledMechanism], conditions: Conditions) -> MachinePlan:
@@ -153,7 +153,7 @@ def event_arrays(
     drift_tol: Float[Any, ""],
     xp: ModuleType = jnp,
 ) -> list[Any]:
-    """Return the arrays of one run, with the member first.
+    """Return the arrays of one run, with a leading axis of members.
 
     Args:
         plan: common part of all runs.
@@ -177,7 +177,7 @@ def _stack(numbers: Sequence[Any], xp: ModuleType) -> Any:
 
 
 def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
-    """Return the arrays that no state and no choice decides: of conditions, of impacts, of masses and of joints."""
+    """Return the numbers of conditions, impacts, masses and joints, which depend neither on states nor on choices."""
     of_conditions, of_joints = (
         xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in numbers), xp.zeros(0)])
         for numbers in (condition_numbers(events), joint_numbers(phases))

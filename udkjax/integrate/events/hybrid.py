@@ -30,7 +30,7 @@ from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.scene.joints import Joint
 
 T = TypeVar("T")
-Added = tuple[Joint, ...]  # the joints that events add, with the numbers that they have now
+Added = tuple[Joint, ...]  # the joints that events add, with their current numbers
 Condition = Callable[[Float[Array, ""], Float[Array, "n"], Float[Array, "n"]], Float[Array, "k"]]  # of t, q and v
 
 
@@ -40,23 +40,23 @@ class Hybrid(eqx.Module):
     phases: Phases
     events: tuple[Event, ...]
     ts: Float[Array, "T"]  # output times (s)
-    q: Float[Array, "n"]  # in which it begins
-    v: Float[Array, "n"]
-    code: Int[Array, ""]  # a `Result` that is known before
+    q: Float[Array, "n"]  # initial positions
+    v: Float[Array, "n"]  # initial velocities
+    code: Int[Array, ""]  # a `Result` that is known before the run
     drift_tol: Float[Array, ""]
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
-    smallest: Float[Array, ""]  # step (s)
+    smallest: Float[Array, ""]  # smallest step (s)
     h: Float[Array, ""] | None  # the first step (s)
     length: Float[Array, ""] | None
-    rate: Float[Array, ""]  # of the system and the run (1/s)
+    rate: Float[Array, ""]  # characteristic rate of the system and the run (1/s)
     method: Pseudoinverse
     baumgarte: Baumgarte | None
     formulation: Formulation | None
     plan: EventPlan = eqx.field(static=True)
-    plans: tuple[RunPlan, ...] = eqx.field(static=True)  # of each phase
+    plans: tuple[RunPlan, ...] = eqx.field(static=True)  # for each phase
 
-    # --- what is known of the events
+    # --- events
 
     @property
     def count(self) -> int:
@@ -90,7 +90,7 @@ class Hybrid(eqx.Module):
         return RunState(self.ts[0], self.q, self.v, jnp.array(0), self.phases.first_added())
 
     def problem(self, phase: int, ts: Float[Array, "T"], start: RunState) -> Problem:
-        """Return the system to integrate from a state, in a phase that is known."""
+        """Return the problem to integrate from a state, in a phase given as a Python int."""
         _, q, v, _, added = start
         mechanism, analysis = self.phases.with_added(phase, added), self.phases.analyses[phase]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
@@ -112,11 +112,11 @@ class Hybrid(eqx.Module):
         )
 
     def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
-        """Integrate from a state over the times `ts`, from its own on."""
+        """Integrate from a state over the times `ts`, which begin with the time of the state."""
 
         def of_phase(phase: int, ts: Array, state: RunState) -> IntegratorOutput:
             problem = self.problem(phase, ts, state)
-            if derivatives:  # of a run that is known to go on
+            if derivatives:  # the run is known to continue, whatever its drift
                 return differentiable(replace(problem, drift_tol=jnp.inf))
             if not self.plans[phase].is_native:
                 return differentiable(problem)
@@ -131,14 +131,14 @@ class Hybrid(eqx.Module):
             phase: the phase.
             function: function to compute.
             *arguments: its arrays.
-            is_free: whether no contact is at rest.
+            is_free: whether the phase is known to have no contact at rest.
         """
         held = self.phases.tables.held
-        among = [k for k, rows in enumerate(held) if not is_free or max(rows) < 0]
-        if len(among) == 1:
-            return function(among[0], *arguments)
-        branches = [lambda *x, k=k: function(k, *x) for k in among]
-        return jax.lax.switch(jnp.searchsorted(np.array(among), phase), branches, *arguments)
+        candidates = [k for k, rows in enumerate(held) if not is_free or max(rows) < 0]
+        if len(candidates) == 1:
+            return function(candidates[0], *arguments)
+        branches = [lambda *x, k=k: function(k, *x) for k in candidates]
+        return jax.lax.switch(jnp.searchsorted(np.array(candidates), phase), branches, *arguments)
 
     def textbook(self, phase: int, added: Added) -> TextbookEquations:
         """Return the equations of a phase, solved by SVD."""
@@ -151,11 +151,11 @@ class Hybrid(eqx.Module):
         return conditions_of(self.events, self.names, t, q, v)
 
     def conditions_and_rates(self, t: Array, q: Array, v: Array) -> tuple[Float[Array, "E"], Float[Array, "E"]]:
-        """Return the conditions, and the rates of those that depend on positions alone."""
+        """Return the conditions and their rates, which are right only if a condition depends on positions alone."""
         return rate_along(self.conditions, t, q, v, jnp.zeros_like(v))
 
     def values(self, at: RunState, is_free: bool = False) -> StateValues:
-        """Return the conditions in a state, with their derivatives; where no contact is at rest, directions of impulses, too."""
+        """Return conditions and their derivatives in a state; with `is_free` (no contact at rest) also directions of impulses."""
         t, q, v, phase, added = at
         by_t, by_q, by_v = jax.jacfwd(self.conditions, (0, 1, 2))(t, q, v)
 

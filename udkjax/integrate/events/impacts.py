@@ -5,7 +5,7 @@ act along Psi_q^T, and keep Psi_dot = 0. With
 
     D = Psi_q M^(-1/2),        u_i = (I - D^+ D) M^(-1/2) n_i^T,        W_ij = u_i . u_j,
 
-where u_i is the part of an impulse that the joints, redundant or not, leave,
+where u_i is the part of an impulse that the joints, redundant or not, do not absorb,
 
     v+ = v- + M^(-1/2) sum_i u_i Lambda_i,        g_dot+ = g_dot- + W Lambda.
 
@@ -13,18 +13,18 @@ Newton's law of restitution, with complementarity (Moreau 1988; Glocker, Set-Val
 
     0 <= Lambda_i,        g_dot+_i + e_i g_dot-_i >= 0,        one of them zero.
 
-No contact pulls, none is penetrated, a single one has g_dot+ = -e g_dot-, and one that the others lift opens. Contacts take part
-that are closed and do not separate, g_dot- <= 0: contacts that their impact penetrates hit next. For a scleronomic mechanism
+No contact pulls or is penetrated, a single one has g_dot+ = -e g_dot-, and contacts lifted by others open. The contacts that take
+part are closed and do not separate, g_dot- <= 0; others that the impact penetrates are hit next. For a scleronomic mechanism
 
     T+ - T- = (g_dot+ + g_dot-) . Lambda / 2 = sum_i (1 - e_i) g_dot-_i Lambda_i / 2 <= 0:
 
-energy never grows, even with different restitutions. (With a contact that separates and is pushed back, it could.) The law treats
+energy never grows, even with different restitutions. (It could grow if a separating contact were pushed back.) The law treats
 all contacts of one instant as one impact: the first of three equal balls in a row, e = 1, bounces off the other two.
 
 Contacts whose g_dot stays zero are in complementarity in accelerations: 0 <= lambda, g_ddot = g_ddot(lambda = 0) + W lambda >= 0,
 one of them zero. Those with lambda > 0 are held, as constraints.
 
-Arrays are of JAX, of one state, or of NumPy, of some states (*m).
+Arrays are JAX's, for one state, or NumPy's, for several states (*m).
 """
 
 from collections.abc import Callable
@@ -70,9 +70,9 @@ class Contacts(NamedTuple):
 
     impacts: Bool[np.ndarray, "E"]  # events that are contacts
     hold: Bool[np.ndarray, "E"]  # contacts that are held at rest
-    stop: Bool[np.ndarray, "E"]  # contacts that end the run there
+    stop: Bool[np.ndarray, "E"]  # contacts that end the run at rest
     restitution: Float[Any, "*m E"]
-    rate: Float[Any, "*m"]  # of the system and the run (1/s)
+    rate: Float[Any, "*m"]  # characteristic rate of the system and the run (1/s)
 
 
 class ContactRows(NamedTuple):
@@ -88,25 +88,25 @@ class Impulses(NamedTuple):
 
     impulse: Float[Any, "*m E"]  # in the unit of M v over that of the condition's derivative by q: N s of a gap
     rate: Float[Any, "*m E"]  # g_dot+
-    remaining: Bool[Any, "*m"]  # whether a contact is still penetrated: the constraints drive it
+    remaining: Bool[Any, "*m"]  # whether constraints still drive a contact to penetrate
 
 
 class ContactChanges(NamedTuple):
     """The contacts at an event, and their states after it."""
 
-    v: Float[Any, "*m n"]  # after it
+    v: Float[Any, "*m n"]  # after the event
     closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
     hits: Bool[Any, "*m E"]
-    held: Bool[Any, "*m E"]  # after it
-    ends: Bool[Any, "*m E"]  # events that come to rest, and end the run by that
-    carried: Bool[Any, "*m E"]  # held at zero by others that are held
-    blocked: Bool[Any, "*m"]  # the constraints leave a contact that approaches no motion
+    held: Bool[Any, "*m E"]  # after the event
+    ends: Bool[Any, "*m E"]  # contacts whose rest ends the run
+    carried: Bool[Any, "*m E"]  # contacts kept at zero by other held contacts
+    blocked: Bool[Any, "*m"]  # whether constraints block an approaching contact
 
 
 def contact_rows(
     equations: TextbookEquations, t: Float[Array, ""], q: Float[Array, "n"], normals: Float[Array, "E n"]
 ) -> ContactRows:
-    """Return W and the directions of impulses along the `normals` dg/dq, with all constraints of the equations kept."""
+    """Return W and the directions of impulses along the `normals` dg/dq, with all constraints of the equations satisfied."""
     mechanism, w = equations.mechanism, equations.weights
     root, D = uk.inverse_sqrt_mass(mechanism), uk.D(mechanism, t, q, w)
     plus, given = uk.pseudoinverse(equations.method, D), root * normals
@@ -141,14 +141,14 @@ def impulses_of_impact(
         floor: tolerance on rates >= 0.
         xp: jax.numpy, or NumPy.
     """
-    found = solve_complementarity(rows.W, (1 + restitution) * rate, closed & rows.free, floor, xp)
-    after = rate + times(rows.W, found.x)
+    solution = solve_complementarity(rows.W, (1 + restitution) * rate, closed & rows.free, floor, xp)
+    after = rate + times(rows.W, solution.x)
     limit = floor + STILL * _largest(rate, closed, xp)
-    return Impulses(found.x, after, xp.any(closed & (after < -limit), -1))
+    return Impulses(solution.x, after, xp.any(closed & (after < -limit), -1))
 
 
-def _largest(x: Any, some: Any, xp: ModuleType) -> Any:
-    return xp.max(xp.where(some, xp.abs(x), 0.0), axis=-1, keepdims=True)
+def _largest(x: Any, mask: Any, xp: ModuleType) -> Any:
+    return xp.max(xp.where(mask, xp.abs(x), 0.0), axis=-1, keepdims=True)
 
 
 def contact_states(
@@ -159,18 +159,18 @@ def contact_states(
     W: Float[Any, "*m E E"],
     xp: ModuleType,
 ) -> Int[Any, "*m E"]:
-    """Return the state of each contact in event k: OPEN where it takes no part, TOUCHES, or SLOW where it is too slow to rebound.
+    """Return the state of each contact in event k: OPEN if it takes no part, SLOW if it is too slow to rebound, else TOUCHES.
 
-    Those take part that are closed, do not separate and, where the event is of a contact, act on it, or on one that does. A
-    contact is slow whose g_dot is small while it is pressed on.
+    A contact takes part if it is closed, does not separate and, if the event is of a contact, acts on that contact, directly or
+    through others. A contact is slow if its g_dot is small while it is pressed.
     """
     h, rate, rate_2, _, scale = before
     E, system = h.shape[-1], contacts.rate[..., None]
-    unit, impacts, own = scale * system, contacts.impacts, np.arange(E) == (k % E)[..., None]
-    closed = impacts & (held | ((xp.abs(h) <= CLOSED * scale) & (rate <= ZERO_RATE * unit)) | own)
+    unit, impacts, is_own = scale * system, contacts.impacts, np.arange(E) == (k % E)[..., None]
+    closed = impacts & (held | ((xp.abs(h) <= CLOSED * scale) & (rate <= ZERO_RATE * unit)) | is_own)
     size = xp.sqrt(diagonal(W, xp))
     acts = (xp.abs(W) > COUPLED * size[..., None, :] * size[..., :, None]) & closed[..., None, :] & closed[..., :, None]
-    joined = own | ((k < E) & ~xp.asarray(impacts)[k % E])[..., None]
+    joined = is_own | ((k < E) & ~xp.asarray(impacts)[k % E])[..., None]
     for _ in range(int(np.sum(impacts)) - 1):
         joined = joined | xp.any(acts & joined[..., None, :], axis=-1)
     closed = closed & joined
@@ -191,18 +191,18 @@ def hit_contacts(
     closed: Int[Any, "*m E"] | None,
     xp: ModuleType = jnp,
 ) -> ContactChanges:
-    """Apply an impact to all contacts that are closed, and find those that then rest.
+    """Apply an impact to all closed contacts, and determine which of them then rest.
 
     Args:
-        contacts: properties that no state changes.
-        k: the index of the event; E + i where contact i lets go.
-        v: the velocities, in the phase that is to follow but for contacts.
+        contacts: properties that do not depend on the state.
+        k: the index of the event; E + i if contact i opens.
+        v: the velocities that the next phase without its contacts allows.
         held: mask of the contacts that were held before.
         before: the conditions before the event.
-        rows: of the phase that is to follow, without contacts.
-        rate: the first rates of all conditions, of v.
-        second_rates: of velocities: the second rates of all conditions in that phase.
-        closed: the contacts, as in `ContactChanges`; None where they are to be found.
+        rows: the rows of the conditions in that phase.
+        rate: the first rates of all conditions at v.
+        second_rates: maps velocities to the second rates of all conditions in that phase.
+        closed: the contacts, as in `ContactChanges`; None: not known yet.
         xp: jax.numpy, or NumPy.
     """
     stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
@@ -211,32 +211,32 @@ def hit_contacts(
     closed = closed if closed is not None else contact_states(contacts, k, held, before, rows.W, xp)
     assert closed is not None
     restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
-    found = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
-    v = v + (found.impulse[..., None, :] @ rows.directions)[..., 0, :]
+    impact = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
+    v = v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
 
-    # Without derivatives from here on: which contacts are held is a choice.
-    rows, rate, found = stop((rows, rate, found))
+    # No derivatives from here on: the set of held contacts is discrete.
+    rows, rate, impact = stop((rows, rate, impact))
     fastest = _largest(rate, closed > OPEN, xp)
-    stays = (closed > OPEN) & rows.free & (found.rate <= xp.maximum(floor, STILL * fastest))
-    # A slow pressed contact that has fallen to zero and rises nevertheless rises by rounding.
+    stays = (closed > OPEN) & rows.free & (impact.rate <= xp.maximum(floor, STILL * fastest))
+    # If a slow, pressed contact that has fallen to zero rises, it rises by rounding.
     stays = stays | ((np.arange(rate.shape[-1]) == k[..., None]) & (closed == SLOW) & (rate > 0))
     stays = stays & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
     is_held, ends, carried = xp.where(closed > OPEN, False, held), xp.zeros_like(stays), xp.zeros_like(stays)
     if xp is not np or stays.any():
         pull, pressed = second_rates(stop(v)), ZERO_RATE_2 * scale * system**2
-        rest = solve_complementarity(rows.W, pull, stays, pressed, xp)
-        presses = rest.passive & (rest.x > 0)
+        solution = solve_complementarity(rows.W, pull, stays, pressed, xp)
+        presses = solution.passive & (solution.x > 0)
         is_held = xp.where(closed > OPEN, presses & contacts.hold, held)
-        resting = stays & ~is_held & (xp.abs(rest.y) <= xp.maximum(pressed, STILL * _largest(pull, stays, xp)))
+        resting = stays & ~is_held & (xp.abs(solution.y) <= xp.maximum(pressed, STILL * _largest(pull, stays, xp)))
         ends, carried = presses & contacts.stop, resting & _depends(rows.W, is_held, xp)
     hits = (closed == TOUCHES) & ~held & (rate < -floor)
-    return ContactChanges(v, closed, hits, is_held, ends, carried, found.remaining)
+    return ContactChanges(v, closed, hits, is_held, ends, carried, impact.remaining)
 
 
-def _depends(W: Float[Any, "*m E E"], on: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m E"]:
-    """Return a mask of the rows that depend on some of the others, which do not depend on one another."""
-    parts = xp.where(on[..., :, None], W, 0.0)
-    both = on[..., None, :] & on[..., :, None]
-    solved = xp.linalg.solve(xp.where(both, W, xp.eye(W.shape[-1])), parts)
-    rest = diagonal(W, xp) - xp.sum(parts * solved, -2)
-    return ~on & (rest <= CARRIED * diagonal(W, xp))
+def _depends(W: Float[Any, "*m E E"], basis: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m E"]:
+    """Return a mask of the rows that depend on the `basis` rows, which are independent."""
+    basis_columns = xp.where(basis[..., :, None], W, 0.0)
+    basis_pairs = basis[..., None, :] & basis[..., :, None]
+    solved = xp.linalg.solve(xp.where(basis_pairs, W, xp.eye(W.shape[-1])), basis_columns)
+    remainder = diagonal(W, xp) - xp.sum(basis_columns * solved, -2)
+    return ~basis & (remainder <= CARRIED * diagonal(W, xp))

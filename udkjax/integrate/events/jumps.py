@@ -1,7 +1,7 @@
-"""Jumps: what an event changes in an instant: velocities, the phase, the joints that it adds, the contacts that are held.
+"""Jumps: the changes of velocities, phase, added joints and held contacts at the instant of an event.
 
-The action of the event comes first, then all contacts that are closed, together, by their complementarity (`impacts`): whatever
-the event is, but for `Log` and `Stop`, it can push or lift them.
+The action of the event is applied first. The complementarity of all closed contacts is then solved (`impacts`), since every event
+except `Log` and `Stop` can push or lift them.
 """
 
 from typing import Any, NamedTuple
@@ -17,32 +17,32 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class JumpResult(NamedTuple):
-    """The states after an event of each of some members."""
+    """The states of members after an event."""
 
     state: RunState
-    contacts: ContactChanges | None  # None where no event is an impact
-    blocked: Bool[Any, "b"]  # the constraints leave an impact no motion, or an attached joint is open
+    contacts: ContactChanges | None  # None if no event is an impact
+    blocked: Bool[Any, "b"]  # whether constraints block an impact, or an attached joint is open
 
 
 def apply_event(
     system: System,
-    some: MemberIndices,
+    members: MemberIndices,
     k: Int[Any, "b"],
     before: RunState,
     values: ConditionValues,
-    found: StateValues,
+    state_values: StateValues,
     closed: Int[Any, "b E"] | None = None,
 ) -> JumpResult:
-    """Apply the action of event k of each of some members, or, from E on, release the contact of event k - E.
+    """Apply the action of event k of each member, or, if k >= E, release the contact of event k - E.
 
     Args:
         system: the system.
-        some: the members.
+        members: the members.
         k: indices of the events.
-        before: their states.
-        values: the conditions there.
-        found: their derivatives, and directions of impulses.
-        closed: the states of the contacts that take part, OPEN, TOUCHES or SLOW; None where they are to be found.
+        before: their states before the event.
+        values: the conditions in these states.
+        state_values: derivatives of the conditions, and directions of impulses.
+        closed: the states of the contacts that take part, OPEN, TOUCHES or SLOW; None: not known yet.
     """
     plan, xp = system.plan, system.xp
     releases, e = k >= plan.count, k % plan.count
@@ -50,11 +50,11 @@ def apply_event(
     after = xp.where(releases, phase, xp.asarray(plan.after)[phase, e])
     blocked, adds = xp.zeros_like(releases), ~releases & xp.asarray(plan.adds)[e]
     if plan.adds.any() and (xp is not np or adds.any()):
-        joints = system.add_joints(some, xp.where(adds, e, -1), q, joints)
-        # Velocities jump to a state that the phase allows, but for contacts at rest, which may be left.
-        q1, _ = system.project(some, RunState(t, q, v, after, joints))
-        _, v1 = system.project(some, RunState(t, q1, v, xp.asarray(plan.free)[after], joints), is_free=True)
-        moved = xp.abs(q1 - q) / take(system.coordinates, some)
+        joints = system.add_joints(members, xp.where(adds, e, -1), q, joints)
+        # Velocities jump to those that the phase without its contacts at rest allows: these contacts may open.
+        q1, _ = system.project(members, RunState(t, q, v, after, joints))
+        _, v1 = system.project(members, RunState(t, q1, v, xp.asarray(plan.free)[after], joints), is_free=True)
+        moved = xp.abs(q1 - q) / take(system.coordinates, members)
         moved = moved if xp is np else stop_gradients(moved)
         blocked = adds & (xp.max(moved, axis=-1) > ATTACHABLE)
         q, v = (xp.where(adds[:, None], x, y) for x, y in ((q1, q), (v1, v)))
@@ -64,14 +64,14 @@ def apply_event(
 
     free, held = state._replace(phase=xp.asarray(plan.free)[after]), xp.asarray(plan.held)[phase]
     is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
-    found = found if is_evaluated else system.look(some, free, is_free=True)
-    rows = rows_of_directions(found.by_q, found.directions, take(system.inverse_mass, some))
+    state_values = state_values if is_evaluated else system.look(members, free, is_free=True)
+    rows = rows_of_directions(state_values.by_q, state_values.directions, take(system.inverse_mass, members))
 
     def second_rates(v: Any) -> Any:
         after = free._replace(v=v)
-        return system.look(some, after if xp is np else stop_gradients(after), is_free=True).rate_2
+        return system.look(members, after if xp is np else stop_gradients(after), is_free=True).rate_2
 
-    hit = hit_contacts(system.contacts(some), k, v, held, values, rows, found.rate, second_rates, closed, xp)
+    hit = hit_contacts(system.contacts(members), k, v, held, values, rows, state_values.rate, second_rates, closed, xp)
     contacts = hit._replace(
         closed=xp.where(acts, hit.closed, OPEN),
         hits=hit.hits & acts,

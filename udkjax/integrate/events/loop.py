@@ -1,7 +1,7 @@
-"""The loop of runs with events: integrate to the next crossing, apply what happens there, and repeat.
+"""The loop of runs with events: integrate to the next crossing, apply its events, and repeat.
 
-Members of a batch that are at the same stage go on together. What takes them to their next crossings is a `System`:
-machine code, all members at once, or the plain form, one window of one member at a time.
+Members of a batch at the same stage proceed together. A `System` takes them to their next crossings: by machine code, all members
+at once, or in its plain form, one window of a single member at a time.
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ CLOSED_FIELD, INDEX_FIELD = RECORD.index("closed"), RECORD.index("event_index")
 
 
 def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
-    """Run from the start to the last of the output times, or an event that stops."""
+    """Run from the start to the last output time, or to an event that ends the run."""
 
     def change(runs: MemberRuns) -> MemberRuns:
         runs = system.when(runs.running & (runs.event == NO_EVENT), system.advance, runs)
@@ -31,27 +31,27 @@ def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
     return system.repeat(change, runs)
 
 
-def _settle(system: System, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
-    """Return the runs with all that happens now to some members: at the start, after an event, or at a crossing."""
+def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
+    """Return the runs with all changes of members at their present times: at the start, after an event, or at a crossing."""
     plan, xp, E = system.plan, system.xp, system.plan.count
-    state, event, sides = runs.state(some), take(runs.event, some), take(runs.sides, some)
-    values, found = condition_values(system, some, state)
-    values = values._replace(scale=xp.maximum(values.scale, take(runs.scale, some)))  # they do not become smaller
-    size, own = xp.abs(values.h), np.arange(E) == event[:, None]
-    carried = take(runs.carried, some) & (size <= CLOSED * values.scale)
-    undefined, ends = ~xp.isfinite(values.h), state.t >= take(system.end, some)
-    # A condition that is located keeps its side until the event happens; one that is not zero is on the side of its sign.
-    known = (event >= NO_EVENT)[:, None] & ~own & (size > ZERO * values.scale)
+    state, event, sides = runs.state(members), take(runs.event, members), take(runs.sides, members)
+    values, state_values = condition_values(system, members, state)
+    values = values._replace(scale=xp.maximum(values.scale, take(runs.scale, members)))  # scales never decrease
+    size, is_current = xp.abs(values.h), np.arange(E) == event[:, None]
+    carried = take(runs.carried, members) & (size <= CLOSED * values.scale)
+    undefined, ends = ~xp.isfinite(values.h), state.t >= take(system.end, members)
+    # A located condition keeps its side until its event happens; any other nonzero condition is on the side of its sign.
+    known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale)
     after = xp.where(known, xp.sign(values.h).astype(int), sides[:, :E])
-    code = xp.where(take(runs.totals, some)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
-    unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # elsewhere what is zero is about to cross, and is located
+    code = xp.where(take(runs.totals, members)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
+    unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
     if xp is not np or unknown.any():
         begins = event == BEGIN
-        is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, some), xp)
-        # Contacts are approached from the side that is allowed: what is zero and falls at the start happens at once.
+        is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
+        # Contacts are approached from the allowed side: an impact whose condition is zero at the start and falls happens at once.
         before = xp.where(begins[:, None], xp.where(plan.impacts & is_zero, 1, now), sides[:, :E])
         watched = plan.watched(state.phase, carried, xp)[:, :E]
-        watched = watched & ~((event == AGAIN)[:, None] & _settled(system, runs, some))
+        watched = watched & ~((event == AGAIN)[:, None] & _settled(system, runs, members))
         crossing = first_crossing(plan.both_directions[:E], watched, before, now, xp)
         after = xp.where(begins[:, None], before, after)
         beyond = begins & xp.any(plan.impacts & (values.h < 0) & ~is_zero, -1)
@@ -61,7 +61,7 @@ def _settle(system: System, runs: MemberRuns, some: MemberIndices) -> MemberRuns
     code = xp.where(goes_on | (code != Result.step_limit), code, Result.successful)
     code = xp.where(xp.any(undefined, -1), Result.undefined_condition, code)
     runs = runs.put(
-        some,
+        members,
         event=event,
         sides=xp.concatenate([after, sides[:, E:]], axis=1),
         scale=values.scale,
@@ -72,53 +72,57 @@ def _settle(system: System, runs: MemberRuns, some: MemberIndices) -> MemberRuns
     )
     happens = runs.running & (runs.event >= 0)
 
-    def jump(runs: MemberRuns, those: MemberIndices) -> MemberRuns:
-        if those is None:
-            return _jump(system, runs, those, values, found)
-        chosen = take(happens, some)
-        of = ConditionValues(*(x[chosen] for x in values)), StateValues(*(x[chosen] for x in found))
-        return _jump(system, runs, those, *of)
+    def jump(runs: MemberRuns, jumping: MemberIndices) -> MemberRuns:
+        if jumping is None:
+            return _jump(system, runs, jumping, values, state_values)
+        mask = take(happens, members)
+        selected = ConditionValues(*(x[mask] for x in values)), StateValues(*(x[mask] for x in state_values))
+        return _jump(system, runs, jumping, *selected)
 
     return system.when(happens, jump, runs)
 
 
-def condition_values(system: System, some: MemberIndices, at: RunState) -> tuple[ConditionValues, StateValues]:
-    """Return the conditions of some members at their states, and the other quantities evaluated there."""
-    xp, found, unit = system.xp, system.look(some, at), take(system.coordinates, some)
-    rate, t = take(system.rate, some)[:, None], at.t[:, None]
-    by_q = xp.abs(found.by_q) * xp.maximum(unit, xp.abs(at.q))[:, None]
-    by_v = xp.abs(found.by_v) * xp.maximum(unit * rate, xp.abs(at.v))[:, None]
-    scale = xp.maximum(xp.maximum(by_q, by_v).max(2), xp.abs(found.by_t) * xp.maximum(1 / rate, xp.abs(t)))
-    scale = xp.where(xp.isfinite(scale), scale, 0.0)  # beyond where a condition is a number it has no scale
-    return ConditionValues(found.g, found.rate, found.rate_2, found.a, scale if xp is np else stop_gradients(scale)), found
+def condition_values(system: System, members: MemberIndices, state: RunState) -> tuple[ConditionValues, StateValues]:
+    """Return the conditions of members at their states, and all quantities evaluated in these states."""
+    xp, state_values, unit = system.xp, system.look(members, state), take(system.coordinates, members)
+    rate, t = take(system.rate, members)[:, None], state.t[:, None]
+    by_q = xp.abs(state_values.by_q) * xp.maximum(unit, xp.abs(state.q))[:, None]
+    by_v = xp.abs(state_values.by_v) * xp.maximum(unit * rate, xp.abs(state.v))[:, None]
+    scale = xp.maximum(xp.maximum(by_q, by_v).max(2), xp.abs(state_values.by_t) * xp.maximum(1 / rate, xp.abs(t)))
+    scale = xp.where(xp.isfinite(scale), scale, 0.0)  # a condition that is NaN has no scale
+    scale = scale if xp is np else stop_gradients(scale)
+    return ConditionValues(state_values.g, state_values.rate, state_values.rate_2, state_values.a, scale), state_values
 
 
-def _settled(system: System, runs: MemberRuns, some: MemberIndices) -> Bool[Any, "b E"]:
-    """Return a mask of the conditions settled by the last event: its contacts, and its own if it only took note."""
+def _settled(system: System, runs: MemberRuns, members: MemberIndices) -> Bool[Any, "b E"]:
+    """Return a mask of the conditions settled by the last event: of its contacts, and its own if the event changes nothing."""
     xp, plan = system.xp, system.plan
-    last = xp.maximum(take(runs.count, some) - 1, 0)
-    members = np.arange(len(runs.t)) if some is None else some
-    closed, index = (runs.record[k][members, last] for k in (CLOSED_FIELD, INDEX_FIELD))
+    last = xp.maximum(take(runs.count, members) - 1, 0)
+    indices = np.arange(len(runs.t)) if members is None else members
+    closed, index = (runs.record[k][indices, last] for k in (CLOSED_FIELD, INDEX_FIELD))
     return (closed > OPEN) | ((np.arange(plan.count) == index[:, None]) & ~plan.changes)
 
 
-def _jump(system: System, runs: MemberRuns, some: MemberIndices, values: ConditionValues, found: StateValues) -> MemberRuns:
-    """Apply the events that happen to some members, and note them with the contacts that take part in them."""
+def _jump(
+    system: System, runs: MemberRuns, members: MemberIndices, values: ConditionValues, state_values: StateValues
+) -> MemberRuns:
+    """Apply the events of members, and record them with the contacts that take part."""
     plan, xp, E, K = system.plan, system.xp, system.plan.count, system.plan.max_events
-    k, before, sides, carried = take(runs.event, some), runs.state(some), take(runs.sides, some), take(runs.carried, some)
+    k, before = take(runs.event, members), runs.state(members)
+    sides, carried = take(runs.sides, members), take(runs.carried, members)
     releases, e = k >= E, k % E
     held, acts = xp.asarray(plan.held)[before.phase], releases | xp.asarray(plan.changes)[e]
-    after, contacts, blocked = apply_event(system, some, k, before, values, found)
+    after, contacts, blocked = apply_event(system, members, k, before, values, state_values)
     code = xp.where(xp.asarray(plan.stops)[e] & ~releases, Result.event_stop, Result.successful)
-    own = np.arange(2 * E) == e[:, None]
-    sides = xp.where(own, xp.where((xp.asarray(plan.impacts)[e] | releases)[:, None], 1, -sides), sides)
+    is_current = np.arange(2 * E) == e[:, None]
+    sides = xp.where(is_current, xp.where((xp.asarray(plan.impacts)[e] | releases)[:, None], 1, -sides), sides)
     noted, others, closed = k[:, None], xp.zeros((len(k), 0), bool), xp.full(held.shape, OPEN)
     if contacts is not None:
         closed = contacts.closed
         rests = (contacts.held & ~held) | contacts.ends
         happens = xp.concatenate([contacts.hits, held & ~contacts.held, rests], axis=1)
-        # The event itself is noted first, be it a contact that only comes to rest.
-        only_rests = xp.any(own[:, :E] & ~contacts.hits & rests, -1) & ~releases
+        # The event itself is recorded first, even if its contact only comes to rest.
+        only_rests = xp.any(is_current[:, :E] & ~contacts.hits & rests, -1) & ~releases
         first = xp.where(only_rests, 2 * E + k, k)[:, None]
         others = happens & (np.arange(3 * E) != first)
         noted = xp.concatenate([first, xp.zeros_like(first) + np.arange(3 * E)], axis=1)
@@ -127,16 +131,16 @@ def _jump(system: System, runs: MemberRuns, some: MemberIndices, values: Conditi
         sides = xp.where(xp.concatenate([closed, closed], axis=1) > OPEN, 1, sides)
     code = xp.where(blocked, Result.event_impossible, code)
 
-    count = take(runs.count, some)
+    count = take(runs.count, members)
     is_noted = xp.concatenate([xp.ones_like(others, shape=(len(k), 1)), others], axis=1)
     total = xp.sum(is_noted, axis=1)
-    full = count + total > K
-    code = xp.where(full, Result.event_limit, code)
-    rows = xp.where(is_noted & ~full[:, None], count[:, None] + xp.cumsum(is_noted, axis=1) - 1, K)
-    stays = (full | blocked)[:, None]
+    is_full = count + total > K
+    code = xp.where(is_full, Result.event_limit, code)
+    rows = xp.where(is_noted & ~is_full[:, None], count[:, None] + xp.cumsum(is_noted, axis=1) - 1, K)
+    stays = (is_full | blocked)[:, None]
     q, v = xp.where(stays, before.q, after.q), xp.where(stays, before.v, after.v)
     runs = runs.note(
-        some,
+        members,
         rows,
         before.t[:, None],
         xp.concatenate([before.q[:, None], q[:, None]], axis=1)[:, None],
@@ -146,24 +150,26 @@ def _jump(system: System, runs: MemberRuns, some: MemberIndices, values: Conditi
         np.arange(noted.shape[1])[None] > 0,
         closed[:, None],
     )
-    follows = _may_follow(system, values, plan.watched(after.phase, carried, xp)[:, :E], closed, own[:, :E] & ~acts[:, None])
+    follows = _may_follow(
+        system, values, plan.watched(after.phase, carried, xp)[:, :E], closed, is_current[:, :E] & ~acts[:, None]
+    )
     return runs.put(
-        some,
+        members,
         q=q,
         v=v,
         phase=xp.where(stays[:, 0], before.phase, after.phase),
         event=xp.where(follows, AGAIN, NO_EVENT),
         sides=sides,
         carried=carried,
-        count=count + xp.where(full, 0, total),
+        count=count + xp.where(is_full, 0, total),
         code=code,
-        running=(code == Result.successful) & (follows | (before.t < take(system.end, some))),
+        running=(code == Result.successful) & (follows | (before.t < take(system.end, members))),
     )._replace(joints=after.joints)
 
 
 def _may_follow(
-    system: System, values: ConditionValues, watched: Bool[Any, "b E"], closed: Int[Any, "b E"], own: Bool[Any, "b E"]
+    system: System, values: ConditionValues, watched: Bool[Any, "b E"], closed: Int[Any, "b E"], settled: Bool[Any, "b E"]
 ) -> Bool[Any, "b"]:
-    """Return a mask of the members that another event may follow at once: a condition is zero, or depends on velocities."""
-    unclear = watched & ~own & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO * values.scale)
+    """Return a mask of the members whose event may cause another at once: a condition is zero, or depends on velocities."""
+    unclear = watched & ~settled & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO * values.scale)
     return system.xp.any(unclear | np.array(system.plan.by_velocity), axis=-1)

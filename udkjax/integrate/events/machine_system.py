@@ -26,20 +26,20 @@ INFO = len(RunStates.info_names)
 
 
 class MachinePlan(NamedTuple):
-    """All that a run by machine code depends on besides its numbers; hashable."""
+    """The part of runs by machine code that does not depend on numbers; hashable."""
 
     events: EventPlan
     phases: tuple[PhasePlan, ...]
-    added: tuple[AddedJoint, ...]  # by events
+    added: tuple[AddedJoint, ...]  # the joints that events add
 
 
 class MemberUnits(NamedTuple):
     """Numbers of each member (B,)."""
 
-    rate: Any  # of the system and the run (1/s)
-    length: Any  # m
-    scene_rate: Any  # 1/s
-    mass: Any  # kg
+    rate: Any  # characteristic rate of the system and the run (1/s)
+    length: Any  # (m)
+    scene_rate: Any  # (1/s)
+    mass: Any  # (kg)
     drift_tol: Any
 
 
@@ -53,7 +53,7 @@ class MachineSystem:
         units: numbers of each member.
         restitution: of all events (B, E).
         inverse_mass: of all coordinates (B, n).
-        joint_numbers: the numbers of joints that events add, except those that the state decides (B, k).
+        joint_numbers: the numbers of joints that events add, except those that depend on the state (B, k).
     """
 
     xp = np
@@ -78,48 +78,50 @@ class MachineSystem:
         self._watched = [np.append(np.arange(E), E + np.flatnonzero(held)) for held in self.plan.held]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
-    def contacts(self, some: MemberIndices) -> Contacts:
-        """Return the contacts of some members."""
+    def contacts(self, members: MemberIndices) -> Contacts:
+        """Return the contacts of members."""
         plan = self.plan
-        numbers = take(self._restitution, some), take(self.rate, some)
+        numbers = take(self._restitution, members), take(self.rate, members)
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, *numbers)
 
-    def look(self, some: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
-        """Evaluate some members at states."""
-        return StateValues(*self._by_phase(some, at, PhaseCode.at))
+    def look(self, members: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
+        """Evaluate the conditions of members at states."""
+        return StateValues(*self._by_phase(members, at, PhaseCode.at))
 
-    def project(self, some: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and velocities that the phases of states allow."""
-        q, v = self._by_phase(some, at, PhaseCode.project)
+    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Return the states projected to the constraints of their phases."""
+        q, v = self._by_phase(members, at, PhaseCode.project)
         return q, v
 
-    def _by_phase(self, some: MemberIndices, at: RunState, function: Callable[..., Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
-        members, found = self._all if some is None else some, []
+    def _by_phase(
+        self, members: MemberIndices, at: RunState, function: Callable[..., Sequence[np.ndarray]]
+    ) -> Sequence[np.ndarray]:
+        indices, results = self._all if members is None else members, []
         for phase in set(at.phase.tolist()):
             of_phase = at.phase == phase
             if of_phase.all():
-                return function(self._phases[phase], members, *at[:3])
-            values = function(self._phases[phase], members[of_phase], *(x[of_phase] for x in at[:3]))
-            found = found or [np.empty((len(members), *x.shape[1:])) for x in values]
-            for to, x in zip(found, values, strict=True):
-                to[of_phase] = x
-        return found
+                return function(self._phases[phase], indices, *at[:3])
+            values = function(self._phases[phase], indices[of_phase], *(x[of_phase] for x in at[:3]))
+            results = results or [np.empty((len(indices), *x.shape[1:])) for x in values]
+            for array, x in zip(results, values, strict=True):
+                array[of_phase] = x
+        return results
 
-    def add_joints(self, some: MemberIndices, event: Int[np.ndarray, "b"], q: np.ndarray, joints: Any) -> Any:
-        """Return the numbers of the joints that events have added, with those that some events add at q; -1: none."""
-        members, start = self._all if some is None else some, 0
+    def add_joints(self, members: MemberIndices, event: Int[np.ndarray, "b"], q: np.ndarray, joints: Any) -> Any:
+        """Return the numbers of the joints that events have added, with those that `event` adds at q; -1: no event."""
+        indices, start = self._all if members is None else members, 0
         for joint, numbers in zip(self._added, joints, strict=True):
             count, new = len(joint.program.inputs) - q.shape[1], event == joint.event
             if new.any():
-                given = self._joint_numbers[members[new], start : start + count]
-                numbers[members[new]] = evaluate_joint(joint, q[new], given)
+                inputs = self._joint_numbers[indices[new], start : start + count]
+                numbers[indices[new]] = evaluate_joint(joint, q[new], inputs)
             start += count
         return joints
 
-    def when(self, those: Bool[np.ndarray, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
+    def when(self, mask: Bool[np.ndarray, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
         """Return the runs with a change of the masked members."""
-        some = np.flatnonzero(those)
-        return runs if not some.size else change(runs, None if some.size == those.size else some)
+        members = np.flatnonzero(mask)
+        return runs if not members.size else change(runs, None if members.size == mask.size else members)
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
         """Return the runs after changing them until none is running."""
@@ -128,86 +130,86 @@ class MachineSystem:
                 runs = change(runs)
         return runs
 
-    def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
-        """Take some members to their next crossings, or to their ends, by one call of machine code for each phase."""
-        members = self._all if some is None else some
-        phases = runs.phase[members]
+    def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
+        """Take members to their next crossings, or to their ends, by one call of machine code for each phase."""
+        indices = self._all if members is None else members
+        phases = runs.phase[indices]
         for phase in set(phases.tolist()):
-            self._run_phase(runs, phase, members[phases == phase])
+            self._run_phase(runs, phase, indices[phases == phase])
         return runs
 
-    def _run_phase(self, runs: MemberRuns, phase: int, some: Int[np.ndarray, "b"]):
-        ts, start, tol = self.ts[some], runs.t[some], self._units.drift_tol[some, None]
-        # The state after an event may itself be due as an output. Machine code writes the later outputs, up to the first that is
-        # infinite, and then the end.
+    def _run_phase(self, runs: MemberRuns, phase: int, members: Int[np.ndarray, "b"]):
+        ts, start, tol = self.ts[members], runs.t[members], self._units.drift_tol[members, None]
+        # The state after an event may itself be a requested output. Machine code writes the later outputs, up to the first
+        # infinite time, and then the end.
         b, k = np.nonzero(ts == start[:, None])
         if b.size:
-            runs.qs[some[b], k], runs.vs[some[b], k] = runs.q[some[b]], runs.v[some[b]]
+            runs.qs[members[b], k], runs.vs[members[b], k] = runs.q[members[b]], runs.v[members[b]]
         (count, T), later = ts.shape, (ts <= start[:, None]).sum(1)
         output = later[:, None] + np.arange(T - later.min())
         times = np.empty((count, output.shape[1] + 2))
         times[:, 0], times[:, -1] = start, ts[:, -1]
         times[:, 1:-1] = np.where(output < T - 1, ts[np.arange(count)[:, None], np.minimum(output, T - 1)], np.inf)
-        found = self._phases[phase].run(some, times, runs.q[some], runs.v[some], self._watch(runs, phase, some))
-        status, counts = found.info[:, STATUS], found.info[:, COUNTS].astype(int)
-        rows = (np.arange(times.shape[1]) <= found.info[:, WRITTEN, None]) & (times <= found.t[:, None])
+        stretch = self._phases[phase].run(members, times, runs.q[members], runs.v[members], self._watch(runs, phase, members))
+        status, counts = stretch.info[:, STATUS], stretch.info[:, COUNTS].astype(int)
+        rows = (np.arange(times.shape[1]) <= stretch.info[:, WRITTEN, None]) & (times <= stretch.t[:, None])
         rows[:, -1] = status == Status.DONE
-        lost = rows & ~(found.violation <= tol)
-        drifts = lost.any(1) | ~(found.worst <= tol[:, 0])
+        lost = rows & ~(stretch.violation <= tol)
+        drifts = lost.any(1) | ~(stretch.worst <= tol[:, 0])
         kept = rows & (np.cumsum(lost, axis=1) == 0) if drifts.any() else rows
-        b, k = np.nonzero((kept & (times < found.t[:, None]))[:, 1:-1])
+        b, k = np.nonzero((kept & (times < stretch.t[:, None]))[:, 1:-1])
         if b.size:
-            places = some[b], output[b, k]
-            runs.qs[places], runs.vs[places] = found.q[b, k + 1], found.v[b, k + 1]
-        runs.totals[some, :3] += counts
+            places = members[b], output[b, k]
+            runs.qs[places], runs.vs[places] = stretch.q[b, k + 1], stretch.v[b, k + 1]
+        runs.totals[members, :3] += counts
         if self._is_projected[phase]:
-            runs.totals[some, 3] += counts[:, 0] + 2 * (rows.sum(1) - 1)
+            runs.totals[members, 3] += counts[:, 0] + 2 * (rows.sum(1) - 1)
         known, watched = ((status == Status.CROSSED) | (status == Status.DONE)) & ~drifts, self._watched[phase]
-        event = np.where(found.event >= 0, watched[found.event.astype(int)], NO_EVENT)
-        runs.put(some, t=found.t, q=found.q_end, v=found.v_end, event=event, running=known)
+        event = np.where(stretch.event >= 0, watched[stretch.event.astype(int)], NO_EVENT)
+        runs.put(members, t=stretch.t, q=stretch.q_end, v=stretch.v_end, event=event, running=known)
         if known.all():
-            runs.sides[some[:, None], watched] = found.sides
+            runs.sides[members[:, None], watched] = stretch.sides
         else:
-            runs.sides[some[known, None], watched] = found.sides[known]
-            self._fail(runs, some, found, known, drifts)
-        if drifts.any():  # the last state that was none too far from the manifold
-            last_kept, those = np.where(kept, times, -np.inf).argmax(1)[drifts], some[drifts]
-            runs.t[those], runs.q[those], runs.v[those] = (x[drifts, last_kept] for x in (times, found.q, found.v))
+            runs.sides[members[known, None], watched] = stretch.sides[known]
+            self._fail(runs, members, stretch, known, drifts)
+        if drifts.any():  # return to the last state close enough to the manifold
+            last_kept, drifting = np.where(kept, times, -np.inf).argmax(1)[drifts], members[drifts]
+            runs.t[drifting], runs.q[drifting], runs.v[drifting] = (x[drifts, last_kept] for x in (times, stretch.q, stretch.v))
             is_open = drifts & lost[:, 0] & (start == ts[:, 0])
-            runs.code[some[is_open]], runs.t[some[is_open]] = Result.initial_state_open, start[is_open]
+            runs.code[members[is_open]], runs.t[members[is_open]] = Result.initial_state_open, start[is_open]
 
     def _fail(
         self,
         runs: MemberRuns,
-        some: Int[np.ndarray, "b"],
-        found: StretchEnd,
+        members: Int[np.ndarray, "b"],
+        stretch: StretchEnd,
         known: Bool[np.ndarray, "b"],
         drifts: Bool[np.ndarray, "b"],
     ):
         """Store the results and ends of the runs that stop."""
-        status, (n, fails) = found.info[:, STATUS], (runs.q.shape[1], ~known)
-        self.unresolved[some] |= (status == Status.UNRESOLVED) & ~drifts
+        status, (n, fails) = stretch.info[:, STATUS], (runs.q.shape[1], ~known)
+        self.unresolved[members] |= (status == Status.UNRESOLVED) & ~drifts
         code = np.where(status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
         code = np.where(status == Status.NOT_FINITE, Result.not_finite, code)
         code = np.where((status == Status.LOST) | drifts, Result.drift, code)
-        last = found.info[fails, TIME], found.info[fails, INFO : INFO + n], found.info[fails, INFO + n :]
-        runs.code[some[fails]] = code[fails]
-        runs.t[some[fails]], runs.q[some[fails]], runs.v[some[fails]] = last
+        last = stretch.info[fails, TIME], stretch.info[fails, INFO : INFO + n], stretch.info[fails, INFO + n :]
+        runs.code[members[fails]] = code[fails]
+        runs.t[members[fails]], runs.q[members[fails]], runs.v[members[fails]] = last
 
-    def _watch(self, runs: MemberRuns, phase: int, some: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b K"]:
-        """Return all that machine code watches in a phase: room for numbers, sides, whether each counts, floors, directions."""
-        where, E, watch = self._watched[phase], self.plan.count, self._watches[phase][some]
+    def _watch(self, runs: MemberRuns, phase: int, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b K"]:
+        """Return the input that describes watched conditions: room for numbers, sides, masks, tolerances, directions."""
+        where, E, watch = self._watched[phase], self.plan.count, self._watches[phase][members]
         room, C = watch.shape[1] - 1 - 4 * len(where), len(where)
-        watch[:, room : room + C] = runs.sides[some[:, None], where]
-        watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[some], runs.carried[some], np)[:, where]
-        watch[:, room + 2 * C : room + 2 * C + E] = ZERO * runs.scale[some]
+        watch[:, room : room + C] = runs.sides[members[:, None], where]
+        watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, where]
+        watch[:, room + 2 * C : room + 2 * C + E] = ZERO * runs.scale[members]
         return watch
 
     def _watch_before(self, plan: PhasePlan, watched: Int[np.ndarray, "C"]) -> Float[np.ndarray, "B K"]:
         """Return the array of `_watch` before a run, with the entries that stay constant."""
         units, B = self._units, len(self.end)
-        assert plan.run.conditions is not None  # it watches some
+        assert plan.run.conditions is not None  # this code has conditions
         room, ones = plan.run.conditions.number_count + 2 * len(watched), np.ones((B, 1))
         force = ZERO * units.mass * units.length * units.rate**2
-        rest = force[:, None] * np.ones(len(watched)), self.plan.both_directions[watched] * ones, units.scene_rate[:, None]
-        return np.concatenate([np.zeros((B, room)), *rest], axis=1)
+        constants = force[:, None] * np.ones(len(watched)), self.plan.both_directions[watched] * ones, units.scene_rate[:, None]
+        return np.concatenate([np.zeros((B, room)), *constants], axis=1)

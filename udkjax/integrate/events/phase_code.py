@@ -1,4 +1,4 @@
-"""Machine code of the phases of a run with events, for the members of a batch: to the next crossing, and at single states."""
+"""Machine code of the phases of runs with events, for batches: integration to the next crossing, evaluation at single states."""
 
 import math
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
 
 INPUTS = RunWatched.input_names
-STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # of the inputs of a run: times and the initial state
-PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # of a phase, as arrays; then its samples, if there are some
+STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # the inputs of a run that are times and initial state
+PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a phase, followed by its samples if it has any
 
 
 class PhasePlan(NamedTuple):
@@ -31,14 +31,14 @@ class PhasePlan(NamedTuple):
 
     run: RunWatched
     states: EvaluateEvents
-    marking: MarkRows | None  # of independent rows, if the run has to find them
+    marking: MarkRows | None  # marks independent rows; None if this is not needed
     projected: bool
-    project: StateOperation | None  # to the joints that events add, where they do
-    joints: tuple[tuple[int, ...], ...]  # of each such joint: the places of its numbers, none where the phase does not have it
+    project: StateOperation | None  # projects to the joints that events add; None without any
+    joints: tuple[tuple[int, ...], ...]  # for each such joint the places of its numbers; empty if the phase lacks it
 
     @property
     def count(self) -> int:
-        """The number of its arrays."""
+        """The number of arrays of the phase."""
         return len(PARTS) + bool(self.run.sampled)
 
 
@@ -48,9 +48,9 @@ def phase_plan(
     """Return the operations of a phase.
 
     Args:
-        compiled: its mechanism.
+        compiled: the mechanism of the phase.
         conditions: conditions of all events.
-        held: of each event, the row of Psi that holds its contact; -1: none.
+        held: for each event the row of Psi that holds its contact; -1: none.
         impacts: the events that are impacts.
         added: the names of joints that events add.
     """
@@ -67,7 +67,7 @@ def phase_plan(
 
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
-    """Return the arrays of a phase, with the member first."""
+    """Return the arrays of a phase, with a leading axis for members."""
     if plan.marking is not None:
         problem = replace(problem, marks=np.ones(plan.run.code.row_count))
     inputs = run_inputs(problem, plan.run, xp)
@@ -81,15 +81,15 @@ def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> lis
 
 
 class StretchEnd(NamedTuple):
-    """The ends of some runs, at a crossing or not, and their outputs; whole numbers as floats."""
+    """The ends of runs, at a crossing or elsewhere, and their outputs; integers are stored as floats."""
 
     q: Float[np.ndarray, "b T n"]  # at the requested times
     v: Float[np.ndarray, "b T n"]
     violation: Float[np.ndarray, "b T"]
     info: Float[np.ndarray, "b K"]  # `RunStates.info_names`, and the last state of the integrator
     event: Float[np.ndarray, "b"]  # index of the watched quantity that crosses; -1: none
-    t: Float[np.ndarray, "b"]  # up to which nothing else happens
-    worst: Float[np.ndarray, "b"]  # violation at a node
+    t: Float[np.ndarray, "b"]  # the end (s); no event happens before
+    worst: Float[np.ndarray, "b"]  # largest violation at a node
     sides: Float[np.ndarray, "b C"]
     q_end: Float[np.ndarray, "b n"]  # at t
     v_end: Float[np.ndarray, "b n"]
@@ -99,12 +99,12 @@ class PhaseCode:
     """The machine code of a phase, with the numbers of all members of a batch.
 
     Args:
-        plan: its operations.
-        arrays: arrays by `phase_arrays`, of one member or of all.
+        plan: the operations of the phase.
+        arrays: arrays from `phase_arrays`, for one member or for all.
         event_numbers: the numbers of all events.
         inverse_mass: one over the mass of each coordinate.
         members: number of members.
-        joints: the numbers of the joints that events have added, of all members; they change.
+        joints: the numbers of the joints that events have added, for all members; changed in place.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class PhaseCode:
         self._event_numbers, self._joints = event_numbers, joints
         rows = max(len(event_numbers), len(inverse_mass))
         self._numbers_of_states = np.concatenate([_spread(x, rows) for x in (event_numbers, inverse_mass)], axis=1)
-        assert plan.states.conditions is not None  # it evaluates some
+        assert plan.states.conditions is not None  # this code has conditions
         n, E = inverse_mass.shape[1], plan.states.conditions.own_count
         self._places, start = [], 0
         for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues`
@@ -131,74 +131,79 @@ class PhaseCode:
             start += math.prod(shape)
         self._marks = np.full((members, plan.run.code.row_count), np.nan)
 
-    def run(self, some: Int[np.ndarray, "b"], ts: np.ndarray, q: np.ndarray, v: np.ndarray, watch: np.ndarray) -> StretchEnd:
-        """Run some members over times (b, T) to the first crossing; `watch` is what is watched, with room for its numbers."""
+    def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, q: np.ndarray, v: np.ndarray, watch: np.ndarray) -> StretchEnd:
+        """Run members over times (b, T) to the first crossing; `watch` describes the conditions, with room for their numbers."""
         operation, conditions = self.plan.run, self.plan.run.conditions
-        assert conditions is not None  # it watches some
-        numbers = self._with_marks(some, ts[:, 0], q, v)
-        own = [_of(x, some) for x in (self._settings, self._rows, self._breaks, *self._samples)]
-        watch[:, : conditions.number_count] = _of(self._event_numbers, some)
-        qs, vs, violation, info, crossing = call_members(numbers, ts, q, v, *own, watch, operation=operation, times=ts.shape[1])
-        behind, n = Conditions.head + conditions.count, q.shape[1]
-        sides, q_end, v_end = crossing[:, Conditions.head : behind], crossing[:, behind : behind + n], crossing[:, behind + n :]
-        return StretchEnd(qs, vs, violation, info, crossing[:, 0], crossing[:, 1], crossing[:, 2], sides, q_end, v_end)
+        assert conditions is not None  # this code has conditions
+        numbers = self._with_marks(members, ts[:, 0], q, v)
+        further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
+        watch[:, : conditions.number_count] = _of(self._event_numbers, members)
+        inputs = numbers, ts, q, v, *further, watch
+        qs, vs, violation, info, crossing = call_members(*inputs, operation=operation, times=ts.shape[1])
+        last_side, n = Conditions.head + conditions.count, q.shape[1]
+        (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
+        q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
+        return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end)
 
-    def at(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> StateValues:
-        """Evaluate some members at states."""
+    def at(self, members: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> StateValues:
+        """Evaluate the conditions of members at states."""
         operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
-        assert conditions is not None  # it evaluates some
-        numbers = self._with_marks(some, t, q, v)
+        assert conditions is not None  # this code has conditions
+        numbers = self._with_marks(members, t, q, v)
         if self._samples:
             numbers = _spread(numbers, b).copy()
-            row = np.sum(_of(self._breaks, some) <= t[:, None], axis=1)
-            numbers[:, list(self.plan.run.sampled)] = _spread(_of(self._samples[0], some), b)[np.arange(b), row]
-        given = numbers, np.stack([t, t], axis=1), q, v, _of(self._of_states, some), _of(self._rows, some), np.zeros((1, 0))
-        (found,) = call_members(*given, _of(self._numbers_of_states, some), operation=operation, times=2)
-        values = [found[:, place].reshape(b, *shape) for place, shape in self._places]
+            row = np.sum(_of(self._breaks, members) <= t[:, None], axis=1)
+            numbers[:, list(self.plan.run.sampled)] = _spread(_of(self._samples[0], members), b)[np.arange(b), row]
+        further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
+        inputs = numbers, np.stack([t, t], axis=1), q, v, *further
+        (results,) = call_members(*inputs, _of(self._numbers_of_states, members), operation=operation, times=2)
+        values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
         directions = np.zeros((b, conditions.own_count, n))
         if operation.impacts:
-            directions[:, list(operation.impacts)] = found[:, self._places[-1][0].stop :].reshape(b, -1, n)
+            directions[:, list(operation.impacts)] = results[:, self._places[-1][0].stop :].reshape(b, -1, n)
         return StateValues._make([*values, directions])
 
-    def project(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the positions and velocities of some members to the constraints of the phase."""
+    def project(
+        self, members: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities of members, projected to the constraints of the phase."""
         operation, n = self.plan.project, q.shape[1]
         assert operation is not None  # events add joints
-        further = _of(self._of_states, some), _of(self._rows, some), np.zeros((1, 0))
-        given = self._with_marks(some, t, q, v), np.stack([t, t], axis=1), q, v
-        (found,) = call_members(*given, *further, operation=operation, times=2)
-        return found[:, :n], found[:, n:]
+        further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
+        inputs = self._with_marks(members, t, q, v), np.stack([t, t], axis=1), q, v
+        (results,) = call_members(*inputs, *further, operation=operation, times=2)
+        return results[:, :n], results[:, n:]
 
-    def _numbers_of(self, some: Int[np.ndarray, "b"]) -> np.ndarray:
-        """Return the numbers of some members, those of joints as events have added them."""
-        numbers = _of(self._numbers, some)
+    def _numbers_of(self, members: Int[np.ndarray, "b"]) -> np.ndarray:
+        """Return the numbers of members, with those of the joints that events have added."""
+        numbers = _of(self._numbers, members)
         if any(self.plan.joints):
-            numbers = _spread(numbers, len(some)).copy()
+            numbers = _spread(numbers, len(members)).copy()
             for places, joint in zip(self.plan.joints, self._joints, strict=True):
                 if places:
-                    numbers[:, list(places)] = joint[some]
+                    numbers[:, list(places)] = joint[members]
         return numbers
 
-    def _with_marks(self, some: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the numbers of some members, with the marks of the rows that are independent near where they came first."""
-        numbers, marking = self._numbers_of(some), self.plan.marking
+    def _with_marks(self, members: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the numbers of members, with marks of independent rows, determined where each member enters the phase first."""
+        numbers, marking = self._numbers_of(members), self.plan.marking
         if marking is None:
             return numbers
         m = self.plan.run.code.row_count
-        if np.isnan(self._marks[some]).any():
-            own = numbers[:, : marking.code.number_count - 2]
-            tol = _spread(_of(self._tol, some), len(numbers))
-            given = np.concatenate([own, tol, np.zeros((len(numbers), 1))], axis=1), np.stack([t, t], axis=1), q, v
-            further = _of(self._settings, some)[:, self._of_marking], _of(self._rows, some), np.zeros((1, 0))
-            (self._marks[some],) = call_members(*given, *further, operation=marking, times=2)
-        numbers = _spread(numbers, len(some)).copy()
-        numbers[:, -2 - m : -2] = self._marks[some]
+        if np.isnan(self._marks[members]).any():
+            scene_numbers = numbers[:, : marking.code.number_count - 2]
+            tol = _spread(_of(self._tol, members), len(numbers))
+            inputs = np.concatenate([scene_numbers, tol, np.zeros((len(numbers), 1))], axis=1), np.stack([t, t], axis=1), q, v
+            further = _of(self._settings, members)[:, self._of_marking], _of(self._rows, members), np.zeros((1, 0))
+            (self._marks[members],) = call_members(*inputs, *further, operation=marking, times=2)
+        numbers = _spread(numbers, len(members)).copy()
+        numbers[:, -2 - m : -2] = self._marks[members]
         return numbers
 
 
-def _of(x: np.ndarray, some: Int[np.ndarray, "b"]) -> np.ndarray:
-    """Return the rows of some members, or the one that all share."""
-    return x if len(x) == 1 else x[some]
+def _of(x: np.ndarray, members: Int[np.ndarray, "b"]) -> np.ndarray:
+    """Return the rows of members, or the single row that all share."""
+    return x if len(x) == 1 else x[members]
 
 
 def _spread(x: np.ndarray, count: int) -> np.ndarray:

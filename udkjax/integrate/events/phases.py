@@ -1,7 +1,7 @@
-"""Phases: the mechanisms that one scene with events goes through, as constraints are released, added, or contacts come to rest.
+"""Phases: the mechanisms that a scene turns into as events release or add constraints, and as contacts come to rest.
 
-All have the scene's bodies, and so its states. Which of them can be reached, and what leads from one to another, is found before
-the run by following every event from every phase; each then has equations, and machine code, of its own.
+All phases have the bodies of the scene, hence the same coordinates. Before the run, every event is followed from every phase to
+determine which phases can be reached. Each phase has its own equations and machine code.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,30 +27,30 @@ MOST_PHASES = 32  # each is compiled
 
 
 class Tables(NamedTuple):
-    """The phases that events lead to, as [phase][event]: hashable, so that programs compiled for them are reused."""
+    """Phase transitions as [phase][event]; hashable, so programs compiled for them are reused."""
 
     after: tuple[tuple[int, ...], ...]  # the phase that follows an event
     resting: tuple[tuple[int, ...], ...]  # the phase after a contact has come to rest
-    freed: tuple[tuple[int, ...], ...]  # the phase after a contact at rest has let go
+    freed: tuple[tuple[int, ...], ...]  # the phase after a contact at rest has opened
     held: tuple[tuple[int, ...], ...]  # the row of Psi that holds a contact; -1: none
 
 
 class Phases(eqx.Module):
-    """Mechanisms, their analyses, and how events lead from one to another. The first is where a run starts."""
+    """The mechanisms of all phases, their analyses, and the transitions between them. Runs start in the first phase."""
 
     mechanisms: tuple[Mechanism, ...]
     analyses: tuple[Analysis, ...]
-    added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, without the numbers that the state at the event decides
-    added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # of each: the event, and the name of the joint
+    added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, without the numbers that depend on the state at the event
+    added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # for each added joint its event and its name
     tables: Tables = eqx.field(static=True)
 
     def with_added(self, phase: int, joints: Sequence[Joint]) -> Mechanism:
-        """Return the mechanism of a phase with the joints as the events have added them."""
+        """Return the mechanism of a phase, with the joints that events have added."""
         mechanism = self.mechanisms[phase]
         for (_, name), joint in zip(self.added_by, joints, strict=True):
             if name in mechanism.joint_names:
-                place = mechanism.joint_names.index(name)
-                mechanism = eqx.tree_at(lambda m, place=place: m._joints[place], mechanism, joint)
+                index = mechanism.joint_names.index(name)
+                mechanism = eqx.tree_at(lambda m, index=index: m._joints[index], mechanism, joint)
         return mechanism
 
     def first_added(self) -> tuple[Joint, ...]:
@@ -64,7 +64,7 @@ class Phases(eqx.Module):
 
 
 def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis) -> Phases:
-    """Return the phases of a mechanism with events. Raises `ValueError` where there are too many."""
+    """Return the phases of a mechanism with events. Raises `ValueError` if there are too many."""
     added, added_by = _additions(mechanism, events)
     names = [name for _, name in added_by]
     known = [*mechanism.constraints, *names]
@@ -72,30 +72,30 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
         for name in sorted(event.action.removed.difference(known)):
             raise ValueError(f"event {quote(event.name)}: no joint or driver named {quote(name)}{suggestion(name, known)}")
     first: frozenset[str] = frozenset(mechanism.constraints)
-    found, steps = [first], []
-    for active in found:  # the list grows in this loop
+    active_sets, transitions = [first], []
+    for active in active_sets:  # the list grows in this loop
         rows = [_next_phases(event, active, names, added_by, k) for k, event in enumerate(events)]
         for target in (x for row in rows for x in row):
-            if target not in found:
-                found.append(target)
-        if len(found) > MOST_PHASES:
+            if target not in active_sets:
+                active_sets.append(target)
+        if len(active_sets) > MOST_PHASES:
             raise ValueError(
                 f"events: more than {MOST_PHASES} combinations of constraints can follow one another; contacts with "
                 'at_rest="stop" instead of "hold" add none'
             )
-        steps.append(rows)
-    place = {active: k for k, active in enumerate(found)}
-    after, resting, freed = (tuple(tuple(place[row[i]] for row in rows) for rows in steps) for i in range(3))
+        transitions.append(rows)
+    index_of = {active: k for k, active in enumerate(active_sets)}
+    after, resting, freed = (tuple(tuple(index_of[row[i]] for row in rows) for rows in transitions) for i in range(3))
     contacts = {_contact(event): HeldContact.of(event, mechanism) for event in events if event.action.rest == "hold"}
     extra = {**dict(zip(names, added, strict=True)), **contacts}
-    mechanisms = [_with(mechanism, active, extra) for active in found]
+    mechanisms = [_with(mechanism, active, extra) for active in active_sets]
     analyses = [analysis]
-    for active, phase in zip(found[1:], mechanisms[1:], strict=True):
-        own = _with(mechanism, active - extra.keys(), {})
-        analyses.append(_analysis(phase, lambda own=own: analysis if own is mechanism else analyse(own)))
+    for active, phase in zip(active_sets[1:], mechanisms[1:], strict=True):
+        base = _with(mechanism, active - extra.keys(), {})
+        analyses.append(_analysis(phase, lambda base=base: analysis if base is mechanism else analyse(base)))
     held = tuple(
         tuple(_row(a, _contact(e)) if _contact(e) in active else -1 for e in events)
-        for active, a in zip(found, analyses, strict=True)
+        for active, a in zip(active_sets, analyses, strict=True)
     )
     tables = Tables(after, resting, freed, held)
     return Phases(tuple(m.without_origin for m in mechanisms), tuple(analyses), tuple(added), tuple(added_by), tables)
@@ -118,7 +118,7 @@ def _additions(mechanism: Mechanism, events: Sequence[Event]) -> tuple[list[Join
 def _next_phases(
     event: Event, active: frozenset[str], names: Sequence[str], by: Sequence[tuple[int, str]], k: int
 ) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
-    """Return the constraints after an event, after it has come to rest, and after its contact has let go."""
+    """Return the active constraints after an event, after its contact has come to rest, and after the contact has opened."""
     added = frozenset(name for i, name in by if i == k)
     contact = frozenset([_contact(event)] if event.action.rest == "hold" else [])
     return (active - event.action.removed) | added, active | contact, active - contact
@@ -128,14 +128,14 @@ def _contact(event: Event) -> str:
     return f"{event.name}.contact"
 
 
-def _analysis(phase: Mechanism, of_own: Callable[[], Analysis]) -> Analysis:
-    """Return the analysis of a phase. Constraints added with traced numbers count as independent of the scene's own."""
-    found = analyse(phase)
-    own = of_own() if found.redundant_rows is None else found
-    if own.redundant_rows is None or found.redundant_rows is not None:
-        return found
-    rows = tuple(found.row_names.index(row) for row in own.redundant)
-    return replace(found, redundant_rows=rows)
+def _analysis(phase: Mechanism, analyse_scene: Callable[[], Analysis]) -> Analysis:
+    """Return the analysis of a phase; constraints added with traced numbers are taken to be independent of the scene's."""
+    analysis = analyse(phase)
+    of_scene = analyse_scene() if analysis.redundant_rows is None else analysis
+    if of_scene.redundant_rows is None or analysis.redundant_rows is not None:
+        return analysis
+    rows = tuple(analysis.row_names.index(row) for row in of_scene.redundant)
+    return replace(analysis, redundant_rows=rows)
 
 
 def _row(analysis: Analysis, name: str) -> int:
@@ -143,7 +143,7 @@ def _row(analysis: Analysis, name: str) -> int:
 
 
 def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint]) -> Mechanism:
-    """Return the mechanism with the constraints that are active, of its own and others."""
+    """Return the mechanism with only the active constraints, from its own and from `extra`."""
     if active == frozenset(mechanism.constraints):
         return mechanism
     joints = {name: joint for name, joint in mechanism.joints.items() if name in active}
@@ -152,7 +152,7 @@ def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint])
     parts = (joints | added, drivers, mechanism.forces, mechanism.gravity, mechanism.name)
     is_concrete = not any(isinstance(x, Tracer) for x in jax.tree.leaves(list(added.values())))
     if mechanism.is_concrete and is_concrete:
-        with jax.ensure_compile_time_eval():  # while something else is traced, what a joint takes from the guess is known, too
+        with jax.ensure_compile_time_eval():  # numbers taken from the guess stay concrete even under tracing
             return Mechanism(mechanism.bodies, *parts)
     origin = None
     if mechanism.origin is not None and is_concrete:
@@ -163,12 +163,12 @@ def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint])
 class HeldContact(Joint):
     """A contact at rest: its condition stays zero. 1 row, in the condition's unit."""
 
-    labels: tuple[str, ...] = eqx.field(static=True)  # the names by which the condition knows the bodies
+    labels: tuple[str, ...] = eqx.field(static=True)  # the names of the bodies in the condition
     condition: Callable[[Number, Frames], ArrayLike]
 
     @classmethod
     def of(cls, event: Event, mechanism: Mechanism) -> "HeldContact":
-        """Return the contact of an event, of all bodies unless its condition has an attribute `bodies`."""
+        """Return the contact of an event; its bodies are all, or those in the attribute `bodies` of the condition."""
         bodies = getattr(event.condition, "bodies", mechanism.body_names)
         return cls(bodies=bodies, labels=tuple(bodies), condition=event.condition)
 

@@ -1,9 +1,9 @@
-"""Runs with events in their plain form, by JAX: of one member, window by window.
+"""Runs with events in their plain form, by JAX: a single member, window by window.
 
-A window has the output times within it, and nodes at which the conditions and the forces of contacts at rest are looked at
-(`detection`). Where these are too coarse for a condition, the window is done again, an eighth as long. An interval in which one
-crosses is the next window, until the zero of its cubic is exact to rounding, which is the end of the last one; or until it is as
-short as can be, as where a condition jumps.
+A window contains output times, and nodes at which conditions and the forces of contacts at rest are evaluated (`detection`). If
+the nodes are too coarse for a condition, the window is repeated with an eighth of its length. If a condition crosses zero between
+two nodes, that interval becomes the next window. This is repeated until the zero of the cubic is exact to rounding, where the
+last window ends, or until the interval is as short as possible, as where a condition jumps.
 """
 
 from collections.abc import Callable
@@ -32,14 +32,14 @@ MOST_OUTPUTS = 32  # output times of a window
 
 
 class Window(NamedTuple):
-    """The next window of a run, and the findings of those before."""
+    """The next window of a run, and the results of the windows before."""
 
-    reach: Float[Array, ""]  # its length, at most (s)
+    reach: Float[Array, ""]  # its largest length (s)
     event: Int[Array, ""]  # the condition whose crossing is being located, or `NO_EVENT`
-    high: Float[Array, ""]  # the end of the interval in which it does (s)
-    lands: Bool[Array, ""]  # whether it does at that end
+    high: Float[Array, ""]  # the end of the interval that contains this crossing (s)
+    lands: Bool[Array, ""]  # whether the crossing is at that end
     last: Float[Array, ""]  # the time of the last event (s)
-    unresolved: Float[Array, "2E"]  # from when on a condition varies too quickly to be sure of its crossings (s), or infinite
+    unresolved: Float[Array, "2E"]  # time (s) from which a condition varies too quickly to be resolved; else infinite
 
 
 def run_plain(hybrid: Hybrid) -> EventRun:
@@ -48,25 +48,25 @@ def run_plain(hybrid: Hybrid) -> EventRun:
     window = Window(ts[-1] - ts[0], jnp.array(NO_EVENT), ts[0], jnp.array(False), ts[0], never)
     start = with_member(hybrid.first_state())
     runs = run_loop(system, runs_before(hybrid.plan, start, len(ts), hybrid.code[None], jnp, window))
-    # A condition may vary quickly before it becomes NaN; the result of the run already tells of the NaN.
+    # A condition may vary quickly before it becomes NaN, but the result of the run already reports the NaN.
     unresolved = jnp.where(runs.undefined, jnp.inf, runs.window.unresolved[: hybrid.count])
     return jax.tree.map(lambda x: x[0], results(hybrid.plan, runs, ts[None], unresolved, jnp))
 
 
 def with_member(state: RunState) -> RunState:
-    """Return a state with the one member in front."""
+    """Return a state with a leading axis for its one member."""
     t, q, v, phase, joints = state
     return RunState(t[None], q[None], v[None], phase[None], joints)
 
 
 def without_member(state: RunState) -> RunState:
-    """Return the state of the one member."""
+    """Return a state without the leading axis of its one member."""
     t, q, v, phase, joints = state
     return RunState(t[0], q[0], v[0], phase[0], joints)
 
 
 class PlainSystem:
-    """The motion of one member (`system.System`) by JAX, with the plain forms of all that machine code does."""
+    """The motion of one member by JAX, a `system.System`, with plain forms of all operations of machine code."""
 
     xp = jnp
 
@@ -76,21 +76,21 @@ class PlainSystem:
         self.coordinates = hybrid.scales.coordinates(len(hybrid.q))[None]
         self.inverse_mass = 1 / mass_of(hybrid.phases.mechanisms[0], jnp)[None]
 
-    def contacts(self, some: MemberIndices) -> Contacts:
+    def contacts(self, members: MemberIndices) -> Contacts:
         """Return the contacts."""
         plan = self.plan
         e = [jnp.asarray(e.action.rebound, float) for e in self.hybrid.events]
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, jnp.stack(e)[None], self.rate)
 
-    def look(self, some: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
+    def look(self, members: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
         """Evaluate a state."""
         return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free))
 
-    def project(self, some: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
+    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
         """Return positions and velocities that the phase of a state allows."""
 
         def of_phase(p: int, t: Array, q: Array, v: Array, added: Added) -> tuple[Array, Array]:
-            # Velocities jump to a state that the phase allows: its derivatives are not those of a small correction.
+            # Velocities jump, so `equations.project`, whose derivatives hold for small corrections, cannot be used.
             equations = self.hybrid.textbook(p, added)
             return uk.project(equations.mechanism, t, q, v, equations.method, equations.weights)
 
@@ -98,8 +98,8 @@ class PlainSystem:
         q, v = self.hybrid.in_phase(phase, of_phase, t, q, v, added, is_free=is_free)
         return q[None], v[None]
 
-    def add_joints(self, some: MemberIndices, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:
-        """Return the joints that events have added, with that which an event adds at q; -1: none."""
+    def add_joints(self, members: MemberIndices, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:
+        """Return the joints that events have added, with the joint that `event` adds at q; -1: no event."""
         phases = self.hybrid.phases
         new = (phases.joint_at(i, q[0]) for i in range(len(joints)))
         is_new = (event[0] == by for by, _ in phases.added_by)
@@ -108,42 +108,42 @@ class PlainSystem:
             for chosen, x, y in zip(is_new, new, joints, strict=True)
         )
 
-    def when(self, those: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
+    def when(self, mask: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
         """Return the run with a change if the mask is true, else unchanged."""
-        return jax.lax.cond(those[0], lambda runs: change(runs, None), lambda runs: runs, runs)
+        return jax.lax.cond(mask[0], lambda runs: change(runs, None), lambda runs: runs, runs)
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
         """Return the run after changing it until it stops."""
         return jax.lax.while_loop(lambda runs: runs.running[0], change, runs)
 
-    def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
+    def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
         """Integrate a window: to its end, to the last node before a certain or possible crossing, or to the crossing itself."""
         hybrid, ts, window, state = self.hybrid, self.hybrid.ts, runs.window, without_member(runs.state(None))
         t, E, T = state.t, hybrid.count, len(ts)
         output = jnp.searchsorted(ts, t) + np.arange(min(MOST_OUTPUTS, T))
-        due = ts[jnp.minimum(output, T - 1)]
+        requested = ts[jnp.minimum(output, T - 1)]
         speed = jnp.maximum(hybrid.scales.rate, hybrid.scales.size(state.v))
         full = jnp.where(speed > 0, INTERVALS / RESOLUTION.per_time / jnp.where(speed > 0, speed, 1.0), ts[-1] - ts[0])
         zooms = window.event != NO_EVENT
         end = jnp.where(zooms, window.high, t + jnp.minimum(full, window.reach))
-        end = jnp.minimum(end, jnp.minimum(due[-1], ts[-1]))
+        end = jnp.minimum(end, jnp.minimum(requested[-1], ts[-1]))
         nodes = (t + (end - t) * NODES).at[-1].set(end)
-        times = jnp.sort(jnp.concatenate([nodes, jnp.clip(due, t, end)]))
+        times = jnp.sort(jnp.concatenate([nodes, jnp.clip(requested, t, end)]))
         length = end - t
-        # Windows too short to integrate; those of members of a batch that are at another stage have no length at all.
-        short = length <= 2 * hybrid.smallest
-        clear = jnp.where(short, t + 100 * hybrid.smallest * np.arange(len(times)), times)
-        raw = hybrid.flow(clear, state, derivatives=False)
-        own = (short | (times <= t))[:, None]
-        q = jnp.where(own, state.q + (times - t)[:, None] * state.v, raw.q)
-        v = jnp.where(own, state.v, raw.v)
+        # Windows too short to integrate; under vmap, windows of members at another stage have length zero.
+        is_short = length <= 2 * hybrid.smallest
+        solver_times = jnp.where(is_short, t + 100 * hybrid.smallest * np.arange(len(times)), times)
+        raw = hybrid.flow(solver_times, state, derivatives=False)
+        is_extrapolated = (is_short | (times <= t))[:, None]
+        q = jnp.where(is_extrapolated, state.q + (times - t)[:, None] * state.v, raw.q)
+        v = jnp.where(is_extrapolated, state.v, raw.v)
         lands = window.lands & (np.arange(2 * E) == window.event)
-        good = jnp.cumsum(~(own[:, 0] | (raw.reached & (np.arange(len(times)) < raw.lost)))) == 0
+        good = jnp.cumsum(~(is_extrapolated[:, 0] | (raw.reached & (np.arange(len(times)) < raw.lost)))) == 0
 
         at = jnp.searchsorted(times, nodes)
         g, g_dot = jax.vmap(hybrid.conditions_and_rates)(nodes, q[at], v[at])
         forces = jax.vmap(lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v)))(nodes, q[at], v[at])
-        found = detect(
+        hit = detect(
             Nodes(nodes, jnp.concatenate([g, forces], axis=1), jnp.concatenate([g_dot, 0 * g_dot], axis=1), good[at]),
             has_rates=np.append(~np.array(self.plan.by_velocity), np.zeros(E, bool)),
             direction=self.plan.both_directions,
@@ -152,40 +152,40 @@ class PlainSystem:
             located=window.event,
             watched=self.plan.watched(runs.phase, runs.carried, jnp)[0] & ~lands,
             is_short=length * hybrid.rate <= RESOLUTION.short,
-            unresolved=jnp.isfinite(window.unresolved) | zooms,  # within an interval that was fine enough
+            unresolved=jnp.isfinite(window.unresolved) | zooms,  # an interval that is being refined was fine enough
         )
-        place, width = found.place, nodes[found.behind] - nodes[found.place]
-        root = nodes[place] + found.root * width
+        place, width = hit.place, nodes[hit.behind] - nodes[hit.place]
+        root = nodes[place] + hit.root * width
         is_shortest = length <= jnp.maximum(RESOLUTION.finest / hybrid.rate, 100 * len(times) * hybrid.smallest)
-        undefined = found.is_coarse & is_shortest & found.undefined[:E]
-        stays = found.is_found | found.is_coarse
+        undefined = hit.is_coarse & is_shortest & hit.undefined[:E]
+        stays = hit.is_found | hit.is_coarse
         fails = (~jnp.all(good) & ~stays) | jnp.any(undefined)
         has_landed, jumps = (
             zooms & window.lands & ~stays & ~fails & (end == window.high),
             width <= 2 / SMALLEST_STEP * hybrid.smallest,
         )
-        is_located = has_landed | (found.is_found & jumps)
+        is_located = has_landed | (hit.is_found & jumps)
 
-        node = jnp.where(stays, jnp.where(found.is_coarse, found.last_sure, place), len(nodes) - 1)
+        node = jnp.where(stays, jnp.where(hit.is_coarse, hit.last_sure, place), len(nodes) - 1)
         last_good = jnp.where(jnp.all(good), len(times) - 1, jnp.maximum(jnp.sum(good) - 1, 0))
         # Where a condition jumps, the event happens at the first time after the jump.
-        k = jnp.where(stays, at[jnp.where(is_located, found.behind, node)], last_good)
+        k = jnp.where(stays, at[jnp.where(is_located, hit.behind, node)], last_good)
         t_new = times[k]
-        rows = jnp.where((output < T) & (due < t_new), output, T)
-        of_outputs = jnp.searchsorted(times, jnp.clip(due, t, end))
+        rows = jnp.where((output < T) & (requested < t_new), output, T)
+        of_outputs = jnp.searchsorted(times, jnp.clip(requested, t, end))
         code = jnp.where(jnp.any(undefined), Result.undefined_condition, _failure(raw))
         reach = jnp.where(
-            found.is_coarse, length / RESOLUTION.finer, jnp.where(zooms | found.is_found, window.reach, 2 * window.reach)
+            hit.is_coarse, length / RESOLUTION.finer, jnp.where(zooms | hit.is_found, window.reach, 2 * window.reach)
         )
         since = t_new - window.last
-        is_unresolved = found.is_coarse & is_shortest & found.coarse & ~found.undefined
+        is_unresolved = hit.is_coarse & is_shortest & hit.coarse & ~hit.undefined
         projections = hybrid.projects * (raw.tried + 2 * len(times) - 2)
         return runs._replace(
             t=t_new[None],
             q=q[k][None],
             v=v[k][None],
-            event=jnp.where(has_landed, window.event, jnp.where(is_located, found.event, NO_EVENT))[None],
-            sides=jnp.where(lands, runs.sides[0], found.sides[node])[None],
+            event=jnp.where(has_landed, window.event, jnp.where(is_located, hit.event, NO_EVENT))[None],
+            sides=jnp.where(lands, runs.sides[0], hit.sides[node])[None],
             running=~fails[None],
             code=jnp.where(fails, code, Result.successful)[None],
             undefined=undefined[None],
@@ -194,9 +194,9 @@ class PlainSystem:
             vs=runs.vs.at[0, rows].set(v[of_outputs], mode="drop"),
             window=Window(
                 reach=jnp.where(is_located & (since > 0), jnp.minimum(reach, 2 * since), reach),
-                event=jnp.where(found.is_found & ~is_located, found.event, jnp.where(end < window.high, window.event, NO_EVENT)),
-                high=jnp.where(found.is_found, jnp.where(found.is_exact, root, nodes[found.behind]), window.high),
-                lands=jnp.where(found.is_found, found.is_exact, window.lands),
+                event=jnp.where(hit.is_found & ~is_located, hit.event, jnp.where(end < window.high, window.event, NO_EVENT)),
+                high=jnp.where(hit.is_found, jnp.where(hit.is_exact, root, nodes[hit.behind]), window.high),
+                lands=jnp.where(hit.is_found, hit.is_exact, window.lands),
                 last=jnp.where(is_located, t_new, window.last),
                 unresolved=jnp.where(is_unresolved & jnp.isinf(window.unresolved), t_new, window.unresolved),
             ),

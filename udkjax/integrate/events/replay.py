@@ -26,11 +26,11 @@ OUTPUTS = 32  # per piece
 
 
 def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
-    """Run a system with events. What is smooth in the result has first derivatives, forward and reverse.
+    """Run a system with events. Smooth results have first derivatives, forward and reverse.
 
     Args:
         hybrid: the system.
-        conditions: conditions of all events, for machine code; None: it cannot serve the run.
+        conditions: conditions of all events, for machine code; None if it cannot run the system.
     """
     arrays, rest = eqx.partition(hybrid, eqx.is_inexact_array)
     xs, tree = jax.tree.flatten(arrays)
@@ -38,7 +38,7 @@ def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
 
 
 class FixedPart(eqx.Module):
-    """The choices that a run depends on besides its numbers."""
+    """The part of a system that is not numbers."""
 
     rest: PyTree
     tree: TreeDef = eqx.field(static=True)
@@ -67,8 +67,8 @@ def _(primals, tangents):
 
     xs = [_differentiate_once(x) for x in xs]
 
-    def replay_from(*some: Array) -> tuple[Array, ...]:
-        return replay(fixed.combine(replaced(xs, has_tangent, some)), stop_gradients(found))
+    def replay_from(*active: Array) -> tuple[Array, ...]:
+        return replay(fixed.combine(replaced(xs, has_tangent, active)), stop_gradients(found))
 
     change = jax.jvp(replay_from, select(xs, has_tangent), select(tangents[1], has_tangent))[1]
     return found, EventRun._make([*change, *(None for _ in found[len(change) :])])
@@ -76,7 +76,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _differentiate_once(x: Array) -> Array:
-    """Return a number that the first derivatives depend on: they are right at fixed event times, and so have no derivatives."""
+    """Return x, without second derivatives: the first ones are exact only at fixed event times, so theirs would be wrong."""
     return x
 
 
@@ -87,14 +87,15 @@ def _(primals, tangents):
 
 # --- derivatives
 #
-# Between events the flow has derivatives of its own, along the state in which it begins and all numbers. At an event the state
-# y before it, taken at the time t0 at which it was found, and so at a fixed time, meets the condition a little later or earlier:
-# h(t0 + d, y + f d) = 0 gives d = -h / h_dot to first order (the theorem of implicit functions). The jump J is done there, and
-# the state after it is taken back to t0 with the flow f+:
+# Between events the flow is differentiable by its initial state and by all numbers. Let t0 be the time at which an event was
+# found, held fixed, and y the state before the event at t0. When numbers change, the condition is met at another time t0 + d:
+# h(t0 + d, y + f d) = 0 gives d = -h / h_dot to first order (implicit function theorem). The jump J is applied at that time, and
+# the state after it is moved back to t0 along the flow f+:
 #
 #     y+ = J(t0 + d, y + f d) - f+ d,        dy+ = J_y dy - (J_y f + J_t - f+) h_y dy / h_dot,
 #
-# the saltation matrix (Leine and Nijmeijer 2004, section 7.5), written without forming it: d is zero, and has derivatives.
+# with the saltation matrix (Leine and Nijmeijer 2004, section 7.5). The code does not form this matrix: it computes y+ with a d
+# whose value is zero, but whose derivatives are not.
 
 
 class PieceStart(NamedTuple):
@@ -102,12 +103,12 @@ class PieceStart(NamedTuple):
 
     state: RunState
     written: Int[Array, ""]  # outputs so far
-    event: Int[Array, ""]  # the next one
+    event: Int[Array, ""]  # the next event
     shift: Float[Array, ""]  # the change d of the time of the last event
 
 
 class PieceOutput(NamedTuple):
-    """The outputs of a piece, and the event at its end; numbers that are too large stand for none."""
+    """The outputs of a piece, and the event at its end; indices beyond the arrays mark unused entries."""
 
     rows: Int[Array, "W"]
     q: Float[Array, "W n"]
@@ -139,7 +140,7 @@ def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
     q, v = (jnp.full((T, n), jnp.inf).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
     last = (ts == found.time)[:, None]
     q, v = jnp.where(last, end.state.q, q), jnp.where(last, end.state.v, v)
-    first = jnp.cumsum(~found.together) - 1  # of each event, the rank of the group of simultaneous events to which it belongs
+    first = jnp.cumsum(~found.together) - 1  # for each event, the index of its group of simultaneous events
     first = jnp.flatnonzero(~found.together, size=K, fill_value=0)[first]
     times = jnp.full(K, jnp.inf).at[out.event].set(out.event_time, mode="drop")[first]
     qs, vs = (jnp.full((K, 2, n), jnp.inf).at[out.event].set(x, mode="drop")[first] for x in (out.event_q, out.event_v))
@@ -155,24 +156,24 @@ def _integrate_piece(
     hybrid, (state, written, event, shift) = system.hybrid, start
     T, K = len(ts), len(found.event_time)
     output = written + np.arange(width)
-    due = ts[jnp.minimum(output, T - 1)]
-    comes = event < found.count
+    requested = ts[jnp.minimum(output, T - 1)]
+    has_next = event < found.count
     j = jnp.minimum(event, K - 1)
-    aim = jnp.where(comes, found.event_time[j], found.time)
-    end = jnp.maximum(jnp.where(output[-1] < T - 1, jnp.minimum(aim, due[-1]), aim), state.t)
-    happens = comes & (end == aim)
-    short = end - state.t <= 2 * hybrid.smallest
-    times = jnp.concatenate([state.t[None], jnp.clip(due, state.t, end), end[None]])
-    raw = hybrid.flow(jnp.where(short, state.t + 100 * hybrid.smallest * np.arange(width + 2), times), state, derivatives=True)
-    own = (short | (times <= state.t))[:, None]
-    q = jnp.where(own, state.q + (times - state.t)[:, None] * state.v, raw.q)
-    v = jnp.where(own, state.v, raw.v)
-    rows = jnp.where((output < T) & (due < end), output, T)
+    target = jnp.where(has_next, found.event_time[j], found.time)
+    end = jnp.maximum(jnp.where(output[-1] < T - 1, jnp.minimum(target, requested[-1]), target), state.t)
+    happens = has_next & (end == target)
+    is_short = end - state.t <= 2 * hybrid.smallest
+    times = jnp.concatenate([state.t[None], jnp.clip(requested, state.t, end), end[None]])
+    raw = hybrid.flow(jnp.where(is_short, state.t + 100 * hybrid.smallest * np.arange(width + 2), times), state, derivatives=True)
+    is_extrapolated = (is_short | (times <= state.t))[:, None]
+    q = jnp.where(is_extrapolated, state.q + (times - state.t)[:, None] * state.v, raw.q)
+    v = jnp.where(is_extrapolated, state.v, raw.v)
+    rows = jnp.where((output < T) & (requested < end), output, T)
     at_end = RunState(end, q[-1], v[-1], state.phase, state.joints)
 
     def jump() -> tuple[RunState, Array, tuple[Array, Array, Array, Array]]:
         found_state = at_end._replace(q=_with_value(at_end.q, found.event_q[j, 0]), v=_with_value(at_end.v, found.event_v[j, 0]))
-        after, d, (t, qs, vs) = _apply_at_fixed_time(system, found, j, found_state, shift, short)
+        after, d, (t, qs, vs) = _apply_at_fixed_time(system, found, j, found_state, shift, is_short)
         return after, d, (j, t, qs, vs)
 
     after, shift, record = jax.lax.cond(happens, jump, lambda: (at_end, shift, _no_event(len(state.q), K)))
@@ -185,15 +186,15 @@ def _integrate_piece(
 def _apply_at_fixed_time(
     system: PlainSystem, found: EventRun, j: Int[Array, ""], state: RunState, shift: Float[Array, ""], again: Array
 ) -> tuple[RunState, Float[Array, ""], tuple[Array, Array, Array]]:
-    """Apply an event that was found at the time of `state`, and return the state after it at that time.
+    """Apply an event that was found at the time of `state`, and return the state after the event at that time.
 
     Args:
         system: the system.
         found: the run.
         j: the index of the event in the run.
-        state: the state before it.
+        state: the state before the event.
         shift: the change d of the time of the event before.
-        again: whether no time has passed since then.
+        again: whether no time has passed since the event before.
 
     Returns:
         The state after the event at the fixed time, the change d of the event's time, and time and states at the event.
@@ -208,7 +209,7 @@ def _apply_at_fixed_time(
     h, rate = h - stop_gradients(h), stop_gradients(rate)
     unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E]) * hybrid.rate
     is_transversal = jnp.abs(rate) > ZERO_RATE * unit
-    # An event that happens again at the same instant, where its condition stands still, moves with the first one.
+    # If its condition is stationary, an event at the same instant as the event before moves with that event.
     d = jnp.where(is_transversal, -h / jnp.where(is_transversal, rate, 1.0), jnp.where(again, shift, 0.0))
     before = with_member(state._replace(t=state.t + d, q=state.q + d * state.v, v=state.v + d * a))
     after = apply_event(system, None, k[None], before, *condition_values(system, None, before), found.closed[j][None]).state
@@ -219,10 +220,10 @@ def _apply_at_fixed_time(
 
 
 def _no_event(n: int, K: int) -> tuple[Array, Array, Array, Array]:
-    """Return the number, time and states that stand for no event."""
+    """Return an index, a time and states as placeholders for a missing event."""
     return jnp.array(K), jnp.zeros(()), jnp.zeros((2, n)), jnp.zeros((2, n))
 
 
 def _with_value(x: Array, value: Array) -> Array:
-    """Return a value with the derivatives of x."""
+    """Return `value` with the derivatives of x."""
     return x + stop_gradients(jnp.where(jnp.isfinite(value), value, x) - x)

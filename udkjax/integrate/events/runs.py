@@ -1,7 +1,7 @@
 """The members of a batch of runs with events: their states, and their results.
 
-Arrays have the members of a batch in front. Those of runs by machine code are NumPy's, and rows of some members change in place;
-those of the plain form are JAX's, of one member, and new ones take their place.
+Arrays have a leading axis of members. Runs by machine code have arrays of NumPy, whose rows change in place; the plain form has
+arrays of JAX for one member, which are replaced.
 """
 
 from collections.abc import Callable
@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float, Int
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.solution import Result
 
-# In place of an event: conditions not evaluated yet, at the start of the run or after an event.
+# Used instead of the index of an event: conditions are not evaluated yet, at the start of the run or after an event.
 BEGIN, AGAIN = -3, -2
 
-MemberIndices = Int[np.ndarray, "b"] | None  # the indices of some members; None: all of them
+MemberIndices = Int[np.ndarray, "b"] | None  # the indices of members; None: all members
 
 
 class RunState(NamedTuple):
@@ -27,21 +27,21 @@ class RunState(NamedTuple):
     q: Float[Any, "*m n"]
     v: Float[Any, "*m n"]
     phase: Int[Any, "*m"]
-    joints: Any  # JAX's, of the one member; or NumPy's arrays of their numbers, of all members, which change in place
+    joints: Any  # joints, with JAX arrays of one member; or NumPy arrays of the numbers of all members, changed in place
 
 
 class EventRun(NamedTuple):
-    """The outputs and events of a run, infinite for those it did not reach. In tangents, fields without derivatives are None."""
+    """The outputs and events of a run, infinite if not reached. In tangents, fields without derivatives are None."""
 
     q: Float[Any, "*m T n"]
     v: Float[Any, "*m T n"]
     time: Float[Any, "*m"]  # the end of the run
     event_time: Float[Any, "*m K"]
-    event_q: Float[Any, "*m K 2 n"]  # before and after
+    event_q: Float[Any, "*m K 2 n"]  # before and after the event
     event_v: Float[Any, "*m K 2 n"]
-    event_index: Int[Any, "*m K"]  # of the event; plus E where a contact is released, plus 2 E where it comes to rest
-    event_phase: Int[Any, "*m K"]  # after it
-    together: Bool[Any, "*m K"]  # whether it happens with the one before it, as one event
+    event_index: Int[Any, "*m K"]  # index of the event; plus E if a contact opens, plus 2 E if it comes to rest
+    event_phase: Int[Any, "*m K"]  # phase after the event
+    together: Bool[Any, "*m K"]  # whether it is simultaneous with the event before, as one event
     closed: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
     count: Int[Any, "*m"]
     unresolved: Float[Any, "*m E"]
@@ -55,7 +55,7 @@ RECORD = (*EVENT_STATES, "event_index", "event_phase", "together", "closed")  # 
 
 
 def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
-    """Return the shapes of the fields of a run of T output times and n coordinates, with room for some events."""
+    """Return the shapes of the fields of a run of T output times and n coordinates, with room for `room` events."""
     E, K = plan.count, room
     return EventRun((T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K,), (K,), (K, E), (), (E,), (E,), (), (4,))
 
@@ -68,52 +68,54 @@ class MemberRuns(NamedTuple):
     v: Float[Any, "B n"]
     phase: Int[Any, "B"]
     joints: Any
-    event: Int[Any, "B"]  # at this time: its number, from E on of a contact that lets go; or `NO_EVENT`, `BEGIN`, `AGAIN`
+    event: Int[Any, "B"]  # index of the event at this time, plus E if a contact opens; or `NO_EVENT`, `BEGIN`, `AGAIN`
     sides: Int[Any, "B 2E"]  # the last side of zero of each condition and contact force: -1 or 1; 0 if unknown
-    scale: Float[Any, "B E"]  # of conditions, as in `ConditionValues`
-    carried: Bool[Any, "B E"]  # the contacts that are held at zero by others that are at rest
+    scale: Float[Any, "B E"]  # scales of conditions, as in `ConditionValues`
+    carried: Bool[Any, "B E"]  # the contacts kept at zero by other contacts at rest
     running: Bool[Any, "B"]
     code: Int[Any, "B"]
     undefined: Bool[Any, "B E"]  # the conditions whose NaN ended the run
     totals: Int[Any, "B 4"]
     qs: Float[Any, "B T n"]
     vs: Float[Any, "B T n"]
-    count: Int[Any, "B"]  # of events
+    count: Int[Any, "B"]  # number of events
     record: tuple[Any, ...]  # fields `RECORD` of `EventRun`, with one more row as a sink for entries without an event
-    window: Any  # of the plain form
+    window: Any  # `Window` of the plain form; else None
 
-    def state(self, some: MemberIndices) -> RunState:
-        """Return the states of some members."""
-        return RunState(take(self.t, some), take(self.q, some), take(self.v, some), take(self.phase, some), self.joints)
+    def state(self, members: MemberIndices) -> RunState:
+        """Return the states of members."""
+        return RunState(
+            take(self.t, members), take(self.q, members), take(self.v, members), take(self.phase, members), self.joints
+        )
 
-    def put(self, some: MemberIndices, **new: Any) -> "MemberRuns":
-        """Return the runs with new values of some members."""
-        if some is None:
+    def put(self, members: MemberIndices, **new: Any) -> "MemberRuns":
+        """Return the runs with new values of members."""
+        if members is None:
             return self._replace(**new)
         for name, x in new.items():
-            getattr(self, name)[some] = x
+            getattr(self, name)[members] = x
         return self
 
-    def note(self, some: MemberIndices, rows: Int[Any, "b k"], *new: Any) -> "MemberRuns":
-        """Return the runs with values of `RECORD`, each (b or 1, k or 1, ...), in some rows of the record."""
-        members = (np.arange(len(self.t)) if some is None else some)[:, None]
+    def note(self, members: MemberIndices, rows: Int[Any, "b k"], *new: Any) -> "MemberRuns":
+        """Return the runs with new values of `RECORD`, each (b or 1, k or 1, ...), in `rows` of the record."""
+        column = (np.arange(len(self.t)) if members is None else members)[:, None]
         if isinstance(self.t, np.ndarray):
             for array, x in zip(self.record, new, strict=True):
-                array[members, rows] = x
+                array[column, rows] = x
             return self
-        return self._replace(record=tuple(x.at[members, rows].set(y) for x, y in zip(self.record, new, strict=True)))
+        return self._replace(record=tuple(x.at[column, rows].set(y) for x, y in zip(self.record, new, strict=True)))
 
 
-Change = Callable[[MemberRuns, MemberIndices], MemberRuns]  # of some members
+Change = Callable[[MemberRuns, MemberIndices], MemberRuns]
 
 
-def take(x: Any, some: MemberIndices) -> Any:
-    """Return the rows of some members."""
-    return x if some is None else x[some]
+def take(x: Any, members: MemberIndices) -> Any:
+    """Return the rows of members."""
+    return x if members is None else x[members]
 
 
 def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], xp: ModuleType, window: Any = None) -> MemberRuns:
-    """Return runs before their start, each with its `Result` so far."""
+    """Return runs before their start, with the `Result` known so far."""
     (B, n), E = state.q.shape, plan.count
     shapes = shapes_of_run(plan, T, n, plan.max_events + 1)._asdict()
     values = dict.fromkeys(EVENT_STATES, np.inf) | {"event_index": -1, "event_phase": -1, "together": False, "closed": 0}
@@ -137,7 +139,7 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
 
 
 def results(plan: EventPlan, runs: MemberRuns, ts: Float[Any, "B T"], unresolved: Float[Any, "B E"], xp: ModuleType) -> EventRun:
-    """Return the results of runs at their ends, whose outputs are those of their last states."""
+    """Return the results of finished runs; an output at the time of the last state is that state."""
     last, record = (ts == runs.t[:, None])[..., None], (x[:, : plan.max_events] for x in runs.record)
     q, v = xp.where(last, runs.q[:, None], runs.qs), xp.where(last, runs.v[:, None], runs.vs)
     ends = runs.count, unresolved, runs.undefined, runs.code, runs.totals

@@ -39,16 +39,16 @@ UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-
 
 
 class Given(NamedTuple):
-    """The arguments that code is compiled for: a mechanism's phases, and the start and the choices of a run."""
+    """The arguments of a run: the phases of a mechanism, the events, the initial state and the choices."""
 
     phases: Phases
     events: tuple[Event, ...]
     ts: Float[Array, "T"]
     state: State | None
-    closure: Closure | None  # in place of the state
+    closure: Closure | None  # instead of the state
     choices: Choices
     max_events: int
-    conditions: Conditions | None  # of all events, for machine code; None: it cannot serve the run
+    conditions: Conditions | None  # conditions of all events, for machine code; None if it cannot run them
 
 
 def simulate_events(
@@ -68,13 +68,13 @@ def simulate_events(
         events: one event or several, ready-made ones among them.
         analysis: its `Analysis`.
         ts: the output times (s).
-        state: the initial state, or None: that of `closure`.
+        state: the initial state; None: the state of `closure`.
         closure: the assembled initial guess.
         choices: the other arguments of `simulate`.
-        max_events: most events that may happen.
+        max_events: the largest number of events.
 
     Raises:
-        ValueError: the events do not fit the mechanism, or machine code was asked for and cannot run it.
+        ValueError: the events do not fit the mechanism, or machine code was requested but cannot run the system.
     """
     listed, phases = _prepare(mechanism, events, analysis)
     has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax and jax.default_backend() == "cpu"
@@ -92,7 +92,7 @@ def simulate_events(
     if is_within_jit() or is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
         return solution(mechanism, names, given, found, reasons, None)
-    found = jax.tree.map(np.asarray, found)  # each operation of JAX would compile a program
+    found = jax.tree.map(np.asarray, found)  # JAX would compile a program for each operation
     if np.isfinite(found.unresolved).any():
         fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
@@ -100,7 +100,7 @@ def simulate_events(
 
 
 def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
-    """Return the result of `_run` for concrete numbers; None if machine code alone cannot find it."""
+    """Return the result of `_run` for concrete numbers; None if machine code alone cannot compute it."""
     is_concrete = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
     if given.conditions is None or not is_concrete or jax.config.jax_disable_jit:
         return None
@@ -123,7 +123,7 @@ Prepared = tuple[tuple[Event, ...], Phases]
 
 
 def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToEvents], analysis: Analysis) -> Prepared:
-    """Return all events by their names, and the phases that they lead to; from the cache if numbers are concrete."""
+    """Return all events, with unique names, and the phases that they lead to; cached if all numbers are concrete."""
     listed = tuple(events) if isinstance(events, Sequence) else (events,)
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, listed, analysis))):
         return _expand(mechanism, listed, analysis)

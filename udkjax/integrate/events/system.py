@@ -12,26 +12,26 @@ from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunS
 
 
 class StateValues(NamedTuple):
-    """Conditions at some states, with their derivatives and what impulses along them do."""
+    """Conditions at states, their derivatives, and the directions of impulses along them."""
 
     a: Float[Any, "*m n"]
     g: Float[Any, "*m E"]
     rate: Float[Any, "*m E"]
-    rate_2: Float[Any, "*m E"]  # 0 of conditions that depend on velocities
+    rate_2: Float[Any, "*m E"]  # 0 for conditions that depend on velocities
     by_t: Float[Any, "*m E"]
     by_q: Float[Any, "*m E n"]
     by_v: Float[Any, "*m E n"]
-    directions: Float[Any, "*m E n"]  # of impulses; of events that are no impacts, of any value
+    directions: Float[Any, "*m E n"]  # directions of impulses; arbitrary for events that are not impacts
 
 
 class System(Protocol):
-    """The motion of the members of a batch: by machine code and NumPy, or, of one member, by JAX.
+    """The motion of the members of a batch by machine code and NumPy, or of one member by JAX.
 
     Attributes:
         xp: jax.numpy, or NumPy.
         plan: the phases and events.
         end: the last output times (B,).
-        rate: of the system and the run (1/s) (B,).
+        rate: characteristic rate of the system and the run (1/s) (B,).
         coordinates: the units of all coordinates (B, n).
         inverse_mass: one over the mass of each coordinate (B, n).
     """
@@ -43,27 +43,27 @@ class System(Protocol):
     coordinates: Float[Any, "B n"]
     inverse_mass: Float[Any, "B n"]
 
-    def contacts(self, some: MemberIndices) -> Contacts:
-        """Return the contacts of some members."""
+    def contacts(self, members: MemberIndices) -> Contacts:
+        """Return the contacts of members."""
         ...
 
-    def look(self, some: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
-        """Evaluate some members at states; if `is_free`, in phases without contacts at rest."""
+    def look(self, members: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
+        """Evaluate the conditions of members at states; if `is_free`, the phases have no contacts at rest."""
         ...
 
-    def project(self, some: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:
-        """Return positions and velocities that the phases of states allow."""
+    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:
+        """Return the states projected to the constraints of their phases."""
         ...
 
-    def add_joints(self, some: MemberIndices, event: Int[Any, "b"], q: Float[Any, "b n"], joints: Any) -> Any:
-        """Return the joints that events have added, with those that some events add at q; -1: none."""
+    def add_joints(self, members: MemberIndices, event: Int[Any, "b"], q: Float[Any, "b n"], joints: Any) -> Any:
+        """Return the joints that events have added, with those that `event` adds at q; -1: no event."""
         ...
 
-    def advance(self, runs: MemberRuns, some: MemberIndices) -> MemberRuns:
-        """Take some members on, no farther than to the next crossing, which is then their `event`."""
+    def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
+        """Advance members, at most to the next crossing, which becomes their `event`."""
         ...
 
-    def when(self, those: Bool[Any, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
+    def when(self, mask: Bool[Any, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
         """Return the runs with a change of the masked members."""
         ...
 
