@@ -17,12 +17,12 @@ from udkjax.native.base import code_cache
 from udkjax.threads import thread_count
 
 LEVEL = 1  # level of code generation; level 2 takes a fifth longer to compile, with equal run time
-QUICK = 0  # level for first calls: a quarter of the compile time; runs take twice as long, five times in lanes, and round equally
+QUICK = 0  # level for first calls: a quarter of the compile time; runs take twice as long, five times in lanes; equal rounding
 # Optimization passes before code generation. Programs have no common subexpressions and no dead code: LLVM's own selection for
-# level 1 would save two percent of a run's time and take half of the compile time.
+# level 1 would shorten runs by 2 % and double the compile time.
 PASSES = ("sroa", "simplify_cfg")
-PART_LINES = 1_000  # lines from which a function is compiled separately: 20 to 30 ms
-GROUP_LINES = 2_000  # lines of a group of smaller functions: 50 ms, to occupy all cores; the overhead of a part is 2 ms
+PART_LINES = 1_000  # a function of at least this many lines is compiled separately, in 20 to 30 ms
+GROUP_LINES = 2_000  # maximum lines of a group of smaller functions, compiled in 50 ms; each part has an overhead of 2 ms
 
 
 @cache
@@ -72,7 +72,7 @@ def _compiler() -> str:
 
 @cache
 def _linker() -> Any:
-    """Return the loader of object code; JITLink places code and constants next to each other, within relative addressing."""
+    """Return the loader of object code; JITLink places code and constants within reach of relative addresses."""
     llvm = _llvm()
     machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
     return llvm.create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
@@ -105,10 +105,10 @@ def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
 
 def _stored_code(text: str, level: int) -> tuple[bytes, int]:
     """Return the code of a level, or of a higher level if that is on disk, and the level."""
-    for some in range(LEVEL, level - 1, -1):
-        code = code_cache.read(digest(text, some))
+    for stored_level in range(LEVEL, level - 1, -1):
+        code = code_cache.read(digest(text, stored_level))
         if code is not None:
-            return code, some
+            return code, stored_level
     code = compile_module(text, level)
     code_cache.write(digest(text, level), code)
     return code, level
@@ -117,8 +117,8 @@ def _stored_code(text: str, level: int) -> tuple[bytes, int]:
 def split_module(text: str) -> list[str]:
     """Split a module into modules for parallel compilation, the largest first, each with its declarations."""
     text = f"\n{text}"  # searching for newlines is several times as fast as multiline anchors
-    found = (text[match.end() : text.index("\n}\n", match.end()) + 3] for match in re.finditer(r"\n(?=define )", text))
-    bodies = {body[body.index("@") + 1 : body.index("(", body.index("@"))]: body for body in found}
+    definitions = (text[match.end() : text.index("\n}\n", match.end()) + 3] for match in re.finditer(r"\n(?=define )", text))
+    bodies = {body[body.index("@") + 1 : body.index("(", body.index("@"))]: body for body in definitions}
     heads = {match[2]: f"{match[1]}\n" for match in re.finditer(r"\n((?:declare [^@\n]*)?@([\w.]+)[ (].*)", text)}
     lines = {name: body.count("\n") for name, body in bodies.items()}
     groups, size = [[name] for name in bodies if lines[name] >= PART_LINES], GROUP_LINES
@@ -145,7 +145,7 @@ def compile_module(text: str, level: int = LEVEL) -> bytes:
 
 
 def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[str] = PASSES) -> bytes:
-    """Compile a module to object code in a context of its own, so that threads compile in parallel."""
+    """Compile a module to object code in a separate context, so that threads can compile in parallel."""
     llvm = _llvm()
     with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
         module.triple = triple

@@ -13,25 +13,26 @@ class Memory:
     """The memory of a run, laid out by `places`, and its call record.
 
     The record has 8-byte fields (`call_fields`): the numbers of members, output times, breakpoints and directions; the addresses
-    of the inputs and their strides between members (in numbers); the addresses of the outputs; the lengths per member of some of
-    them; and the address of two words that threads share, the index of the next member and whether memory was refused.
+    of the inputs and their strides between members (in numbers); the addresses of the outputs; the lengths per member of some
+    inputs and outputs; and the address of two words that threads share, the index of the next member and whether memory was
+    refused.
     """
 
     plan: Plan
     places: Layout
     tangents: Layout  # memory of one direction of a derivative
-    begins: list[Callable[[Function], None]]  # write numbers that are stored once for each run
+    begins: list[Callable[[Function], None]]  # write the numbers that are stored once per run
     n: int  # coordinates
     m: int  # rows of Psi
-    rowcount: int  # registers that the coordinates take
+    rowcount: int  # number of registers of an array of coordinates
     stage_accelerations: list[str]
 
     settings: tuple[str, ...] = SETTINGS
-    inputs: tuple[str, ...] = ()  # in addition to those of every run
+    inputs: tuple[str, ...] = ()  # in addition to `INPUTS`
     results: tuple[str, ...] = OUTPUTS
     outputs: tuple[str, ...] = ()
     lengths: tuple[str, ...] = ()  # inputs and outputs whose length per member is in the call record
-    directions_in = 0  # the axis of the last input whose length is the number of directions
+    directions_in = 0  # axis of the last input; its length is the number of directions
     written_text = ""  # the text of the module, after `generate`
 
     @property
@@ -55,7 +56,7 @@ class Memory:
         return layout[name] * layout.width
 
     def registers(self, pointer: str) -> int:
-        """Return the number of registers that the coordinates take."""
+        """Return the number of registers of an array of coordinates."""
         return -(-self.n * self.layout(pointer).width // self.plan.vector)
 
     def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
@@ -75,8 +76,8 @@ class Memory:
         with f.each(self.rowcount) as r:
             for x in values(r):
                 worst.value = f.max(x, worst.value)
-        found = worst.value
-        return found if self.plan.width > 1 else f.largest_of(found)
+        result = worst.value
+        return result if self.plan.width > 1 else f.largest_of(result)
 
     def address(self, f: Function, name: str) -> Value:
         return f.at(f.given["work"], self.places[name] * self.plan.width)
@@ -109,7 +110,7 @@ class Memory:
             for name, x in zip(sources, "qva", strict=True):
                 self.put(f, f"{to} {x}", r, f.select(mask, self.vector(f, name, r), self.vector(f, f"{to} {x}", r)))
 
-    # --- single numbers of arrays, of all lanes or of one
+    # --- single numbers of arrays, in all lanes or in one
 
     def place(self, name: str, i: Operand = 0, pointer: str = "work") -> Operand:
         """Return the index, relative to a pointer, of the i-th number of an array in the first lane."""
@@ -133,7 +134,7 @@ class Memory:
 
     @contextmanager
     def each_lane(self, f: Function, mask: Value) -> Iterator[Value]:
-        """Run the block with the index of every lane in which a condition holds or a number is one."""
+        """Run the block for each lane whose mask is true, or one, with the index of the lane."""
         marks = mask if mask.base == DOUBLE else f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
         with f.each(f.width) as k, f.if_(f.lane(marks, k) > 0.5):
             yield k

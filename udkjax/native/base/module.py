@@ -11,7 +11,7 @@ from udkjax.native.base.memory import Memory
 from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.steps import POINTS
 
-# Functions that are called once for each run, near singular configurations, or where a piece may end.
+# Rarely called functions: once per run, near singular configurations, or where a piece may end.
 COLD = (
     "leave",
     "finish_members",
@@ -133,7 +133,7 @@ class Module(Memory):
 
     @property
     def solving(self) -> list[str]:
-        """The names of the functions that solve: programs by elimination, or dense equations."""
+        """The names of the functions that solve linear systems: programs by elimination, or dense equations."""
         if not self.plan.projected:
             return ["accelerations"]
         of_step = ["project_and_accelerate", "tangent_part"] if self.method.ends else ["end_of_step"]
@@ -242,13 +242,13 @@ class Module(Memory):
         """Hook: writes the functions of derivatives; does nothing by default."""
 
     def record_stage(self, f: Function, s: Lane, i: int):
-        """Hook: called at the state of stage i of a step, after its accelerations."""
+        """Hook: called at the state of stage i of a step, after its accelerations have been computed."""
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         """Hook: called after a step, when its end has become point 3 in lanes that `accept`."""
 
     def record_output(self, f: Function, s: Lane):
-        """Hook: called with a state between steps (`state t`, `state q`, `result v`) of lanes that are `due`."""
+        """Hook: called at an output (`state t`, `state q`, `result v`) of lanes that are `due`."""
 
     def weigh_rows(self):
         """Reserve memory for weights of rows, which are set for the member in each lane."""
@@ -256,7 +256,7 @@ class Module(Memory):
             self.places.add("weights", self.m)
 
     def begin_memory(self, f: Function):
-        """Store numbers that are the same for all members, once for each run, in zeroed memory."""
+        """Store the numbers that all members share, once per run, in zeroed memory."""
         for begin in self.begins:
             begin(f)
 
@@ -267,10 +267,10 @@ class Module(Memory):
                 self.put_lane_entry(f, "weights", lane, length / self.lane_entry(f, "rows", lane, i), i)
 
     def begin_member(self, f: Function, lane: Value, member: Value):
-        """Hook: called with a member that is taken into a lane; does nothing by default."""
+        """Hook: called when a member is loaded into a lane; does nothing by default."""
 
     def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
-        """Hook: called with the addresses of new numbers and constants of a lane; does nothing by default."""
+        """Hook: called with the addresses of the numbers and constants of a lane when they have changed."""
 
     def end_members(self, f: Function, s: Lane):
         """Hook: called for completed members, in lanes that are `due`."""

@@ -16,7 +16,7 @@ from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, l
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
 COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
 HALF_PI = (math.pi / 2, 6.123233995736766e-17)  # in two parts: their sum is exact to 107 binary digits
-ROUND = 1.5 * 2.0**52  # added to a number, it leaves the nearest integer in the last digits
+ROUND = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
 _COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
 _INTRINSIC = {
     "abs": "fabs", "exp": "exp", "log": "log", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum", "pow": "pow",
@@ -49,7 +49,7 @@ def write(
 ) -> Function:
     """Write a program as a function of some pointers; conditions are stored as one or zero.
 
-    `lanes` are the widths of pointers to numbers of another width; results that depend only on single numbers are computed once.
+    `lanes` has the widths of pointers to numbers of another width; results that depend only on single numbers are computed once.
     """
     f = Function(name, [(POINTER, x) for x in pointers], width, cold=cold)
     writer, lanes = Writer(f, program), dict.fromkeys(pointers, width) | dict(lanes or {})
@@ -63,7 +63,7 @@ def write(
 
 
 def vector_function(program: ScalarProgram, name: str, given: str, found: str, places: Sequence[int] | None = None) -> Function:
-    """Return a function of two pointers: inputs are contiguous at `given`; outputs go to `places` of `found`, None: all."""
+    """Return a function of two pointers: contiguous inputs at `given`, outputs at `places` of `found`, by default contiguous."""
     outputs = consecutive(found, len(program.outputs)) if places is None else [(found, k) for k in places]
     return write(program, name, 1, (given, found), consecutive(given, len(program.inputs)), outputs)
 
@@ -89,9 +89,9 @@ class Writer:
         used = Counter(s.index for index in self.program.order for s in nodes[index].arguments)
         used.update(s.index for s in self.program.outputs)
         for index in self.program.order:
-            self.values[index] = found = self._operation(nodes[index])
+            self.values[index] = result = self._operation(nodes[index])
             if used[index] > 1:  # fused with several sums, a product would occupy two registers instead of one
-                found.product = None
+                result.product = None
         return [self._with_sign(s) for s in self.program.outputs]
 
     def _with_sign(self, s: Any) -> Value:
@@ -146,8 +146,8 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             return _log1p(f, a[0])
         case "sign":
             zero = f.const(0.0, DOUBLE, f.width)
-            one = f.select(a[0] > zero, f.const(1.0, DOUBLE, f.width), f.const(-1.0, DOUBLE, f.width))
-            return f.select(a[0].is_(zero) | a[0].is_not(a[0]), a[0], one)
+            unit = f.select(a[0] > zero, f.const(1.0, DOUBLE, f.width), f.const(-1.0, DOUBLE, f.width))
+            return f.select(a[0].is_(zero) | a[0].is_not(a[0]), a[0], unit)
         case "select_n" if len(a) == 3 and a[0].base == BOOL:
             return f.select(a[0], a[2], a[1])
         case "clamp":
@@ -186,9 +186,9 @@ def _convert(f: Function, a: Value, dtype: Any) -> Value:
 def _expm1(f: Function, x: Value) -> Value:
     """Return e^x - 1 (Kahan), accurate also for small x."""
     u = f.intrinsic("exp", x)
-    small, gone = u.is_(1.0), (u - 1.0).is_(-1.0)
-    exact = (u - 1.0) * x / f.intrinsic("log", f.select(small | gone | ~f.is_finite(u), 2.0, u))
-    return f.select(small, x, f.select(gone | ~f.is_finite(u), u - 1.0, exact))
+    small, vanishes = u.is_(1.0), (u - 1.0).is_(-1.0)
+    exact = (u - 1.0) * x / f.intrinsic("log", f.select(small | vanishes | ~f.is_finite(u), 2.0, u))
+    return f.select(small, x, f.select(vanishes | ~f.is_finite(u), u - 1.0, exact))
 
 
 def _log1p(f: Function, x: Value) -> Value:
@@ -211,8 +211,8 @@ def integer_power(a: Value, n: int) -> Value:
 
 
 def sincos(f: Function, a: Value) -> tuple[Value, Value]:
-    """Return sine and cosine to rounding, by one reduction to within pi / 4 and two polynomials, without library calls."""
-    width, T, whole = a.width, a.type, llvm_type(INT, a.width)
+    """Return sine and cosine, exact to rounding, by one reduction to within pi / 4 and two polynomials; no library calls."""
+    width, T, integers = a.width, a.type, llvm_type(INT, a.width)
     shifted = f.fma(a, 2 / math.pi, ROUND)
     turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUND, DOUBLE, width).name}", DOUBLE, width)
     x = f.fma(turns, -HALF_PI[0], a)
@@ -224,7 +224,7 @@ def sincos(f: Function, a: Value) -> tuple[Value, Value]:
     s = f.fma(s, y * x, x)
     for k in range(8, -1, -1):
         c = f.fma(c, y, COS[k])
-    quarter = f.op(f"bitcast {T} {shifted.name} to {whole}", INT, width)
+    quarter = f.op(f"bitcast {T} {shifted.name} to {integers}", INT, width)
 
     def bit(j: Value, mask: int) -> Value:
         return f.logic("and", j, mask).is_not(0)

@@ -8,7 +8,7 @@ close a mechanism ("_newton_q", "_newton_v") the functions are
     twice(work, stored, tangent, out)     the same along two directions and along both, in three consecutive tangents
     reverse(work, stored, bar)      `bar constants` and `bar state`, from the cotangents of the results
 
-All except the accelerations write tangents to `result` of a tangent, and read cotangents from `bar result`.
+All programs except the accelerations write tangents to `result` of a tangent, and read cotangents from `bar result`.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from udkjax.native.base.module import Module
 from udkjax.native.base.program import PointerPlace
 
 WAYS = ("d", "e", "de")  # derivatives along two directions and along both, one in each of three tangents
-GIVEN = ("d", "e")  # directions of numbers and of the first state, which have no second derivative
+GIVEN = ("d", "e")  # directions of numbers and of initial states, whose second derivatives are zero
 
 
 class ProgramDerivative:
@@ -51,13 +51,13 @@ class ProgramDerivative:
             module.places.add("along", len(PREFIXES[module.mode]) * sum(module.code.stored_sizes.values()))
 
     def place(self, name: str) -> int:
-        """Return the offset of an array among those that loops store."""
+        """Return the offset of an array in the results that loops store."""
         return self._stored[name]
 
     @property
     def _at(self) -> dict[str, PointerPlace]:
-        results = {x: ("stored", place) for x, place in self._stored.items()}
-        return self._module.arrays | results | {"stored": ("stored", 0)}
+        stored_arrays = {x: ("stored", place) for x, place in self._stored.items()}
+        return self._module.arrays | stored_arrays | {"stored": ("stored", 0)}
 
     def _along(self, prefixes: Sequence[str]) -> dict[str, PointerPlace]:
         if self._module.unrolled:
@@ -90,9 +90,9 @@ class ProgramDerivative:
 
     def reverse(self):
         module, p = self._module, self._module.places
-        found = {"constants": "bar constants", "q": "bar state q", "v": "bar state v", "q1": "bar result q", "v1": "bar result v"}
+        bars = {"constants": "bar constants", "q": "bar state q", "v": "bar state v", "q1": "bar result q", "v1": "bar result v"}
         prefixes, program = PREFIXES[module.mode], self._evaluated.in_mode(module.mode, self._fixed)
-        at = self._at | self._along(prefixes) | {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
+        at = self._at | self._along(prefixes) | {COTANGENT + x: ("work", p[place]) for x, place in bars.items()}
         counts = {x: module.code.stored_sizes[x] for x in self._stored} | {
             "constants": len(module.moving),
             "q": module.n,

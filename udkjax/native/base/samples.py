@@ -29,14 +29,14 @@ def enter_first_row(module: Module, f: Function, lane: Value, member: Value):
 
 
 def write_next_breakpoint(module: Module):
-    """Write `next_breakpoint(work, call)`: `due` becomes the first breakpoint that a lane has not passed; infinite if none."""
+    """Write `next_breakpoint(work, call)`: `due` becomes the first breakpoint that a lane has not passed, or infinity."""
     f, s = module.function("next_breakpoint", ARGUMENTS[:2])
     knots = module.field(f, "knots")
     with f.each(f.width) as k:
-        knot, at = module.to_int(f, f.lane(s.knot, k)), f.variable(float("inf"), width=1)
+        knot, time = module.to_int(f, f.lane(s.knot, k)), f.variable(float("inf"), width=1)
         with f.if_(knot < knots):
-            at.value = module.input_number(f, "breaks", f.lane(s.member, k), knot)
-        module.put_lane_entry(f, "due", k, at.value)
+            time.value = module.input_number(f, "breaks", f.lane(s.member, k), knot)
+        module.put_lane_entry(f, "due", k, time.value)
 
 
 def write_enter(module: Module):

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 
 class StepFactors(NamedTuple):
-    """The ratio of a step to the previous one: `safety` times the one whose error equals the tolerance, from `shrink` to `grow`.
+    """Factors of step control: the next step is `safety` times the step whose error would equal the tolerance.
 
-    These are the usual bounds. With a safety of 0.9 every tenth step of a typical run is rejected, and most runs take 4 to 15 %
-    more steps at equal error. A step that is repeated because of a small pivot is shortened by `safety`.
+    Its ratio to the previous step is between `shrink` and `grow`. These are the usual bounds. With a safety of 0.9 a tenth of the
+    steps of a typical run is rejected, and most runs take 4 to 15 % more steps for the same error. A step that is repeated
+    because of a small pivot is shortened by `safety`.
     """
 
     safety: float = 0.8
@@ -17,21 +18,21 @@ class StepFactors(NamedTuple):
 
 FACTORS = StepFactors()
 
-# Length of the first step after a breakpoint, relative to the step before it. Its outputs are interpolated from states on one
-# side only and have larger errors: with `safety` instead, the error of rates across the knots of a cam is 34 times the tolerance,
-# not ten.
+# Length of the first step after a breakpoint, relative to the step before it. Outputs in this step are interpolated from states
+# on one side only and have larger errors: with `safety` instead of 0.5, the error of rates across the knots of a cam is 34 times
+# the tolerance instead of ten times.
 RESTART_FACTOR = 0.5
 
 # Steps near singular configurations. The distance is the root of the smallest pivot of D D^T relative to its diagonal entry.
 RETRIES = 3  # attempts to avoid a pivot that is too small for elimination, before the fallback takes the step
 # Smallest distance at the stages of a step: elimination is not used below 1e-3 (`BRANCH_TOL`).
 NEAREST_STAGE = 1.5e-3
-# Rounding errors of accelerations, in the scene's own units, are this number over the third power of the distance; their
+# The rounding error of accelerations, in the scene's own units, is this number divided by the cube of the distance. Its
 # contribution to the velocity in a step must be less than the tolerance.
 ROUNDING_GROWTH = 3e-14
-# SURE: fraction of a step. A singular configuration that is predicted before this point lies before the end of the step, although
-# predictions are early by up to a tenth of a step. From far away a prediction may be early by three tenths, so that the
-# configuration is still ahead: then the distance at the end is less than EXPECTED times the extrapolated one.
+# SURE: fraction of a step. If a singular configuration is predicted before this fraction, the step certainly passes it:
+# predictions are too early by at most a tenth of a step. From far away they may be too early by three tenths, and the configuration
+# may still be ahead; then the distance at the end of the step is less than EXPECTED times the extrapolated distance.
 SURE, EXPECTED = 0.85, 0.3
 
 # Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.
@@ -42,18 +43,19 @@ ENDS_BEFORE, BEGINS_BEHIND = 2 * UNIT, UNIT
 GAP = ENDS_BEFORE + BEGINS_BEHIND
 
 # Pieces of the state.
-EDGE = 1e-7  # length of the step across the end of a piece, as a fraction of a step; its error is of the order of the square
+EDGE = 1e-7  # length of the step across the end of a piece, as a fraction of a step; its error is of the order of its square
 # Fraction of a step. The end of a piece nearer than this to an end of the step is located to rounding from the state there.
 NEAR_END = 0.01
-# A repeated step ends slightly beyond the end of a piece; or just before it, once it has been located; or leads across it.
+# A repeated step ends slightly beyond the end of a piece; once the end has been located, a step ends just before it, and the next
+# leads across.
 AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
-HALVINGS = 40
-TRIES = 8  # successive attempts to end a step at the end of a piece: at rest there, rounding decides which piece applies
+HALVINGS = 40  # bisections that locate the end of a piece within a step
+TRIES = 8  # attempts in succession to end a step at the end of a piece; at rest there, rounding decides which piece applies
 
 POINTS = 4  # states that the interpolating polynomial passes through; with three, velocities between steps are less accurate
 # Fraction of a step. If less than this would remain for the last step, the remaining time is halved instead. Outputs of the
-# first step wait for the second, and interpolation through a pair of close points amplifies rounding: to 1e-4 m/s if the last
-# step is 1 / 300.
+# first step are interpolated after the second, and interpolation through two close points amplifies rounding errors: to 1e-4 m/s
+# if the last step is 1/300 of the step before it.
 SHORTEST_LAST = 0.25
 STRETCH = 12.0  # largest ratio of the last step to those before: steps grow at most tenfold
 
@@ -68,16 +70,16 @@ class Status:
     RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, CROSSED, UNRESOLVED = range(8)
 
 
-# Largest row of Psi over its scale after the projection of a step, which usually leaves 1e-12. Beyond it no position nearby is
-# closed, for instance because a driver exceeds the range of a linkage, and the motion cannot be continued.
+# Tolerance of Psi after the projection of a step, each row over its scale; projection usually leaves 1e-12. If it is exceeded, no
+# position nearby is closed, for instance because a driver exceeds the range of a linkage, and the motion cannot be continued.
 LOST_TOL = 1e-2
 
 LOOK_AHEAD = 1e-6  # fraction of the span after the end of a stopped run that is searched for non-finite numbers
 
-# Weight of the error component normal to the manifold. Projection removes this component, so that only its effect within the step
-# remains. Near singular configurations it is the stages' distance from the manifold over a small singular value: with weight one,
-# runs took up to six times as many steps at tolerances of 1e-11. With 1e-2 some of these steps are left; with zero, runs across
-# singular configurations are less accurate than their tolerance.
+# Weight of the error component normal to the manifold. Projection removes this component, and only its effect within the step
+# remains. Near singular configurations the component is the stages' distance from the manifold divided by a small singular value:
+# with weight one, runs took up to six times as many steps at tolerances of 1e-11. With weight 1e-2 some of these extra steps
+# remain; with weight zero, runs across singular configurations are less accurate than their tolerance.
 NORMAL_ERROR_WEIGHT = 1e-3
 
 # Thresholds of a pivot, relative to its diagonal entry of D D^T. A pivot below the first is a rounding error. Rows of outputs
@@ -85,12 +87,13 @@ NORMAL_ERROR_WEIGHT = 1e-3
 # velocities.
 ROUNDING_PIVOT, OUTPUT_PIVOT_TOL = 1e-14, 1e-8
 
-OUTPUT_STEPS = 7  # Newton steps for an output: where two branches of the manifold meet, each only halves the distance
+OUTPUT_STEPS = 7  # Newton steps for an output: where two branches of the manifold meet, a step only halves the distance
 NEWTON_STEPS = 3  # maximum number of Newton steps in a projection; the last usually changes nothing
-# Newton steps that move q by less, in characteristic lengths or rad, are the last: the method converges quadratically.
+# A Newton step that moves q by less, in characteristic lengths or rad, is the last: the method converges quadratically.
 NEWTON_TOL = 1e-8
-# Tolerance of Psi at an output after its projection, each row over its scale: Newton's last step leaves far less, and
-# interpolation without projection far more. If it is exceeded, the output is closed on all rows.
+# Tolerance of Psi at an output after its projection, each row over its scale: the last Newton step leaves much
+# less, and interpolation without projection much more. If it is exceeded, the output is closed on all rows.
 OPEN_OUTPUT = 1e-9
-# Outputs nearer to the manifold take a single Newton step in q and v, which leaves a residual of the distance squared.
+# Outputs nearer to the manifold need only one Newton step in q and v, which leaves a residual of the order of the distance
+# squared.
 SINGLE_STEP_TOL = 1e-7

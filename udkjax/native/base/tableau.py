@@ -20,7 +20,7 @@ class Method:
     order: float
     ends: bool  # whether the last stage is the first of the next step
 
-    _methods: ClassVar[dict[tuple[bytes, ...], "Method"]] = {}  # by their numbers: operations are looked up by identity
+    _methods: ClassVar[dict[tuple[bytes, ...], "Method"]] = {}  # by their numbers, as operations compare methods by identity
 
     @classmethod
     def of(
@@ -39,7 +39,7 @@ class Method:
 
     @property
     def clearings(self) -> tuple[float, float]:
-        """Fractions of a step far from all nodes: the middle of the widest gap between two nodes, and of the widest before it."""
+        """Fractions of a step far from all nodes: the middles of the widest gap between nodes, and of the widest gap before."""
         nodes = np.unique(self.nodes)
         middles, gaps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
         widest = np.argmax(gaps)

@@ -1,6 +1,6 @@
 """Rows for dense methods: D = W Psi_q M^(-1/2), with W the characteristic length over the scale of each row.
 
-They are made from the arrays `psi_q` and `root`, M^(-1/2).
+D is computed from the arrays `psi_q` and `root`, which holds M^(-1/2).
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,17 +15,17 @@ _ENTRIES, _FACTORS, _CHOSEN = "@entries", "@factors", "@chosen"
 
 
 class RowEntries:
-    """The entries of Psi_q, or of chosen rows of it, with their tables among the constants of a module.
+    """The entries of Psi_q, or of some of its rows; their tables are constants of the module.
 
-    A module has only one choice of rows.
+    All instances in a module must choose the same rows.
     """
 
     def __init__(self, module: Module, chosen: Sequence[int] | None = None):
         self._module = module
         rows, columns, places, factors = module.code.psi_q_entries
         if chosen is not None:
-            kept = np.isin(rows, chosen)
-            rows, columns, places, factors = (x[kept] for x in (np.searchsorted(chosen, rows), columns, places, factors))
+            is_chosen = np.isin(rows, chosen)
+            rows, columns, places, factors = (x[is_chosen] for x in (np.searchsorted(chosen, rows), columns, places, factors))
         self._count = len(rows)
         self._chosen = range(module.m) if chosen is None else chosen
         entries = ", ".join(f"i64 {x}" for entry in zip(rows, columns, places, strict=True) for x in entry)
@@ -52,7 +52,7 @@ class RowEntries:
 class WeightedRows(RowEntries):
     """The rows of a module, and their solution by a dense method in all lanes, or lane by lane.
 
-    Lane by lane, functions that use it have one lane, whose index is their argument `lane`.
+    If `by_lane`, functions that use it have one lane, whose index is their argument `lane`.
     """
 
     def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False, chosen: Sequence[int] | None = None):

@@ -14,13 +14,13 @@ class BatchProgram:
     """A program of scalars, evaluated for M members on the calling thread.
 
     Args:
-        program: the program; its first inputs differ between members.
-        shared: number of the last inputs that are the same for all members.
+        program: its first inputs differ between members.
+        shared: number of inputs, the last ones, that are the same for all members.
     """
 
     def __init__(self, program: ScalarProgram, shared: int = 0):
         self.program, self.width = program, machine.lanes()
-        self.own = len(program.inputs) - shared
+        self._input_count = len(program.inputs) - shared
         f = self._write()
         self._library = machine.library("\n".join([*sorted(f.declared), f.text()]), (f.name,))
         self._run = machine.function(self._library[f.name], *[ctypes.c_void_p] * 3, ctypes.c_int64)
@@ -29,12 +29,12 @@ class BatchProgram:
         """Return the outputs (outputs, M) for inputs (inputs, M) and shared inputs."""
         count = members.shape[1]
         padded = -(-count // self.width) * self.width
-        given = np.empty((self.own, padded))
-        given[:, :count], given[:, count:] = members, members[:, -1:]
-        same = np.ascontiguousarray(np.zeros(1) if shared is None else shared, float)
-        found = np.empty((len(self.program.outputs), padded))
-        self._run(given.ctypes.data, same.ctypes.data, found.ctypes.data, padded)
-        return found[:, :count]
+        inputs = np.empty((self._input_count, padded))
+        inputs[:, :count], inputs[:, count:] = members, members[:, -1:]
+        shared_inputs = np.ascontiguousarray(np.zeros(1) if shared is None else shared, float)
+        outputs = np.empty((len(self.program.outputs), padded))
+        self._run(inputs.ctypes.data, shared_inputs.ctypes.data, outputs.ctypes.data, padded)
+        return outputs[:, :count]
 
     def _write(self) -> Function:
         f = Function("run", [(POINTER, "members"), (POINTER, "shared"), (POINTER, "found"), (INT, "count")], self.width)
@@ -44,10 +44,10 @@ class BatchProgram:
             for k, s in enumerate(self.program.inputs):
                 if not self.program.uses(s):
                     continue
-                if k < self.own:
+                if k < self._input_count:
                     x = f.load(f.given["members"], count * k + first, self.width)
                 else:
-                    x = f.repeat(f.load(f.given["shared"], k - self.own), self.width)
+                    x = f.repeat(f.load(f.given["shared"], k - self._input_count), self.width)
                 writer.values[s.index] = from_memory(f, x, s.node.dtype)
             for k, value in enumerate(writer.run()):
                 f.store(value, f.given["found"], count * k + first, self.width)

@@ -2,8 +2,8 @@
 
     q <- q - s C J^T y,      J C J^T y = Psi,      J = Psi_q,      C = M^(-1)
 
-by steps that are limited, and halved until the residual falls; then v is projected onto the constraints. Corrections are those of
-corrections.py, with all rows.
+with steps of limited length, which are halved until the residual decreases; then v is projected onto the constraints. The
+corrections of corrections.py use all rows.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ class Closing(Module):
 
     settings = ("length", "fallback_tol")
     results = ("state", "residuals", "rank")
-    further = 1  # corrections of a closed state, which only change derivatives
+    further = 1  # further corrections, of the closed state, which only change derivatives
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
         plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, unrolled=False, steps=False)
@@ -68,11 +68,11 @@ class Closing(Module):
             self.invoke(f, "psi")
             total = f.variable(0.0)
             with f.each(m) as i:
-                part = self.entry(f, "psi", i) / self.entry(f, "rows", i)
-                total.value = f.fma(part, part, total.value)
+                relative = self.entry(f, "psi", i) / self.entry(f, "rows", i)
+                total.value = f.fma(relative, relative, total.value)
             return f.intrinsic("sqrt", total.value)
 
-        def moved(scale: Value):
+        def move(scale: Value):
             with f.each(n) as i:
                 q = f.fma(scale, self.entry(f, "state dq", i), self.entry(f, "corrected q", i))
                 self.put_entry(f, "state q", i, q)
@@ -99,16 +99,16 @@ class Closing(Module):
                 scale = f.variable(f.select(longest.value > LONGEST_STEP, LONGEST_STEP / longest.value, f.const(1.0)))
                 halvings, better.value = f.variable(0, INT), 0.0
                 with f.while_(lambda: (better.value < 0.5) & (halvings.value < STEP_HALVINGS)):
-                    moved(scale.value)
+                    move(scale.value)
                     better.value = f.select(size() < before, f.const(1.0), 0.0)
                     scale.value = scale.value * 0.5
                     halvings.value = halvings.value + 1
                 with f.if_(better.value < 0.5):
-                    moved(f.const(0.0))
+                    move(f.const(0.0))
                 with f.if_(better.value > 0.5):
-                    taken = scale.value * 2.0
+                    step_scale = scale.value * 2.0
                     limited = f.select(longest.value > LONGEST_STEP, f.const(1.0), 0.0)
-                    self._at_previous_state(f, "q", lambda: self._record_correction(f, "q", taken, limited))
+                    self._at_previous_state(f, "q", lambda: self._record_correction(f, "q", step_scale, limited))
         for _ in range(self.further):
             self._record_correction(f, "q", f.const(1.0), f.const(0.0))
         for _ in range(VELOCITIES):
@@ -153,7 +153,7 @@ class Closing(Module):
         """Hook: called at the state before each correction with its `scale`, and `limited`, one if the scale is a limit."""
 
     def _finish_closing(self, f: Function, member: Value):
-        """Hook: called for a closed member."""
+        """Hook: called when a member has been closed."""
 
     def _at_previous_state(self, f: Function, x: str, do: Callable[[], None]):
         """Run `do` at the state before a step, which is in `corrected q`, instead of the state after it."""

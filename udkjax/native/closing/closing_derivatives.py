@@ -1,9 +1,9 @@
 """Derivatives of closing a mechanism, through its steps, in forward mode along directions and in reverse mode.
 
-The coordinates change by -s times a correction; if s limits the step, it is a function of the correction as well. After the last
-step, one more correction only changes the derivative, which it projects onto the constraint manifold. corrections.py has the
-derivatives of corrections. Second derivatives take another correction, as large tangents leave an error of their square after the
-first.
+The coordinates change by -s times a correction; if the step is limited, s depends on the correction as well. After the last
+step, one more correction changes only the derivative, which it projects onto the constraint manifold. corrections.py has the
+derivatives of corrections. Second derivatives need a further correction, because the first leaves an error of the square of the
+tangents.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -71,11 +71,11 @@ class ClosingForward(ClosingDerivative):
     def _write_push(self, x: str):
         """Write push_x(work, scale, limited): the tangents of a correction times `scale`, which may be `limited`."""
         f, _ = self.function(f"push_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
-        known = self._linearize(f, x)
+        stored = self._linearize(f, x)
         longest, which = self._longest(f, x)
         limits = (f.given["limited"] > 0.5) & (longest > 0.0)
         with self._each_direction(f):
-            f.call(f"{self.mode}_newton_{x}", f.given["work"], known, f.given["d"], f.given["d"])
+            f.call(f"{self.mode}_newton_{x}", f.given["work"], stored, f.given["d"], f.given["d"])
             for way in self.ways:
                 with f.each(self.n) as i:
                     self._increase(f, f"result {x}", i, -self.entry(f, f"state {x}", i, way), way)
@@ -93,7 +93,7 @@ class ClosingForward(ClosingDerivative):
 
     @contextmanager
     def _each_direction(self, f: Function) -> Iterator[Value]:
-        """Run the block for every direction, with the addresses of its tangents by their names."""
+        """Run the block for every direction; the tangents' addresses become arguments of the function, by name."""
         first = f.load(f.given["work"], self.places["tangents"], base=POINTER)
         with f.each(self.field(f, "directions")) as p:
             for k, way in enumerate(self.ways):
@@ -157,15 +157,15 @@ class ClosingTwice(ClosingForward):
         self._eliminated[x].forward()
 
     def _linearize(self, f: Function, x: str) -> Value:
-        known = self.address(f, "linearization")
-        f.call(f"eliminated_newton_{x}", f.given["work"], f.given["work"], known)
+        stored = self.address(f, "linearization")
+        f.call(f"eliminated_newton_{x}", f.given["work"], f.given["work"], stored)
         self._evaluate(f, x)
-        return known
+        return stored
 
     def _limited(self, steps: dict[str, Value], shares: dict[str, Value], step: Value) -> dict[str, Value]:
-        (one, other, _), (a, b, _) = ([found[way] for way in self.ways] for found in (steps, shares))
-        moved = super()._limited(steps, shares, step)
-        return moved | {"de": moved["de"] - a * other - b * one + (a * b * 2.0) * step}
+        (step_d, step_e, _), (a, b, _) = ([values[way] for way in self.ways] for values in (steps, shares))
+        first_order = super()._limited(steps, shares, step)
+        return first_order | {"de": first_order["de"] - a * step_e - b * step_d + (a * b * 2.0) * step}
 
 
 class ClosingReverse(ClosingDerivative):
@@ -177,9 +177,9 @@ class ClosingReverse(ClosingDerivative):
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
-        n, most, p = self.n, CLOSURE_ITERATIONS + 1 + VELOCITIES, self.places
+        n, capacity, p = self.n, CLOSURE_ITERATIONS + 1 + VELOCITIES, self.places
         self.row = 3 + 2 * n  # length of a row of the record: index of the quantity, scale, whether limited, q and v before
-        p.add("record", most * self.row)
+        p.add("record", capacity * self.row)
         p.add("records")
         for name, count in {
             "total bar constants": self.constants,
@@ -243,10 +243,10 @@ class ClosingReverse(ClosingDerivative):
                 self.put_entry(f, f"bar iterate {x}", i, f.load(bars, i + k * self.n))
 
     def _finish_closing(self, f: Function, member: Value):
-        def left() -> Value:
+        def has_records() -> Value:
             return self.entry(f, "records", 0) > 0.5
 
-        with f.while_(left):
+        with f.while_(has_records):
             self.put_entry(f, "records", 0, self.entry(f, "records", 0) - 1.0)
             row = f.at(f.given["work"], self.to_int(f, self.entry(f, "records", 0)) * self.row + self.places["record"])
             for k, x in enumerate("qv"):

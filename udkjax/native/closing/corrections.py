@@ -1,18 +1,20 @@
 """Corrections that close a mechanism, with their derivatives: x - M^(-1/2) D^+ r, for q with r = Psi, and for v with r = Psi_dot.
 
-For small scenes they are of least norm, by singular values. With weighted rows, A = W Psi_q M^(-1/2) and z = A^+ W r, along a
-change of the state and of the numbers, where the rank is constant (Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413),
+Small scenes use the correction of least norm, by singular values. With A = W Psi_q M^(-1/2), W the weights of the rows, and
+z = A^+ W r, the derivatives along a change of the state and of the numbers, where the rank is constant, are (Golub, Pereyra,
+SIAM J. Numer. Anal. 10 (1973) 413)
 
     dz = A^+ (dr - dA z - A g) + g,        g = dA^T y,        y = (A^+)^T z,
 
-and transposed, from a cotangent w of z,
+and in reverse mode, from a cotangent w of z,
 
     u = (A^+)^T w,    h = w - A^T u:    u is the cotangent of r, and -u z^T + y h^T that of A.
 
-While loops are open, redundant rows are inconsistent: singular values below the rank tolerance are not exactly zero. The rotation
-of their vectors is neglected, a relative error of the derivative of the size of their product with the violation, at most 1e-6.
+While loops are open, redundant rows are inconsistent, and singular values below the rank tolerance are not exactly zero. The
+rotation of their singular vectors is neglected. The relative error of the derivative is the product of these singular values and
+the violation, at most 1e-6.
 
-For large scenes they are by elimination of all rows with dependent ones left out.
+Large scenes use elimination of all rows, with dependent rows left out.
 """
 
 from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
@@ -27,7 +29,7 @@ class EliminationCorrection(ProgramDerivative):
     """A correction by elimination."""
 
     def write_adjoint(self):
-        """Do nothing: an evaluation stores all intermediate results."""
+        """Do nothing: the evaluation already stores all intermediate results."""
 
     def prepare_derivative(self, f: Function):
         """Do nothing."""
@@ -42,7 +44,7 @@ class EliminationCorrection(ProgramDerivative):
 
 
 class LeastNormCorrection:
-    """A correction by singular values, for one lane. The stored results are x corrected, z, y.
+    """A correction by singular values, for one lane. It stores the corrected x, z and y.
 
     Derivatives at the same state use the factors of A from the evaluation.
     """
@@ -145,9 +147,9 @@ class LeastNormCorrection:
     def reverse(self):
         """Write `reverse_...(work, stored, bar)`: from cotangents of the correction to those of the state and the constants."""
         module, p = self._module, self._module.places
-        found = {"constants": "bar constants", "q": "bar state q", "v": "bar state v"}
+        bars = {"constants": "bar constants", "q": "bar state q", "v": "bar state v"}
         at = module.arrays | {"root": ("work", p["root"])} | self._changes(COTANGENT)
-        at |= {COTANGENT + x: ("work", p[place]) for x, place in found.items()}
+        at |= {COTANGENT + x: ("work", p[place]) for x, place in bars.items()}
         counts = {"constants": len(module.moving), "q": module.n, "v": module.n}
         cleared = [Reset(COTANGENT + x, 0, count) for x, count in counts.items()]
         name = f"row_cotangents_{self._x}"
@@ -170,11 +172,11 @@ class LeastNormCorrection:
             self._put(f, "change psi", i, u.entry(i) * self._weight(f, i))
         for row, column, place, factor in self._rows.entries(f):
             factor = factor * self._weight(f, row)
-            of_A = self._stored(f, "y", row) * f.load(h, column) - u.entry(row) * self._stored(f, "z", column)
-            moved = self._at(f, "change psi_q", place) + of_A * factor * self._at(f, "root", column)
-            self._put(f, "change psi_q", place, moved)
-            moved = self._at(f, "change root", column) + of_A * factor * self._at(f, "psi_q", place)
-            self._put(f, "change root", column, moved)
+            bar_A = self._stored(f, "y", row) * f.load(h, column) - u.entry(row) * self._stored(f, "z", column)
+            new = self._at(f, "change psi_q", place) + bar_A * factor * self._at(f, "root", column)
+            self._put(f, "change psi_q", place, new)
+            new = self._at(f, "change root", column) + bar_A * factor * self._at(f, "psi_q", place)
+            self._put(f, "change root", column, new)
         f.call(name, f.given["work"])
         with f.each(module.n) as i:
             bar = f"bar state {self._x}"

@@ -1,12 +1,12 @@
 """Machine code that follows the positions of a driven mechanism from value to value: a batch of members in W lanes.
 
 A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects twice by Newton's
-method with elimination. All lanes take the same steps, even if some fail. Reliable positions are counted, up to the first that is
-not closed to rounding, lies far from its prediction, has turned its tangent too far, or has a row near dependence. From there
-the caller continues by singular values.
+method with elimination. All lanes take the same steps, even if some fail. Reliable positions are counted: up to the first
+position that is not closed to rounding, is far from its prediction, has too large a rotation of the tangent, or has a nearly
+dependent row. From there the caller continues by singular values.
 
-If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. It
-changes where branches meet, and differs on another branch that comes close.
+If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. The
+side changes where branches meet, and differs on another branch nearby.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ CORRECTIONS = 2
 STRAIGHT = 0.95  # cosine of the largest rotation of the tangent in a step
 SLACK = 0.1  # largest distance of a position from its prediction, as a fraction of the step
 _METHOD = LUCode(relative=True)
-DISTANT = 1e-2  # smallest distance from dependence; nearer, elimination loses more than half of the digits of q''
+DISTANT = 1e-2  # smallest distance from dependent rows: below, elimination loses more than half of the digits of q''
 
 
 class Marching(Module):
@@ -103,9 +103,9 @@ class Marching(Module):
         """Predict the next positions, correct them, and compute their q' and q''."""
         with f.each(self.n) as i:
             first, second = self.entry(f, "result dq", i), self.entry(f, "result dv", i)
-            bend = f.fma(h * (1 / 6), self.entry(f, "third derivative", i), second * 0.5)
-            ahead = f.fma(f.fma(bend, h, first), h, self.entry(f, "state q", i))
-            for name, x in (("previous dq", first), ("previous ddq", second), ("state q", ahead), ("prediction", ahead)):
+            curvature = f.fma(h * (1 / 6), self.entry(f, "third derivative", i), second * 0.5)
+            predicted = f.fma(f.fma(curvature, h, first), h, self.entry(f, "state q", i))
+            for name, x in (("previous dq", first), ("previous ddq", second), ("state q", predicted), ("prediction", predicted)):
                 self.put_entry(f, name, i, x)
         for _ in range(CORRECTIONS):
             self.invoke(f, "newton_q")
@@ -124,14 +124,14 @@ class Marching(Module):
     def _is_sound(self, f: Function, s: Lane, h: Value, begins: Value) -> Value:
         """Return whether positions are closed, near their prediction, and with little rotation; estimate the third derivative."""
         one, zero, eps = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width), float(np.finfo(float).eps)
-        off, largest = f.variable(0.0), f.variable(1.0)
+        deviation, largest = f.variable(0.0), f.variable(1.0)
         product, old_square, new_square = f.variable(0.0), f.variable(0.0), f.variable(0.0)
-        moves_on = h.is_not(0.0)
-        per_h = f.select(moves_on, one / f.select(moves_on, h, one), zero)
+        has_step = h.is_not(0.0)
+        per_h = f.select(has_step, one / f.select(has_step, h, one), zero)
         with f.each(self.n) as i:
             unit, q = self.entry(f, "inverse unit", i), self.entry(f, "state q", i)
             largest.value = f.max(f.abs(q) * unit, largest.value)
-            off.value = f.max(f.abs(q - self.entry(f, "prediction", i)) * unit, off.value)
+            deviation.value = f.max(f.abs(q - self.entry(f, "prediction", i)) * unit, deviation.value)
             old, new = self.entry(f, "previous dq", i) * unit, self.entry(f, "result dq", i) * unit
             product.value = f.fma(old, new, product.value)
             old_square.value = f.fma(old, old, old_square.value)
@@ -140,11 +140,11 @@ class Marching(Module):
             self.put_entry(f, "third derivative", i, change * per_h)
         violated, per_unit = largest_violation(self, f), one / (s.omega * s.omega)
         old_length2, new_length2 = old_square.value + per_unit, new_square.value + per_unit
-        straight = product.value + per_unit > f.intrinsic("sqrt", old_length2 * new_length2) * STRAIGHT
-        near = off.value < f.abs(h) * f.intrinsic("sqrt", old_length2) * SLACK + largest.value * (64 * eps)
-        closed = ~(violated > largest.value * (ROUNDING_UNITS * eps)) & f.is_finite(violated)
-        moves = (straight & near) | (f.repeat(begins, f.width) if f.width > 1 else begins)
-        return closed & (s.distance > DISTANT) & moves
+        is_straight = product.value + per_unit > f.intrinsic("sqrt", old_length2 * new_length2) * STRAIGHT
+        is_near = deviation.value < f.abs(h) * f.intrinsic("sqrt", old_length2) * SLACK + largest.value * (64 * eps)
+        is_closed = ~(violated > largest.value * (ROUNDING_UNITS * eps)) & f.is_finite(violated)
+        is_smooth = (is_straight & is_near) | (f.repeat(begins, f.width) if f.width > 1 else begins)
+        return is_closed & (s.distance > DISTANT) & is_smooth
 
     def step_all(self, f: Function, s: Lane, fill):
         f.call("march", f.given["work"], f.given["call"])

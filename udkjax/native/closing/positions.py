@@ -1,7 +1,7 @@
 """Machine code of the positions of batches of mechanisms (equations/position_programs.py), W members at a time.
 
-The constants are computed once for each member; then q is predicted, closed by Newton's method, and measured at one position
-after another. A march follows positions from the drawn one on; otherwise each position starts from its own guess.
+The constants are computed once for each member. Then q is predicted, closed by Newton's method, and measured, at one position
+after another. A march follows positions from the drawn position on; otherwise each position starts from a given guess.
 """
 
 import ctypes
@@ -19,14 +19,14 @@ from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value, Variabl
 from udkjax.native.base.program import consecutive, write
 from udkjax.threads import thread_count
 
-# A Newton step shorter than this, in units of the coordinates, is the last: the next one would be its square.
+# A Newton step shorter than this, in units of the coordinates, is the last: the next would be of the order of its square.
 LAST_STEP = 1e-7
-LONGEST_CORRECTION = 0.5  # largest Newton step, in units of the coordinates; a longer one leads to another position
+LONGEST_CORRECTION = 0.5  # largest Newton step, in units of the coordinates; longer steps lead to another position
 LONGEST_OF_MARCH = 0.1  # largest Newton step in a march; otherwise the step of the march is shortened
-SHORTEST = 1 / 128  # shortest step of a march, relative to the longest; a member that fails with it has reached its end
+SHORTEST = 1 / 128  # shortest step of a march, relative to the longest; a member that fails even so has reached its end
 MOST_CORRECTIONS = 12
 FARTHEST = 4.0  # largest extrapolation by the cubic through two positions, relative to the previous step
-MOST_SUBSTEPS = 1000  # maximum between two positions; more indicate a wrong unit of the values
+MOST_SUBSTEPS = 1000  # maximum number between two positions; more indicate a wrong unit of the values
 POINTERS = ("x", "s", "guess", "data", "unit", "q", "out", "end", "next")
 FIELDS = ("members", "count", "marches", "s stride", "data stride", *POINTERS, "longest")
 
@@ -46,7 +46,7 @@ class Positions(NamedTuple):
 
 
 class PositionCode:
-    """The machine code of some position programs."""
+    """The machine code of position programs."""
 
     def __init__(self, programs: PositionPrograms):
         self.programs, self.width = programs, machine.lanes()
@@ -75,12 +75,12 @@ class PositionCode:
             threads: Number of threads that share the members; by default one for each core, or `UDKJAX_THREADS`.
 
         Returns:
-            The positions; NaN where one was not reached.
+            The positions; NaN where a position was not reached.
         """
         members, count, sizes = len(x), s.shape[-1], self.programs.sizes
         data = np.zeros((count, sizes.data)) if data is None else data
-        given = {"x": x, "s": s, "data": data, "unit": unit, "guess": np.zeros(1) if guess is None else guess}
-        arrays = {name: np.ascontiguousarray(a, np.float64) for name, a in given.items()}
+        inputs = {"x": x, "s": s, "data": data, "unit": unit, "guess": np.zeros(1) if guess is None else guess}
+        arrays = {name: np.ascontiguousarray(a, np.float64) for name, a in inputs.items()}
         arrays |= {
             "q": np.empty((members, count, sizes.coordinates)),
             "out": np.empty((members, count, self.programs.output_count)),
@@ -123,7 +123,7 @@ class _Text:
             return [(pointer, p[name] + k) for pointer, k in consecutive("work", count)]
 
         state = [*places("constants", programs.constant_count), ("work", p["s"]), *places("q", sizes.coordinates)]
-        found = [
+        functions = [
             write(programs.prologue, "prologue", self.width, ["work"], places("x", sizes.parameters),
                   places("constants", programs.constant_count + sizes.coordinates + 1)),
             write(programs.newton, "newton", self.width, ["work"], state, places("new", 2 * sizes.coordinates + 2)),
@@ -132,10 +132,10 @@ class _Text:
             self._close(),
             self._run(),
         ]  # fmt: skip
-        for f in found[:3]:
+        for f in functions[:3]:
             f.noinline = True
-        declared = {"declare ptr @malloc(i64)", "declare void @free(ptr)"}.union(*(f.declared for f in found))
-        return "\n".join([*sorted(declared), *(f.text() for f in found)])
+        declared = {"declare ptr @malloc(i64)", "declare void @free(ptr)"}.union(*(f.declared for f in functions))
+        return "\n".join([*sorted(declared), *(f.text() for f in functions)])
 
     # --- memory
 
@@ -169,23 +169,23 @@ class _Text:
         arguments = [(POINTER, "work"), (DOUBLE, "most")]
         f, n = Function("close", arguments, self.width), self.programs.sizes.coordinates
         most = f.given["most"]
-        todo = f.variable(f.select(self._load(f, "end").is_(self._load(f, "end")), f.const(1.0, DOUBLE, self.width), 0.0))
+        continues = f.variable(f.select(self._load(f, "end").is_(self._load(f, "end")), f.const(1.0, DOUBLE, self.width), 0.0))
         rounds = f.variable(0, INT, 1)
-        with f.while_(lambda: f.any_of(todo.value > 0.5) & (rounds.value < MOST_CORRECTIONS)):
+        with f.while_(lambda: f.any_of(continues.value > 0.5) & (rounds.value < MOST_CORRECTIONS)):
             f.call("newton", f.given["work"])
             size = f.variable(0.0)
             with f.each(n) as i:
                 step = f.abs(self._load(f, "new", i) - self._load(f, "q", i)) / self._load(f, "unit", i)
                 size.value = f.select(step <= size.value, size.value, step)  # NaN stays
-            goes = (todo.value > 0.5) & (size.value < f.repeat(most, self.width))
+            succeeds = (continues.value > 0.5) & (size.value < f.repeat(most, self.width))
             with f.each(n) as i:
-                self._put(f, "q", f.select(goes, self._load(f, "new", i), self._load(f, "q", i)), i)
-            last = f.select(todo.value > 0.5, f.select(goes, size.value, np.nan), self._load(f, "end"))
+                self._put(f, "q", f.select(succeeds, self._load(f, "new", i), self._load(f, "q", i)), i)
+            last = f.select(continues.value > 0.5, f.select(succeeds, size.value, np.nan), self._load(f, "end"))
             self._put(f, "end", last)
             is_open = (size.value >= LAST_STEP) | (self._load(f, "violation") > CLOSED_TOL**2)
-            todo.value = f.select(goes & is_open, f.const(1.0, DOUBLE, self.width), 0.0)
+            continues.value = f.select(succeeds & is_open, f.const(1.0, DOUBLE, self.width), 0.0)
             rounds.value = rounds.value + 1
-        self._put(f, "end", f.select(todo.value > 0.5, np.nan, self._load(f, "end")))
+        self._put(f, "end", f.select(continues.value > 0.5, np.nan, self._load(f, "end")))
         return f
 
     def _run(self) -> Function:
@@ -211,11 +211,11 @@ class _Text:
     @contextmanager
     def _groups(self, f: Function, members: Value) -> Iterator[Value]:
         """Run the block for groups of members, which threads take in turn."""
-        following = self._field(f, "next", POINTER)
+        next_member = self._field(f, "next", POINTER)
         first = f.variable(0, INT, 1)
 
         def take() -> Value:
-            first.value = f.op(f"atomicrmw add ptr {following.name}, i64 {self.width} seq_cst", INT)
+            first.value = f.op(f"atomicrmw add ptr {next_member.name}, i64 {self.width} seq_cst", INT)
             return first.value < members
 
         with f.while_(take):
@@ -259,7 +259,7 @@ class _Text:
         f.call("close", f.given["work"], f.const(LONGEST_CORRECTION))
 
     def _march(self, f: Function, before: Variable, sign: Variable, longest: Variable):
-        """Continue to the target, in steps that are halved if a lane fails, and grow again."""
+        """Continue to the target, in steps that are halved if a lane fails, and doubled if none does."""
         n, goes_on = self.programs.sizes.coordinates, f.variable(1.0, width=1)
         limit = self._field(f, "longest", DOUBLE)
 
@@ -281,17 +281,17 @@ class _Text:
         with f.while_(lambda: goes_on.value > 0.5):
             rounds.value = rounds.value + 1
             alive = self._load(f, "end")
-            way = f.select(alive >= 0.0, self._load(f, "target") - self._load(f, "s"), 0.0)
-            most = f.reduce("fmax", f.abs(way))
-            steps = f.max(f.intrinsic("ceil", most / longest.value), f.const(1.0))
-            step = way / f.repeat(steps, self.width)
+            rest = f.select(alive >= 0.0, self._load(f, "target") - self._load(f, "s"), 0.0)
+            farthest = f.reduce("fmax", f.abs(rest))
+            steps = f.max(f.intrinsic("ceil", farthest / longest.value), f.const(1.0))
+            step = rest / f.repeat(steps, self.width)
             self._predict(f, step, before.value)
             self._put(f, "s", self._load(f, "s") + step)
             f.call("close", f.given["work"], f.const(LONGEST_OF_MARCH))
             end = self._load(f, "end")
             lost = (self._load(f, "sign") * sign.value <= 0.0) | end.is_not(end)
             self._put(f, "end", f.select(lost, np.nan, end))
-            size = most / steps
+            size = farthest / steps
             repeats = f.any_of(lost & (alive >= 0.0)) & (size > limit * SHORTEST) & (rounds.value < MOST_SUBSTEPS)
             f.choose(
                 repeats,
@@ -303,17 +303,17 @@ class _Text:
         self._put(f, "s", self._load(f, "target"))
 
     def _predict(self, f: Function, step: Value, before: Value):
-        """Extrapolate the cubic through the last two positions and their rates; in the first step, the rate."""
-        known = (f.abs(before) > 0.0) & (f.abs(before) * FARTHEST >= f.abs(step))
-        u = f.select(known, step / f.select(known, before, 1.0), 0.0) + 1.0
+        """Extrapolate the cubic through the last two positions and their rates; in the first step, use the rate alone."""
+        has_previous = (f.abs(before) > 0.0) & (f.abs(before) * FARTHEST >= f.abs(step))
+        u = f.select(has_previous, step / f.select(has_previous, before, 1.0), 0.0) + 1.0
         u2, u3 = u * u, u * u * u
         old, old_rate = u3 * 2.0 - u2 * 3.0 + 1.0, (u3 - u2 * 2.0 + u) * before
         now, now_rate = u2 * 3.0 - u3 * 2.0, (u3 - u2) * before
-        first = f.select(known, 0.0, step)
+        first = f.select(has_previous, 0.0, step)
         with f.each(self.programs.sizes.coordinates) as i:
             q, rate = self._load(f, "q", i), self._load(f, "rate", i)
-            found = old * self._load(f, "q before", i) + old_rate * self._load(f, "rate before", i)
-            found = f.fma(now, q, f.fma(now_rate + first, rate, found))
+            old_part = old * self._load(f, "q before", i) + old_rate * self._load(f, "rate before", i)
+            old_part = f.fma(now, q, f.fma(now_rate + first, rate, old_part))
             self._put(f, "q before", q, i)
             self._put(f, "rate before", rate, i)
-            self._put(f, "q", f.select(known, found, f.fma(step, rate, q)), i)
+            self._put(f, "q", f.select(has_previous, old_part, f.fma(step, rate, q)), i)
