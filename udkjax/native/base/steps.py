@@ -31,8 +31,9 @@ NEAREST_STAGE = 1.5e-3
 # contribution to the velocity in a step must be less than the tolerance.
 ROUNDING_GROWTH = 3e-14
 # SURE: fraction of a step. If a singular configuration is predicted before this fraction, the step certainly passes it:
-# predictions are too early by at most a tenth of a step. From far away they may be too early by three tenths, and the configuration
-# may still be ahead; then the distance at the end of the step is less than EXPECTED times the extrapolated distance.
+# predictions are too early by at most a tenth of a step. From far away they may be too early by three tenths, and the
+# configuration may still be ahead; then the distance at the end of the step is less than EXPECTED times the extrapolated
+# distance.
 SURE, EXPECTED = 0.85, 0.3
 
 # Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.
