@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from udkjax import folders
 from udkjax.cli import store_compiled_programs
-from udkjax.native.base import code_cache
 
 CASES = {
     "beside machine code": ({"UDKJAX_CACHE": "/somewhere"}, False, "/somewhere/jax"),
@@ -23,6 +23,6 @@ def test_programs_are_stored_beside_machine_code(monkeypatch, given, imported, e
     monkeypatch.setattr(os, "environ", dict(given))
     if not imported:
         monkeypatch.delitem(sys.modules, "jax")
-    monkeypatch.setattr(code_cache, "is_writable", lambda folder: folder != Path("/sealed"))
+    monkeypatch.setattr(folders, "is_writable", lambda folder: folder != Path("/sealed"))
     store_compiled_programs()
     assert os.environ.get("JAX_COMPILATION_CACHE_DIR") == expected

@@ -80,9 +80,9 @@ def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> 
 
 def is_of_library(scene: Path) -> bool:
     """Return True if a mechanism of `udkjax.library`, and no file, has this name."""
-    from udkjax.scene import library
+    import udkjax as udk
 
-    return str(scene) in library.__all__ and not scene.exists()
+    return str(scene) in udk.library.__all__ and not scene.exists()
 
 
 def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":

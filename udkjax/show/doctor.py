@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.extras import EXTRAS
+from udkjax.folders import is_writable
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
-from udkjax.native.base.code_cache import cache_folder, cached_files, is_writable
+from udkjax.native.base.code_cache import cache_folder, cached_files
 from udkjax.native.base.machine import lanes
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import processor

@@ -31,15 +31,6 @@ def cache_folder() -> Path | None:
     return folder if choice or folder.is_absolute() else None  # without a home platformdirs returns "~/.cache/udkjax"
 
 
-def is_writable(folder: Path) -> bool:
-    """Return whether files can be written into a folder, which is created if necessary."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK | os.X_OK)
-
-
 def cached_files() -> list[tuple[float, int, Path]]:
     """List the time of last use, the size in bytes and the path of each file."""
     folder, files = cache_folder(), []
