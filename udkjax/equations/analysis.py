@@ -149,12 +149,12 @@ class _Cache(Generic[Stored]):
             if key in self._found:
                 self._found.move_to_end(key)
                 return self._found[key]
-        found = make()
+        value = make()
         with self._lock:
-            self._found[key] = found
+            self._found[key] = value
             while len(self._found) > ANALYSIS_CACHE_SIZE:
                 self._found.popitem(last=False)
-        return found
+        return value
 
 
 _analyses: _Cache[Analysis] = _Cache()

@@ -154,11 +154,11 @@ class BlockElimination:
 
     @cached_property
     def _gram(self) -> list[KernelLoop]:
-        found, start = [], 0
+        loops, start = [], 0
         for group in self.terms.layout.eliminated:
-            found.append(self._diagonal_blocks(group, self._diagonals[start : start + len(group.members)]))
+            loops.append(self._diagonal_blocks(group, self._diagonals[start : start + len(group.members)]))
             start += len(group.members)
-        return found + self._off_diagonal_blocks()
+        return loops + self._off_diagonal_blocks()
 
     def _diagonal_blocks(self, group: ConstraintGroup, places: Sequence[int]) -> KernelLoop:
         p, base = len(group.rows), group.table.shape[1]
@@ -196,11 +196,11 @@ class BlockElimination:
 
     def _product(self, g: ConstraintGroup, r: int, h: ConstraintGroup, s: int):
         def write(w: KernelWriter):
-            one = [[g.entry(w, row, 3 * r + k, 0) for k in range(3)] for row in g.rows]
-            two = [_scaled(w, [h.entry(w, row, 3 * s + k, 1) for k in range(3)], lambda _: 3) for row in h.rows]
-            for i, x in enumerate(one):
-                for j, y in enumerate(two):
-                    w.write(dot(w.graph, x, y), "gram", 2, i * len(two) + j, ADD)
+            late_entries = [[g.entry(w, row, 3 * r + k, 0) for k in range(3)] for row in g.rows]
+            early_entries = [_scaled(w, [h.entry(w, row, 3 * s + k, 1) for k in range(3)], lambda _: 3) for row in h.rows]
+            for i, x in enumerate(late_entries):
+                for j, y in enumerate(early_entries):
+                    w.write(dot(w.graph, x, y), "gram", 2, i * len(early_entries) + j, ADD)
 
         key: Hashable = ("product", g, r, h, s)
         return self.terms.kernel(key, write)
@@ -269,8 +269,8 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool, 
             for i, row in enumerate(block):
                 for j, other in enumerate(below[b]):
                     if a > b or j <= i:
-                        place = i * later[b] + j if a > b else later[a] + triangle(i, j)
-                        w.write(-dot(w.graph, row, other), "gram", base, place, ADD)
+                        offset = i * later[b] + j if a > b else later[a] + triangle(i, j)
+                        w.write(-dot(w.graph, row, other), "gram", base, offset, ADD)
             base += 1
 
 

@@ -35,10 +35,10 @@ def psi(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m"]:
     Returns:
         Psi (m,), in m or rad.
     """
-    found = evaluate_by_kind(
+    kinds = evaluate_by_kind(
         lambda c, *frames: vector(c.residual(t, *frames)), mechanism, [*mechanism.constraints.values()], bodies(q)
     )
-    return jnp.concatenate([jnp.ravel(rows) for _, rows in found])[_row_order(found)] if found else jnp.zeros(0)
+    return jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])[_row_order(kinds)] if kinds else jnp.zeros(0)
 
 
 @traced_once
@@ -96,14 +96,14 @@ def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
     residual = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
     rows = jax.eval_shape(lambda: [rows for _, rows in evaluate_by_kind(residual, mechanism, constraints, bodies(mechanism.q0))])
     size = np.zeros(len(names), int)
-    for kind, found in zip(element_kinds(mechanism, constraints), rows, strict=True):
-        size[kind.members] = found.shape[1]
+    for kind, values in zip(element_kinds(mechanism, constraints), rows, strict=True):
+        size[kind.members] = values.shape[1]
     return [(name, k) for name, count in zip(names, size, strict=True) for k in range(count)]
 
 
-def _row_order(found: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
+def _row_order(kinds: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
     """Return the permutation from rows ordered by kind to rows in the order of their constraints."""
-    owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in found])
+    owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in kinds])
     return np.argsort(owner, kind="stable")
 
 

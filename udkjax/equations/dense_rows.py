@@ -79,9 +79,9 @@ class DenseTerms(RowTerms):
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
         _, rate, entries = self.geometry(t, q, np.zeros_like(q))
-        found = np.zeros((self.count, self.size))
-        found[self.entries] = entries
-        return found, rate
+        Psi_q = np.zeros((self.count, self.size))
+        Psi_q[self.entries] = entries
+        return Psi_q, rate
 
     def gamma(self, t: Time, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return gamma (m,), the right-hand side of Psi_q a = gamma."""

@@ -108,17 +108,17 @@ class DifferentiablePrograms:
             yield from implicit.correct_solution(solve)
         yield from implicit.transposed(**names)
 
-    def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, to: str, sign: int) -> DifferentiableProgram:
+    def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, target: str, sign: int) -> DifferentiableProgram:
         """Compute x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
         solver, terms = self._solver, self._solver.terms
-        z, result = terms.add("z", solution=0), terms.add(to, start=x, change="z", sign=sign)
+        z, result = terms.add("z", solution=0), terms.add(target, start=x, change="z", sign=sign)
         system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]
         residuals = self._implicit_terms.residuals(right)
         implicit = [*residuals, z, *terms.rates("z", 1, subtract=True), *solver.solve(1)]
         return DifferentiableProgram(
-            program(system, solver.solve(), [z, result], [solver.safe] if to == "a" else []),
+            program(system, solver.solve(), [z, result], [solver.safe] if target == "a" else []),
             [*loads, *implicit, terms.add("z", solution=1, update=ADD, fixed=("constants",)), result],
-            [*loads, *self._corrected(right), terms.add(to, start=x, solution=0, sign=sign)],
+            [*loads, *self._corrected(right), terms.add(target, start=x, solution=0, sign=sign)],
         )
 
 

@@ -25,8 +25,8 @@ class ElementPrograms:
         self.leaves = []
         for k, (shape, dtype) in enumerate(structure.shapes):
             leaf = np.empty(shape, object)
-            for place in np.ndindex(*shape):
-                leaf[place] = graph.input((k, place), "parameter", dtype)
+            for index in np.ndindex(*shape):
+                leaf[index] = graph.input((k, index), "parameter", dtype)
             self.leaves.append(leaf)
         self.t = graph.input("t", "time")
         self.state: list[tuple[str, int, Scalar]] = []
@@ -35,9 +35,9 @@ class ElementPrograms:
         self.outputs: dict[str, list[Scalar]] = {}
 
     def _inputs(self, names: Sequence[str], body: int, group: str) -> list[Scalar]:
-        found = [self.graph.input((name, body), group) for name in names]
-        self.state += [(name, body, scalar) for name, scalar in zip(names, found, strict=True)]
-        return found
+        scalars = [self.graph.input((name, body), group) for name in names]
+        self.state += [(name, body, scalar) for name, scalar in zip(names, scalars, strict=True)]
+        return scalars
 
     def _find_constants(self):
         """Find the sines and cosines of the bodies' angles, and the constants, which depend only on parameters."""
@@ -49,8 +49,10 @@ class ElementPrograms:
             if name in ("sin", "cos") and node.arguments[0].index in angles and node.arguments[0].sign > 0:
                 self.state.append((name, angles[node.arguments[0].index], Scalar(self.graph, index)))
         wanted = [s for outputs in self.outputs.values() for s in outputs]
-        given = {s.index for _, _, s in self.state}
-        constant = [s for s in frontier(self.graph, wanted, lambda node: node.depends <= {"parameter"}) if s.index not in given]
+        state_nodes = {s.index for _, _, s in self.state}
+        constant = [
+            s for s in frontier(self.graph, wanted, lambda node: node.depends <= {"parameter"}) if s.index not in state_nodes
+        ]
         self.constants = constant
 
 

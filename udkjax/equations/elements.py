@@ -77,21 +77,21 @@ def _gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: l
     for row in rows:
         terms: dict[tuple[int, int], Scalar] = {}
         for k, entry in row.items():
-            for place, slope in entries.row(entry).items():
-                if place not in column:
+            for variable, slope in entries.row(entry).items():
+                if variable not in column:
                     return None
-                pair = min(k, column[place]), max(k, column[place])
+                pair = min(k, column[variable]), max(k, column[variable])
                 terms[pair] = terms[pair] + slope if pair in terms else slope
         total.append(sum((slope * (v[j] * v[k]) for (j, k), slope in terms.items()), graph.constant(0.0)))
     return total
 
 
-def _choose_shorter(graph: Graph, known: list[SparseRow], one: list[Scalar], other: list[Scalar] | None) -> list[Scalar]:
+def _choose_shorter(graph: Graph, rows: list[SparseRow], first: list[Scalar], second: list[Scalar] | None) -> list[Scalar]:
     """Return whichever of two equal lists of expressions needs fewer operations once the entries of the rows are computed."""
-    if other is None:
-        return one
-    given = [entry for row in known for entry in row.values()]
-    return other if operations(graph, given, other) < operations(graph, given, one) else one
+    if second is None:
+        return first
+    entries = [entry for row in rows for entry in row.values()]
+    return second if operations(graph, entries, second) < operations(graph, entries, first) else first
 
 
 def trace_force(
@@ -113,8 +113,8 @@ def trace_piece(
     graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], t: Scalar, q: list[Scalar], v: list[Scalar]
 ) -> Scalar:
     """Return the index of the smooth piece that contains the state of an element, on scalars."""
-    (found,) = _trace_piece_number(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
-    return as_scalar(found)
+    (piece,) = _trace_piece_number(*kind)(graph, leaves, [np.asarray(s, object) for s in (t, *q, *v)])
+    return as_scalar(piece)
 
 
 @lru_cache(maxsize=256)
@@ -172,9 +172,9 @@ def _trace_loads(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...]) ->
 
     def loads(leaves, numbers):
         element = jax.tree.unflatten(tree, leaves)
-        own = element.loads(numbers[0], *_frames(ground, numbers[1 : 1 + n], numbers[1 + n :]))
-        own = [(0.0, 0.0, 0.0)] * len(ground) if own is None else own
-        components = [c for load, fixed in zip(own, ground, strict=True) if not fixed for c in load]
+        forces = element.loads(numbers[0], *_frames(ground, numbers[1 : 1 + n], numbers[1 + n :]))
+        forces = [(0.0, 0.0, 0.0)] * len(ground) if forces is None else forces
+        components = [c for load, fixed in zip(forces, ground, strict=True) if not fixed for c in load]
         slope = jax.grad(lambda q: potential(leaves, [numbers[0], *q, *numbers[1 + n :]]))(numbers[1 : 1 + n])
         return [jnp.asarray(c, number.dtype) - s for c, s in zip(components, slope, strict=True)]
 

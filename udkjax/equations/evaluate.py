@@ -36,16 +36,16 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
     @wraps(function)
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        given = parameters.bind(*args, **kwargs)
-        found = given.arguments
-        mechanism: Mechanism = found["mechanism"]
-        if "analysis" in parameters.parameters and found.get("analysis") is None:
-            found["analysis"] = analyse(mechanism)
-        for name, value in found.items():
+        bound = parameters.bind(*args, **kwargs)
+        arguments = bound.arguments
+        mechanism: Mechanism = arguments["mechanism"]
+        if "analysis" in parameters.parameters and arguments.get("analysis") is None:
+            arguments["analysis"] = analyse(mechanism)
+        for name, value in arguments.items():
             if not isinstance(value, Mechanism | Analysis):
-                found[name] = jnp.asarray(value, jnp.result_type(float))  # Python numbers would be static
-        found["mechanism"] = mechanism.without_origin
-        return program(*given.args, **given.kwargs)
+                arguments[name] = jnp.asarray(value, jnp.result_type(float))  # Python numbers would be static
+        arguments["mechanism"] = mechanism.without_origin
+        return program(*bound.args, **bound.kwargs)
 
     return checked(run)
 

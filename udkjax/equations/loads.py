@@ -83,8 +83,8 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyAr
         V (J).
     """
     gravity = jnp.tile(jnp.append(mechanism.gravity, 0.0), len(mechanism.body_names))
-    found = _evaluate_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
-    return sum((jnp.sum(V) for _, V in found if V is not None), -(mass(mechanism) * gravity) @ vector(q))
+    potentials = _evaluate_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
+    return sum((jnp.sum(V) for _, V in potentials if V is not None), -(mass(mechanism) * gravity) @ vector(q))
 
 
 @traced_once
@@ -94,8 +94,8 @@ def element_loads(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray
     time = jnp.asarray(t, jnp.result_type(float))
 
     def loads(element: ForceElement, *frames: Frame) -> Float[Array, "frames 3"] | None:
-        found = element.loads(time, *frames)
-        return None if found is None else jnp.stack([vector(list(load)) for load in found])
+        result = element.loads(time, *frames)
+        return None if result is None else jnp.stack([vector(list(load)) for load in result])
 
     total = jnp.zeros((len(mechanism.body_names), 3))
     for kind, found in _evaluate_forces(loads, mechanism, q, v):

@@ -79,33 +79,35 @@ class MotionMeasures:
         shaped = np.array(y, object).reshape(len(b), len(psi))
         (g,) = _read(self._own, model.measures, X, S[0], Q, u, w, shaped, self._let("d", d))
         self.values = self._copy(list(g.flat))
-        left = [[_column(moved, psi, row, v, zero) - right[k] for k, v in enumerate(Q)] for row, right in zip(y, b, strict=True)]
-        self._parts = list(g.flat), list(psi), first, second, left
+        adjoint_residuals = [
+            [_column(moved, psi, row, v, zero) - right[k] for k, v in enumerate(Q)] for row, right in zip(y, b, strict=True)
+        ]
+        self._parts = list(g.flat), list(psi), first, second, adjoint_residuals
         self._by = (*S, *X), Q, u, w, y
 
     def slopes(self) -> list[list[Scalar]]:
         """Return the derivatives of each measure with respect to s and x."""
-        g, psi, first, second, left = self._parts
+        g, psi, first, second, adjoint_residuals = self._parts
         moved, Q, u, w, y = self._by
         z = [self._inputs(f"z{k}", len(psi)) for k in range(3)]
         z3 = [self._inputs(f"z3{k}", len(Q)) for k in range(len(y))]
-        taken = self._own.constant(0.0)
-        for rows, by in ((psi, z[0]), (first, z[1]), (second, z[2]), *zip(left, z3, strict=True)):
-            for row, multiplier in zip(rows, by, strict=True):
-                taken = taken + row * multiplier
-        found, zero = [], self._graph.constant(0.0)
+        constraint_terms = self._own.constant(0.0)
+        for rows, multipliers_of_rows in ((psi, z[0]), (first, z[1]), (second, z[2]), *zip(adjoint_residuals, z3, strict=True)):
+            for row, multiplier in zip(rows, multipliers_of_rows, strict=True):
+                constraint_terms = constraint_terms + row * multiplier
+        result, zero = [], self._graph.constant(0.0)
         for measure in g:
-            L = measure - taken
-            every = [*moved, *Q, *u, *w, *(v for row in y for v in row)]
-            row = Differential(self._own, [L], every).row(L)
+            L = measure - constraint_terms
+            inputs = [*moved, *Q, *u, *w, *(v for row in y for v in row)]
+            row = Differential(self._own, [L], inputs).row(L)
             for k in (*z[0], *z[1], *z[2], *(v for right in z3 for v in right)):
                 self._known[k.index] = zero
             for variables, multipliers in zip(y, z3, strict=True):
                 self._set(multipliers, self._factors.solve(self._slope(row, variables)))
             for variables, multipliers in ((w, z[2]), (u, z[1]), (Q, z[0])):
                 self._set(multipliers, self._factors.solve_transposed(self._slope(row, variables)))
-            found.append(self._slope(row, moved))
-        return found
+            result.append(self._slope(row, moved))
+        return result
 
     def _slope(self, row: SparseRow, variables: Scalars) -> list[Scalar]:
         zero = self._own.constant(0.0)
@@ -115,9 +117,9 @@ class MotionMeasures:
         return np.array([self._own.input((name, k), name) for k in range(count)], object)
 
     def _let(self, name: str, values: Sequence[Scalar]) -> np.ndarray:
-        found = self._inputs(name, len(values))
-        self._set(found, values)
-        return found
+        variables = self._inputs(name, len(values))
+        self._set(variables, values)
+        return variables
 
     def _set(self, variables: Scalars, values: Sequence[Scalar]):
         self._known |= {v.index: value for v, value in zip(variables, values, strict=True)}
@@ -133,8 +135,8 @@ class MotionMeasures:
 
 
 def _read(graph: Graph, function: Callable[..., jax.Array], *arguments: Scalar | np.ndarray) -> list[np.ndarray]:
-    given = [np.array(a, object) for a in arguments]
-    return trace(function, *[jnp.zeros(a.shape) for a in given])(graph, *given)
+    arrays = [np.array(a, object) for a in arguments]
+    return trace(function, *[jnp.zeros(a.shape) for a in arrays])(graph, *arrays)
 
 
 def _along(row: SparseRow, variables: Scalars, tangents: Scalars, zero: Scalar) -> Scalar:

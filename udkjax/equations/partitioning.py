@@ -107,8 +107,8 @@ class PartitionedSystem(WrappedSystem):
 
     @property
     def _tol(self) -> Float[Array, ""]:
-        given = self.formulation.rank_tol
-        return self.equations.scales.rank_tol if given is None else given
+        tol = self.formulation.rank_tol
+        return self.equations.scales.rank_tol if tol is None else tol
 
     def _plus(self, D: Float[Array, "m n"]) -> Plus:
         """Return D^+ of the dependent columns, zero for the others."""

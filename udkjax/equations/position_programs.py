@@ -138,13 +138,15 @@ class PositionPrograms:
         columns = [self._column(v) for v in moved]
         if len(partial) > len(moved):
             changes = [[-x for x in self._factors.solve(column)] for column in columns]
-            along = [[_dot(row[len(moved) :], change, zero) for change in changes] for row in partial]
+            by_position = [[_dot(row[len(moved) :], change, zero) for change in changes] for row in partial]
         else:
             adjoints = [self._factors.solve_transposed(row[len(moved) :]) for row in partial]
-            along = [[-_dot(y, column, zero) for column in columns] for y in adjoints]
-        found = [[a + b for a, b in zip(row, part, strict=False)] for row, part in zip(partial, along, strict=True)]
-        place = len(self._measures)
-        return [*found[:place], *(self._motion.slopes() if self._motion else []), *found[place:]]
+            by_position = [[-_dot(y, column, zero) for column in columns] for y in adjoints]
+        slopes = [
+            [a + b for a, b in zip(row, indirect, strict=False)] for row, indirect in zip(partial, by_position, strict=True)
+        ]
+        count = len(self._measures)
+        return [*slopes[:count], *(self._motion.slopes() if self._motion else []), *slopes[count:]]
 
     def _column(self, variable: Scalar) -> list[Scalar]:
         """Return the derivatives of Psi with respect to one variable."""
@@ -165,12 +167,12 @@ class PositionPrograms:
 
     def _sign(self) -> Scalar:
         """Return the determinant of B, which changes its sign where branches meet; one if B is not square."""
-        R, found = self._factors.triangle, self._graph.constant(1.0)
+        R, determinant = self._factors.triangle, self._graph.constant(1.0)
         if not self._is_square:
-            return found
+            return determinant
         for k in range(len(self._factors.open_columns)):
-            found = found * R[k][k]
-        return found
+            determinant = determinant * R[k][k]
+        return determinant
 
     def _find_transmission(self) -> tuple[Scalar, list[Scalar]]:
         """Return the transmission tau and its derivatives for s, x and q: d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2."""
@@ -194,7 +196,7 @@ class PositionPrograms:
 def trace_model(model: Model, parameters: int, coordinates: int, data: int = 0) -> TracedModel:
     """Trace a model for any number of programs; the arguments are those of `PositionPrograms`."""
     examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
-    return trace(lambda *given: [model(*given)[k] for k in ("psi", "q0", "s0", "measures")], *examples)
+    return trace(lambda *numbers: [model(*numbers)[k] for k in ("psi", "q0", "s0", "measures")], *examples)
 
 
 def _inputs(graph: Graph, name: str, group: str, count: int) -> list[Scalar]:

@@ -106,16 +106,16 @@ def unique_reactions(
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
     analysis, (ts, q, _) = analyse(mechanism), _states(solution)
-    found = _uniqueness_of_loads(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol), frame, about)
-    return _name_by_body(mechanism, found)
+    marks = _uniqueness_of_loads(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol), frame, about)
+    return _name_by_body(mechanism, marks)
 
 
 def _name_by_body(mechanism: Mechanism, values: list[list[Array]]) -> ByBody:
     """Return values by the names of their constraints and bodies, in order; dictionaries would lose the order under `jit`."""
     bodies = {name: dict.fromkeys(mechanism.frames_of(element)) for name, element in mechanism.constraints.items()}
     return {
-        name: dict(zip([body for body in bodies[name] if body != GROUND], own, strict=True))
-        for name, own in zip(bodies, values, strict=True)
+        name: dict(zip([body for body in bodies[name] if body != GROUND], by_body, strict=True))
+        for name, by_body in zip(bodies, values, strict=True)
     }
 
 
@@ -129,23 +129,23 @@ def _split_by_body(
     about: About,
 ) -> ByBody:
     """Split the loads of rows by joint and body, (rows, T, 3) each, in the chosen axes and about the chosen point."""
-    places = {name: k for k, name in enumerate(mechanism.body_names)}
-    seen = {name: _frame(q, place) for name, place in places.items()} | {GROUND: GROUND_FRAME}
-    found: ByBody = {}
+    body_index = {name: k for k, name in enumerate(mechanism.body_names)}
+    body_frames = {name: _frame(q, index) for name, index in body_index.items()} | {GROUND: GROUND_FRAME}
+    result: ByBody = {}
     for name, element in mechanism.constraints.items():
-        own = np.array([k for k, owner in enumerate(row_names) if owner == name])
+        rows = np.array([k for k, owner in enumerate(row_names) if owner == name])
         bodies = mechanism.frames_of(element)
-        frames = [seen[body] for body in bodies]
+        frames = [body_frames[body] for body in bodies]
         axes = _joint_angle(element, frames) if frame == "joint" else 0.0
-        found[name] = {}
+        result[name] = {}
         for k, body in enumerate(bodies):
             if body == GROUND:
                 continue
-            load = total(jnp.moveaxis(by_row[:, own, 3 * places[body] : 3 * places[body] + 3], 1, 0))
+            load = total(jnp.moveaxis(by_row[:, rows, 3 * body_index[body] : 3 * body_index[body] + 3], 1, 0))
             point = _joint_point(element, k, frames) if about == "joint" else None
             angle = frames[k].angle if frame == "body" else axes
-            found[name][body] = load if point is None and frame == "ground" else _transform_load(load, frames[k], point, angle)
-    return found
+            result[name][body] = load if point is None and frame == "ground" else _transform_load(load, frames[k], point, angle)
+    return result
 
 
 def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Number) -> Float[Array, "... 3"]:
@@ -157,8 +157,8 @@ def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | Non
     return jnp.stack([cos * fx + sin * fy, cos * fy - sin * fx, torque], axis=-1)
 
 
-def _frame(q: Float[Array, "T n"], place: int) -> Frame:
-    x, y, angle = (q[:, 3 * place + k] for k in range(3))
+def _frame(q: Float[Array, "T n"], body: int) -> Frame:
+    x, y, angle = (q[:, 3 * body + k] for k in range(3))
     return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
 
 
@@ -185,17 +185,17 @@ def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | No
 
 
 def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, NumberLike]) -> Float[Array, "m"]:
-    known, counts = mechanism.constraints, {}
+    constraints, counts = mechanism.constraints, {}
     for name, _ in analyse(mechanism).row_names:
         counts[name] = counts.get(name, 0) + 1
-    for name, given in compliances.items():
-        if name not in known:
-            raise ValueError(f"compliances: no joint named {quote(name)}{suggestion(name, known)}")
-        shape, alike = np.shape(given), isinstance(known[name], Revolute) or counts[name] == 1
-        if shape != (counts[name],) and not (shape == () and alike):
-            raise ValueError(f"compliances: {quote(name)} takes {counts[name]} numbers, one for each row, not {given!r}")
-        if not isinstance(given, Tracer) and not np.all(np.asarray(given) >= 0):
-            raise ValueError(f"compliances: {quote(name)} has a negative compliance: {given!r}")
+    for name, compliance in compliances.items():
+        if name not in constraints:
+            raise ValueError(f"compliances: no joint named {quote(name)}{suggestion(name, constraints)}")
+        shape, single_number = np.shape(compliance), isinstance(constraints[name], Revolute) or counts[name] == 1
+        if shape != (counts[name],) and not (shape == () and single_number):
+            raise ValueError(f"compliances: {quote(name)} takes {counts[name]} numbers, one for each row, not {compliance!r}")
+        if not isinstance(compliance, Tracer) and not np.all(np.asarray(compliance) >= 0):
+            raise ValueError(f"compliances: {quote(name)} has a negative compliance: {compliance!r}")
     rows = [jnp.broadcast_to(jnp.asarray(compliances.get(name, 0.0), float), (count,)) for name, count in counts.items()]
     return jnp.concatenate(rows) if rows else jnp.zeros(0)
 
@@ -224,35 +224,35 @@ def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about)
     """Compute -Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
     equations = prepare(mechanism, method, baumgarte, analysis)
 
-    def one(t, q, v):
-        found = equations.multipliers(t, q, v)
+    def row_loads(t, q, v):
+        multipliers = equations.multipliers(t, q, v)
         if soft is not None:
-            found = split_by_compliance(mechanism, t, q, found, soft, analysis.scales.weights)
-        return -equations.jacobian(t, q) * found[:, None]
+            multipliers = split_by_compliance(mechanism, t, q, multipliers, soft, analysis.scales.weights)
+        return -equations.jacobian(t, q) * multipliers[:, None]
 
-    by_row, rows = jax.vmap(one)(ts, q, v), [name for name, _ in analysis.row_names]
-    found = _split_by_body(mechanism, rows, q, by_row, lambda part: part.sum(0), frame, about)
-    return [list(loads.values()) for loads in found.values()]
+    by_row, rows = jax.vmap(row_loads)(ts, q, v), [name for name, _ in analysis.row_names]
+    by_body = _split_by_body(mechanism, rows, q, by_row, lambda load: load.sum(0), frame, about)
+    return [list(loads.values()) for loads in by_body.values()]
 
 
 @deferred
 def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
     """Return whether equilibrium determines each component of `_loads`, from Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
 
-    def one(t, q):
+    def terms(t, q):
         return psi_q(mechanism, t, q), left_null_space(mechanism, t, q, analysis, rank_tol).basis
 
-    Psi_q, N = jax.vmap(one)(ts, q)
+    Psi_q, N = jax.vmap(terms)(ts, q)
     rows = [name for name, _ in analysis.row_names]
     unit = jnp.stack([1.0, 1.0, analysis.length])  # units of the components: a torque over the length is a force
 
-    def unique(part: Array, N: Array) -> Array:
+    def unique(coefficients: Array, N: Array) -> Array:
         """Return whether c^T N = 0, from the coefficients c (rows, T, 3) of a component and its rows (T, rows, m) of N."""
-        size = jnp.max(jnp.linalg.norm(part, axis=0) / unit, axis=-1, keepdims=True)
-        return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", part, N), axis=-1) <= UNIQUE_TOL * unit * size
+        size = jnp.max(jnp.linalg.norm(coefficients, axis=0) / unit, axis=-1, keepdims=True)
+        return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", coefficients, N), axis=-1) <= UNIQUE_TOL * unit * size
 
-    found = _split_by_body(mechanism, rows, q, Psi_q / analysis.scales.rows[:, None], lambda part: part, frame, about)
+    by_body = _split_by_body(mechanism, rows, q, Psi_q / analysis.scales.rows[:, None], lambda c: c, frame, about)
     return [
-        [unique(part, N[:, [k for k, n in enumerate(rows) if n == name]]) for part in loads.values()]
-        for name, loads in found.items()
+        [unique(coefficients, N[:, [k for k, n in enumerate(rows) if n == name]]) for coefficients in loads.values()]
+        for name, loads in by_body.items()
     ]

@@ -109,18 +109,18 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
     first = rows.close(0.0, q)
     if first is None:
         return []
-    found, failures, time_step = [first], 0, rows.driver_time_step
+    positions, failures, time_step = [first], 0, rows.driver_time_step
     random = np.random.default_rng(0)
     heading = random.standard_normal(rows.size)
     for k in range(POSITION_SAMPLES if rows.count <= MANY_ROWS else POSITION_SAMPLES // 3):
-        full = [p for p in found if p.is_clear and p.rank == rows.count]
-        if full:
-            return full[:1]
+        full_rank = [p for p in positions if p.is_clear and p.rank == rows.count]
+        if full_rank:
+            return full_rank[:1]
         if failures == FAILURES:
-            if any(p.is_clear for p in found[1:]):
+            if any(p.is_clear for p in positions[1:]):
                 break
             time_step = CREEP * rows.driver_time_step
-        last = found[-1]
+        last = positions[-1]
         heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(rows.size) / np.sqrt(rows.size)
         heading = last.tangent_part(heading)  # keep the direction, so that the motion covers the range
         step = rows.metric * heading
@@ -130,12 +130,12 @@ def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Positi
             heading, jump = random.standard_normal(rows.size), random.uniform(-1.0, 1.0, rows.size)
             position = rows.close(time_step * (k + 1), first.q + LONGEST_STEP * rows.metric * jump, give_up=True)
         failures = 0 if position is not None else failures + 1
-        found.extend([] if position is None else [position])
-    found = [p for p in found if p.is_clear]
-    if not found or (len(found) == 1 and found[0] is first and first.rank < rows.size):
+        positions.extend([] if position is None else [position])
+    positions = [p for p in positions if p.is_clear]
+    if not positions or (len(positions) == 1 and positions[0] is first and first.rank < rows.size):
         return []
-    rank = max(p.rank for p in found)
-    return [p for p in found if p.rank == rank]
+    rank = max(p.rank for p in positions)
+    return [p for p in positions if p.rank == rank]
 
 
 def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position]) -> tuple[int, ...]:
@@ -143,9 +143,9 @@ def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position
     if positions[0].rank == rows.count:
         return ()
     chosen = []
-    for members, found in rows.split_rows(positions):
-        ordinary = [part for part in found if part.smallest > GENERIC_TOL] or found
-        chosen += members[list(choose_dispensable([part.null_space for part in ordinary]))].tolist()
+    for members, subsets in rows.split_rows(positions):
+        generic = [subset for subset in subsets if subset.smallest > GENERIC_TOL] or subsets
+        chosen += members[list(choose_dispensable([subset.null_space for subset in generic]))].tolist()
     return tuple(sorted(chosen))
 
 
@@ -156,7 +156,7 @@ def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...
     if position is None:
         return ()
     involved = np.asarray((abs(position.null_space) > NEGLIGIBLE_SHARE).sum(axis=1)).ravel() > 0
-    names = [name for (name, _), part in zip(rows.names, involved, strict=True) if part]
+    names = [name for (name, _), is_involved in zip(rows.names, involved, strict=True) if is_involved]
     return tuple(dict.fromkeys(names))
 
 
@@ -207,8 +207,8 @@ def choose_dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
 def owners_of_row(rows: PositionRows, t: Time, q: np.ndarray, name: str) -> set[str] | None:
     """Return the constraints on whose rows the first row of constraint `name` depends; None if it is independent."""
     D, owners = dense(rows.at(t, q)[2]), np.array([owner for owner, _ in rows.names])  # D has unit rows
-    own, others = D[owners == name][0], D[owners != name]
-    shares = np.linalg.lstsq(others.T, own, rcond=NEGLIGIBLE_SHARE)[0]
-    if np.linalg.norm(own - others.T @ shares) > NEGLIGIBLE_SHARE:
+    row, others = D[owners == name][0], D[owners != name]
+    shares = np.linalg.lstsq(others.T, row, rcond=NEGLIGIBLE_SHARE)[0]
+    if np.linalg.norm(row - others.T @ shares) > NEGLIGIBLE_SHARE:
         return None
     return set(owners[owners != name][np.abs(shares) > NEGLIGIBLE_SHARE])

@@ -60,7 +60,7 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
         for k, (row, body) in enumerate(meets):
             columns = first + k, group.table[:, ROW] + row, *masses[group.bodies[body]].T
             pair_table = np.concatenate([pair_table, np.stack(columns, 1)])
-    parts = [
+    loops = [
         *(Reset("scales", 0, ROWS), Reset("largest", 0, LARGEST), Reset("change", 0, layout.row_count), Reset("t", 0, 1)),
         KernelLoop(_kernel(_write_finite), np.arange(number_count)[:, None]),
         KernelLoop(_kernel(_write_guess), body_table),
@@ -77,7 +77,7 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
     rows, pairs = layout.row_count, len(pair_table)
     sizes = {"scales": ROWS + rows, "largest": LARGEST, "change": rows, "psi_t": rows, "gamma": rows}
     sizes |= {"moved": pairs, "turned": pairs, "constants": layout.constant_count, "t": 1}
-    return ScaleProgram(LoopProgram(parts), sizes | dict.fromkeys("qv", layout.coordinate_count))
+    return ScaleProgram(LoopProgram(loops), sizes | dict.fromkeys("qv", layout.coordinate_count))
 
 
 def _row_body_pairs(group: ConstraintGroup) -> list[tuple[int, int]]:
@@ -107,17 +107,17 @@ def _over_elements(terms: SceneTerms, group: ConstraintGroup, meets: list[tuple[
             w.write(rate, "psi_t", ROW, row)
             w.write(gamma, "gamma", ROW, row)
 
-    part = terms.over_group("scales", group, write)
-    return part._replace(table=np.concatenate([group.table, first[:, None]], 1))
+    loop = terms.over_group("scales", group, write)
+    return loop._replace(table=np.concatenate([group.table, first[:, None]], 1))
 
 
 def _psi_t(group: ConstraintGroup) -> list[Scalar]:
     """Return Psi_t of an element: Psi_dot at rest."""
     programs, graph = group.programs, group.programs.graph
-    known = {s.index: Scalar(graph, s.index) for s in (*programs.constants, programs.t, *(s for *_, s in programs.state))}
-    known |= {s.index: graph.constant(0.0) for name, _, s in programs.state if name in VELOCITY_INPUTS}
-    rate = ScalarProgram(graph, [Scalar(graph, k) for k in known], programs.outputs["psi_dot"])
-    return graph.copy(rate, known)
+    values = {s.index: Scalar(graph, s.index) for s in (*programs.constants, programs.t, *(s for *_, s in programs.state))}
+    values |= {s.index: graph.constant(0.0) for name, _, s in programs.state if name in VELOCITY_INPUTS}
+    rate = ScalarProgram(graph, [Scalar(graph, k) for k in values], programs.outputs["psi_dot"])
+    return graph.copy(rate, values)
 
 
 # --- kernels; numbers may be NaN or infinite

@@ -88,8 +88,8 @@ def _traced_scales(numbers: list[ArrayLike], programs: ScenePrograms) -> Scales:
     return _unpack(scales_p.bind(numbers_as_vector(numbers), programs=programs))
 
 
-def _unpack(found: Any) -> Scales:
-    return Scales(found[LENGTH], found[ARM], found[RATE], found[MASS], found[ROWS:], found[THRESHOLD])
+def _unpack(values: Any) -> Scales:
+    return Scales(values[LENGTH], values[ARM], values[RATE], values[MASS], values[ROWS:], values[THRESHOLD])
 
 
 def _evaluate(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
@@ -109,8 +109,8 @@ def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
 
 def evaluate_scales(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
     """Return the array `scales` for each vector of `numbers`, by NumPy."""
-    found = [_evaluate(programs, x, np) for x in numbers.reshape(-1, numbers.shape[-1])]
-    return np.array(found, numbers.dtype).reshape(*numbers.shape[:-1], -1)
+    results = [_evaluate(programs, x, np) for x in numbers.reshape(-1, numbers.shape[-1])]
+    return np.array(results, numbers.dtype).reshape(*numbers.shape[:-1], -1)
 
 
 def scales_by_jax(numbers: Array, programs: ScenePrograms) -> Array:
@@ -118,8 +118,8 @@ def scales_by_jax(numbers: Array, programs: ScenePrograms) -> Array:
     return jnp.vectorize(lambda x: _evaluate(programs, x, jnp), signature="(n)->(m)")(numbers)
 
 
-def _batch(given: Any, axes: Any, programs: ScenePrograms) -> tuple[Any, int]:
-    return scales_p.bind(jnp.moveaxis(given[0], axes[0], 0), programs=programs), 0
+def _batch(inputs: Any, axes: Any, programs: ScenePrograms) -> tuple[Any, int]:
+    return scales_p.bind(jnp.moveaxis(inputs[0], axes[0], 0), programs=programs), 0
 
 
 scales_p = Primitive("scales")

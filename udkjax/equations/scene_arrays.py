@@ -35,9 +35,9 @@ class SceneArrays(Generic[AnyArray]):
 
     def geometry(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q in the order of `ScenePrograms.psi_q_entries`."""
-        found = self._run("geometry", t, q, v)
+        arrays = self._run("geometry", t, q, v)
         _, _, places, factors = self.programs.psi_q_entries
-        return found["psi"], found["psi_dot"], found["psi_q"][places] * factors
+        return arrays["psi"], arrays["psi_dot"], arrays["psi_q"][places] * factors
 
     def loads(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return a_F (n,), and b (m,)."""
@@ -67,8 +67,8 @@ def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndar
 def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """Return the constants of the loops from the numbers of a scene and the gains."""
     evaluate, _ = _evaluator(programs, "prologue", xp)
-    given = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(programs.constants))}
-    return evaluate(given)["constants"]
+    arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(programs.constants))}
+    return evaluate(arrays)["constants"]
 
 
 @lru_cache(maxsize=256)

@@ -74,8 +74,8 @@ class ConstraintGroup(ElementGroup):
         s = self.programs.outputs["psi_q"][row * self.coordinates + k]
         if s.constant is not None:
             return w.graph.constant(s.constant)
-        found = w.read("psi_q", base, self.entry_index[s.index])
-        return found if s.sign > 0 else -found
+        value = w.read("psi_q", base, self.entry_index[s.index])
+        return value if s.sign > 0 else -value
 
     def entries(self, w: KernelWriter, row: int, base: int = ENTRIES) -> list[Scalar]:
         """Read all entries of a row of Psi_q."""
@@ -196,19 +196,19 @@ class SceneLayout:
     @cached_property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The entries of Psi_q: their rows, columns, indices in the array `psi_q`, and factors."""
-        found = [np.zeros((4, 0))]
+        blocks = [np.zeros((4, 0))]
         for group in self.constraints:
-            for place, s in enumerate(group.programs.outputs["psi_q"]):
+            for k, s in enumerate(group.programs.outputs["psi_q"]):
                 if s.is_zero:
                     continue
-                row, k = divmod(place, group.coordinates)
+                row, coordinate = divmod(k, group.coordinates)
                 ones = np.ones(len(group.table))
-                where = self.one * ones if s.constant is not None else group.table[:, ENTRIES] + group.entry_index[s.index]
+                index = self.one * ones if s.constant is not None else group.table[:, ENTRIES] + group.entry_index[s.index]
                 factor = ones * (s.sign if s.constant is None else s.constant)
-                column = group.table[:, BODIES + 3 * (k // 3)] + k % 3
-                found.append(np.stack([group.table[:, ROW] + row, column, where, factor]))
-        row, column, place, factor = np.concatenate(found, 1)
-        return row.astype(int), column.astype(int), place.astype(int), factor
+                column = group.table[:, BODIES + 3 * (coordinate // 3)] + coordinate % 3
+                blocks.append(np.stack([group.table[:, ROW] + row, column, index, factor]))
+        row, column, index, factor = np.concatenate(blocks, 1)
+        return row.astype(int), column.astype(int), index.astype(int), factor
 
 
 def abstract_mechanism(tree: TreeDef, shapes: LeafShapes) -> Mechanism:

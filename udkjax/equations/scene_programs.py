@@ -88,8 +88,8 @@ class ScenePrograms:
     @cached_property
     def is_small(self) -> bool:
         """True if the programs are unrolled because the accelerations take few operations."""
-        loops = [part for part in self.accelerations.parts if isinstance(part, KernelLoop)]
-        return sum(len(part.table) * part.kernel.operation_count for part in loops) <= UNROLLED_SCENE_OPERATIONS
+        loops = [loop for loop in self.accelerations.parts if isinstance(loop, KernelLoop)]
+        return sum(len(loop.table) * loop.kernel.operation_count for loop in loops) <= UNROLLED_SCENE_OPERATIONS
 
     @property
     def drop_tol_index(self) -> int:
@@ -147,7 +147,7 @@ class ScenePrograms:
         """Compute q1 and v1, each after a Newton step, and a, all from one factorization."""
         terms, solver, right = self._terms, self._solver, ("b", "psi", "psi_dot")
         system = [terms.sincos(), *terms.free_accelerations("v"), *terms.element_terms(("psi_q", *right))]
-        solves = [part for k in range(3) for part in solver.refined_solve(k, 3)]
+        solves = [loop for k in range(3) for loop in solver.refined_solve(k, 3)]
         corrected = [terms.add(f"{x}1", start=x, solution=k, sign=-1) for k, x in enumerate("qv", 1)]
         return program(system, solver.factorize_dropping, solves, [terms.add("a", start="free", solution=0), *corrected])
 
@@ -211,11 +211,11 @@ class ScenePrograms:
     @property
     def eliminated_rows(self) -> dict[int, int]:
         """The index in the linear systems of each retained row of Psi."""
-        found = {}
+        index = {}
         for group in self._layout.eliminated:
             for start, right in zip(group.table[:, ROW].tolist(), group.table[:, RIGHT].tolist(), strict=True):
-                found |= {start + row: right + k for k, row in enumerate(group.rows)}
-        return found
+                index |= {start + row: right + k for k, row in enumerate(group.rows)}
+        return index
 
     @cached_property
     def rows_and_loads(self) -> LoopProgram:
@@ -332,5 +332,5 @@ def scene_programs(
     Returns:
         The programs; the same object for the same structure and settings.
     """
-    of = structure(mechanism) if in_pieces else whole_structure(mechanism)
-    return _scene_programs(*of, redundant_rows, baumgarte, policy)
+    tree_and_shapes = structure(mechanism) if in_pieces else whole_structure(mechanism)
+    return _scene_programs(*tree_and_shapes, redundant_rows, baumgarte, policy)

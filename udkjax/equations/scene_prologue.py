@@ -36,20 +36,20 @@ def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) ->
     scene = KernelWriter()
     copies = [(GAINS + k, number_count + k) for k in range(layout.gains)]
     copies += [(k, number_count + layout.gains + layout.marks + k) for k in (DROP_TOL, SAFE_TOL)]
-    copies += [(layout.gravity + k, int(place)) for k, place in enumerate(np.ravel(places.gravity))]
-    for to, place in copies:
-        scene.write(scene.read("numbers", None, place), "constants", None, to)
+    copies += [(layout.gravity + k, int(source)) for k, source in enumerate(np.ravel(places.gravity))]
+    for target, source in copies:
+        scene.write(scene.read("numbers", None, source), "constants", None, target)
     body = KernelWriter()
     for k in range(2):
         body.write(1.0 / body.read("numbers", k), "constants", 2, k)
     bodies = [[int(b.mass), int(b.inertia), layout.of_body(k)] for k, b in enumerate(places.bodies.values())]
-    parts = [KernelLoop(scene.kernel(), np.zeros((1, 1), int)), KernelLoop(body.kernel(), np.array(bodies).reshape(-1, 3))]
+    loops = [KernelLoop(scene.kernel(), np.zeros((1, 1), int)), KernelLoop(body.kernel(), np.array(bodies).reshape(-1, 3))]
     constraints, forces = list(places.constraints.values()), list(places.forces.values())
-    parts += [_group_constants(layout, group, constraints) for group in layout.constraints]
-    parts += [_group_constants(layout, group, forces) for group in layout.forces]
+    loops += [_group_constants(layout, group, constraints) for group in layout.constraints]
+    loops += [_group_constants(layout, group, forces) for group in layout.forces]
     if layout.marks:
-        parts += [_marks(layout, group, number_count + layout.gains) for group in layout.constraints]
-    return LoopProgram(parts)
+        loops += [_marks(layout, group, number_count + layout.gains) for group in layout.constraints]
+    return LoopProgram(loops)
 
 
 def _marks(layout: SceneLayout, group: ConstraintGroup, start: int) -> KernelLoop:
@@ -65,8 +65,8 @@ def _group_constants(layout: SceneLayout, group: ElementGroup, elements: Sequenc
     starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)
     w, columns = KernelWriter(programs.graph), table.shape[1]
     for k, leaf in enumerate(programs.leaves):
-        for place, s in enumerate(leaf.flat):
-            w.bind(s, "numbers", columns + k, place)
+        for index, s in enumerate(leaf.flat):
+            w.bind(s, "numbers", columns + k, index)
     if isinstance(programs, ConstraintPrograms):
         for k, s in enumerate([*programs.gains, *programs.gravity]):
             w.bind(s, "constants", None, (GAINS if layout.gains else layout.gravity) + k)

@@ -86,6 +86,6 @@ class SceneSolver:
         yield self.elimination.distance()
 
 
-def program(*parts: Iterable[KernelLoop | Reset]) -> LoopProgram:
+def program(*sequences: Iterable[KernelLoop | Reset]) -> LoopProgram:
     """Concatenate sequences of loops to a program."""
-    return LoopProgram([part for some in parts for part in some])
+    return LoopProgram([loop for loops in sequences for loop in loops])

@@ -88,8 +88,8 @@ class SceneTerms:
 
         def write(w: KernelWriter):
             angle = np.asarray(w.read("q", BODY_COORDINATES, 2), object)
-            found = trace(lambda x: [jnp.sin(x), jnp.cos(x)], np.zeros(()))(w.graph, angle)
-            for k, s in enumerate(found):
+            sine_and_cosine = trace(lambda x: [jnp.sin(x), jnp.cos(x)], np.zeros(()))(w.graph, angle)
+            for k, s in enumerate(sine_and_cosine):
                 w.write(s.item(), "sines", SINE, k)
 
         return self.over_bodies("sincos", write, q=q, sines=sines)
@@ -138,8 +138,8 @@ class SceneTerms:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 if "psi_q" in outputs:
-                    for index, place in group.entry_index.items():
-                        w.write(Scalar(group.programs.graph, index), "psi_q", ENTRIES, place)
+                    for index, offset in group.entry_index.items():
+                        w.write(Scalar(group.programs.graph, index), "psi_q", ENTRIES, offset)
                 for k, name in enumerate(rights):
                     for i, row in enumerate(group.rows):
                         w.write(group.programs.outputs[name][row], f"right{k}", RIGHT, i)
@@ -172,8 +172,8 @@ class SceneTerms:
                 v, mass = w.read("v", BODY_COORDINATES, k), 1.0 / compliance(w, k)
                 kinetic = kinetic + mass * (v * v) * 0.5
                 potential = potential - mass * self._gravity(w, k) * w.read("q", BODY_COORDINATES, k)
-            for place, x in enumerate((kinetic, potential)):
-                w.write(x, "energy", None, place, ADD)
+            for index, x in enumerate((kinetic, potential)):
+                w.write(x, "energy", None, index, ADD)
 
         yield self.over_bodies("energy", write)
         for group in self.layout.forces:
@@ -191,8 +191,8 @@ class SceneTerms:
             def write(w: KernelWriter, group: ElementGroup = group, base: int = base):
                 w.write(group.programs.outputs["piece"][0], "pieces", base)
 
-            part = self.over_group("piece", group, write)
-            yield part._replace(table=np.concatenate([group.table, places[:, None]], 1))
+            loop = self.over_group("piece", group, write)
+            yield loop._replace(table=np.concatenate([group.table, places[:, None]], 1))
 
     # --- products with the eliminated rows of Psi_q and their transpose
 
@@ -220,7 +220,7 @@ class SceneTerms:
 
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
-    def remainder(self, solve: int, to: int) -> ProgramParts:
+    def remainder(self, solve: int, target: int) -> ProgramParts:
         """Compute the residual right - Psi_q M^(-1) Psi_q^T x of a linear system as the right-hand side of another one."""
         for group in self.layout.eliminated:
 
@@ -230,7 +230,7 @@ class SceneTerms:
                 for i, row in enumerate(group.rows):
                     w.write(w.read("right", RIGHT, i) - dot(w.graph, group.entries(w, row), z), "remainder", RIGHT, i)
 
-            names = {"jt_x": f"jt_x{solve}", "right": f"right{solve}", "remainder": f"right{to}"}
+            names = {"jt_x": f"jt_x{solve}", "right": f"right{solve}", "remainder": f"right{target}"}
             yield KernelLoop(self.kernel(("remainder", group), write), group.table, names)
 
     def add(
@@ -252,14 +252,14 @@ class SceneTerms:
 
         def write(w: KernelWriter):
             for k in range(size):
-                part = total = w.graph.constant(0.0)
+                difference = total = w.graph.constant(0.0)
                 if solution is not None:
-                    part = compliance(w, k) * w.read("change", base, k)
+                    difference = compliance(w, k) * w.read("change", base, k)
                 elif change is not None:
-                    part = w.read("change", base, k)
+                    difference = w.read("change", base, k)
                 if start is not None:
                     total = self.read_free(w, k) if start == "free" else w.read("start", base, k)
-                total = total + part if sign > 0 else total - part
+                total = total + difference if sign > 0 else total - difference
                 w.write(total, "to", base, k, update)
 
         key = "add", size, start if start in (None, "free") else "array", change is None, solution is None, sign, update

@@ -79,11 +79,11 @@ class SparsePosition(NamedTuple):
         for start in range(0, count, NULL_SPACE_BATCH):
             dependent = self.dependent[start : start + NULL_SPACE_BATCH]
             right = (independent @ self.D[dependent].T).toarray()
-            found = np.zeros((rows, len(dependent)))
-            found[self.independent] = -solve(right)
-            found[dependent, np.arange(len(dependent))] = 1.0
-            found[np.abs(found) < NEGLIGIBLE_SHARE] = 0.0
-            blocks.append(coo_array(found))
+            basis = np.zeros((rows, len(dependent)))
+            basis[self.independent] = -solve(right)
+            basis[dependent, np.arange(len(dependent))] = 1.0
+            basis[np.abs(basis) < NEGLIGIBLE_SHARE] = 0.0
+            blocks.append(coo_array(basis))
         return csc_array(_stack_columns(blocks, rows))
 
 
@@ -92,11 +92,11 @@ _SYMMETRIC: dict[str, Any] = {"permc_spec": "MMD_AT_PLUS_A", "options": {"Symmet
 
 def _stack_columns(blocks: list[SparseMatrix], rows: int) -> SparseMatrix:
     shift = np.cumsum([0, *(p.shape[1] for p in blocks)])
-    place = (
+    indices = (
         np.concatenate([p.row for p in blocks]),
         np.concatenate([p.col + s for p, s in zip(blocks, shift, strict=False)]),
     )
-    return coo_array((np.concatenate([p.data for p in blocks]), place), shape=(rows, shift[-1]))
+    return coo_array((np.concatenate([p.data for p in blocks]), indices), shape=(rows, shift[-1]))
 
 
 class SparseRows(RowTerms):
@@ -178,11 +178,11 @@ class SparseRows(RowTerms):
 
 def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
     """Return the pivots of D D^T in the order of elimination, for unit rows; dependent rows are skipped."""
-    place = np.empty(len(order), int)
-    place[order] = np.arange(len(order))
+    position = np.empty(len(order), int)
+    position[order] = np.arange(len(order))
     column: list[dict[int, float]] = [{} for _ in order]
     entries = coo_array(gram)
-    for i, j, value in zip(place[entries.row].tolist(), place[entries.col].tolist(), entries.data.tolist(), strict=True):
+    for i, j, value in zip(position[entries.row].tolist(), position[entries.col].tolist(), entries.data.tolist(), strict=True):
         if i >= j:
             column[j][i] = value
     pivots = np.zeros(len(order))
@@ -209,10 +209,12 @@ class RowSubset(NamedTuple):
 
 def split_dependent_rows(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[RowSubset]]]:
     """Split the rows into sets that depend on each other, and find the null space of each set."""
-    every = _stack_columns([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
-    rows, columns = every.shape
-    links = coo_array((np.ones(every.nnz), (every.row, rows + every.col)), shape=(rows + columns, rows + columns))
-    involved = np.unique(every.row)
+    null_vectors = _stack_columns([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
+    rows, columns = null_vectors.shape
+    links = coo_array(
+        (np.ones(null_vectors.nnz), (null_vectors.row, rows + null_vectors.col)), shape=(rows + columns, rows + columns)
+    )
+    involved = np.unique(null_vectors.row)
     _, label = np.unique(connected_components(links, directed=False)[1][involved], return_inverse=True)
     sets = [involved[label == k] for k in range(label.max(initial=-1) + 1)]
     return [(members, [_row_subset(p, members) for p in positions]) for members in sets]

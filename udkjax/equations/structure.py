@@ -46,21 +46,23 @@ def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
 
 def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
     """Return numbers and arrays as one vector, in order; by NumPy if they are concrete."""
-    parts = [jnp.ravel(jnp.asarray(x, float)) if isinstance(x, Tracer) else np.asarray(x) for x in join_concrete_numbers(numbers)]
-    if len(parts) < 2:
-        return parts[0] if parts else np.zeros(0)
-    return jnp.concatenate(parts)
+    vectors = [
+        jnp.ravel(jnp.asarray(x, float)) if isinstance(x, Tracer) else np.asarray(x) for x in join_concrete_numbers(numbers)
+    ]
+    if len(vectors) < 2:
+        return vectors[0] if vectors else np.zeros(0)
+    return jnp.concatenate(vectors)
 
 
 def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
     """Join each run of successive concrete numbers and arrays into one NumPy vector."""
-    parts = []
+    joined = []
     for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):
         if traced:
-            parts += group
+            joined += group
         else:
-            parts.append(np.concatenate([np.ravel(np.asarray(x, float)) for x in group]))
-    return parts
+            joined.append(np.concatenate([np.ravel(np.asarray(x, float)) for x in group]))
+    return joined
 
 
 class ElementStructure(NamedTuple):
@@ -105,13 +107,13 @@ def element_kinds(
 ) -> list[ElementKind]:
     """Sort elements by their structure and, if given, by their `labels`."""
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
-    found: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
+    kinds: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):
         frames = attached_bodies(element, joints)  # called once: a method call on a large module visits all of its leaves
         key = element_structure(element, frames), labels[i] if labels else None
-        found.setdefault(key, []).append((i, [body_index[name] for name in frames if name in body_index]))
+        kinds.setdefault(key, []).append((i, [body_index[name] for name in frames if name in body_index]))
     result = []
-    for (kind, _), members in found.items():
+    for (kind, _), members in kinds.items():
         bodies = np.array([b for _, b in members], int).reshape(len(members), -1).T
         result.append(ElementKind(kind, np.array([i for i, _ in members]), bodies))
     return result
@@ -131,18 +133,18 @@ def evaluate_by_kind(
     Returns:
         The kinds, each with its results; the first axis is that of the elements.
     """
-    q, found = states[0], []
+    q, results = states[0], []
     cos, sin = jnp.cos(q[:, 2:]), jnp.sin(q[:, 2:])
     frames = jnp.concatenate([q, cos, sin, *states[1:]], axis=1)  # the fields of `Frame` of each body
     ground = GROUND_FRAME if len(states) == 1 else GROUND_FRAME_AT_REST
     for kind in element_kinds(mechanism, elements):
 
         def evaluate(leaves: Sequence[Array], body_frames: Array, kind: ElementStructure = kind.structure) -> Result:
-            rest = iter(body_frames)
+            moving_frames = iter(body_frames)
             element = jax.tree.unflatten(kind.tree, leaves)
-            return function(element, *(ground if fixed else Frame(*next(rest)) for fixed in kind.ground))
+            return function(element, *(ground if fixed else Frame(*next(moving_frames)) for fixed in kind.ground))
 
         columns = zip(*(jax.tree.leaves(elements[i]) for i in kind.members), strict=True)
         leaves = [jnp.asarray(numbers_as_vector(column)).reshape(-1, *np.shape(column[0])) for column in columns]
-        found.append((kind, jax.vmap(evaluate)(leaves, frames[kind.bodies.T])))
-    return found
+        results.append((kind, jax.vmap(evaluate)(leaves, frames[kind.bodies.T])))
+    return results

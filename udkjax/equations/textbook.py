@@ -49,8 +49,8 @@ class TextbookEquations(MechanismSystem):
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """Return (I - M^(-1/2) D^+ D M^(1/2)) times dq and dv, the tangent parts of small changes at q."""
         mechanism, w = self.mechanism, self.weights
-        of = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
-        return TangentPart(*of(jnp.stack([dq, dv])))
+        tangent = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
+        return TangentPart(*tangent(jnp.stack([dq, dv])))
 
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Return Psi and Psi_dot of all rows."""

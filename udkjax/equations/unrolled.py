@@ -90,20 +90,20 @@ class Unrolled:
     def derivative(self, name: str) -> UnrolledDerivative:
         """Return one of the differentiable programs with its derivative."""
         results, outputs = self._derivatives[name]
-        early = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
-        stored = [s for s in early if s not in self._inputs]
-        at = {s: ("stored", k) for k, s in enumerate(stored)}
-        evaluation = self._program(results | {place: s for s, place in at.items()}, {})
-        return UnrolledDerivative(evaluation, self._program(outputs, at | self._seeds))
+        before_seeds = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
+        stored = [s for s in before_seeds if s not in self._inputs]
+        stored_inputs = {s: ("stored", k) for k, s in enumerate(stored)}
+        evaluation = self._program(results | {place: s for s, place in stored_inputs.items()}, {})
+        return UnrolledDerivative(evaluation, self._program(outputs, stored_inputs | self._seeds))
 
     def evaluations(self, names: Sequence[str]) -> UnrolledProgram:
         """Return the program of the numbers that derivatives need at one state, in arrays "stored" plus the name of a program."""
-        found: dict[ArrayPlace, Scalar] = {}
+        stored: dict[ArrayPlace, Scalar] = {}
         for name in names:
             evaluation = self.derivative(name).evaluation
             scalars = zip(evaluation.outputs, evaluation.program.outputs, strict=True)
-            found |= {(f"stored {name}", k): s for (x, k), s in scalars if x == "stored"}
-        return self._program(found, {})
+            stored |= {(f"stored {name}", k): s for (x, k), s in scalars if x == "stored"}
+        return self._program(stored, {})
 
     def prologue_derivative(self, active: Sequence[bool], mode: str) -> UnrolledProgram:
         """Return the program from tangents of the active numbers to tangents of the moving constants, or its transpose."""
@@ -117,18 +117,18 @@ class Unrolled:
 
         if mode == REVERSE:
             seeds = seeds_of(COTANGENT + "constants", range(len(values)))
-            found = dict(zip(variables, cotangents(graph, values, list(seeds), variables), strict=True))
-            outputs = {(COTANGENT + "numbers", k): found.get(s, graph.constant(0.0)) for s, (_, k) in numbers.items()}
+            changes = dict(zip(variables, cotangents(graph, values, list(seeds), variables), strict=True))
+            outputs = {(COTANGENT + "numbers", k): changes.get(s, graph.constant(0.0)) for s, (_, k) in numbers.items()}
         else:
             places = [numbers[s][1] for s in variables]
-            seeds, found = {}, {}
+            seeds, changes = {}, {}
             for prefix in (TANGENT, OTHER) if mode == TWICE else (TANGENT,):
-                some = seeds_of(prefix + "numbers", places)
-                found[prefix] = tangents(graph, values, dict(zip(variables, some, strict=True)))
-                seeds |= some
+                new_seeds = seeds_of(prefix + "numbers", places)
+                changes[prefix] = tangents(graph, values, dict(zip(variables, new_seeds, strict=True)))
+                seeds |= new_seeds
             if mode == TWICE:
-                found[SECOND] = tangents(graph, found[TANGENT], dict(zip(variables, some, strict=True)))
-            outputs = {(prefix + "constants", k): s for prefix, scalars in found.items() for k, s in enumerate(scalars)}
+                changes[SECOND] = tangents(graph, changes[TANGENT], dict(zip(variables, new_seeds, strict=True)))
+            outputs = {(prefix + "constants", k): s for prefix, scalars in changes.items() for k, s in enumerate(scalars)}
         program = ScalarProgram(graph, [*numbers, *seeds], list(outputs.values()))
         return UnrolledProgram(program, [*numbers.values(), *seeds.values()], list(outputs))
 
@@ -146,24 +146,24 @@ class Unrolled:
         return {}
 
     def _differentiate(
-        self, given: DifferentiableProgram, n: int, mode: str
+        self, differentiable: DifferentiableProgram, n: int, mode: str
     ) -> tuple[dict[ArrayPlace, Scalar], dict[ArrayPlace, Scalar]]:
         """Return the results and their tangents, or the cotangents of the inputs."""
-        arrays = self._unroll(given.program)
+        arrays = self._unroll(differentiable.program)
         results = {x: range(n) for x in ("a", "q1", "v1") if x in arrays}
         variables = {"constants": self.moving, "q": range(n), "v": range(n)}
-        prefixes, program = PREFIXES[mode], given.in_mode(mode)
+        prefixes, program = PREFIXES[mode], differentiable.in_mode(mode)
         group = "cotangent" if mode == REVERSE else "tangent"
         seeded, sought = (results, variables) if mode == REVERSE else (variables, results)
         seeds: Arrays = {}
         for prefix, x in product(prefixes, seeded):
             seeds[prefix + x] = {k: self.graph.input((prefix + x, k), group) for k in seeded[x]}
         self._seeds |= {s: (x, i) for x, scalars in seeds.items() for i, s in enumerate(scalars.values())}
-        found = self._unroll(program, arrays | seeds, None if mode == TWICE else group)
+        derivatives = self._unroll(program, arrays | seeds, None if mode == TWICE else group)
         changes = {}
         for prefix, x in product(prefixes, sought):
-            some = found.get(prefix + x, {})
-            changes |= {(prefix + x, i): some.get(k, self.graph.constant(0.0)) for i, k in enumerate(sought[x])}
+            by_index = derivatives.get(prefix + x, {})
+            changes |= {(prefix + x, i): by_index.get(k, self.graph.constant(0.0)) for i, k in enumerate(sought[x])}
         return _entries(arrays, ("a", "safe")), changes
 
 
@@ -173,8 +173,8 @@ def _entries(arrays: Arrays, names: Sequence[str]) -> dict[ArrayPlace, Scalar]:
 
 def _depending(graph: Graph, scalars: Sequence[Scalar]) -> set[int]:
     """Return the nodes that depend on any of the scalars."""
-    found = {s.index for s in scalars}
+    dependent = {s.index for s in scalars}
     for index, node in enumerate(graph.nodes):
-        if any(a.index in found for a in node.arguments):
-            found.add(index)
-    return found
+        if any(a.index in dependent for a in node.arguments):
+            dependent.add(index)
+    return dependent

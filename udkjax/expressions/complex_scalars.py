@@ -67,19 +67,19 @@ def solve_complex(
             factor = rows[i][k] * inverses[k]
             rows[i] = [*rows[i][: k + 1], *(x - factor * y for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True))]
     for k in reversed(range(n)):
-        found = rows[k][n:]
+        solution = rows[k][n:]
         for j in range(k + 1, n):
-            found = [x - rows[k][j] * y for x, y in zip(found, rows[j][n:], strict=True)]
-        rows[k] = [*rows[k][:n], *(x * inverses[k] for x in found)]
+            solution = [x - rows[k][j] * y for x, y in zip(solution, rows[j][n:], strict=True)]
+        rows[k] = [*rows[k][:n], *(x * inverses[k] for x in solution)]
     return [row[n:] for row in rows]
 
 
 def _larger_first(a: list[ComplexScalar], b: list[ComplexScalar], k: int) -> tuple[list[ComplexScalar], list[ComplexScalar]]:
-    """Return two rows, the one with the larger entry k first, without their entries before k."""
+    """Return two rows, the row with the larger entry k first; entries before k are not exchanged."""
     swap = greater(absolute(b[k].re) + absolute(b[k].im), absolute(a[k].re) + absolute(a[k].im))
 
     def choose(yes: ComplexScalar, no: ComplexScalar) -> ComplexScalar:
         return ComplexScalar(where(swap, yes.re, no.re), where(swap, yes.im, no.im))
 
-    rest = list(zip(a[k:], b[k:], strict=True))
-    return [*a[:k], *(choose(y, x) for x, y in rest)], [*b[:k], *(choose(x, y) for x, y in rest)]
+    pairs = list(zip(a[k:], b[k:], strict=True))
+    return [*a[:k], *(choose(y, x) for x, y in pairs)], [*b[:k], *(choose(x, y) for x, y in pairs)]

@@ -2,7 +2,7 @@
 
 A differential is a linear combination of the differentials of the inputs, d f = sum (df/dx) dx, stored as a row {x: df/dx}. The
 partial derivatives are expressions of the same graph: a cosine that they share with the function is one node, and zeros vanish.
-They serve any number of directions at once, and transposed, reverse mode.
+The same partial derivatives serve any number of directions at once and, transposed, reverse mode.
 
 Results of an opaque node (an array primitive, `call`) count as additional inputs. Their differentials follow from those of its
 arguments by JAX's rule for the primitive, forward or transposed.
@@ -98,16 +98,17 @@ def tangents(
         graph: The graph of all scalars.
         outputs: The functions f.
         seeds: The tangents dx by input; an input without one is constant.
-        given: Nodes already computed. If given, a factor common to all df/dx of an x is taken out of the sums and multiplies dx.
+        given: Nodes already computed. If not None, a factor common to all df/dx of an x is taken out of the sums and multiplies
+            dx.
 
     Returns:
         The tangent of each output.
     """
     differential = Differential(graph, outputs, list(seeds))
-    known = differential.forward({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
+    tangents_of_nodes = differential.forward({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
     rows, factors = _factored(differential, outputs, given)
-    known = {k: t * factors[k] if k in factors else t for k, t in known.items()}
-    return [product(row, known, graph) for row in rows]
+    tangents_of_nodes = {k: t * factors[k] if k in factors else t for k, t in tangents_of_nodes.items()}
+    return [product(row, tangents_of_nodes, graph) for row in rows]
 
 
 def cotangents(
@@ -129,12 +130,12 @@ def cotangents(
     Returns:
         The cotangent of each input.
     """
-    differential, found = Differential(graph, outputs, inputs), {}
+    differential, result = Differential(graph, outputs, inputs), {}
     rows, factors = _factored(differential, outputs, given)
     for row, seed in zip(rows, seeds, strict=True):
-        accumulate(found, row, seed)
-    found = {k: c * factors[k] if k in factors else c for k, c in found.items()}
-    return [c if s.sign > 0 else -c for c, s in zip(differential.reverse(found), inputs, strict=True)]
+        accumulate(result, row, seed)
+    result = {k: c * factors[k] if k in factors else c for k, c in result.items()}
+    return [c if s.sign > 0 else -c for c, s in zip(differential.reverse(result), inputs, strict=True)]
 
 
 def _factored(
@@ -144,9 +145,9 @@ def _factored(
     return (rows, {}) if given is None else common_factors(rows, given)
 
 
-def product(row: SparseRow, known: Mapping[int, Scalar], graph: Graph) -> Scalar:
+def product(row: SparseRow, vector: Mapping[int, Scalar], graph: Graph) -> Scalar:
     """Return the product of a row and a vector."""
-    return sum((p * known[k] for k, p in row.items() if k in known), graph.constant(0.0))
+    return sum((p * vector[k] for k, p in row.items() if k in vector), graph.constant(0.0))
 
 
 def accumulate(total: SparseRow, row: SparseRow, factor: Scalar) -> None:
@@ -169,17 +170,19 @@ def common_factors(rows: Sequence[SparseRow], given: Collection[int] = ()) -> tu
     factors: SparseRow = {}
     for k, entries in columns.items():
         splits = [e.node.kind == "mul" and e.index not in given for e in entries]
-        held = [{a.index for a in e.node.arguments} if split else set() for e, split in zip(entries, splits, strict=True)]
-        common = set.intersection(*held) if len(entries) > 1 else None
+        factors_of_entries = [
+            {a.index for a in e.node.arguments} if split else set() for e, split in zip(entries, splits, strict=True)
+        ]
+        common = set.intersection(*factors_of_entries) if len(entries) > 1 else None
         if common:
             factors[k] = Scalar(entries[0].graph, max(common))
     return [{k: _without(e, factors[k]) if k in factors else e for k, e in row.items()} for row in rows], factors
 
 
 def _without(entry: Scalar, factor: Scalar) -> Scalar:
-    one, other = entry.node.arguments
-    rest = other if one.index == factor.index else one
-    return rest if entry.sign > 0 else -rest
+    first, second = entry.node.arguments
+    quotient = second if first.index == factor.index else first
+    return quotient if entry.sign > 0 else -quotient
 
 
 def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
@@ -229,8 +232,8 @@ def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Seq
         return jax.jvp(_restrict(node.detail, arrays, active, wanted), [arrays[k] for k in active], dots)[1]
 
     jaxpr = jax.make_jaxpr(pushed)(_structs(arrays), _structs([dots[k] for k in active]))
-    found = dict(zip(wanted, read_jaxpr(graph, jaxpr, [*arrays, *(dots[k] for k in active)]), strict=True))
-    return {k: _pick(graph, k, found) for k in results if not _pick(graph, k, found).is_zero}
+    result = dict(zip(wanted, read_jaxpr(graph, jaxpr, [*arrays, *(dots[k] for k in active)]), strict=True))
+    return {k: _pick(graph, k, result) for k in results if not _pick(graph, k, result).is_zero}
 
 
 def _pull_back(graph: Graph, call: int, seeds: SparseRow, flags: Sequence[bool]) -> list[Scalar]:
@@ -259,9 +262,9 @@ def _restrict(
 ) -> Callable[..., list[jax.Array]]:
     """Return an array primitive as a function from some of its arguments to some of its results."""
 
-    def function(*some):
+    def function(*active_values):
         values = list(arrays)
-        for k, value in zip(active, some, strict=True):
+        for k, value in zip(active, active_values, strict=True):
             values[k] = value
         results = detail.primitive.bind(*values, **detail.parameters)
         results = results if detail.primitive.multiple_results else [results]
@@ -274,9 +277,9 @@ def _outputs(graph: Graph, results: Sequence[int]) -> list[int]:
     return sorted({graph.nodes[k].detail[0] for k in results})
 
 
-def _pick(graph: Graph, k: int, found: Mapping[int, np.ndarray]) -> Scalar:
+def _pick(graph: Graph, k: int, outputs: Mapping[int, np.ndarray]) -> Scalar:
     output, flat = graph.nodes[k].detail
-    return found[output].flat[flat]  # pyright: ignore[reportReturnType]
+    return outputs[output].flat[flat]  # pyright: ignore[reportReturnType]
 
 
 def _arrays(node: Node, scalars: Sequence[object]) -> list[np.ndarray]:

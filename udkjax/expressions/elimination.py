@@ -1,8 +1,8 @@
 """Symbolic factorization of a sparse matrix of scalars, done while the graph is built.
 
-Constant entries are the first pivots, in the sparsest rows and columns: no number of a run can make them small. The rest of the
-matrix A (m, n), m >= n, of full column rank, is triangularized by Givens rotations, which need no pivoting either: in lanes, all
-members take the same operations. With E for the row operations, E A = [U, V; 0, B], B = Q R,
+Constant entries are the first pivots, in the sparsest rows and columns: no input can make them small. The rest of the
+matrix A (m, n), m >= n, of full column rank, is triangularized by Givens rotations, which need no pivoting either: all members of
+a batch run the same operations. With E for the row operations, E A = [U, V; 0, B], B = Q R,
 
     A x = b:      B x_2 = (E b)_2 by R x_2 = Q^T (E b)_2, then U x_1 = (E b)_1 - V x_2,
     A^T y = c:    the same operations transposed, in the reverse order.
@@ -40,11 +40,11 @@ class SymbolicFactors:
         self._sizes = [max((abs(x.constant) for x in row.values() if x.constant is not None), default=0.0) for row in self._rows]
         self._pivots: list[tuple[int, int]] = []
         self._operations: list[tuple[int, int, Scalar]] = []  # (i, r, factor): row i minus factor times row r
-        while (place := self._sparsest_constant()) is not None:
-            self._eliminate(*place)
-        taken = {c for _, c in self._pivots}
+        while (pivot := self._sparsest_constant()) is not None:
+            self._eliminate(*pivot)
+        pivot_columns = {c for _, c in self._pivots}
         used = {r for r, _ in self._pivots}
-        self.open_columns = [c for c in range(columns) if c not in taken]
+        self.open_columns = [c for c in range(columns) if c not in pivot_columns]
         self._open_rows = [r for r in range(len(rows)) if r not in used]
         zero = graph.constant(0.0)
         self.block = [[self._rows[r].get(c, zero) for c in self.open_columns] for r in self._open_rows]
@@ -66,8 +66,8 @@ class SymbolicFactors:
         x = dict(zip(self.open_columns, y, strict=False))
         for r, c in reversed(self._pivots):
             row = self._rows[r]
-            rest = sum((a * x[j] for j, a in row.items() if j != c), self._graph.constant(0.0))
-            x[c] = (b[r] - rest) / row[c]
+            other_terms = sum((a * x[j] for j, a in row.items() if j != c), self._graph.constant(0.0))
+            x[c] = (b[r] - other_terms) / row[c]
         return [x[c] for c in range(len(x))]
 
     def solve_transposed(self, right: Sequence[Scalar]) -> list[Scalar]:
@@ -98,13 +98,13 @@ class SymbolicFactors:
         """Return the position of the constant entry that causes the least fill."""
         used = {r for r, _ in self._pivots}
         counts: dict[int, int] = {}
-        left = [(r, row) for r, row in enumerate(self._rows) if r not in used]
-        for _, row in left:
+        remaining = [(r, row) for r, row in enumerate(self._rows) if r not in used]
+        for _, row in remaining:
             for c in row:
                 counts[c] = counts.get(c, 0) + 1
         costs = [
             ((len(row) - 1) * (counts[c] - 1), r, c)
-            for r, row in left
+            for r, row in remaining
             for c, a in row.items()
             if a.constant is not None and abs(a.constant) >= LEAST_PIVOT * self._sizes[r]
         ]

@@ -2,7 +2,7 @@
 
 Equal expressions are one node, zeros and ones vanish while the graph is built, and a sign costs nothing: a `Scalar` is a
 signed reference to a node, so that a - b, b - a and -(a - b) share one subtraction. Nodes that no output needs are
-never emitted (scalar_program.py), so a caller builds freely and chooses later.
+never emitted (scalar_program.py), so a caller may build more nodes than it needs.
 """
 
 import math
@@ -144,9 +144,9 @@ class Graph:
         x, y = a.constant, b.constant
         if x is not None and y is not None:
             return self.constant(x * y, a.node.dtype)
-        for one, other, factor in ((a, b, x), (b, a, y)):
+        for x_side, other, factor in ((a, b, x), (b, a, y)):
             if factor == 0.0:
-                return one
+                return x_side
             if factor in (1.0, -1.0):
                 return other if factor > 0 else -other
         if b.index < a.index:
@@ -201,53 +201,53 @@ class Graph:
         arrays = []
         for k, (shape, dtype) in enumerate(outputs):
             array = np.empty(shape, object)
-            for place in np.ndindex(*shape):
-                flat = int(np.ravel_multi_index(place, shape)) if shape else 0
-                array[place] = Scalar(self, self._operation("pick", (Scalar(self, index),), (k, flat), np.dtype(dtype)))
+            for position in np.ndindex(*shape):
+                flat = int(np.ravel_multi_index(position, shape)) if shape else 0
+                array[position] = Scalar(self, self._operation("pick", (Scalar(self, index),), (k, flat), np.dtype(dtype)))
             arrays.append(array)
         return arrays
 
     def dependencies(self, wanted: Iterable[int], given: Collection[int] = (), group: str | None = None) -> list[int]:
-        """Return the nodes on which some nodes depend, in order of evaluation, without `given` and its dependencies.
+        """Return the nodes on which the `wanted` nodes depend, in order of evaluation, without `given` and its dependencies.
 
         With a `group` of inputs, return only those that depend on it.
         """
-        nodes, found, stack = self.nodes, set(), list(wanted)
+        nodes, visited, stack = self.nodes, set(), list(wanted)
         while stack:
             index = stack.pop()
-            if index not in found and index not in given and (group is None or group in nodes[index].depends):
-                found.add(index)
+            if index not in visited and index not in given and (group is None or group in nodes[index].depends):
+                visited.add(index)
                 stack += [a.index for a in nodes[index].arguments]
-        return sorted(found)
+        return sorted(visited)
 
-    def copy(self, program: "Expressions", known: Mapping[int, Scalar]) -> list[Scalar]:
+    def copy(self, program: "Expressions", inputs: Mapping[int, Scalar]) -> list[Scalar]:
         """Copy a program of another graph into this one and return its outputs; its inputs, by index, are replaced by scalars."""
-        found = dict(known)
+        copies = dict(inputs)
 
         def here(a: Scalar) -> Scalar:
-            new = found[a.index]
+            new = copies[a.index]
             return new if a.sign > 0 else -new
 
         for index in program.order:
             node = program.graph.nodes[index]
             match node.kind:
                 case "constant":
-                    found[index] = self.constant(node.detail, node.dtype)
+                    copies[index] = self.constant(node.detail, node.dtype)
                 case "add":
-                    found[index] = here(node.arguments[0]) + here(node.arguments[1])
+                    copies[index] = copied(node.arguments[0]) + copied(node.arguments[1])
                 case "sub":
-                    found[index] = here(node.arguments[0]) - here(node.arguments[1])
+                    copies[index] = copied(node.arguments[0]) - copied(node.arguments[1])
                 case "mul":
-                    found[index] = self.multiply(here(node.arguments[0]), here(node.arguments[1]))
+                    copies[index] = self.multiply(copied(node.arguments[0]), copied(node.arguments[1]))
                 case "div":
-                    found[index] = self.divide(here(node.arguments[0]), here(node.arguments[1]))
+                    copies[index] = self.divide(copied(node.arguments[0]), copied(node.arguments[1]))
                 case "sqrt":
-                    found[index] = self.sqrt(here(node.arguments[0]))
+                    copies[index] = self.sqrt(copied(node.arguments[0]))
                 case _:
-                    found[index] = Scalar(
-                        self, self._operation(node.kind, tuple(map(here, node.arguments)), node.detail, node.dtype)
+                    copies[index] = Scalar(
+                        self, self._operation(node.kind, tuple(map(copied, node.arguments)), node.detail, node.dtype)
                     )
-        return [here(s) for s in program.outputs]
+        return [copied(s) for s in program.outputs]
 
     def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
         depends = frozenset().union(*[self.nodes[a.index].depends for a in arguments])
@@ -263,7 +263,7 @@ class Graph:
 
 
 class Expressions(Protocol):
-    """Some nodes of a graph in order of evaluation, and the outputs among them."""
+    """Nodes of a graph in order of evaluation, and the outputs among them."""
 
     graph: Graph
     order: list[int]

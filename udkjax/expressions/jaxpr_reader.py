@@ -1,8 +1,8 @@
 """Read a jaxpr into a graph of scalars.
 
 An array is a NumPy array of Scalars: reshaping, slicing and broadcasting vanish, and elementwise primitives become scalar
-operations, which the graph can simplify. Any other primitive becomes one opaque node with its arrays: all that JAX can trace can
-be read.
+operations, which the graph can simplify. Any other primitive becomes one opaque node with its arrays: every function that JAX can
+trace can be read.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from udkjax.expressions.graph import BoundPrimitive, Graph, Scalar
 ClosedJaxpr: TypeAlias = Any  # JAX exports the class, but not to type checkers
 Equation: TypeAlias = Any  # its annotations omit the shapes of its variables
 Dimensions = tuple[Sequence[int], Sequence[int]]
-DimensionNumbers = tuple[Dimensions, Dimensions]  # of `dot_general`: contracted and batch dimensions of each operand
+DimensionNumbers = tuple[Dimensions, Dimensions]  # parameters of `dot_general`: contracted and batch dimensions of each operand
 
 _INLINED = (
     "jit",
@@ -35,7 +35,7 @@ _INLINED = (
     "checkpoint",
 )
 POWERS = 20  # powers of two whose sum is exact, also in single precision
-UNROLLED_OPERATIONS = 20_000  # most operations of an unrolled loop, over all its iterations: more take too long to compile
+UNROLLED_OPERATIONS = 20_000  # maximum for an unrolled loop, over all its iterations: more take too long to compile
 # Positions of the updates and of the indices among the inputs of primitives that put elements into an array.
 _REPLACING: dict[str, Callable[[list[np.ndarray]], tuple[np.ndarray, list[np.ndarray]]]] = {
     "scatter": lambda inputs: (inputs[2], [inputs[1]]),
@@ -53,7 +53,7 @@ def trace(function: Callable, *examples: object) -> Callable[..., list[np.ndarra
 
     Args:
         function: A function of arrays.
-        examples: Arrays or shapes of its arguments, as `jax.make_jaxpr` takes them.
+        examples: Its arguments, or their shapes, as for `jax.make_jaxpr`.
 
     Returns:
         A function of a graph and of arguments, given as arrays of Scalars, that returns the outputs as arrays of Scalars.
@@ -82,8 +82,8 @@ def read_jaxpr(graph: Graph, closed: ClosedJaxpr, arguments: Sequence[np.ndarray
 def _constants(graph: Graph, value: ArrayLike) -> np.ndarray:
     value = np.asarray(value)
     array = np.empty(value.shape, object)
-    for place in np.ndindex(*value.shape):
-        array[place] = graph.constant(value[place], value.dtype)
+    for position in np.ndindex(*value.shape):
+        array[position] = graph.constant(value[position], value.dtype)
     return array
 
 
@@ -131,8 +131,8 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return [np.asarray(_replace(equation, inputs), object)]
     if name in ("pad", "tile"):  # JAX moves the indices of the elements; the index of the padding follows them
         places, size = np.arange(inputs[0].size).reshape(inputs[0].shape), inputs[0].size
-        taken = _fold(equation.primitive, parameters, [places, *(np.asarray(size) for _ in inputs[1:])])
-        return [np.concatenate([i.reshape(-1) for i in inputs])[np.asarray(taken)]]
+        positions = _fold(equation.primitive, parameters, [places, *(np.asarray(size) for _ in inputs[1:])])
+        return [np.concatenate([i.reshape(-1) for i in inputs])[np.asarray(positions)]]
     if name == "scatter-add" and all(s.constant is not None for s in inputs[1].flat):
         return [_add_at(equation, *inputs)]
     if name == "unstack":
@@ -157,20 +157,20 @@ def _unroll(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[
     rows = sum(a.aval.shape != b.aval.shape for a, b in zip(equation.invars, inner.invars, strict=True))
     carries = sum(a.aval.shape == b.aval.shape for a, b in zip(equation.outvars, inner.outvars, strict=True))
     ends = np.cumsum([len(inputs) - carries - rows, carries])
-    fixed, state, each = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
-    found: dict[int, list[np.ndarray]] = {}
+    fixed, state, scanned = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
+    rows_of_outputs: dict[int, list[np.ndarray]] = {}
     for k in reversed(order) if equation.params["reverse"] else order:
-        outputs = _read_inner(graph, body, [*fixed, *state, *(np.asarray(x[k], object) for x in each)])
-        state, found[k] = outputs[:carries], outputs[carries:]
-    columns = zip(*(found[k] for k in order), strict=True)
+        outputs = _read_inner(graph, body, [*fixed, *state, *(np.asarray(x[k], object) for x in scanned)])
+        state, rows_of_outputs[k] = outputs[:carries], outputs[carries:]
+    columns = zip(*(rows_of_outputs[k] for k in order), strict=True)
     return [*state, *(np.stack([np.asarray(x, object) for x in column]) for column in columns)]
 
 
 def _elementwise(operation: Callable[..., Scalar], shape: tuple[int, ...], inputs: list[np.ndarray]) -> np.ndarray:
     result = np.empty(shape, object)
     inputs = [np.broadcast_to(i, shape) for i in inputs]
-    for place in np.ndindex(*shape):
-        result[place] = operation(*(i[place] for i in inputs))
+    for position in np.ndindex(*shape):
+        result[position] = operation(*(i[position] for i in inputs))
     return result
 
 
@@ -207,21 +207,21 @@ def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
     places = np.arange(elements.size, dtype=equation.outvars[0].aval.dtype)
     numbered = iter(np.split(places, [inputs[0].size]))
     values = [_values(i) if any(i is x for x in indices) else next(numbered).reshape(i.shape) for i in inputs]
-    taken = _fold(equation.primitive, equation.params, values)
-    return elements[np.asarray(taken, int)]
+    positions = _fold(equation.primitive, equation.params, values)
+    return elements[np.asarray(positions, int)]
 
 
 def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates: np.ndarray) -> np.ndarray:
-    """Add the elements of one array to another at constant indices: JAX adds powers of two, whose sums tell the elements."""
-    found, dtype = array.copy(), equation.outvars[0].aval.dtype
+    """Add the elements of one array to another at constant indices: JAX adds powers of two, whose sums identify the elements."""
+    result, dtype = array.copy(), equation.outvars[0].aval.dtype
     for first in range(0, updates.size, POWERS):
         powers = np.zeros(updates.size, dtype)
         powers[first : first + POWERS] = 2.0 ** np.arange(min(POWERS, updates.size - first))
         zeros, places = np.zeros(array.shape, dtype), _values(indices)
         sums = np.asarray(_fold(equation.primitive, equation.params, [zeros, places, powers.reshape(updates.shape)]), np.int64)
         for k in range(first, min(first + POWERS, updates.size)):
-            found[sums >> (k - first) & 1 == 1] += updates.flat[k]
-    return found
+            result[sums >> (k - first) & 1 == 1] += updates.flat[k]
+    return result
 
 
 def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
@@ -229,11 +229,11 @@ def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
     array, *indices = inputs
     places, outside = np.arange(array.size).reshape(array.shape), array.size  # the position of indices out of bounds
     parameters = {**equation.params, "fill_value": outside} if "fill_value" in equation.params else equation.params
-    taken = _fold(equation.primitive, parameters, [places, *(_values(i) for i in indices)])
-    if not np.any(taken == outside):
-        return array.reshape(-1)[taken]
+    positions = _fold(equation.primitive, parameters, [places, *(_values(i) for i in indices)])
+    if not np.any(positions == outside):
+        return array.reshape(-1)[positions]
     graph, fill = array.flat[0].graph, equation.params["fill_value"]
-    return np.append(array.reshape(-1), graph.constant(np.nan if fill is None else fill, array.flat[0].node.dtype))[taken]
+    return np.append(array.reshape(-1), graph.constant(np.nan if fill is None else fill, array.flat[0].node.dtype))[positions]
 
 
 def _integer_power(x: Scalar, y: int) -> Scalar:

@@ -15,10 +15,10 @@ from udkjax.expressions.loop_program import ADD, SET, Address, Kernel, KernelLoo
 from udkjax.expressions.scalar_program import ScalarProgram
 
 TANGENT, COTANGENT = "d_", "bar_"
-OTHER, SECOND = "e_", "de_"  # tangents along another direction, and along both
+OTHER, SECOND = "e_", "de_"  # prefixes of tangents along another direction, and along both
 # Modes of differentiation: along a direction, its transpose, and along two directions with the second derivative of both.
 FORWARD, REVERSE, TWICE = "forward", "reverse", "twice"
-PREFIXES = {FORWARD: (TANGENT,), REVERSE: (COTANGENT,), TWICE: (TANGENT, OTHER, SECOND)}  # of arrays of changes, or cotangents
+PREFIXES = {FORWARD: (TANGENT,), REVERSE: (COTANGENT,), TWICE: (TANGENT, OTHER, SECOND)}  # of the names of arrays
 
 
 class LoopDerivative:
@@ -52,7 +52,7 @@ class LoopDerivative:
     def second(self, settled: Collection[str]) -> LoopProgram:
         """Return the program of the tangents of all arrays along two directions and along both: d x, e x, and d(e x).
 
-        Each kernel computes the three for its results at once, so that a number that has been read may still be added to. The
+        Each kernel computes the three for its results at once, so that numbers that have been read can still be added to. The
         `settled` arrays have only second-order tangents.
         """
         parts: list[KernelLoop | Reset] = []
@@ -85,9 +85,9 @@ class LoopDerivative:
         seeds = {s: graph.input((TANGENT, s.index), "tangent") for s, _ in active}
         given = {s.index for s in kernel.program.inputs}
         stored, added = ([x for x in outputs if (x[1].update == SET) == is_stored] for is_stored in (True, False))
-        found = [*tangents(graph, [s for s, _ in stored], seeds, given), *tangents(graph, [s for s, _ in added], seeds)]
+        results = [*tangents(graph, [s for s, _ in stored], seeds, given), *tangents(graph, [s for s, _ in added], seeds)]
         places = [address for _, address in (*stored, *added)]
-        writes = [(s, address) for s, address in zip(found, places, strict=True) if address.update == SET or not s.is_zero]
+        writes = [(s, address) for s, address in zip(results, places, strict=True) if address.update == SET or not s.is_zero]
         reads = [(seeds[s], address) for s, address in active]
         return _kernel(kernel, _prefixed(reads, TANGENT), _prefixed(writes, TANGENT))
 
@@ -96,9 +96,9 @@ class LoopDerivative:
         graph = kernel.program.graph
         seeds = [graph.input((COTANGENT, k), "cotangent") for k in range(len(outputs))]
         given = {s.index for s in kernel.program.inputs}
-        found = cotangents(graph, [s for s, _ in outputs], seeds, [s for s, _ in active], given)
+        results = cotangents(graph, [s for s, _ in outputs], seeds, [s for s, _ in active], given)
         places = [address._replace(update=ADD) for _, address in active]
-        writes = [(s, address) for s, address in zip(found, places, strict=True) if not s.is_zero]
+        writes = [(s, address) for s, address in zip(results, places, strict=True) if not s.is_zero]
         reads = list(zip(seeds, (address for _, address in outputs), strict=True))
         return _kernel(kernel, _prefixed(reads, COTANGENT), _prefixed(writes, COTANGENT))
 
@@ -109,7 +109,7 @@ Addressed = list[tuple[Scalar, Address]]
 def _active(kernel: Kernel, constant_arrays: frozenset[str]) -> tuple[Addressed, Addressed]:
     """Return the inputs and the outputs that have derivatives.
 
-    A fixed input that is computed from others, such as the sine of an angle, is differentiated with respect to them.
+    A fixed input that is computed from other inputs, such as the sine of an angle, is differentiated with respect to these.
     """
     inputs, outputs = (
         zip(kernel.program.inputs, kernel.inputs, strict=True),
@@ -122,15 +122,15 @@ def _push_twice(kernel: Kernel, constant_arrays: frozenset[str], still: frozense
     active, outputs = _active(kernel, constant_arrays)
     graph, results = kernel.program.graph, [s for s, _ in outputs]
     moving = {prefix: [x for x in active if x[1].array not in still] for prefix in (TANGENT, OTHER)} | {SECOND: active}
-    seeds = {prefix: {s: graph.input((prefix, s.index), "tangent") for s, _ in some} for prefix, some in moving.items()}
-    one, other = (tangents(graph, results, seeds[prefix]) for prefix in (TANGENT, OTHER))
+    seeds = {prefix: {s: graph.input((prefix, s.index), "tangent") for s, _ in addressed} for prefix, addressed in moving.items()}
+    first_tangents, second_tangents = (tangents(graph, results, seeds[prefix]) for prefix in (TANGENT, OTHER))
     first = seeds[OTHER] | {d: seeds[SECOND][s] for s, d in seeds[TANGENT].items()}
     settled = {s: d for s, d in seeds[SECOND].items() if s not in seeds[TANGENT]}
-    both = [a + b for a, b in zip(tangents(graph, one, first), tangents(graph, results, settled), strict=True)]
+    mixed = [a + b for a, b in zip(tangents(graph, first_tangents, first), tangents(graph, results, settled), strict=True)]
     reads, writes = [], []
-    for prefix, found in {TANGENT: one, OTHER: other, SECOND: both}.items():
+    for prefix, changes in {TANGENT: first_tangents, OTHER: second_tangents, SECOND: mixed}.items():
         reads += _prefixed([(seeds[prefix][s], address) for s, address in moving[prefix]], prefix)
-        written = [(s, x) for s, (_, x) in zip(found, outputs, strict=True) if prefix == SECOND or x.array not in still]
+        written = [(s, x) for s, (_, x) in zip(changes, outputs, strict=True) if prefix == SECOND or x.array not in still]
         writes += _prefixed([(s, x) for s, x in written if x.update == SET or not s.is_zero], prefix)
     return _kernel(kernel, reads, writes)
 

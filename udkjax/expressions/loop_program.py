@@ -21,14 +21,14 @@ from udkjax.expressions.scalar_program import ScalarProgram
 # Ways to update a number with an output: replace it, add to it, take the maximum, or the conjunction.
 SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
 _BY_ARRAYS = {ADD: np.add, MAXIMUM: np.maximum, ALL: np.minimum}
-_BY_FLOATS = {  # NaN stays
+_BY_FLOATS = {  # NaN propagates
     ADD: operator.add,
     MAXIMUM: lambda a, b: a if a >= b or a != a else b,
     ALL: lambda a, b: a if a <= b or a != a else b,
 }
 _NEUTRAL = {ADD: 0.0, MAXIMUM: -math.inf, ALL: math.inf}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
-MOST_TURNS = 8  # updates of one place that JAX makes one by one; more become a loop
+MOST_TURNS = 8  # number of updates of one place that JAX unrolls; more become a loop
 
 
 class Address(NamedTuple):
@@ -108,23 +108,23 @@ class LoopProgram(NamedTuple):
     @property
     def arrays(self) -> set[str]:
         """The names of all arrays that the program reads or writes."""
-        found = {part.array for part in self.parts if isinstance(part, Reset)}
-        return found.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, KernelLoop)))
+        names = {part.array for part in self.parts if isinstance(part, Reset)}
+        return names.union(*({part.array(x) for x in part.kernel.arrays} for part in self.parts if isinstance(part, KernelLoop)))
 
 
 class LaidOutPart(NamedTuple):
-    """A part of a program with the places of each of its numbers, one for each row of its table."""
+    """A part of a program with the indices of each of its numbers, one for each row of its table."""
 
     run: ScalarProgram | float  # a float: the constant that part of an array is set to
-    inputs: list[tuple[str, Any]]  # array ("" if unused) and places of each
-    outputs: list[tuple[str, Any, str]]  # array, places and update of each
-    count: int  # of rows
+    inputs: list[tuple[str, Any]]  # array ("" if unused) and indices of each
+    outputs: list[tuple[str, Any, str]]  # array, indices and update of each
+    count: int  # number of rows
 
 
 class ArrayLoops:
     """A loop program as a function of its arrays, by NumPy or JAX; no row of a loop may read a number that another row writes.
 
-    The places of all numbers are found once, for all calls.
+    The indices of all numbers are computed once, for all calls.
     """
 
     def __init__(self, program: LoopProgram, xp: ModuleType):
@@ -138,26 +138,26 @@ class ArrayLoops:
     def __call__(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
         """Return the arrays after a run of the program; the given arrays do not change."""
         if self._xp is jnp:
-            found = dict(arrays)
+            results = dict(arrays)
             for part in self._parts:
-                _run_by_jax(part, found)
-            return found
+                _run_by_jax(part, results)
+            return results
         if self._short_parts:
             try:
                 return self._run_on_floats(arrays, self._short_parts)
-            except (ArithmeticError, ValueError):  # from a number that is not finite
+            except (ArithmeticError, ValueError):  # a number is not finite
                 pass
-        found = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
+        results = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
         for part in self._parts:
-            _run_by_numpy(part, found)
-        return found
+            _run_by_numpy(part, results)
+        return results
 
     def _run_on_floats(self, arrays: Mapping[str, Any], parts: Sequence[LaidOutPart]) -> dict[str, np.ndarray]:
         involved = self._written | self._read
-        found = {name: np.asarray(x, float).tolist() for name, x in arrays.items() if name in involved}
+        lists = {name: np.asarray(x, float).tolist() for name, x in arrays.items() if name in involved}
         for part in parts:
-            _run_on_floats(part, found)
-        return {name: np.array(found[name], float) if name in self._written else x for name, x in arrays.items()}
+            _run_on_floats(part, lists)
+        return {name: np.array(lists[name], float) if name in self._written else x for name, x in arrays.items()}
 
 
 def _lay_out(part: KernelLoop | Reset) -> LaidOutPart:
@@ -175,70 +175,70 @@ def _lay_out(part: KernelLoop | Reset) -> LaidOutPart:
 
 
 def _with_lists(part: LaidOutPart) -> LaidOutPart:
-    """Return a part with lists in place of arrays."""
+    """Return a part with lists instead of arrays."""
     if not isinstance(part.run, ScalarProgram):
         return part
     inputs = [(name, places.tolist()) for name, places in part.inputs]
     return part._replace(inputs=inputs, outputs=[(name, places.tolist(), update) for name, places, update in part.outputs])
 
 
-def _run_by_numpy(part: LaidOutPart, found: dict[str, np.ndarray]) -> None:
+def _run_by_numpy(part: LaidOutPart, arrays: dict[str, np.ndarray]) -> None:
     if not part.outputs:
         return
     results: Any = [part.run]
     if isinstance(part.run, ScalarProgram):
-        results = part.run.by_numpy([found[name][places] if name else places for name, places in part.inputs])
+        results = part.run.by_numpy([arrays[name][places] if name else places for name, places in part.inputs])
     for x, (name, places, update) in zip(results, part.outputs, strict=True):
         if update == SET:
-            found[name][places] = x
+            arrays[name][places] = x
         else:
-            _BY_ARRAYS[update].at(found[name], places, x)
+            _BY_ARRAYS[update].at(arrays[name], places, x)
 
 
-def _run_on_floats(part: LaidOutPart, found: dict[str, list[float]]) -> None:
+def _run_on_floats(part: LaidOutPart, arrays: dict[str, list[float]]) -> None:
     if not isinstance(part.run, ScalarProgram):
         for name, places, _ in part.outputs:
-            found[name][places] = [part.run] * part.count
+            arrays[name][places] = [part.run] * part.count
         return
     if not part.outputs:
         return
     run = part.run.on_floats
-    columns = [[found[name][k] for k in places] if name else places for name, places in part.inputs]
+    columns = [[arrays[name][k] for k in places] if name else places for name, places in part.inputs]
     rows = [run(row) for row in (zip(*columns, strict=True) if columns else [()] * part.count)]
     for column, (name, places, update) in zip(zip(*rows, strict=True), part.outputs, strict=True):
-        to = found[name]
+        target = arrays[name]
         for k, x in zip(places, column, strict=True):
-            to[k] = x if update == SET else _BY_FLOATS[update](to[k], x)
+            target[k] = x if update == SET else _BY_FLOATS[update](target[k], x)
 
 
-def _run_by_jax(part: LaidOutPart, found: dict[str, Array]) -> None:
+def _run_by_jax(part: LaidOutPart, arrays: dict[str, Array]) -> None:
     """Run a part, with one operation for all reads from an array and one for all writes: XLA takes milliseconds for each."""
     if not isinstance(part.run, ScalarProgram):
         for name, places, _ in part.outputs:
-            x = found[name]
-            found[name] = jnp.concatenate([x[: places.start], jnp.full(part.count, part.run), x[places.stop :]])
+            x = arrays[name]
+            arrays[name] = jnp.concatenate([x[: places.start], jnp.full(part.count, part.run), x[places.stop :]])
         return
     if not part.outputs:
         return
     values: list = [np.zeros(part.count)] * len(part.inputs)
-    for (name,), some in _group(part.inputs, 1).items():
+    for (name,), group in _group(part.inputs, 1).items():
         if name:
-            rows = _take(found[name], np.stack([places for _, (_, places) in some]))
-            for (k, _), row in zip(some, rows, strict=True):
+            rows = _take(arrays[name], np.stack([places for _, (_, places) in group]))
+            for (k, _), row in zip(group, rows, strict=True):
                 values[k] = row
     run: Callable = jax.vmap(part.run) if values else part.run.by_numpy
     results = run(values)
-    for (name, update), some in _group([(name, update, places) for name, places, update in part.outputs], 2).items():
-        new = jnp.concatenate([jnp.broadcast_to(results[k], part.count) for k, _ in some])
-        found[name] = _put(found[name], np.concatenate([places for _, (*_, places) in some]), new, update)
+    for (name, update), group in _group([(name, update, places) for name, places, update in part.outputs], 2).items():
+        new = jnp.concatenate([jnp.broadcast_to(results[k], part.count) for k, _ in group])
+        arrays[name] = _put(arrays[name], np.concatenate([places for _, (*_, places) in group]), new, update)
 
 
 def _group(items: Sequence[tuple], heads: int) -> dict[tuple, list[tuple[int, tuple]]]:
     """Group items, with their indices, by their first entries."""
-    found: dict[tuple, list[tuple[int, tuple]]] = {}
+    groups: dict[tuple, list[tuple[int, tuple]]] = {}
     for k, item in enumerate(items):
-        found.setdefault(item[:heads], []).append((k, item))
-    return found
+        groups.setdefault(item[:heads], []).append((k, item))
+    return groups
 
 
 def _take(x: jax.Array, places: np.ndarray) -> jax.Array:
@@ -252,19 +252,19 @@ def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.A
     """Return an array with some places updated: by a gather, since XLA compiles a scatter into a loop."""
     order = np.argsort(places, kind="stable")
     first = np.searchsorted(places[order], places[order])
-    turn = np.empty(len(places), int)
-    turn[order] = np.arange(len(places)) - first  # number of earlier updates of the same place
-    if turn.max() >= MOST_TURNS:
-        at = x.at[places]
-        write = {SET: at.set, ADD: at.add, MAXIMUM: at.max, ALL: at.min}[update]
+    earlier = np.empty(len(places), int)
+    earlier[order] = np.arange(len(places)) - first  # number of earlier updates of the same place
+    if earlier.max() >= MOST_TURNS:
+        selected = x.at[places]
+        write = {SET: selected.set, ADD: selected.add, MAXIMUM: selected.max, ALL: selected.min}[update]
         return write(new, mode="promise_in_bounds")
     padded = jnp.append(new, _NEUTRAL.get(update, 0.0))
-    for k in range(turn.max() + 1):
+    for k in range(earlier.max() + 1):
         source = np.full(len(x), len(places))
-        source[places[turn == k]] = np.flatnonzero(turn == k)
-        taken, known = _take(padded, source), source < len(places)
+        source[places[earlier == k]] = np.flatnonzero(earlier == k)
+        updates, is_updated = _take(padded, source), source < len(places)
         if update == SET:
-            x = taken if known.all() else jnp.where(known, taken, x)
+            x = updates if is_updated.all() else jnp.where(is_updated, updates, x)
         else:
-            x = getattr(jnp, _BY_ARRAYS[update].__name__)(x, taken)
+            x = getattr(jnp, _BY_ARRAYS[update].__name__)(x, updates)
     return x

@@ -1,4 +1,4 @@
-"""Scalar programs: functions that compute outputs of a graph, and only the nodes that these need.
+"""Scalar programs: functions that compute outputs of a graph by evaluating only the nodes that these need.
 
 With JAX scalars a program is traced (under vmap each scalar becomes a vector over the batch, the layout that vectorizes); with
 Python floats it is evaluated at once, so that a scene is analysed without compiling anything.
@@ -18,8 +18,8 @@ from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 from udkjax.expressions.written_steps import Operand, WrittenSteps
 
 _SINE_AND_COSINE = ("sin", "cos")
-_LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # under the same names in `math` and NumPy
-# Other primitives on Python numbers: a call of JAX takes about a hundred times as long.
+_LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # which have the same names in `math` and NumPy
+# Other primitives on Python numbers: calling JAX instead takes about a hundred times as long.
 _NUMBER_FUNCTIONS: dict[str, Callable] = {
     **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_")},
     "abs": abs,
@@ -57,7 +57,7 @@ _OPERATORS: dict[str, tuple[Callable, Callable]] = {
 
 
 class ScalarProgram:
-    """`program(values)` takes one value for each of `inputs` and returns one for each of `outputs`."""
+    """`program(values)` returns a value for each of `outputs`, from one for each of `inputs`."""
 
     def __init__(self, graph: Graph, inputs: Sequence[Scalar], outputs: Sequence[Scalar]):
         self.graph, self.inputs, self.outputs = graph, list(inputs), list(outputs)
@@ -90,25 +90,25 @@ class ScalarProgram:
         shape = (len(values[0]) if values else 1,)
         with np.errstate(all="ignore"):
             if self._calls_arrays:  # row by row
-                found = [self([float(v[k]) for v in values]) for k in range(shape[0])]
-                return [np.array(x, float) for x in zip(*found, strict=True)]
-            found = self._steps_on_arrays(values)
-        return [x if np.shape(x) == shape else np.broadcast_to(x, shape) for x in found]
+                results = [self([float(v[k]) for v in values]) for k in range(shape[0])]
+                return [np.array(x, float) for x in zip(*results, strict=True)]
+            results = self._steps_on_arrays(values)
+        return [x if np.shape(x) == shape else np.broadcast_to(x, shape) for x in results]
 
     @cached_property
     def _calls_arrays(self) -> bool:
         return any(self.graph.nodes[i].kind == "call" for i in self.order)
 
     def _typed(self, values: Sequence[Operand]) -> list[Operand]:
-        given = zip(values, (s.node.dtype for s in self.inputs), strict=True)
-        return [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in given]
+        typed_values = zip(values, (s.node.dtype for s in self.inputs), strict=True)
+        return [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in typed_values]
 
     def _run(self, values: Sequence[Operand]) -> list[Operand]:
-        known: dict[int, Operand] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
+        computed: dict[int, Operand] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
         for index in self.order:
             node = self.graph.nodes[index]
-            known[index] = _evaluate(node, [_signed(known, a) for a in node.arguments])
-        return [_signed(known, s) for s in self.outputs]
+            computed[index] = _evaluate(node, [_signed(computed, a) for a in node.arguments])
+        return [_signed(computed, s) for s in self.outputs]
 
     @cached_property
     def on_floats(self) -> Callable[[Sequence[float]], list[Operand]]:
@@ -196,8 +196,8 @@ def _needed(graph: Graph, given: set[int], wanted: Sequence[int]) -> list[int]:
     return needed
 
 
-def _signed(known: dict[int, Operand], scalar: Scalar) -> Operand:
-    value = known[scalar.index]
+def _signed(values: dict[int, Operand], scalar: Scalar) -> Operand:
+    value = values[scalar.index]
     return value if scalar.sign > 0 else _negative(value)
 
 
@@ -254,8 +254,8 @@ def _plain_function(node: Node, library: ModuleType, others: Mapping[str, Callab
 
 def _evaluate_by_jax(node: Node, values: Sequence[np.ndarray]) -> np.ndarray | list[np.ndarray]:
     with jax.ensure_compile_time_eval():
-        found = _evaluate(node, list(values))
-        return found if isinstance(found, list) else np.asarray(found)[()]
+        result = _evaluate(node, list(values))
+        return result if isinstance(result, list) else np.asarray(result)[()]
 
 
 def _library(x: Operand) -> ModuleType:
@@ -275,9 +275,9 @@ def _apply(node: Node, values: list[Operand]) -> Operand:
         values = list(jnp.broadcast_arrays(*values)) if len({np.shape(v) for v in values}) > 1 else values
         return primitive.bind(*(jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)), **parameters)
     with jax.ensure_compile_time_eval():
-        known = [jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
-        found = np.asarray(primitive.bind(*known, **parameters))
-        return found[()] if any(isinstance(v, np.generic) for v in values) else found.item()  # Python floats raise on 1/0
+        arrays = [jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
+        result = np.asarray(primitive.bind(*arrays, **parameters))
+        return result[()] if any(isinstance(v, np.generic) for v in values) else result.item()  # Python floats raise on 1/0
 
 
 def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Operand]) -> list[Operand]:

@@ -18,17 +18,17 @@ ArrayPlace = tuple[str, int]  # the name of an array and an index into it
 
 
 class _Joined(list[Scalar]):
-    """Numbers whose maximum or conjunction is wanted, joined as a balanced tree, for short chains of dependence."""
+    """Numbers whose maximum or conjunction is computed by a balanced tree, to keep chains of dependent operations short."""
 
     def __init__(self, join: Callable[[Scalar, Scalar], Scalar], first: Scalar | None):
         super().__init__([] if first is None else [first])
         self.join = join
 
     def value(self) -> Scalar:
-        found = list(self)
-        while len(found) > 1:
-            found = [*map(self.join, found[::2], found[1::2]), *found[len(found) // 2 * 2 :]]
-        return found[0]
+        numbers = list(self)
+        while len(numbers) > 1:
+            numbers = [*map(self.join, numbers[::2], numbers[1::2]), *numbers[len(numbers) // 2 * 2 :]]
+        return numbers[0]
 
 
 def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], graph: Graph, linear: str | None = None) -> Arrays:
@@ -38,25 +38,25 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
         program: The program.
         arrays: Its inputs by array.
         graph: The graph of all scalars.
-        linear: A group of inputs in which the program is linear, such as tangents: the coefficients of each are added up
-            first, so that a sum has one product for each number that it depends on.
+        linear: A group of inputs in which the program is linear, such as tangents: the coefficients of each input are added up
+            first, so that a sum has only one product for each input.
     """
-    found: dict[str, dict[int, Scalar]] = {name: dict(x) for name, x in arrays.items()}
+    results: dict[str, dict[int, Scalar]] = {name: dict(x) for name, x in arrays.items()}
     joined: dict[ArrayPlace, _Joined] = {}
     zero = graph.constant(0.0)
 
-    # Places added to since they were last read. In order (a dict), so that equal programs have equal texts, compiled once.
+    # Places that have been added to since they were last read. A dict keeps their order: equal programs are compiled once.
     sums: dict[ArrayPlace, None] = {}
-    atoms: set[int] = set()  # numbers of a linear program, whose combinations the sums are
+    atoms: set[int] = set()  # nodes of a linear program that sums combine
 
     def read(name: str, place: int) -> Scalar:
         if (name, place) in joined:
-            found.setdefault(name, {})[place] = joined.pop((name, place)).value()
-        s = found.get(name, {}).get(place, zero)
+            results.setdefault(name, {})[place] = joined.pop((name, place)).value()
+        s = results.get(name, {}).get(place, zero)
         if (name, place) in sums:
             del sums[name, place]
             if linear in s.node.depends:
-                s = found[name][place] = collect(s, linear, atoms)
+                s = results[name][place] = collect(s, linear, atoms)
         if linear in s.node.depends:
             atoms.add(s.index)
         return s
@@ -65,7 +65,7 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
         if isinstance(part, Reset):
             value = graph.constant(part.value)
             places = range(part.start, part.start + part.count)
-            found.setdefault(part.array, {}).update(dict.fromkeys(places, value))
+            results.setdefault(part.array, {}).update(dict.fromkeys(places, value))
             for place in places:
                 joined.pop((part.array, place), None)
             continue
@@ -73,8 +73,8 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
         inputs = [(s.index, name, x) for s, name, x in inputs if part.kernel.program.uses(s)]
         outputs = [(part.array(x.array), x) for x in part.kernel.outputs]
         for row in part.table.tolist():
-            known = {s: read(name, x.offset + (0 if x.base is None else row[x.base])) for s, name, x in inputs}
-            for value, (name, x) in zip(graph.copy(part.kernel.program, known), outputs, strict=True):
+            inputs_of_row = {s: read(name, x.offset + (0 if x.base is None else row[x.base])) for s, name, x in inputs}
+            for value, (name, x) in zip(graph.copy(part.kernel.program, inputs_of_row), outputs, strict=True):
                 place = x.offset + (0 if x.base is None else row[x.base])
                 if x.update in (MAXIMUM, ALL):
                     key = name, place
@@ -85,16 +85,16 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
                         )
                     joined[key].append(value)
                 elif x.update == ADD:
-                    found.setdefault(name, {})[place] = found.get(name, {}).get(place, zero) + value
+                    results.setdefault(name, {})[place] = results.get(name, {}).get(place, zero) + value
                     sums[name, place] = None
                 else:
-                    found.setdefault(name, {})[place] = value
+                    results.setdefault(name, {})[place] = value
                     sums.pop((name, place), None)
                     if linear in value.node.depends:
                         atoms.add(value.index)
     for name, place in [*sums, *joined]:
         read(name, place)
-    return found
+    return results
 
 
 def collect(s: Scalar, group: str, atoms: Collection[int]) -> Scalar:

@@ -12,11 +12,11 @@ _WORTH_WRITING = 20
 
 
 class WrittenSteps:
-    """Functions called one after another, each with arguments among the given numbers and the earlier results.
+    """Functions called one after another; the arguments of each are given numbers or earlier results.
 
     Args:
-        given: the count of given numbers.
-        steps: each function, and the indices of its arguments: given numbers come first, results after them.
+        given: the number of given numbers.
+        steps: each function with the indices of its arguments, which count the given numbers first, then the results.
         outputs: the indices of the results that are returned.
     """
 
@@ -28,10 +28,10 @@ class WrittenSteps:
         if self._function is None:
             self._runs += 1
             if self._runs <= _WORTH_WRITING:
-                known: list[Operand] = [*values]
+                results: list[Operand] = [*values]
                 for function, places in self._steps:
-                    known.append(function(*[known[k] for k in places]))
-                return [known[k] for k in self._outputs]
+                    results.append(function(*[results[k] for k in places]))
+                return [results[k] for k in self._outputs]
             self._function = self._write()
         return self._function(values)
 
@@ -44,13 +44,13 @@ class WrittenSteps:
         for k, (function, places) in enumerate(self._steps, self._given):
             arguments = [f"x{p}" for p in places]
             if function in _SYMBOLS:
-                found = f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}"
+                expression = f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}"
             elif function is operator.neg:
-                found = f"-{arguments[0]}"
+                expression = f"-{arguments[0]}"
             else:
                 functions[f"f{k}"] = function
-                found = f"f{k}({', '.join(arguments)})"
-            lines.append(f" x{k} = {found}")
+                expression = f"f{k}({', '.join(arguments)})"
+            lines.append(f" x{k} = {expression}")
         lines.append(f" return [{', '.join(f'x{k}' for k in self._outputs)}]")
         exec("\n".join(lines), functions)
         return functions["run"]

@@ -6,9 +6,9 @@ from jaxtyping import Array, Float
 from udkjax.pinv.rule import Dense, number
 from udkjax.pinv.svd import SVD, SVDFactors
 
-# Pivot relative to the diagonal entry of its row: the square of a distance from dependence. Elimination loses digits by its
-# reciprocal: 1e-6 leaves ten. Singular configurations are crossed equally well with 1e-5 and with 1e-7; the larger the value,
-# the more often singular values are needed.
+# Pivot relative to the diagonal entry of its row: the square of a distance from dependence. Elimination amplifies rounding errors
+# by its reciprocal: with 1e-6, ten digits remain. Singular configurations are crossed equally well with 1e-5 and with 1e-7; the
+# larger the value, the more often singular values are needed.
 BRANCH_TOL = 1e-6
 
 
@@ -16,7 +16,7 @@ class Auto(Dense):
     """Elimination where the rows are known to be independent, else the truncated `SVD`.
 
     Machine code eliminates the rows of a mechanism that `analyse` found independent, until a pivot falls to `branch_tol` times
-    its row's diagonal entry of D D^T: near singular configurations a step takes all rows and drops the dependent ones. For a
+    its row's diagonal entry of D D^T: near singular configurations a step uses all rows and drops the dependent ones. For a
     general matrix, and with diffrax, the method is the `SVD`.
 
     Args:

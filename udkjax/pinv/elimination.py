@@ -1,7 +1,7 @@
 """Elimination: D^+ from the triangular factors of D D^T. Fast, and as accurate as cond(D)^2 allows.
 
-A row that depends on earlier rows has a pivot of rounding size and is dropped. With K the rows kept and L the factor,
-D = C D_K for C = L L_K^(-1), which has a unit row for each row kept, so
+A row that depends on earlier rows has a pivot of rounding size and is dropped. With K the retained rows and L the factor, D = C
+D_K for C = L L_K^(-1), which has a unit row for each retained row, so
 
     D^+ = D_K^+ C^+ = D_K^T (L_K L_K^T)^(-1) (C^T C)^(-1) C^T.
 """
@@ -17,7 +17,7 @@ from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 def default_rank_tol(dtype: np.dtype) -> float:
-    """Return eps^(1/3): the relative length at or below which the remainder of a row is rounding, where rows are eliminated."""
+    """Return eps^(1/3): in elimination, the remainder of a row up to this relative length is a rounding error."""
     return float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
@@ -32,9 +32,9 @@ class EliminationFactors(NamedTuple):
 class Elimination(Dense):
     """Eliminate D D^T by its largest pivots; a pivot whose square root is at most the threshold is dropped.
 
-    A pivot is compared with its own row, so that rows of very different sizes, as from very different masses, do no harm. Errors
-    grow as eps cond(D)^2. The default threshold is eps^(1/3): rounding of a dependent row stays well below it, and pivots below
-    it have lost most of their digits.
+    A pivot is compared with its own row: very different sizes of rows, as with very different masses, do no harm. Errors
+    grow as eps cond(D)^2. The default threshold is eps^(1/3): rounding errors of a dependent row are well below it, and pivots
+    below it have lost most of their digits.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> EliminationFactors:
@@ -47,7 +47,7 @@ class Elimination(Dense):
         L = length[:, None] * L
         L = L[order]
         dropped = jnp.diag((~independent).astype(D.dtype))
-        inverse = _inverse(jnp.where(independent[:, None], L, 0.0) + dropped)  # of L_K
+        inverse = _inverse(jnp.where(independent[:, None], L, 0.0) + dropped)  # L_K^(-1)
         C = dot(L, inverse)
         inner, _, inner_order = _cholesky(dot(C.T, C) + dropped, jnp.zeros(len(gram)))
         inner = _inverse(inner[inner_order])[:, jnp.argsort(inner_order)]
@@ -67,7 +67,7 @@ class Elimination(Dense):
 def _cholesky(
     gram: Float[Array, "m m"], threshold: Float[Array, "m"]
 ) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
-    """Return L with L L^T = gram, by the largest pivot left; which pivots exceed their thresholds; and the order of the rows.
+    """Return L with L L^T = gram, by the largest remaining pivot; which pivots exceed their thresholds; and the order of rows.
 
     L[order] is lower triangular. A dropped pivot leaves a zero column.
     """
@@ -87,6 +87,6 @@ def _cholesky(
 
 
 def _inverse(T: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """T^(-1) of a lower triangle, by rows."""
+    """Return T^(-1) of a lower triangular T, row by row."""
     identity = jnp.eye(len(T), dtype=T.dtype)
     return jax.lax.fori_loop(0, len(T), lambda j, X: X.at[j].set((identity[j] - dot(T[j], X)) / T[j, j]), jnp.zeros_like(T))

@@ -14,29 +14,29 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
     for i, row in enumerate(rows):
         for k in row:
             meets.setdefault(k, set()).add(i)
-    near = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
+    neighbours = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
     order: list[int] = []
     wait = [0] * len(rows)  # length of the longest chain of earlier rows
-    queue, left = [(len(others), 0, i) for i, others in enumerate(near)], set(range(len(rows)))
+    queue, remaining = [(len(others), 0, i) for i, others in enumerate(neighbours)], set(range(len(rows)))
     heapify(queue)
-    while left:
-        *known, i = heappop(queue)
-        if i not in left or known != [len(near[i]), wait[i]]:  # an outdated entry of the queue
+    while remaining:
+        *queued, i = heappop(queue)
+        if i not in remaining or queued != [len(neighbours[i]), wait[i]]:  # outdated entry of the queue
             continue
-        left.remove(i)
+        remaining.remove(i)
         order.append(i)
-        for k in near[i]:
-            near[k] = (near[k] | near[i]) - {i, k}
+        for k in neighbours[i]:
+            neighbours[k] = (neighbours[k] | neighbours[i]) - {i, k}
             wait[k] = max(wait[k], wait[i] + 1)
-            heappush(queue, (len(near[k]), wait[k], k))
+            heappush(queue, (len(neighbours[k]), wait[k], k))
     return order
 
 
 class Fronts(NamedTuple):
     """Blocks eliminated consecutively by the same operations: fronts of equal sizes."""
 
-    size: int  # rows of each block
-    later_sizes: tuple[int, ...]  # rows of the later blocks that each of them meets
+    size: int  # number of rows of each block
+    later_sizes: tuple[int, ...]  # numbers of rows of the later blocks that each block meets
     blocks: list[int]
     later: list[list[int]]  # the later blocks that each block meets, in the order of elimination
 
@@ -46,18 +46,18 @@ def order_blocks(sizes: Sequence[int], holds: Sequence[Set[int]]) -> list[Fronts
 
     A block waits only for the earlier blocks that it meets. The next run is the largest group of equal blocks that are ready.
     """
-    place = {k: i for i, k in enumerate(minimum_degree([set(h) for h in holds]))}
-    order = sorted(place, key=lambda k: place[k])
+    position = {k: i for i, k in enumerate(minimum_degree([set(h) for h in holds]))}
+    order = sorted(position, key=lambda k: position[k])
     meets: dict[int, list[int]] = {}
-    for k, held in enumerate(holds):
-        for x in held:
+    for k, entries in enumerate(holds):
+        for x in entries:
             meets.setdefault(x, []).append(k)
-    near = [{j for x in held for j in meets[x]} - {k} for k, held in enumerate(holds)]
+    neighbours = [{j for x in entries for j in meets[x]} - {k} for k, entries in enumerate(holds)]
     later: list[list[int]] = [[] for _ in sizes]
     waits, parent = [0] * len(sizes), [-1] * len(sizes)
-    filled: list[set[int]] = [{j for j in n if place[j] > place[k]} for k, n in enumerate(near)]
+    filled: list[set[int]] = [{j for j in n if position[j] > position[k]} for k, n in enumerate(neighbours)]
     for k in order:
-        later[k] = sorted(filled[k], key=lambda j: place[j])
+        later[k] = sorted(filled[k], key=lambda j: position[j])
         if later[k]:
             parent[k] = later[k][0]
             waits[parent[k]] += 1
@@ -70,7 +70,7 @@ def order_blocks(sizes: Sequence[int], holds: Sequence[Set[int]]) -> list[Fronts
     for k in order:
         if not waits[k]:
             ready.setdefault(front_sizes(k), []).append(k)
-    found = []
+    fronts = []
     while ready:
         key = max(ready, key=lambda key: len(ready[key]))
         blocks = ready[key]
@@ -81,5 +81,5 @@ def order_blocks(sizes: Sequence[int], holds: Sequence[Set[int]]) -> list[Fronts
                 if not waits[j]:
                     ready.setdefault(front_sizes(j), []).append(j)
         del ready[key]
-        found.append(Fronts(*key, blocks, [later[k] for k in blocks]))
-    return found
+        fronts.append(Fronts(*key, blocks, [later[k] for k in blocks]))
+    return fronts

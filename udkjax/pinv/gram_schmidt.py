@@ -35,9 +35,9 @@ def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: boo
     column = jnp.arange(columns)
 
     def orthogonalize(i, state):
-        rest, q, r, order, rank, used = state
-        pivot = jnp.argmax(jnp.where(used, -1, jnp.linalg.norm(rest, axis=0)))
-        a = rest[:, pivot]
+        remainders, q, r, order, rank, used = state
+        pivot = jnp.argmax(jnp.where(used, -1, jnp.linalg.norm(remainders, axis=0)))
+        a = remainders[:, pivot]
         above = r[:, pivot]
         if twice:
             correction = dot(q.T, a)
@@ -48,10 +48,10 @@ def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: boo
 
         unit = jnp.where(goes_on, a / jnp.where(goes_on, norm, 1), 0)
         used = used | (column == pivot)
-        along = jnp.where(used, 0, dot(unit, rest))
-        rest = rest - jnp.outer(unit, along)
-        r = jnp.where((column == pivot) & goes_on, above.at[i].set(norm)[:, None], r.at[i].set(along))
-        return rest, q.at[:, i].set(unit), r, order.at[i].set(pivot), rank + goes_on, used
+        products = jnp.where(used, 0, dot(unit, remainders))
+        remainders = remainders - jnp.outer(unit, products)
+        r = jnp.where((column == pivot) & goes_on, above.at[i].set(norm)[:, None], r.at[i].set(products))
+        return remainders, q.at[:, i].set(unit), r, order.at[i].set(pivot), rank + goes_on, used
 
     q, r = jnp.zeros((rows, steps), D.dtype), jnp.zeros((steps, columns), D.dtype)
     start = D, q, r, jnp.arange(steps), jnp.array(0), jnp.zeros(columns, bool)

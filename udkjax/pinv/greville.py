@@ -27,8 +27,8 @@ class Greville(Dense):
 
     The error is of the order of eps cond(D)^2, because the error of P, eps cond(D) |P|, enters c. The remainder of a dependent
     row is of this order too, while that of an independent row may be as small as 1/cond(D). Hence the default `rank_tol`
-    eps^(1/3), where the two are equal; beyond cond(D) = eps^(-1/3) no threshold is right. A dependent row taken for independent
-    can make the result wrong by any factor.
+    eps^(1/3), where the two are equal; beyond cond(D) = eps^(-1/3) no threshold is right. A dependent row mistaken for
+    independent can make the result wrong by any factor.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> GrevilleFactors:

@@ -14,15 +14,15 @@ from udkjax.programs.varying_axes import zero_of
 
 
 def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Callable, transpose: Callable) -> Primitive:
-    """Make a primitive from four rules for one operator and one vector; batches map them.
+    """Make a primitive from four rules for one operator and one vector; a batch maps the rules.
 
-    `equinox.internal.create_vprim` does so too, but its transpose does not sum the cotangents of a vector shared by a batch of
+    `equinox.internal.create_vprim` does the same, but its transpose does not sum the cotangents of a vector shared by a batch of
     operators. Here such a vector is broadcast first, and the transpose of broadcasting is the sum.
 
     Args:
-        name: Name in printed programs of JAX.
+        name: The name in printed JAX programs.
         apply: (operator, vector) -> vector.
-        shape: The same for shapes.
+        shape: The same for the types of arrays: returns the type of the result.
         derivative: The forward-mode rule.
         transpose: The reverse-mode rule for the vector.
 
@@ -38,8 +38,8 @@ def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Ca
         if axes[-1] is None:
             vector = jnp.broadcast_to(vector + sum(map(zero_of, operator)), (size, *vector.shape))
             axes = (*axes[:-1], 0)
-        found = jax.vmap(partial(member.bind, **params), in_axes=tuple(axes))(*operator, vector)
-        return found, [0] * len(found)
+        result = jax.vmap(partial(member.bind, **params), in_axes=tuple(axes))(*operator, vector)
+        return result, [0] * len(result)
 
     primitive = Primitive(name)
     primitive.multiple_results = True

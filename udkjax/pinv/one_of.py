@@ -21,7 +21,7 @@ from udkjax.pinv.varga import Varga
 
 
 class OneOfFactors(NamedTuple):
-    """The factors of each method; all but those of the chosen one are zero."""
+    """The factors of each method; zero except for the chosen method."""
 
     of_each: tuple[Any, ...]
 
@@ -31,11 +31,11 @@ class OneOfFactors(NamedTuple):
 
 
 def _number(value: NumberLike) -> Float[Array, ""]:
-    """Make an array of a number, as `number` does of one that may be missing."""
-    found = number(value)
-    if found is None:
+    """Convert a number to an array leaf; None is an error."""
+    array = number(value)
+    if array is None:
         raise TypeError("number must be one number, not None")
-    return found
+    return array
 
 
 class OneOf(Dense):
@@ -78,11 +78,13 @@ class OneOf(Dense):
 
     def apply(self, factors: OneOfFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         choices = zip(self.choices, factors.of_each, strict=True)
-        return self._switch([lambda b, m=method, f=found: m.apply(f, b) for method, found in choices], b)
+        return self._switch([lambda b, m=method, f=factors_of_method: m.apply(f, b) for method, factors_of_method in choices], b)
 
     def apply_transpose(self, factors: OneOfFactors, c: Float[Array, "n"]) -> Float[Array, "m"]:
         choices = zip(self.choices, factors.of_each, strict=True)
-        return self._switch([lambda c, m=method, f=found: m.apply_transpose(f, c) for method, found in choices], c)
+        return self._switch(
+            [lambda c, m=method, f=factors_of_method: m.apply_transpose(f, c) for method, factors_of_method in choices], c
+        )
 
     def _switch(self, branches: Sequence[Any], x: Array) -> Any:
         return jax.lax.switch(self.number.astype(int), branches, x)

@@ -37,7 +37,7 @@ class Orthogonal(Dense):
 
 
 def divide(t: Float[Array, "k k"], b: Float[Array, "k s"], rank: Int[Array, ""]) -> Float[Array, "k s"]:
-    """T^(-1) b for the leading triangle T of t of size `rank`, with zeros below.
+    """Return T^(-1) b, followed by zeros, for the leading triangle T of t of size `rank`.
 
     (LAPACK is avoided: two concurrent batched calls deadlock jax 0.10 on a machine with two cores.)
     """

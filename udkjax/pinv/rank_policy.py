@@ -1,8 +1,8 @@
 """The policy for small pivots in elimination: the one decision near singular configurations.
 
 D D^T = L diag(p) L^T. The pivot p_i, relative to its row's diagonal entry of D D^T, is the square of the sine of the angle
-between row i and the rows eliminated before it: a rounding error where the row depends on them, small near a singular
-configuration. Elimination loses digits by the factor 1 / p_i. It is compared with two thresholds, which may be traced:
+between row i and the rows eliminated before it: a rounding error if the row depends on them, and small near a singular
+configuration. Elimination amplifies rounding errors by 1 / p_i. The pivot is compared with two thresholds, which may be traced:
 
     drop_tol    at or below it the row counts as dependent and is left out, with zero for 1 / p_i;
     safe_tol    at or below it the result cannot be trusted, which the last output of the program, `safe`, reports.

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 
-SMALLEST_COEFFICIENT = 1e-5  # relative to the largest; directions found from differences are accurate to 1e-8
+SMALLEST_COEFFICIENT = 1e-5  # relative to the largest; directions from difference quotients are accurate to 1e-8
 
 
 def null_space(matrix: Float[np.ndarray, "R K"], tol: float) -> Float[np.ndarray, "D K"]:

@@ -45,13 +45,13 @@ class LeastSquaresSolution(NamedTuple):
 
 
 def number(value: NumberLike | None) -> Float[Array, ""] | None:
-    """Convert a number to an array leaf: a Python float as a field would be static, and each new value would recompile."""
+    """Convert a number to an array leaf: a Python float as a field would be static and recompile for each new value."""
     dtype = jnp.result_type(float)
     if isinstance(value, float | int | np.number):
         value = np.asarray(value, dtype)  # JAX would compile a program to convert it
-    known = nullcontext() if isinstance(value, jax.core.Tracer) else jax.ensure_compile_time_eval()  # in a trace, too
+    context = nullcontext() if isinstance(value, jax.core.Tracer) else jax.ensure_compile_time_eval()  # concrete also in a trace
     try:
-        with known:
+        with context:
             return None if value is None else jnp.asarray(value, dtype=dtype)
     except (TypeError, ValueError):
         what = "a text" if isinstance(value, str) else f"an object of type {type(value).__name__}"
@@ -71,8 +71,8 @@ class Pseudoinverse(PrintsLine):
     where it jumps, no derivative exists.
 
     Args:
-        rank_tol: threshold of the rank, relative to the method's scale of D; None: rounding.
-        relative: whether it is relative to that scale, or in the units of D.
+        rank_tol: threshold of the rank, relative to the method's scale of D; None: the rounding error.
+        relative: whether `rank_tol` is relative to that scale, or in the units of D.
     """
 
     rank_tol: Float[Array, ""] | None = eqx.field(converter=number, default=None)
@@ -103,15 +103,15 @@ class Pseudoinverse(PrintsLine):
 
     @abstractmethod
     def rmatvec(self, D: Operator, y: Float[Array, "m"]) -> Float[Array, "n"]:
-        """D^T y, bilinear in D and y."""
+        """Return D^T y, bilinear in D and y."""
 
     @abstractmethod
     def factor(self, D: Operator) -> Factors:
-        """Return the factors that `apply` takes: a pytree with an integer leaf `.rank`. It is never differentiated."""
+        """Return the factors for `apply`: a pytree with an integer leaf `.rank`. They are never differentiated."""
 
     @abstractmethod
     def apply(self, factors: Any, b: Float[Array, "m"]) -> Float[Array, "n"]:
-        """D^+ b."""
+        """Return D^+ b."""
 
     @abstractmethod
     def apply_transpose(self, factors: Any, c: Float[Array, "n"]) -> Float[Array, "m"]:
@@ -120,7 +120,7 @@ class Pseudoinverse(PrintsLine):
     # The functions that all methods share.
 
     def plus(self, D: Operator) -> "Plus":
-        """D^+ as an operator, factorized once: `plus @ b`, `plus.T @ x`, `plus.rank`."""
+        """Return D^+ as an operator, factorized once: `plus @ b`, `plus.T @ x`, `plus.rank`."""
         if np.shape(self.rank_tol):
             raise ValueError(f"rank_tol must be one number, not of the shape {np.shape(self.rank_tol)}; a batch is for jax.vmap")
         D = self.admit(D)
@@ -128,7 +128,7 @@ class Pseudoinverse(PrintsLine):
         return Plus(method, jax.lax.stop_gradient(method.factor(jax.lax.stop_gradient(D))), D)
 
     def solve(self, D: Operator, b: Float[ArrayLike, "m *k"]) -> LeastSquaresSolution:
-        """Solve D x = b by least squares of minimum norm, x = D^+ b, for one b (m,) or columns (m, k), and find rank(D)."""
+        """Return the minimum-norm least-squares solution x = D^+ b, for one b (m,) or columns (m, k), and rank(D)."""
         plus = self.plus(D)
         return LeastSquaresSolution(plus @ jnp.asarray(b), plus.rank)
 
@@ -137,7 +137,7 @@ class Pseudoinverse(PrintsLine):
         return self.plus(D).rank
 
     def __call__(self, D: Operator) -> Float[Array, "n m"]:
-        """D^+ itself, as a matrix."""
+        """Return D^+ itself, as a matrix."""
         plus = self.plus(D)
         rows, _ = self.shape(plus.matrix)
         dtype = jnp.result_type(*(leaf for leaf in jtu.tree_leaves(plus.matrix) if eqx.is_inexact_array(leaf)))
@@ -178,7 +178,7 @@ class Dense(Pseudoinverse):
 
 
 def exceeds(size: Float[Array, "*s"], threshold: Float[Array, ""]) -> Bool[Array, "*s"]:
-    """Return whether a size counts as nonzero. NaN does: an invalid matrix gives NaN, not rank zero and a plausible answer."""
+    """Return whether a size counts as nonzero. NaN does, so that an invalid matrix results in NaN instead of rank zero."""
     return ~(size <= threshold)
 
 
@@ -214,12 +214,12 @@ class Plus(eqx.Module):
 #
 #     (D^+)' = -D^+ D' D^+ + D^+ D^+^T D'^T (I - D D^+) + (I - D^+ D) D'^T D^+^T D^+
 #
-# The first term is the derivative of an inverse. D^+ maps onto the row space of D, which turns with D: the third term; and it
-# ignores what is orthogonal to the column space, which turns too: the second. With y = D^+^T x, r = b - D x, w = D'^T y:
+# The first term is the derivative of an inverse. D^+ maps onto the row space of D, which rotates when D changes (third term), and
+# ignores vectors orthogonal to the column space, which rotates as well (second term). With y = D^+^T x, r = b - D x, w = D'^T y:
 #
 #     x' = D^+ b' + (D^+)' b = w + D^+ (b' - D' x - D w + D^+^T D'^T r)
 #
-# Only D^+ and its transpose are applied, by the factors at hand; no difference of singular values is ever divided by. Since
+# Only D^+ and its transpose are applied, by the existing factors; there is no division by differences of singular values. Since
 # (D^+)^T = (D^T)^+, the same rule holds for the transpose, with D and D^T exchanged. And D^+ b is linear in b with the
 # transpose D^+^T, which is all that reverse mode needs. Both rules apply D^+, and so are themselves differentiable, to any
 # order. This is a primitive because a jax.custom_jvp is lost in the linear part of a reverse pass, whose second derivative
@@ -242,7 +242,7 @@ def _shape_of_apply(plus, b):
 def _derivative(primals, tangents):
     plus, b = primals
     d_plus, db = tangents
-    dD = d_plus.matrix  # factors and method carry no tangent: as functions of D they follow its tangent
+    dD = d_plus.matrix  # the factors, functions of D, need no tangents
     x = _bind(plus, b)
     s = jnp.zeros_like(b) if db is None else db
     if not jtu.tree_leaves(dD):
@@ -255,9 +255,9 @@ def _derivative(primals, tangents):
     def along(product, v):
         return eqx.filter_jvp(lambda D: product(D, v), (plus.matrix,), (dD,))
 
-    Dx, dD_x = along(forward, x)
-    w = along(backward, _bind(plus.T, x))[1]
-    g = along(backward, b - Dx)[1]
+    Dx, dD_x = value_and_change(forward, x)
+    w = value_and_change(backward, _bind(plus.T, x))[1]
+    g = value_and_change(backward, b - Dx)[1]
     return x, w + _bind(plus, s - dD_x - forward(plus.matrix, w) + _bind(plus.T, g))
 
 

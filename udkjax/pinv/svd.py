@@ -20,7 +20,7 @@ class SVDFactors(NamedTuple):
 class SVD(Dense):
     """D = U S V^T, D^+ = V S^+ U^T: the reference, and the only method whose threshold applies to the singular values themselves.
 
-    The error is of the order of eps cond(D), cond taken over the kept singular values.
+    The error is of the order of eps cond(D), with cond(D) of the retained singular values.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> SVDFactors:

@@ -28,7 +28,7 @@ class ControlFlow(NamedTuple):
     cond: Callable[..., Any]
     scan: Callable[..., Any]
     map: Callable[..., Any]
-    vmap: Callable[[Callable[..., Any]], Callable[..., Any]]  # of functions of one argument
+    vmap: Callable[[Callable[..., Any]], Callable[..., Any]]  # for functions of one argument
     put: Callable[[Any, Any, Any], Any]  # set an element of an array; the old array must not be used again
     call: Callable[..., Any]  # call a function written for JAX
 
@@ -44,11 +44,11 @@ def _cond(condition: Any, if_true: Callable[[], Carry], if_false: Callable[[], C
 
 
 def _scan(function: Callable[[Any, Any], tuple[Any, Any]], state: Any, xs: PyTree) -> tuple[Any, PyTree]:
-    found = []
+    outputs = []
     for x in _rows(xs):
         state, y = function(state, x)
-        found.append(y)
-    return state, _stack(found)
+        outputs.append(y)
+    return state, _stack(outputs)
 
 
 def _map(function: Callable[[Any], Any], xs: PyTree) -> PyTree:
@@ -78,16 +78,16 @@ def _at(array: jax.Array, index: Any, value: Any) -> jax.Array:
 
 
 @deferred
-def _compiled(function: Callable[..., Result], *given: Any) -> Result:
-    return function(*given)
+def _compiled(function: Callable[..., Result], *arguments: Any) -> Result:
+    return function(*arguments)
 
 
-def _call(function: Callable[..., Result], *given: Any) -> Result:
-    return function(*given)
+def _call(function: Callable[..., Result], *arguments: Any) -> Result:
+    return function(*arguments)
 
 
-def _call_compiled(function: Callable[..., Result], *given: Any) -> Result:
-    return jax.tree.map(np.asarray, _compiled(function, *given))
+def _call_compiled(function: Callable[..., Result], *arguments: Any) -> Result:
+    return jax.tree.map(np.asarray, _compiled(function, *arguments))
 
 
 BY_JAX = ControlFlow(jnp, jax.lax.while_loop, jax.lax.cond, jax.lax.scan, jax.lax.map, jax.vmap, _at, _call)
@@ -99,23 +99,23 @@ def control_flow(xp: ArrayLibrary) -> ControlFlow:
     return BY_NUMPY if xp is np else BY_JAX
 
 
-def solve(function: Callable[..., Result], *given: Any) -> Result:
-    """Return function(*given, by): `by` is NumPy's control flow if all numbers are concrete, else JAX's in one program."""
-    if is_traced(given):
-        return _compiled(_by_jax, function, *given)
+def solve(function: Callable[..., Result], *arguments: Any) -> Result:
+    """Return function(*arguments, flow), by NumPy's control flow if all numbers are concrete, else by JAX's in one program."""
+    if is_traced(arguments):
+        return _compiled(_by_jax, function, *arguments)
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
-        known = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, given)
-        return jax.device_put(function(*known, BY_NUMPY))
+        concrete = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, arguments)
+        return jax.device_put(function(*concrete, BY_NUMPY))
 
 
-def _by_jax(function: Callable[..., Result], *given: Any) -> Result:
-    return function(*given, BY_JAX)  # compared by identity: as an argument of a compiled function it would be a copy
+def _by_jax(function: Callable[..., Result], *arguments: Any) -> Result:
+    return function(*arguments, BY_JAX)  # compared by identity: as an argument of a compiled function it would be a copy
 
 
 def sequential(function: Callable[..., Result], *arguments: PyTree) -> Result:
-    """Return function(*arguments), pytrees of arrays and static values, without derivatives; under `vmap`, one member at a time.
+    """Return function(*arguments), pytrees of arrays and static values, without derivatives; `vmap` maps one member at a time.
 
-    Batched, all members of a loop would take as many steps as the slowest.
+    In a batched loop all members would take as many steps as the slowest one.
     """
     arrays, choices = eqx.partition(arguments, eqx.is_array)
 
@@ -127,7 +127,7 @@ def sequential(function: Callable[..., Result], *arguments: PyTree) -> Result:
     def _(axis_size: int, batched: PyTree, arrays: PyTree) -> tuple[Result, PyTree]:
         del axis_size
         moving, shared = eqx.partition(arrays, batched[0])
-        found = jax.lax.map(lambda moving: each(eqx.combine(moving, shared)), moving)
-        return found, jax.tree.map(lambda _: True, found)
+        results = jax.lax.map(lambda moving: each(eqx.combine(moving, shared)), moving)
+        return results, jax.tree.map(lambda _: True, results)
 
     return each(arrays)

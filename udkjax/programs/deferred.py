@@ -1,8 +1,8 @@
 """Programs that NumPy evaluates at first (numpy_program.py), and that are compiled once they have been called often.
 
 XLA takes about two milliseconds to compile an operation, and NumPy two microseconds to evaluate it: a program that runs once is
-faster without compilation. NumPy therefore evaluates a program until this has cost as much as compiling it; from then on the
-compiled program runs. Both agree to rounding.
+faster without compilation. NumPy therefore evaluates a program until the evaluations have cost as much as compilation; from then
+on the compiled program runs. Both agree to rounding.
 
 For JAX such a program is one operation, whose derivatives and batches are again deferred programs.
 
@@ -53,7 +53,7 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         if jax.config.jax_disable_jit:
             return function(*args, **kwargs)
-        if any(varies(x) for x in jax.tree.leaves((args, kwargs))):  # within `shard_map`, by the types of its values
+        if any(varies(x) for x in jax.tree.leaves((args, kwargs))):  # within `shard_map`, which the types of its values show
             return by_jit(*args, **kwargs)
         try:
             program, leaves, out = trace_once(function, args, kwargs)
@@ -61,8 +61,8 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
             return by_jit(*args, **kwargs)
         # Binding would make JAX retrace a program with custom derivative rules, to remove them before evaluation.
         is_concrete = not any(isinstance(x, Tracer) for x in (*leaves, jax.device_put(0.0)))
-        found = (_evaluate if is_concrete else deferred_p.bind)(*leaves, call_jaxpr=program)
-        return out.rebuild(found)
+        results = (_evaluate if is_concrete else deferred_p.bind)(*leaves, call_jaxpr=program)
+        return out.rebuild(results)
 
     return run
 
@@ -80,17 +80,17 @@ def trace_once(
 
 
 def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Like `deferred`, for a function that checks or branches on concrete numbers: they stay concrete within it.
+    """Like `deferred`, for a function that checks or branches on concrete numbers, which stay concrete within it.
 
-    So do results that depend only on these. If nothing is traced, the function itself is called.
+    Results that depend only on concrete numbers are concrete as well. If nothing is traced, the function itself is called.
     """
 
     call: Callable[..., Any] = function
 
     def with_concrete(leaves: list[Any], tree: Any, concrete: tuple["_ConcreteLeaf", ...]) -> Any:
         numbers = iter(concrete)
-        found = [x if _is_traced(x) else next(numbers).value for x in leaves]
-        args, kwargs = jax.tree.unflatten(tree, found)
+        values = [x if _is_traced(x) else next(numbers).value for x in leaves]
+        args, kwargs = jax.tree.unflatten(tree, values)
         traced, rest = eqx.partition(call(*args, **kwargs), _is_traced)
         return traced, _StaticPart(rest)
 
@@ -188,8 +188,8 @@ def _trace(
         static = jax.tree.unflatten(fixed_tree, fixed)
         args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
         dynamic, out.static = eqx.partition(function(*args, **kwargs), _is_array)
-        found, out.tree = jax.tree.flatten(dynamic)
-        return found
+        outputs, out.tree = jax.tree.flatten(dynamic)
+        return outputs
 
     shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in types]
     program = jax.jit(flat).trace(*shapes).jaxpr
@@ -204,12 +204,12 @@ def _evaluate(*xs: Any, call_jaxpr: Any) -> list[Array]:
         meter = Meter(limit - spent)
         try:
             with np.errstate(all="ignore"):
-                found = numpy_program(call_jaxpr)(meter, [np.asarray(x) for x in xs])
+                results = numpy_program(call_jaxpr)(meter, [np.asarray(x) for x in xs])
         except TooLongError:
             _SPENT[call_jaxpr] = limit
         else:
             _SPENT[call_jaxpr] = spent + meter.count
-            return jax.device_put([np.asarray(x, a.dtype) for x, a in zip(found, call_jaxpr.out_avals, strict=True)])
+            return jax.device_put([np.asarray(x, a.dtype) for x, a in zip(results, call_jaxpr.out_avals, strict=True)])
     return _compiled(call_jaxpr)(*xs)
 
 

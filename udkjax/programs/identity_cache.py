@@ -22,41 +22,41 @@ _BY_VALUE = (bool, int, float, str, np.generic, type(None))  # isinstance of an 
 
 
 def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Cache the results of a function by its arguments: numbers and texts by value, others by identity.
+    """Cache the results of a function by its arguments: numbers and strings by value, others by identity.
 
-    A result is stored while its arguments exist, and among the `CACHE_SIZE` most recently used ones. Arguments must be concrete
-    and must not change.
+    A result is stored as long as its arguments exist and it is one of the `CACHE_SIZE` most recently used results. Arguments must
+    be concrete and must not change.
     """
-    found: OrderedDict[tuple[Hashable, ...], tuple[list[Any], Result]] = OrderedDict()
+    cache: OrderedDict[tuple[Hashable, ...], tuple[list[Any], Result]] = OrderedDict()
     lock = RLock()  # an object may be deleted at any time, also within the lock
 
     def forget(key: tuple[Hashable, ...]) -> None:
         with lock:
-            found.pop(key, None)
+            cache.pop(key, None)
 
     @wraps(function)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         objects = (*args, *kwargs.values())
         key = (*[(type(x), x) if issubclass(type(x), _BY_VALUE) else id(x) for x in objects], *kwargs)
-        stored = found.get(key)
+        stored = cache.get(key)
         if stored is not None:
             with lock:
-                if key in found:
-                    found.move_to_end(key)
+                if key in cache:
+                    cache.move_to_end(key)
             return stored[1]
         result = function(*args, **kwargs)
         holds = [_reference(x, lambda _: forget(key)) for x in objects]
         with lock:
-            found[key] = holds, result
-            while len(found) > CACHE_SIZE:
-                found.popitem(last=False)
+            cache[key] = holds, result
+            while len(cache) > CACHE_SIZE:
+                cache.popitem(last=False)
         return result
 
     return call
 
 
 def _reference(x: object, forget: Callable[[Any], None]) -> Any:
-    """Return a weak reference that calls `forget` when the object is deleted; the object itself if it allows none."""
+    """Return a weak reference that calls `forget` when the object is deleted; the object itself if it has none."""
     try:
         return weakref.ref(x, forget)
     except TypeError:

@@ -14,9 +14,9 @@ def dynamic_slice(x: np.ndarray, *starts: Any, slice_sizes: Sequence[int]) -> np
 
 def dynamic_update_slice(x: np.ndarray, update: np.ndarray, *starts: Any) -> np.ndarray:
     """Return an array with a slice replaced."""
-    found = np.array(x)
-    found[_window(found.shape, starts, np.shape(update))] = update
-    return found
+    result = np.array(x)
+    result[_window(result.shape, starts, np.shape(update))] = update
+    return result
 
 
 def _window(shape: Sequence[int], starts: Sequence[Any], sizes: Sequence[int]) -> tuple[slice, ...]:
@@ -35,18 +35,27 @@ def gather(
 ) -> np.ndarray:
     """Return slices of an array that begin at the given indices (XLA's operation Gather)."""
     d = dimension_numbers
-    whole = (*d.collapsed_slice_dims, *d.operand_batching_dims)
+    dropped = (*d.collapsed_slice_dims, *d.operand_batching_dims)
     batch, inside, places = _places(
-        np.shape(x), indices, d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims, whole, slice_sizes, mode
+        np.shape(x),
+        indices,
+        d.start_index_map,
+        d.operand_batching_dims,
+        d.start_indices_batching_dims,
+        dropped,
+        slice_sizes,
+        mode,
     )
-    found = np.asarray(x)[places]
+    slices = np.asarray(x)[places]
     if inside is not None:
-        missing = np.nan if np.issubdtype(found.dtype, np.inexact) else np.iinfo(found.dtype).min if found.dtype != bool else True
+        missing = (
+            np.nan if np.issubdtype(slices.dtype, np.inexact) else np.iinfo(slices.dtype).min if slices.dtype != bool else True
+        )
         if fill_value is not None:
             missing = fill_value
-        found = np.where(inside.reshape(*inside.shape, *[1] * (found.ndim - inside.ndim)), found, missing).astype(found.dtype)
+        slices = np.where(inside.reshape(*inside.shape, *[1] * (slices.ndim - inside.ndim)), slices, missing).astype(slices.dtype)
     offsets = list(d.offset_dims)
-    return np.moveaxis(found, range(batch, found.ndim), offsets) if offsets else found
+    return np.moveaxis(slices, range(batch, slices.ndim), offsets) if offsets else slices
 
 
 def scatter(combine: Callable[[np.ndarray, Any, np.ndarray], None]) -> Callable[..., np.ndarray]:
@@ -55,18 +64,18 @@ def scatter(combine: Callable[[np.ndarray, Any, np.ndarray], None]) -> Callable[
     def apply(
         x: np.ndarray, indices: np.ndarray, updates: np.ndarray, dimension_numbers: Any, mode: GatherScatterMode, **_: Any
     ) -> np.ndarray:
-        d, found, updates = dimension_numbers, np.array(x), np.asarray(updates)
-        whole = (*d.inserted_window_dims, *d.operand_batching_dims)
+        d, result, updates = dimension_numbers, np.array(x), np.asarray(updates)
+        dropped = (*d.inserted_window_dims, *d.operand_batching_dims)
         window = [size for k, size in enumerate(updates.shape) if k in d.update_window_dims]
-        rest = iter(window)
-        sizes = [1 if k in whole else next(rest) for k in range(found.ndim)]
+        window_sizes = iter(window)
+        sizes = [1 if k in dropped else next(window_sizes) for k in range(result.ndim)]
         batch, inside, places = _places(
-            found.shape,
+            result.shape,
             indices,
             d.scatter_dims_to_operand_dims,
             d.operand_batching_dims,
             d.scatter_indices_batching_dims,
-            whole,
+            dropped,
             sizes,
             mode,
         )
@@ -75,8 +84,8 @@ def scatter(combine: Callable[[np.ndarray, Any, np.ndarray], None]) -> Callable[
             shape = updates.shape
             places = tuple(np.broadcast_to(p, shape)[inside] for p in places)
             updates = updates[inside]
-        combine(found, places, updates)
-        return found
+        combine(result, places, updates)
+        return result
 
     return apply
 
@@ -87,17 +96,17 @@ def _places(
     index_map: Sequence[int],
     batching: Sequence[int],
     index_batching: Sequence[int],
-    whole: Sequence[int],
+    dropped: Sequence[int],
     sizes: Sequence[int],
     mode: GatherScatterMode,
 ) -> tuple[int, np.ndarray | None, tuple[np.ndarray, ...]]:
-    """Return the number of batch dimensions, the slices that lie inside (None: all), and each entry's index in each dimension.
+    """Return the number of batch dimensions, marks of slices within the array (None: all), and each entry's indices.
 
     Entries have the batch dimensions of `indices` first, then the dimensions of the slices.
     """
     indices = np.asarray(indices)
     batch_shape, batch = indices.shape[:-1], indices.ndim - 1
-    kept = [k for k in range(len(shape)) if k not in whole]
+    retained = [k for k in range(len(shape)) if k not in dropped]
     inside, places = None, []
     for k, n in enumerate(shape):
         start = np.zeros((), int)
@@ -111,12 +120,12 @@ def _places(
         elif k in batching:
             axis = index_batching[list(batching).index(k)]
             start = np.arange(n).reshape([-1 if j == axis else 1 for j in range(batch)])
-        start = start.reshape(*start.shape, *[1] * len(kept)) if start.ndim else start
-        if k in kept:
-            start = start + np.arange(sizes[k]).reshape([-1 if j == k else 1 for j in kept])
+        start = start.reshape(*start.shape, *[1] * len(retained)) if start.ndim else start
+        if k in retained:
+            start = start + np.arange(sizes[k]).reshape([-1 if j == k else 1 for j in retained])
         places.append(start)
-    full = (*batch_shape, *(sizes[k] for k in kept))
+    result_shape = (*batch_shape, *(sizes[k] for k in retained))
     if not places:
         return batch, None, ()
-    places[0] = np.broadcast_to(places[0], full)
+    places[0] = np.broadcast_to(places[0], result_shape)
     return batch, None if inside is None or inside.all() else inside, tuple(places)

@@ -16,7 +16,7 @@ from jax.extend.core import Jaxpr, Literal, Primitive, jaxprs_in_params
 from udkjax.programs.numpy_rules import RULES
 
 Step = tuple[Callable[..., Any], list[int], Any]  # a function, and the indices of its arguments and of its result or results
-ENTRIES = 2_000  # of an array that cost NumPy as much time as the overhead of an operation
+ENTRIES = 2_000  # number of array entries that take as long as the overhead of an operation
 PLAIN = (np.dtype(float), np.dtype(int), np.dtype(bool))  # dtypes that every NumPy operation preserves
 
 _EXPANSIONS: dict[Primitive, Callable[..., Callable[..., Any]]] = {}
@@ -38,7 +38,7 @@ class TooLongError(Exception):
 
 
 class Meter:
-    """Counts operations (large arrays as several), and ends an evaluation that exceeds `limit`."""
+    """Counts operations (an operation on a large array as several), and ends an evaluation that exceeds `limit`."""
 
     def __init__(self, limit: float):
         self.count, self.limit = 0, limit
@@ -83,11 +83,11 @@ class NumpyProgram:
         for place, x in zip(self._inputs, inputs, strict=True):
             memory[place] = x
         for function, places, results in self._steps:
-            found = function(meter, *[memory[k] for k in places])
+            values = function(meter, *[memory[k] for k in places])
             if type(results) is int:
-                memory[results] = found
+                memory[results] = values
             else:
-                for k, x in zip(results, found, strict=True):
+                for k, x in zip(results, values, strict=True):
                     memory[k] = x
         return [memory[k] for k in self._outputs]
 
@@ -120,11 +120,11 @@ _PROGRAMS: "WeakKeyDictionary[Any, NumpyProgram]" = WeakKeyDictionary()
 
 def numpy_program(jaxpr: Any) -> NumpyProgram:
     """Return the NumPy program of a jaxpr, with its constants if it is closed; cached."""
-    found = _PROGRAMS.get(jaxpr)
-    if found is None:
-        parts = (jaxpr.jaxpr, jaxpr.consts) if hasattr(jaxpr, "consts") else (jaxpr, ())
-        found = _PROGRAMS[jaxpr] = NumpyProgram(*parts)
-    return found
+    program = _PROGRAMS.get(jaxpr)
+    if program is None:
+        arguments = (jaxpr.jaxpr, jaxpr.consts) if hasattr(jaxpr, "consts") else (jaxpr, ())
+        program = _PROGRAMS[jaxpr] = NumpyProgram(*arguments)
+    return program
 
 
 # --- steps
@@ -149,23 +149,23 @@ def _by_rule(equation: Any, rule: Callable[..., Any]) -> Callable[..., Any]:
 
     def step(_: Meter, *xs: Any) -> Any:
         try:
-            found = rule(*xs, **parameters)
+            result = rule(*xs, **parameters)
         except np.linalg.LinAlgError:  # a singular matrix: XLA returns infinity
-            found = NotImplemented
-        if found is NotImplemented:
+            result = NotImplemented
+        if result is NotImplemented:
             return _by_jax(primitive, parameters, xs)
         if exact:
-            return found
+            return result
         if primitive.multiple_results:
-            return [np.asarray(x, d) for x, d in zip(found, dtypes, strict=True)]
-        return np.asarray(found, dtypes[0])
+            return [np.asarray(x, d) for x, d in zip(result, dtypes, strict=True)]
+        return np.asarray(result, dtypes[0])
 
     return step
 
 
 def _by_jax(primitive: Primitive, parameters: dict[str, Any], xs: Sequence[Any]) -> Any:
-    found = primitive.bind(*(jax.device_put(np.asarray(x)) for x in xs), **parameters)
-    return [np.asarray(x) for x in found] if primitive.multiple_results else np.asarray(found)
+    result = primitive.bind(*(jax.device_put(np.asarray(x)) for x in xs), **parameters)
+    return [np.asarray(x) for x in result] if primitive.multiple_results else np.asarray(result)
 
 
 class _Expanded:
@@ -182,11 +182,11 @@ class _Expanded:
             self._program = False if traced is None else numpy_program(traced)
         if self._program is False:
             return _by_jax(self._primitive, self._parameters, xs)
-        found = self._program(meter, xs)
-        return found if self._primitive.multiple_results else found[0]
+        results = self._program(meter, xs)
+        return results if self._primitive.multiple_results else results[0]
 
     def trace(self) -> Any:
-        """Return the program of the operations that it is expanded into, or None."""
+        """Return the program of the operations into which this one is expanded, or None."""
         function = self._function()
         return None if function is None else jax.make_jaxpr(function)(*self._inputs)
 
@@ -214,15 +214,17 @@ def _while(cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: in
         of_condition, of_body = xs[:cond_nconsts], xs[cond_nconsts : cond_nconsts + body_nconsts]
         state = list(xs[cond_nconsts + body_nconsts :])
         while np.any(goes_on := condition(meter, [*of_condition, *state])[0]):
-            found = body(meter, [*of_body, *state])
-            state = list(found) if np.ndim(goes_on) == 0 else [_where(goes_on, x, y) for x, y in zip(found, state, strict=True)]
+            results = body(meter, [*of_body, *state])
+            state = (
+                list(results) if np.ndim(goes_on) == 0 else [_where(goes_on, x, y) for x, y in zip(results, state, strict=True)]
+            )
         return state
 
     return step
 
 
 def _where(condition: np.ndarray, a: Any, b: Any) -> np.ndarray:
-    """Select a where the condition holds, else b: in a batch of loops, some may have ended."""
+    """Select a where the condition holds, else b: some loops of a batch may have ended."""
     return np.where(condition.reshape(condition.shape + (1,) * (np.ndim(a) - condition.ndim)), a, b)
 
 
@@ -238,7 +240,7 @@ def _cond(branches: Sequence[Any], **_: Any) -> Callable[..., Any]:
 def _scan(jaxpr: Any, length: int, reverse: bool, **parameters: Any) -> Callable[..., Any]:
     program = numpy_program(jaxpr)
     if "ft_in" in parameters:
-        constants, carry, _ = (len(part) for part in parameters["ft_in"].unpack())
+        constants, carry, _ = (len(group) for group in parameters["ft_in"].unpack())
     else:
         constants, carry = parameters["num_consts"], parameters["num_carry"]
     avals = jaxpr.out_avals[carry:]
@@ -247,9 +249,9 @@ def _scan(jaxpr: Any, length: int, reverse: bool, **parameters: Any) -> Callable
         fixed, state, rows = xs[:constants], list(xs[constants : constants + carry]), xs[constants + carry :]
         outputs = [np.zeros((length, *a.shape), a.dtype) for a in avals]
         for k in range(length - 1, -1, -1) if reverse else range(length):
-            found = program(meter, [*fixed, *state, *(x[k] for x in rows)])
-            state = found[:carry]
-            for output, y in zip(outputs, found[carry:], strict=True):
+            results = program(meter, [*fixed, *state, *(x[k] for x in rows)])
+            state = results[:carry]
+            for output, y in zip(outputs, results[carry:], strict=True):
                 output[k] = y
         return [*state, *outputs]
 
@@ -257,11 +259,11 @@ def _scan(jaxpr: Any, length: int, reverse: bool, **parameters: Any) -> Callable
 
 
 def _linear_solve(const_lengths: Any, jaxprs: Any, **_: Any) -> Callable[..., Any]:
-    program, before = numpy_program(jaxprs.solve), const_lengths.matvec + const_lengths.vecmat
-    after = before + const_lengths.solve
-    given = after + const_lengths.transpose_solve
+    program, start = numpy_program(jaxprs.solve), const_lengths.matvec + const_lengths.vecmat
+    end = start + const_lengths.solve
+    right_sides = end + const_lengths.transpose_solve
 
-    return lambda meter, *xs: program(meter, [*xs[before:after], *xs[given:]])
+    return lambda meter, *xs: program(meter, [*xs[start:end], *xs[right_sides:]])
 
 
 _CONTROL: dict[str, Callable[..., Callable[..., Any]]] = {

@@ -57,15 +57,17 @@ def _slice(
 
 def _pad(x: np.ndarray, value: Any, padding_config: Sequence[tuple[int, int, int]]) -> np.ndarray:
     sizes = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(np.shape(x), padding_config, strict=True)]
-    found = np.full([low + n + high for n, (low, high, _) in zip(sizes, padding_config, strict=True)], value, np.asarray(x).dtype)
+    result = np.full(
+        [low + n + high for n, (low, high, _) in zip(sizes, padding_config, strict=True)], value, np.asarray(x).dtype
+    )
     target, source = [], []
-    for n, (low, _, inner), size in zip(np.shape(x), padding_config, found.shape, strict=True):
+    for n, (low, _, inner), size in zip(np.shape(x), padding_config, result.shape, strict=True):
         places = low + np.arange(n) * (1 + inner)
         inside = (places >= 0) & (places < size)
         target.append(places[inside])
         source.append(np.flatnonzero(inside))
-    found[np.ix_(*target)] = np.asarray(x)[np.ix_(*source)]
-    return found
+    result[np.ix_(*target)] = np.asarray(x)[np.ix_(*source)]
+    return result
 
 
 def _iota(*_: Any, dtype: Any, shape: Sequence[int], dimension: int, **__: Any) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The Jacobian J(x) of a function as a linear map with its transpose, which is a JAX primitive, and its derivatives.
 
-To differentiate the map, its two applications are themselves functions, of x and a tangent v, or of x and a cotangent w:
+To differentiate the map, its two applications are treated as functions of x and a tangent v, or of x and a cotangent w:
 
     g(x, v) = J(x) v,        h(x, w) = J(x)^T w.
 
@@ -45,7 +45,7 @@ class DifferentiableFunction(eqx.Module):
 
     @property
     def orders(self) -> int:
-        """The highest order of derivatives that is machine code."""
+        """The highest order of derivatives computed by machine code."""
         return 0
 
     @abstractmethod
@@ -53,7 +53,7 @@ class DifferentiableFunction(eqx.Module):
         """Return the shapes of f(x)."""
 
     def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
-        """Return J v. `run` is stored by the evaluation of f at x for its first derivatives, or None."""
+        """Return J v. `run` is the record that the evaluation of f at x stored for first derivatives, or None."""
         del run
         return change_along(self, inputs, active, tangents)[1]
 
@@ -91,26 +91,26 @@ class TangentMap(DifferentiableFunction):
         del run
         (inputs, directions), (of_x, of_v) = self.parts(inputs), self.parts(active)
         dxs, dvs = tangents[: sum(of_x)], tangents[sum(of_x) :]
-        found = [jnp.zeros(shape) for shape in self.shapes([*inputs, *directions])]
+        result = [jnp.zeros(shape) for shape in self.shapes([*inputs, *directions])]
         if dxs:
-            found = self.of.twice(inputs, self.active, directions, of_x, dxs)
+            result = self.of.twice(inputs, self.active, directions, of_x, dxs)
         if dvs:
-            found = [a + b for a, b in zip(found, self.of.forward(inputs, self._expand(of_v), dvs, None), strict=True)]
-        return found
+            result = [a + b for a, b in zip(result, self.of.forward(inputs, self._expand(of_v), dvs, None), strict=True)]
+        return result
 
     def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
         del run
         (inputs, directions), (of_x, of_v) = self.parts(inputs), self.parts(active)
-        found = _by_rows(lambda units: self.of.twice(inputs, self.active, directions, of_x, units), inputs, of_x, cotangents)
-        return [*found, *(self.of.backward(inputs, self._expand(of_v), cotangents, None) if any(of_v) else [])]
+        by_inputs = _by_rows(lambda units: self.of.twice(inputs, self.active, directions, of_x, units), inputs, of_x, cotangents)
+        return [*by_inputs, *(self.of.backward(inputs, self._expand(of_v), cotangents, None) if any(of_v) else [])]
 
     def parts(self, inputs: Sequence[Any]) -> tuple[Any, Any]:
         return inputs[: len(self.active)], inputs[len(self.active) :]
 
     def _expand(self, which: Mask) -> Mask:
         """Return a mask of x from a mask of the active entries of x."""
-        rest = iter(which)
-        return tuple(m and next(rest) for m in self.active)
+        marks = iter(which)
+        return tuple(m and next(marks) for m in self.active)
 
     def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
         return self.of.shapes(self.parts(inputs)[0])
@@ -127,19 +127,19 @@ class CotangentMap(TangentMap):
         del run
         (inputs, bars), (of_x, of_w) = self.parts(inputs), self.parts(active)
         dxs, dws = tangents[: sum(of_x)], tangents[sum(of_x) :]
-        found = [jnp.zeros(x.shape) for x in select(inputs, self.active)]
+        result = [jnp.zeros(x.shape) for x in select(inputs, self.active)]
         if dxs:
-            found = _by_rows(lambda units: self.of.twice(inputs, of_x, dxs, self.active, units), inputs, self.active, bars)
+            result = _by_rows(lambda units: self.of.twice(inputs, of_x, dxs, self.active, units), inputs, self.active, bars)
         if dws:
             dws = replaced([jnp.zeros(x.shape) for x in bars], of_w, dws)
-            found = [a + b for a, b in zip(found, self.of.backward(inputs, self.active, dws, None), strict=True)]
-        return found
+            result = [a + b for a, b in zip(result, self.of.backward(inputs, self.active, dws, None), strict=True)]
+        return result
 
     def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
         del run
         (inputs, bars), (of_x, of_w) = self.parts(inputs), self.parts(active)
-        found = _by_rows(lambda units: self.of.twice(inputs, self.active, cotangents, of_x, units), inputs, of_x, bars)
-        return [*found, *(select(self.of.forward(inputs, self.active, cotangents, None), of_w) if any(of_w) else [])]
+        by_inputs = _by_rows(lambda units: self.of.twice(inputs, self.active, cotangents, of_x, units), inputs, of_x, bars)
+        return [*by_inputs, *(select(self.of.forward(inputs, self.active, cotangents, None), of_w) if any(of_w) else [])]
 
     def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
         return [x.shape for x in select(self.parts(inputs)[0], self.active)]
@@ -148,17 +148,17 @@ class CotangentMap(TangentMap):
 def _by_rows(
     rate: Callable[[list[Array]], list[Array]], inputs: list[Array], active: Mask, cotangents: list[Array]
 ) -> list[Array]:
-    """Return the gradient with respect to e of w^T r(e), for a function r linear in tangents e of x, by all unit vectors e_i."""
-    some = [x.shape for x in select(inputs, active)]
-    if not some:
+    """Return the gradient with respect to e of w^T r(e), for a function r linear in tangents e of x, by all unit vectors."""
+    shapes = [x.shape for x in select(inputs, active)]
+    if not shapes:
         return []
-    row = lambda e: jnp.vdot(_flat(cotangents), _flat(rate(_split(e, some))))  # noqa: E731
-    return _split(jax.vmap(row)(jnp.eye(sum(map(math.prod, some)))), some)
+    row = lambda e: jnp.vdot(_flat(cotangents), _flat(rate(_split(e, shapes))))  # noqa: E731
+    return _split(jax.vmap(row)(jnp.eye(sum(map(math.prod, shapes)))), shapes)
 
 
 def change_along(function: Callable, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[Any, Any]:
     """Return f(x) and its derivative along v, by forward mode."""
-    return jax.jvp(lambda *some: function(replaced(inputs, active, some)), select(inputs, active), tangents)
+    return jax.jvp(lambda *active_inputs: function(replaced(inputs, active, active_inputs)), select(inputs, active), tangents)
 
 
 # --- the linear map
@@ -169,7 +169,7 @@ class Linear(eqx.Module):
 
     function: DifferentiableFunction
     inputs: list[Array]
-    run: Any  # stored by the evaluation for its first derivatives, or None
+    run: Any  # the record that the evaluation stored for first derivatives, or None
     active: Mask = eqx.field(static=True)
     transposed: bool = eqx.field(static=True, default=False)
 
@@ -200,18 +200,18 @@ def _shape(linear, vector):
 @eqxi.filter_primitive_jvp
 def _derivative(primals, tangents):
     linear, vector = primals
-    at, change = tangents
-    found = _bind(linear, vector)
-    if all(dx is None for dx in at.inputs):
-        return found, _bind(linear, change)
+    d_linear, d_vector = tangents
+    result = _bind(linear, vector)
+    if all(dx is None for dx in d_linear.inputs):
+        return result, _bind(linear, d_vector)
     kind = CotangentMap if linear.transposed else TangentMap
-    parts = [None] * len(linear.argument_shapes) if change is None else _split(change, linear.argument_shapes)
-    dxs = [*at.inputs, *parts]
+    changes = [None] * len(linear.argument_shapes) if d_vector is None else _split(d_vector, linear.argument_shapes)
+    dxs = [*d_linear.inputs, *changes]
     active = tuple(dx is not None for dx in dxs)
     further = Linear(
         kind(linear.function, linear.active), [*linear.inputs, *_split(vector, linear.argument_shapes)], None, active
     )
-    return found, _bind(further, _flat(select(dxs, active)))
+    return result, _bind(further, _flat(select(dxs, active)))
 
 
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
@@ -225,7 +225,7 @@ _linear_p = linear_primitive("derivative_of_a_run", _apply, _shape, _derivative,
 
 @eqxi.filter_primitive_def
 def _apply_short(linear, vector):
-    """Apply a map if it is machine code; others contain diffrax's loops, which are compiled in any case."""
+    """Apply a map if it is machine code; diffrax's loops in other maps are compiled in any case."""
     if linear.run is None and linear.function.orders < 1:
         raise TooLongError
     return _apply(linear, vector)

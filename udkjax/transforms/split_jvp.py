@@ -1,7 +1,7 @@
 """A value and its tangent, computed by one program wherever no further transformation applies.
 
 JAX splits a derivative into parts: the value with its residuals, then linear maps of tangents, which `linearize` stores and a
-batch of tangents shares. If both run together in any case, one program that computes both need not store the residuals.
+batch of tangents shares. If both are needed together, one program that computes both need not store the residuals.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,35 +19,35 @@ from jaxtyping import Array, PyTree
 from udkjax.programs.numpy_program import expand_as
 from udkjax.programs.varying_axes import result_type
 
-OutputShapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # of a value and of its tangent
-SplitFunction = Callable[..., tuple[list[Array], list[Array]]]  # (at, direction) -> value, tangent: lists of arrays
+OutputShapes = tuple[list[jax.ShapeDtypeStruct], list[jax.ShapeDtypeStruct]]  # shapes of a value and of its tangent
+SplitFunction = Callable[..., tuple[list[Array], list[Array]]]  # (point, direction) -> value, tangent: lists of arrays
 
 
 def split_jvp(
-    seen: SplitFunction, run: SplitFunction, at: PyTree, direction: PyTree, shapes: OutputShapes
+    seen: SplitFunction, run: SplitFunction, point: PyTree, direction: PyTree, shapes: OutputShapes
 ) -> tuple[list[Array], list[Array]]:
-    """Return the value at `at` and its derivative along `direction`, trees of arrays, by `run`; JAX transforms `seen` instead.
+    """Return the value at `point` and its derivative along `direction`, trees of arrays, by `run`; JAX transforms `seen` instead.
 
     Both are mapped over any batch. `shapes` are the shapes of the value and of the derivative.
     """
     direction = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, direction)  # a tangent may be 1.0
-    (place, way), static = eqx.partition((at, direction), eqx.is_array)
-    (start, places), (ways, form) = jax.tree.flatten(place), jax.tree.flatten(way)
+    (point_arrays, direction_arrays), static = eqx.partition((point, direction), eqx.is_array)
+    (start, point_tree), (changes, direction_tree) = jax.tree.flatten(point_arrays), jax.tree.flatten(direction_arrays)
 
-    def flat(parts: SplitFunction) -> Callable[..., list[Array]]:
+    def flat(form: SplitFunction) -> Callable[..., list[Array]]:
         def function(*xs: Array) -> list[Array]:
-            given = places.unflatten(xs[: len(start)]), form.unflatten(xs[len(start) :])
-            return [x for found in parts(*eqx.combine(given, static)) for x in found]
+            arguments = point_tree.unflatten(xs[: len(start)]), direction_tree.unflatten(xs[len(start) :])
+            return [x for found in form(*eqx.combine(arguments, static)) for x in found]
 
         return function
 
-    both = SplitForms(flat(seen), flat(run), len(start), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ways], shapes)
-    found = along_p.bind(*start, *ways, both=both)
+    both = SplitForms(flat(seen), flat(run), len(start), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in changes], shapes)
+    found = along_p.bind(*start, *changes, both=both)
     return list(found[: both.values]), list(found[both.values :])
 
 
 class SplitForms:
-    """The forms `seen` and `run` as functions of arrays: `start` arrays of the point, then the direction, of shapes `ways`."""
+    """The forms `seen` and `run` as functions of arrays: first `start` arrays of the point, then those of the direction."""
 
     def __init__(
         self,
@@ -77,10 +77,10 @@ def _avals(*xs: Array, both: SplitForms) -> list[jax.core.ShapedArray]:
 
 def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: SplitForms) -> tuple[list[Array], list[int | None]]:
     size = next(x.shape[axis] for x, axis in zip(xs, axes, strict=True) if axis is not None)
-    found = along_p.bind(*xs, both=both.mapped(axes, size))
+    results = along_p.bind(*xs, both=both.mapped(axes, size))
     if any(axis is not None for axis in axes[: both.start]):
-        return found, [0] * len(found)
-    value, change = found[: both.values], found[both.values :]
+        return results, [0] * len(results)
+    value, change = results[: both.values], results[both.values :]
     return [*(x[0] for x in value), *change], [*[None] * len(value), *[0] * len(change)]
 
 
@@ -95,14 +95,16 @@ def _jvp(
 ) -> tuple[list[Array], list[Array | ad.Zero]]:
     moving = [not isinstance(dx, ad.Zero) for dx in tangents]
 
-    def function(*some: Array) -> list[Array]:
-        rest = iter(some)
-        return run(*[next(rest) if m else x for x, m in zip(primals, moving, strict=True)])
+    def function(*moving_primals: Array) -> list[Array]:
+        values = iter(moving_primals)
+        return run(*[next(values) if m else x for x, m in zip(primals, moving, strict=True)])
 
-    some, changes = ([x for x, m in zip(xs, moving, strict=True) if m] for xs in (primals, tangents))
-    found, slopes = jax.jvp(function, some, changes)
-    none = [dx.dtype == jax.dtypes.float0 for dx in slopes]
-    return found, [ad.Zero(jax.typeof(x).to_tangent_aval()) if n else dx for x, dx, n in zip(found, slopes, none, strict=True)]
+    moving_primals, changes = ([x for x, m in zip(xs, moving, strict=True) if m] for xs in (primals, tangents))
+    results, slopes = jax.jvp(function, moving_primals, changes)
+    has_no_tangent = [dx.dtype == jax.dtypes.float0 for dx in slopes]
+    return results, [
+        ad.Zero(jax.typeof(x).to_tangent_aval()) if n else dx for x, dx, n in zip(results, slopes, has_no_tangent, strict=True)
+    ]
 
 
 def _part(trace: Any, *xs: Array, both: SplitForms) -> list[Array]:
@@ -110,11 +112,11 @@ def _part(trace: Any, *xs: Array, both: SplitForms) -> list[Array]:
         return both.seen(*xs)
 
 
-def _checkpointed(saveable: Any, unknown: Sequence[bool], there: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
+def _checkpointed(saveable: Any, unknown: Sequence[bool], instantiated: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
     """Split under `jax.checkpoint`: if only directions are unknown the value is computed; the backward pass recomputes both."""
     del saveable
     both: SplitForms = eqn.params["both"]
-    inputs = [x for x, t in zip(eqn.invars, there, strict=True) if not t and not isinstance(x, Literal)]
+    inputs = [x for x, t in zip(eqn.invars, instantiated, strict=True) if not t and not isinstance(x, Literal)]
     if any(unknown[: both.start]):
         return None, eqn, [True] * len(eqn.outvars), [True] * len(eqn.outvars), inputs
     value = new_jaxpr_eqn(eqn.invars[: both.start], eqn.outvars[: both.values], value_p, {"both": both}, no_effects)
@@ -127,8 +129,8 @@ def _value(*xs: Array, both: SplitForms) -> list[Array]:
 
 
 def _value_batched(xs: Sequence[Array], axes: Sequence[int | None], both: SplitForms) -> tuple[list[Array], list[int]]:
-    found = jax.vmap(partial(_value, both=both), in_axes=tuple(axes))(*xs)
-    return found, [0] * len(found)
+    results = jax.vmap(partial(_value, both=both), in_axes=tuple(axes))(*xs)
+    return results, [0] * len(results)
 
 
 value_p = Primitive("value_along_no_direction")

@@ -17,7 +17,7 @@ Mask = tuple[bool, ...]  # True for the arrays of a list that have tangents
 
 
 class ConcreteNumbers:
-    """The concrete arrays of a tree, None in place of traced ones; compared by value, so that they are static."""
+    """The concrete arrays of a tree, with None for traced ones; static because they are compared by value."""
 
     def __init__(self, arrays: Sequence[Array | None]):
         self.arrays = arrays
@@ -43,14 +43,14 @@ class TreeOfNumbers(eqx.Module):
         return eqx.combine(jax.tree.unflatten(self.structure, arrays), self.rest)
 
     def marks(self, active: Mask) -> Any:
-        """Return the tree with True in place of active arrays, and False in place of others."""
+        """Return the tree with True for active arrays and False for others."""
         traced = iter(active)
         return jax.tree.unflatten(self.structure, [x is None and next(traced) for x in self.concrete.arrays])
 
-    def changes(self, active: Mask, some: Sequence[Array]) -> Any:
-        """Return the tree with `some` arrays in place of active ones, and None in place of others."""
-        marks, rest = jax.tree.leaves(self.marks(active)), iter(some)
-        return jax.tree.unflatten(self.structure, [next(rest) if m else None for m in marks])
+    def changes(self, active: Mask, active_arrays: Sequence[Array]) -> Any:
+        """Return the tree with `active_arrays` for active arrays and None for others."""
+        marks, values = jax.tree.leaves(self.marks(active)), iter(active_arrays)
+        return jax.tree.unflatten(self.structure, [next(values) if m else None for m in marks])
 
 
 def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
@@ -66,7 +66,7 @@ def select(xs: Sequence[Any], which: Mask) -> list[Any]:
     return [x for x, m in zip(xs, which, strict=True) if m]
 
 
-def replaced(xs: Sequence[Array], active: Mask, some: Sequence[Array]) -> list[Array]:
-    """Return the arrays with `some` in place of the active ones."""
-    rest = iter(some)
-    return [next(rest) if m else x for x, m in zip(xs, active, strict=True)]
+def replaced(xs: Sequence[Array], active: Mask, active_arrays: Sequence[Array]) -> list[Array]:
+    """Return the arrays with the active ones replaced by `active_arrays`."""
+    values = iter(active_arrays)
+    return [next(values) if m else x for x, m in zip(xs, active, strict=True)]
