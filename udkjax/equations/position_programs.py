@@ -111,13 +111,13 @@ class PositionPrograms:
         self.constant_count = len(constants)
         state = [*constants, self._s, *self._q]
         self.prologue = ScalarProgram(self._graph, self._x, [*constants, *self._q0, self._s0])
-        """From x: the constants, q0 and s0."""
+        """Computes the constants, q0 and s0 from x."""
         self.drawn_value = ScalarProgram(self._graph, self._x, [self._s0])
-        """From x: s0."""
+        """Computes s0 from x."""
         self.newton = ScalarProgram(self._graph, state, newton)
-        """From the constants, s and q: q after a Newton step, dq/ds, the sign of the branch (`_sign`), and the violation."""
+        """Computes, from the constants, s and q: q after a Newton step, dq/ds, the sign of the branch, and the violation."""
         self.measure = ScalarProgram(self._graph, [*state, *self._d], outputs)
-        """From the constants, s, q and d: the outputs."""
+        """Computes the outputs from the constants, s, q and d."""
 
     def _outputs(self, derivatives: bool) -> list[Scalar]:
         of_motion = self._motion.values if self._motion else []

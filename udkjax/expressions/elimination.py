@@ -48,7 +48,7 @@ class SymbolicFactors:
         self._open_rows = [r for r in range(len(rows)) if r not in used]
         zero = graph.constant(0.0)
         self.block = [[self._rows[r].get(c, zero) for c in self.open_columns] for r in self._open_rows]
-        """B: the remaining rows, in the columns without a constant pivot."""
+        """The block B: the remaining rows, in the columns without a constant pivot."""
         self._rotations: list[tuple[int, int, Scalar, Scalar]] = []
         self.triangle = self._rotate([list(row) for row in self.block])
 

@@ -224,7 +224,7 @@ class Graph:
         """Copy a program of another graph into this one and return its outputs; its inputs, by index, are replaced by scalars."""
         copies = dict(inputs)
 
-        def here(a: Scalar) -> Scalar:
+        def copied(a: Scalar) -> Scalar:
             new = copies[a.index]
             return new if a.sign > 0 else -new
 

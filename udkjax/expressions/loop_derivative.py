@@ -18,7 +18,7 @@ TANGENT, COTANGENT = "d_", "bar_"
 OTHER, SECOND = "e_", "de_"  # prefixes of tangents along another direction, and along both
 # Modes of differentiation: along a direction, its transpose, and along two directions with the second derivative of both.
 FORWARD, REVERSE, TWICE = "forward", "reverse", "twice"
-PREFIXES = {FORWARD: (TANGENT,), REVERSE: (COTANGENT,), TWICE: (TANGENT, OTHER, SECOND)}  # of the names of arrays
+PREFIXES = {FORWARD: (TANGENT,), REVERSE: (COTANGENT,), TWICE: (TANGENT, OTHER, SECOND)}  # for names of arrays
 
 
 class LoopDerivative:

@@ -17,15 +17,16 @@ class RankPolicy(Enum):
     """Treatment of pivots below a threshold."""
 
     REFUSE = "refuse"
-    """Look at no pivot while eliminating, and report whether all exceed `safe_tol`. A step that is not safe is refused; machine
-    code takes it again by a rank-revealing method. The fastest: no operation waits for a comparison."""
+    """Use all pivots, and report whether all exceed `safe_tol`. A step that is not safe is rejected, and machine code repeats it
+    by a rank-revealing method. This is the fastest policy, because no operation waits for a comparison."""
 
     DROP = "drop"
-    """Leave out the rows whose pivots do not exceed `drop_tol`, and trust the rest: the pseudoinverse by elimination alone."""
+    """Leave out the rows whose pivots do not exceed `drop_tol`, and use the result without a check: the pseudoinverse by
+    elimination alone."""
 
     FALL_BACK = "fall back"
-    """Leave out the rows whose pivots do not exceed `drop_tol`, and report whether all exceed `safe_tol`: what the rank-revealing
-    method that a refused step falls back on does, written as elimination. Derivatives take it."""
+    """Leave out the rows whose pivots do not exceed `drop_tol`, and report whether all exceed `safe_tol`. Derivatives use this
+    policy: elimination then agrees with the rank-revealing method that repeats rejected steps."""
 
     @property
     def drops(self) -> bool:

@@ -252,7 +252,7 @@ def _derivative(primals, tangents):
     if plus.transposed:
         forward, backward = backward, forward
 
-    def along(product, v):
+    def value_and_change(product, v):
         return eqx.filter_jvp(lambda D: product(D, v), (plus.matrix,), (dD,))
 
     Dx, dD_x = value_and_change(forward, x)
