@@ -1,7 +1,7 @@
 """The operations of machine code: a class for each, with its module and the shapes of its inputs and outputs.
 
 An operation defines its code up to the number of lanes. The first axis of inputs and outputs is that of the members, of length
-one for shared inputs. runs.py has the operations that integrate, position_operations.py those that find positions.
+one for shared inputs. runs.py has the operations that integrate, position_operations.py those that compute positions.
 """
 
 from abc import ABC, abstractmethod
@@ -40,11 +40,11 @@ class Operation(ABC):
     in_lanes: ClassVar[bool] = True  # whether members run in lanes
     results: ClassVar[int] = len(OUTPUTS)  # number of outputs without directions: the first ones
     share: ClassVar[int] = SHARE  # minimum number of members of a thread
-    is_reverse: ClassVar[bool] = False  # whether two passes integrate and backpropagate, each with a part of the outputs
+    is_reverse: ClassVar[bool] = False  # whether two passes, integration and backpropagation, write a part of the outputs each
 
     @property
     def all_settings(self) -> tuple[str, ...]:
-        """The names of the settings, those of the formulation included."""
+        """The names of all settings, including those of a formulation."""
         return self.settings
 
     @property
@@ -90,7 +90,7 @@ class Operation(ABC):
             ts: Times (s).
             q: Positions (n,).
             v: Velocities (n,).
-            settings: Settings by name; others than those of the operation are ignored.
+            settings: Settings by name; settings of other operations are ignored.
             rows: The scales of the rows of Psi.
             breaks: Times (s) where the motion is not smooth, in their order.
             xp: jax.numpy, without derivatives, or NumPy if all inputs are concrete.
@@ -101,8 +101,8 @@ class Operation(ABC):
         """
         as_vector = partial(np.concatenate, axis=None) if xp is np else numbers_as_vector
         values = [settings[name] for name in self.all_settings]
-        given = (as_vector(numbers), ts, q, v, as_vector(values), rows, breaks, *further)
-        arrays = [xp.asarray(x, float)[None] for x in given]
+        inputs = (as_vector(numbers), ts, q, v, as_vector(values), rows, breaks, *further)
+        arrays = [xp.asarray(x, float)[None] for x in inputs]
         return arrays if xp is np else jax.lax.stop_gradient(arrays)
 
 
@@ -128,7 +128,7 @@ class StateOperation(Operation):
 
     @property
     def tangent_part(self) -> "FindTangentPart":
-        """The operation that finds the tangent part of small changes of states."""
+        """The operation that computes the tangent part of small changes of states."""
         return FindTangentPart(self.code, self.pseudoinverse, self.formulation)
 
     def of_events(self, conditions: Conditions, impacts: tuple[int, ...]) -> "EvaluateEvents":
@@ -143,7 +143,7 @@ class StateOperation(Operation):
 
 
 class Accelerate(StateOperation):
-    """Find the accelerations of states."""
+    """Compute the accelerations of states."""
 
     function = StateAccelerations
 
@@ -155,14 +155,14 @@ class ProjectStates(StateOperation):
 
 
 class FindTangentPart(StateOperation):
-    """Find the tangent part of small changes of states."""
+    """Compute the tangent part of small changes of states."""
 
     function = StateTangentPart
 
 
 @dataclass(frozen=True)
 class EvaluateEvents(StateOperation):
-    """Find accelerations, conditions and directions of impulses at states."""
+    """Compute accelerations, conditions and directions of impulses at states."""
 
     conditions: Conditions | None = None
     impacts: tuple[int, ...] = ()  # indices of the conditions with directions of impulses
@@ -193,7 +193,7 @@ class MarkRows(Operation):
 
 @dataclass(frozen=True)
 class FindScales(Operation):
-    """Find the characteristic scales from the numbers of a scene."""
+    """Compute the characteristic scales from the numbers of a scene."""
 
     settings: ClassVar[tuple[str, ...]] = ()
     in_lanes: ClassVar[bool] = False

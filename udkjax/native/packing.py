@@ -18,10 +18,10 @@ from udkjax.transforms.gradients import stop_gradients
 class ActiveNumbers:
     """The numbers of a tree, some of which are active, that is, have derivatives.
 
-    Machine code takes them as one vector, followed by the two thresholds of pivots, which are inactive.
+    Machine code receives them as one vector, followed by two thresholds of pivots, which are inactive.
 
     Attributes:
-        mask: whether each of all numbers and the two thresholds is active.
+        mask: for each number, and for the two thresholds, whether it is active.
     """
 
     def __init__(self, numbers: PyTree[Array], active: PyTree[bool]):
@@ -34,12 +34,12 @@ class ActiveNumbers:
         """Return a change of the tree as one vector, with zeros for numbers that are not active."""
         leaves = zip(self._numbers, self._active, leaves_and_none(change), strict=True)
         moving = [jnp.ravel(jnp.asarray(dx, float)) for x, m, dx in leaves if x is not None and m is True]
-        which = np.array(self.mask)
-        # Two operations for any number of parts: XLA takes as long for each as for a hundred steps of a small scene.
-        return jnp.concatenate([*moving, np.zeros(1)])[np.where(which, np.cumsum(which) - 1, np.sum(which))]
+        mask = np.array(self.mask)
+        # Two operations for any number of parts, as each operation of XLA takes as long as a hundred steps of a small scene.
+        return jnp.concatenate([*moving, np.zeros(1)])[np.where(mask, np.cumsum(mask) - 1, np.sum(mask))]
 
     def cotangents(self, bars: Array) -> PyTree[Array]:
-        """Return the tree of the cotangents of active numbers, from those of all numbers, in order."""
+        """Return the tree of the cotangents of active numbers, from a vector of the cotangents of all numbers."""
         parts, place = [], 0
         for x, m in zip(self._numbers, self._active, strict=True):
             size = 0 if x is None else np.size(x)
@@ -68,13 +68,13 @@ class SampleRows:
         return xp.sort(stop_gradients(self._breakpoints)) if traced else np.sort(np.asarray(self._breakpoints))
 
     def stand_in(self, mechanism: Mechanism, marks: bool = False) -> Mechanism:
-        """Return a mechanism, or a tree of its tangents or, with `marks`, of active numbers, with one row for the samples."""
-        found = {}
-        for place, given in mechanism.samples.items():
-            present = [leaf for leaf in leaves_and_none(given) if leaf is not None]
+        """Return a mechanism, or a tree of its tangents or (with `marks`) active marks, with one row instead of all samples."""
+        samples = {}
+        for place, sampled in mechanism.samples.items():
+            present = [leaf for leaf in leaves_and_none(sampled) if leaf is not None]
             zeros = np.zeros(row_size(self.samples[place])) if present else None
-            found[place] = with_row(self.samples[place], any(leaf is True for leaf in present) if marks else zeros)
-        return mechanism.with_samples(found)
+            samples[place] = with_row(self.samples[place], any(leaf is True for leaf in present) if marks else zeros)
+        return mechanism.with_samples(samples)
 
     def places(self, mechanism: Mechanism) -> tuple[int, ...]:
         """Return the indices of a row's numbers among all numbers of the mechanism from `stand_in`."""
@@ -90,14 +90,14 @@ class SampleRows:
         columns = []
         for x in self.samples.values() if samples is None else samples:
             traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
-            rows, own = rows_of(x, xp if traced else np), x.breakpoints
-            if any(isinstance(b, Tracer) for b in (breakpoints, own)):
+            rows, knots = rows_of(x, xp if traced else np), x.breakpoints
+            if any(isinstance(b, Tracer) for b in (breakpoints, knots)):
                 after = xp.concatenate([xp.full(1, -np.inf), breakpoints])
-                columns.append(rows[xp.searchsorted(stop_gradients(xp.asarray(own)), after, side="right")])
-            elif np.array_equal(own, breakpoints):
+                columns.append(rows[xp.searchsorted(stop_gradients(xp.asarray(knots)), after, side="right")])
+            elif np.array_equal(knots, breakpoints):
                 columns.append(rows)
             else:
-                columns.append(rows[np.searchsorted(np.asarray(own, float), np.append(-np.inf, breakpoints), side="right")])
+                columns.append(rows[np.searchsorted(np.asarray(knots, float), np.append(-np.inf, breakpoints), side="right")])
         return xp.concatenate(columns, axis=1)
 
     def changes(self, mechanism: Mechanism) -> Array:
@@ -108,9 +108,9 @@ class SampleRows:
         return jax.jvp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), (leaves,), (along,))[1]
 
     def with_cotangents(self, mechanism: Mechanism, active: Mechanism, bars: Array) -> Mechanism:
-        """Return a mechanism of cotangents with those of the samples, from those of the rows."""
+        """Return a mechanism of cotangents that includes the samples, from the cotangents of the rows."""
         leaves, form = jax.tree.flatten(list(self.samples.values()))
         marks = leaves_and_none(list(active.samples.values()))
-        (found,) = jax.vjp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), leaves)[1](bars)
-        kept = [bar if mark is True else None for bar, mark in zip(found, marks, strict=True)]
-        return mechanism.with_samples(dict(zip(self.samples, jax.tree.unflatten(form, kept), strict=True)))
+        (sample_bars,) = jax.vjp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), leaves)[1](bars)
+        active_bars = [bar if mark is True else None for bar, mark in zip(sample_bars, marks, strict=True)]
+        return mechanism.with_samples(dict(zip(self.samples, jax.tree.unflatten(form, active_bars), strict=True)))

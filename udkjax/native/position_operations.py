@@ -1,4 +1,4 @@
-"""The operations of machine code that find positions: closing with its derivatives, and following the positions of a drive."""
+"""The operations of machine code that compute positions: closing with its derivatives, and following the positions of a drive."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from udkjax.native.operations import Operation
 
 @dataclass(frozen=True)
 class Close(Operation):
-    """Close a mechanism: its state, the remaining Psi and Psi_dot, and the rank of Psi_q."""
+    """Close a mechanism: the outputs are its state, the remaining Psi and Psi_dot, and the rank of Psi_q."""
 
     settings: ClassVar[tuple[str, ...]] = Closing.settings
     in_lanes: ClassVar[bool] = False
     results: ClassVar[int] = len(Closing.results)
 
     def with_tangents(self, active: tuple[bool, ...]) -> "CloseTangents":
-        """Return the operation that finds the changes of the state, too, along directions of the active numbers."""
+        """Return the operation that also computes tangents of the state along directions of the active numbers."""
         return CloseTangents(self.code, active)
 
     def with_second_tangents(self, active: tuple[bool, ...]) -> "CloseSecondTangents":
-        """Return the operation that finds second derivatives of the state along pairs of directions of the active numbers."""
+        """Return the operation that computes second derivatives of the state along pairs of directions of the active numbers."""
         return CloseSecondTangents(self.code, active)
 
     def with_cotangents(self, active: tuple[bool, ...]) -> "CloseCotangents":
-        """Return the operation that walks back to the active numbers and the guess."""
+        """Return the operation that pulls cotangents back to the active numbers and the guess."""
         return CloseCotangents(self.code, active)
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:

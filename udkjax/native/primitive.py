@@ -1,4 +1,4 @@
-"""Machine code of operations: compiled once for each, called directly or, as a JAX primitive, from compiled programs."""
+"""Machine code of operations: compiled once per operation, called directly or, as a JAX primitive, from compiled programs."""
 
 import ctypes
 import math
@@ -33,7 +33,7 @@ from udkjax.threads import cores, thread_count
 
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
-QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls for each line of text: a tenth of the time of compiling a line
+QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
 TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
 FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
@@ -55,7 +55,7 @@ def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
 def unsupported(code: ScenePrograms) -> str:
     """Return the unsupported operations of a scene; empty if there are none.
 
-    Each kernel of its elements is written once, in loops; the text that is compiled may be unrolled and much longer.
+    For this check each kernel is written once, in loops; the text that is compiled may be unrolled and much longer.
     """
     loops, at = LoopWriter(1), defaultdict(lambda: ("work", 0))
     try:
@@ -69,8 +69,8 @@ def unsupported(code: ScenePrograms) -> str:
 class LoadedCode:
     """The machine code of one operation in `width` lanes.
 
-    First calls use quickly compiled code, until they have taken a tenth of the time of compiling optimized code; and only if they
-    have few members and steps, as it runs slowly. Both round equally.
+    First calls use quickly compiled code, which runs slowly: only calls with few members and steps, and only until they have
+    taken a tenth of the time of compiling optimized code. Both codes round equally.
     """
 
     def __init__(self, operation: Operation, width: int, tangent_lanes: int):
@@ -99,33 +99,35 @@ class LoadedCode:
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
         if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and not self._quick.library.is_optimized:
-            found = self._call_quickly(inputs, shapes)
-            if found is not None:
-                return found
+            outputs = self._call_quickly(inputs, shapes)
+            if outputs is not None:
+                return outputs
         return self.prepare(inputs, shapes)()
 
     def _call_quickly(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray] | None:
         """Return the outputs; None if there are too many steps."""
-        inputs, most, place = [*inputs], QUICK_STEPS / shapes[0][0], self._step_limit
-        if place is not None:
+        inputs, allowed, column = [*inputs], QUICK_STEPS / shapes[0][0], self._step_limit
+        if column is not None:
             k = INPUTS.index("settings")
             settings = inputs[k] = np.array(inputs[k], np.float64)
-            is_limited = settings[:, place] > most
-            settings[is_limited, place] = most
+            is_limited = settings[:, column] > allowed
+            settings[is_limited, column] = allowed
         start = time.perf_counter()
-        found = self.prepare(inputs, shapes, self._quick)()
+        outputs = self.prepare(inputs, shapes, self._quick)()
         self._seconds -= time.perf_counter() - start
-        if place is not None and np.any(is_limited & (found[OUTPUTS.index("info")][:, INFO.index("code")] == Status.STEP_LIMIT)):
+        if column is not None and np.any(
+            is_limited & (outputs[OUTPUTS.index("info")][:, INFO.index("code")] == Status.STEP_LIMIT)
+        ):
             self._seconds = 0.0
             return None
-        return found
+        return outputs
 
     def prepare(
         self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: "Code | None" = None
     ) -> "PreparedCall":
-        """Return a call, which can be repeated with other numbers in its inputs; these are the given arrays if float64."""
+        """Return a call that can be repeated with other numbers in `inputs`, which are the given arrays if these are float64."""
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
-        # Each pass of reverse mode writes only a part of the outputs: zeros instead of NaN, which jax.debug_nans would report.
+        # Each pass of reverse mode writes only a part of the outputs. The rest is zero, as jax.debug_nans would report NaN.
         found = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
         members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
         arrays, following = (*inputs, *found), (ctypes.c_int64 * 2)()
@@ -184,7 +186,7 @@ _LOADING = Lock()
 
 
 def load(text: str, level: int = machine.LEVEL) -> Code:
-    """Load the code of a module at a level of optimization, or optimized code if there is some.
+    """Load the code of a module at a level of optimization, or optimized code if available.
 
     XLA keeps one address for each name, and compiled programs may call it at any time: loaded code is never freed, and serves all
     callers with the same text.
@@ -217,10 +219,10 @@ def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int
 
 
 def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
-    few = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
-    directions = inputs[-1].shape[1] if operation.tangents and few and operation.code.is_small else 1
+    one_by_one = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
+    directions = inputs[-1].shape[1] if operation.tangents and one_by_one and operation.code.is_small else 1
     tangent_lanes = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are faster
-    return machine_code(operation, 1 if few else machine.lanes(), tangent_lanes)
+    return machine_code(operation, 1 if one_by_one else machine.lanes(), tangent_lanes)
 
 
 def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
@@ -269,13 +271,13 @@ def _batch(
         return [*found[:results], *changes], [*[None] * results, *[1] * len(changes)]
     members = max(x.shape[0 if axis is None else 1] for x, axis in zip(first, axes, strict=True))
 
-    def each(x: Any, axis: int | None) -> Any:
+    def as_members(x: Any, axis: int | None) -> Any:
         if axis is None and x.shape[0] <= 1:
             return x
         x = x[None] if axis is None else x
         return jnp.broadcast_to(x, (size, members, *x.shape[2:])).reshape(size * members, *x.shape[2:])
 
-    found = native_p.bind(*(each(x, axis) for x, axis in zip(first, axes, strict=True)), operation=operation, times=times)
+    found = native_p.bind(*(as_members(x, axis) for x, axis in zip(first, axes, strict=True)), operation=operation, times=times)
     return [x.reshape(size, members, *x.shape[1:]) for x in found], [0] * len(found)
 
 
@@ -292,8 +294,8 @@ evaluate_as(native_p, call_members)
 
 
 def _scale_inputs(numbers: Any) -> list[Any]:
-    none = np.zeros((1, 0))
-    return [numbers.reshape(-1, numbers.shape[-1]), np.zeros((1, 1)), *[none] * (len(INPUTS) - 2)]
+    empty = np.zeros((1, 0))
+    return [numbers.reshape(-1, numbers.shape[-1]), np.zeros((1, 1)), *[empty] * (len(INPUTS) - 2)]
 
 
 def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:

@@ -52,7 +52,7 @@ class RunStates(Operation):
 
     @property
     def accelerations(self) -> Accelerate:
-        """The operation that finds accelerations at single states by the same method."""
+        """The operation that computes accelerations at single states by the same method."""
         return Accelerate(self.code, self.pseudoinverse, self.formulation)
 
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
@@ -69,19 +69,19 @@ class RunStates(Operation):
         Args:
             active: mask of the numbers of the scene.
             breakpoints: number of times where the motion is not smooth.
-            points: capacity of the record of a run; None: sufficient for most.
+            points: capacity of the record of a run; None: sufficient for most runs.
         """
         points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
 
     def watching(self, conditions: Conditions) -> "RunWatched":
         """Return the operation that integrates up to the first crossing of conditions."""
-        return RunWatched(**{each.name: getattr(self, each.name) for each in fields(self)}, conditions=conditions)
+        return RunWatched(**{item.name: getattr(self, item.name) for item in fields(self)}, conditions=conditions)
 
     @property
     def _for_derivatives(self) -> dict[str, Any]:
         """The fields of the same operation with derivatives."""
-        return {each.name: getattr(self, each.name) for each in fields(self)} | {"code": self.code.for_derivatives}
+        return {item.name: getattr(self, item.name) for item in fields(self)} | {"code": self.code.for_derivatives}
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return Trajectory(self.plan(width, vector))
@@ -93,7 +93,7 @@ class RunStates(Operation):
 
 @dataclass(frozen=True)
 class RunWatched(RunStates):
-    """Integrate up to the first crossing of conditions, or to where one cannot be ruled out."""
+    """Integrate up to the first crossing of conditions, or until a crossing cannot be ruled out."""
 
     conditions: Conditions | None = None
 

@@ -1,13 +1,14 @@
 """Derivatives of a trajectory in reverse mode, by backpropagation through the recorded steps (record.py).
 
-A point is an accepted state (q, v, a) at its time; each step leads from one to the next. Cotangents of the points are accumulated
-from the last to the first: those of an output go through its projection and interpolation to the four points of its polynomial;
-those of a point go through its accelerations and its projection to the end of the step that led to it, and through the sums
+A point is an accepted state (q, v, a) at its time; each step leads from one point to the next. Cotangents of the points are
+accumulated from the last point to the first. Those of an output are pulled back through its projection and interpolation to the
+four points of its polynomial. Those of a point are pulled back through its accelerations and its projection to the end of the
+step before it, and through the sums
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
-of its stages, the last first, to the point before. The stages are evaluated again with the intermediate results that derivatives
-need; the transposed programs are those of expressions/differential.py.
+of the stages of this step, the last first, to the point before. The stages are evaluated again with the intermediate results that
+derivatives need; the transposed programs are those of expressions/differential.py.
 
 Members in lanes are backpropagated together; the next ones are loaded when all are complete.
 """
@@ -26,7 +27,7 @@ from udkjax.native.run.runge_kutta import stage_state
 
 
 class Reverse(Recorded):
-    """A trajectory with backpropagation from cotangents of its outputs and its end; without cotangents it only runs."""
+    """A trajectory with backpropagation from cotangents of its outputs and its end; without cotangents it only integrates."""
 
     inputs = ("given record", "given qs", "given vs", "ysbar", "endbar")
     outputs = ("numbersbar", "qbar", "vbar", "record")
@@ -52,8 +53,8 @@ class Reverse(Recorded):
             p.add(f"bar difference{k}", n)
 
     def write_derivatives(self):
-        for each in self._linearizations:
-            each.reverse()
+        for derivative in self._linearizations:
+            derivative.reverse()
         if self.count:
             write_prologue_derivative(self, self.active, REVERSE)
         write_differences_back(self)
@@ -68,8 +69,8 @@ class Reverse(Recorded):
     def _accumulate_constants(self, f: Function, mask: Value):
         """Add the cotangents of the constants from one program to the sums, in the lanes of `mask`."""
         with f.each(self.count) as i:
-            total, more = (self.entry(f, name, i) for name in ("total bar constants", "bar constants"))
-            self.put_entry(f, "total bar constants", i, f.select(mask, total + more, total))
+            total, change = (self.entry(f, name, i) for name in ("total bar constants", "bar constants"))
+            self.put_entry(f, "total bar constants", i, f.select(mask, total + change, total))
 
     def _pull_projection(self, f: Function, mask: Value):
         """Pull `bar result` back through the projection that led to the state, after its evaluation, to `bar state`."""
@@ -87,7 +88,7 @@ class Reverse(Recorded):
         self._accumulate_constants(f, mask)
 
     def _write_step_back(self):
-        """Write `step_back`: from the cotangents of point 3 to those of point 2, in lanes with points left (`at`)."""
+        """Write `step_back`: from the cotangents of point 3 to those of point 2, in lanes after their first point (`at`)."""
         f, s = self.function("step_back")
         active = s.at > 0.5
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.point3_t - s.point2_t)
@@ -124,9 +125,9 @@ class Reverse(Recorded):
         with f.each(self.rowcount) as r:
             of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
             hq = h * of_q
-            for x, more in (("q", of_q), ("v", f.fma(hq, float(method.nodes[i]), of_v))):
+            for x, change in (("q", of_q), ("v", f.fma(hq, float(method.nodes[i]), of_v))):
                 old = self.vector(f, f"bar point2 {x}", r)
-                self.put(f, f"bar point2 {x}", r, f.select(active, old + more, old))
+                self.put(f, f"bar point2 {x}", r, f.select(active, old + change, old))
             hhq, hv = h * hq, h * of_v
             for j in stages:
                 a2, a = float(method.q[i][j]), float(method.v[i][j])
@@ -269,21 +270,23 @@ class Reverse(Recorded):
             return
         f, _ = self.function("leave_row", ARGUMENTS)
         k, count = f.given["lane"], self.code.number_count
-        constants, bars, found = (Value(f, f.reserve(DOUBLE, c), POINTER) for c in (max(self.constants, 1), self.count, count))
+        constants, bars, number_bars = (
+            Value(f, f.reserve(DOUBLE, c), POINTER) for c in (max(self.constants, 1), self.count, count)
+        )
         self.copy_lane(f, constants, 0, "constants", k, count=self.constants)
         self.copy_lane(f, bars, 0, "total bar constants", k, count=self.count)
         member, row = self.to_int(f, self.lane_entry(f, "member", k)), self.lane_entry(f, "row", k)
         sampled = self.plan.sampled
         numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, "numbers", member)
-        f.call(PROLOGUE[REVERSE], numbers, constants, bars, found)
+        f.call(PROLOGUE[REVERSE], numbers, constants, bars, number_bars)
         if sampled:
             rows = (self.field(f, "knots") + 1) * len(sampled)
-            to = f.at(self._result(f, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))
+            output = f.at(self._result(f, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))
             for column, place in self.active_samples.items():
-                f.store(f.load(to, column) + f.load(found, place), to, column)
-        to = self._result(f, "numbersbar", k, count)
+                f.store(f.load(output, column) + f.load(number_bars, place), output, column)
+        output = self._result(f, "numbersbar", k, count)
         with f.each(count) as i:
-            f.store(f.load(to, i) + f.load(found, i), to, i)
+            f.store(f.load(output, i) + f.load(number_bars, i), output, i)
         with f.each(self.count) as i:
             self.put_lane_entry(f, "total bar constants", k, 0.0, i)
 

@@ -9,7 +9,7 @@ from udkjax.native.run.trajectory import Trajectory
 class Differentiated(Trajectory):
     """The base of both modes: programs of derivatives, and memory for their intermediate results.
 
-    `active` marks the numbers of the scene with derivatives; positions and velocities always have them.
+    `active` marks the numbers of the scene that have derivatives; positions and velocities always have them.
     """
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
@@ -29,12 +29,12 @@ class Differentiated(Trajectory):
         """Compute the accelerations of stage i with the intermediate results that derivatives need."""
         f.call("evaluation", f.given["work"], self.address(f, f"stage{i} a"), self.address(f, f"stage{i} linearization"))
         if self.dense or self.formulated:
-            self.accelerate(f, f"stage{i} a")  # all methods share the derivatives; values are the method's own
+            self.accelerate(f, f"stage{i} a")  # derivatives are the same for all methods; values depend on the method
 
     def write_programs(self):
         super().write_programs()
-        for each in self._linearizations:
-            each.evaluation()
+        for derivative in self._linearizations:
+            derivative.evaluation()
         if self.unrolled and self.of_projection:
             names = ("accelerations", "projection")
             at = {f"stored {name}": (name, 0) for name in names} | self.arrays
@@ -55,6 +55,6 @@ class Differentiated(Trajectory):
             self._evaluate_projection(f)
 
     def _evaluate_projection(self, f: Function):
-        """Evaluate a projection at the state, which lies on the manifold, for the derivatives of the projection."""
+        """Evaluate the projection at the state, which lies on the manifold, for its derivatives."""
         if self.of_projection:
             f.call("evaluation_projection", f.given["work"], f.given["work"], self.address(f, "projection linearization"))

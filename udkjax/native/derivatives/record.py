@@ -1,7 +1,7 @@
 """The record of a trajectory for reverse mode: its accepted states and the steps between them.
 
-A first call of the code integrates, and returns the record of each member among its outputs. A second one takes the record and
-cotangents, and backpropagates; a member whose record was too long for the output is integrated again.
+A first call of the code integrates, and returns the record of each member among its outputs. A second call reads the record and
+the cotangents, and backpropagates; a member whose record was too long for the output is integrated again.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ def record_length(n: int, points: int) -> int:
 
 
 class Recorded(Differentiated):
-    """A trajectory that returns a record, or backpropagates from one."""
+    """A trajectory that returns a record, or backpropagates along a given record."""
 
     lengths = ("given record", "record")
 
@@ -142,7 +142,7 @@ class Recorded(Differentiated):
             self.put_lane_entry(f, "points", k, points + 1.0)
 
     def _load_point(self, f: Function, k: Value, number: Value, point: str):
-        """Load a point of lane k from its record; numbers before the first point mean the first."""
+        """Load a point of lane k from its record; negative indices mean the first point."""
         row = f.at(self._record(f, k), self.to_int(f, f.max(number, 0.0)) * self.row)
         self.put_lane_entry(f, f"{point}_t", k, f.load(row, 0))
         for j, x in enumerate("qva"):

@@ -26,9 +26,9 @@ from udkjax.native.run.dense_output import write_between, write_differences
 class Forward(Differentiated):
     """A trajectory with its tangents along directions.
 
-    Directions come in groups, each with its own memory, a `tangent`: one direction for all members, or, for a single member, as
-    many directions as there are lanes. For second derivatives along pairs of directions, a group has three consecutive tangents,
-    for each direction and for both.
+    Directions come in groups. Each group has memory, a `tangent`: for one direction of all members or, if there is only one
+    member, for as many directions as there are lanes. For second derivatives along pairs of directions, a group has three
+    consecutive tangents: one for each direction, and one for both.
     """
 
     accelerate_stage = Differentiated.evaluate_stage  # intermediate results are needed in each step
@@ -56,8 +56,8 @@ class Forward(Differentiated):
             w.add(f"difference{k}", self.n)
 
     def write_derivatives(self):
-        for each in self._linearizations:
-            each.forward()
+        for derivative in self._linearizations:
+            derivative.forward()
         if self.count:
             write_prologue_derivative(self, self.active, self.mode)
         w = self.tangents
@@ -129,8 +129,8 @@ class Forward(Differentiated):
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for k in range(POINTS - 1):
                 for x in "qva":
-                    mine, other = (self.vector(f, f"point{j} {x}", r, "tangent") for j in (k, k + 1))
-                    self.put(f, f"point{k} {x}", r, f.select(accept, other, mine), "tangent")
+                    old_point, next_point = (self.vector(f, f"point{j} {x}", r, "tangent") for j in (k, k + 1))
+                    self.put(f, f"point{k} {x}", r, f.select(accept, next_point, old_point), "tangent")
         setattr(s, "state t", s.point3_t)
         with f.each(self.rowcount) as r:
             for x in "qv":
@@ -198,17 +198,17 @@ class Forward(Differentiated):
         """Compute the tangents of the constants along all directions."""
         if not self.count:
             return
-        found = [Value(f, f.reserve(DOUBLE, self.count), POINTER) for _ in self.ways]
-        none = Value(f, f.reserve(DOUBLE, self.code.number_count), POINTER)  # numbers have no second derivatives
+        tangents = [Value(f, f.reserve(DOUBLE, self.count), POINTER) for _ in self.ways]
+        zeros = Value(f, f.reserve(DOUBLE, self.code.number_count), POINTER)  # numbers have no second derivatives
         if len(self.ways) > 1:
             with f.each(self.code.number_count) as i:
-                f.store(0.0, none, i)
-        with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, place):
-            given = [self._changes_of_numbers(f, way, member, direction) if way in GIVEN else none for way in self.ways]
-            f.call(PROLOGUE[self.mode], numbers, constants, *given, *found)
-            for way, changes in zip(self.ways, found, strict=True):
+                f.store(0.0, zeros, i)
+        with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, tangent_lane):
+            inputs = [self._changes_of_numbers(f, way, member, direction) if way in GIVEN else zeros for way in self.ways]
+            f.call(PROLOGUE[self.mode], numbers, constants, *inputs, *tangents)
+            for way, changes in zip(self.ways, tangents, strict=True):
                 with f.each(self.count) as i:
-                    f.store(f.load(changes, i), self._way(f, way), place + self.place("constants", i, "tangent"))
+                    f.store(f.load(changes, i), self._way(f, way), tangent_lane + self.place("constants", i, "tangent"))
 
     def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
         """Return the address of the tangents of a member's numbers along a direction, with those of the row of samples."""

@@ -1,8 +1,8 @@
 """Machine code of the pseudoinverses of `udkjax.pinv`: D^+ b for a dense D, each by the algorithm of its class in `pinv`.
 
-`dense` has matrices in the memory of a run, one for each lane, as rows of whole registers, and the operations on rows that all
-methods use. A method defines its matrices, the factorization and the solution. Each lane has its own pivots and rank: lanes
-differ by `select`, as everywhere in machine code.
+`dense` stores matrices in the memory of a run, one for each lane, as rows that fill whole registers, and has the operations on
+rows that all methods use. A method defines its matrices, the factorization and the solution. Each lane has its own pivots and
+rank: lanes differ by `select`, as everywhere in machine code.
 """
 
 from udkjax import pinv
@@ -26,9 +26,9 @@ METHODS: dict[type[pinv.Pseudoinverse], type[DenseMethod]] = {
 def dense_method(method: pinv.Pseudoinverse) -> DenseMethod | None:
     """Return the machine code of a pseudoinverse; None if there is none."""
     if isinstance(method, pinv.OneOf):
-        found = [dense_method(choice) for choice in method.choices]
-        known = tuple(code for code in found if code is not None)
-        return OneOfCode(method.relative, known) if len(known) == len(found) else None
+        choices = [dense_method(choice) for choice in method.choices]
+        codes = tuple(code for code in choices if code is not None)
+        return OneOfCode(method.relative, codes) if len(codes) == len(choices) else None
     kind = METHODS.get(type(method))
     if kind is None:
         return None

@@ -1,7 +1,7 @@
 """Dense matrices in the memory of a run, one per lane, and operations on their rows.
 
-The entries of a row are contiguous, each in all lanes, and fill whole registers; the padding of the last register is zero. So an
-operation on rows is one on registers, which hold several columns of one member, or one column of W members.
+The entries of a row are contiguous, each in all lanes, and fill whole registers; the padding of the last register is zero.
+Operations on rows are therefore operations on registers, which hold several columns of one member, or one column of W members.
 """
 
 from abc import ABC, abstractmethod
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from udkjax.native.base.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
 from udkjax.native.base.memory import Memory
 
-UNROLLED = 16  # registers of a row up to which operations on it are unrolled; longer rows take this many per iteration
+UNROLLED = 16  # operations on this many registers are unrolled; operations on longer rows are loops over as many
 SUMS = 4  # independent partial sums of a scalar product, to hide the latency of additions
 
 
@@ -49,7 +49,7 @@ class DenseLayout:
         matrices: The shapes of the matrices other than D, by name.
         shape: The shape of D.
         prefix: Prefix of the names of arrays.
-        tol: The name of the rank tolerance.
+        tol: The name of the lane number that holds the rank tolerance.
         width: Number of lanes that have a matrix; by default all.
     """
 
@@ -104,18 +104,18 @@ class MatrixRow:
         f.store(x, self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
 
     def at(self, places: Value) -> Value:
-        """Return the entries at an index for each lane."""
+        """Return one entry for each lane, at the indices `places`."""
         f = self._d.f
         if f.width == 1:
             return f.load(self.address, places)
-        found = Value(f, "poison", DOUBLE, f.width)
+        entries = Value(f, "poison", DOUBLE, f.width)
         for k in range(f.width):
             x = f.load(self.address, self._place(places, k))
-            found = f.op(f"insertelement {found.type} {found.name}, double {x.name}, i64 {k}", DOUBLE, f.width)
-        return found
+            entries = f.op(f"insertelement {entries.type} {entries.name}, double {x.name}, i64 {k}", DOUBLE, f.width)
+        return entries
 
     def put_at(self, places: Value, x: Value):
-        """Store entries at an index for each lane."""
+        """Store one entry for each lane, at the indices `places`."""
         f = self._d.f
         if f.width == 1:
             f.store(x, self.address, places)
@@ -180,7 +180,7 @@ class DenseMatrices:
 
     @property
     def method_number(self) -> Value:
-        """The index of the method that each lane has chosen."""
+        """The index of the method that each lane uses."""
         return self.f.load(self.f.given["work"], self.module.places["method"] * self.f.width, self.f.width)
 
     def part(self, prefix: str) -> "DenseMatrices":
@@ -210,7 +210,7 @@ class DenseMatrices:
         return MatrixRow(self, f.at(f.given["work"], place), registers)
 
     def gather(self, name: str, places: Value, to: MatrixRow):
-        """Copy a row of a matrix, with an index for each lane."""
+        """Copy one row for each lane, at the indices `places` of a matrix."""
         f, registers = self.f, self.layout.registers[self._name(name)]
         if f.width == 1:
             self.copy(self.row(name, places), to)

@@ -65,19 +65,19 @@ class GramSchmidtCode(DenseMethod):
             d.over_registers(q.registers, unit)
             row = d.row("r", k)
 
-            def take_out(r: Operand):
+            def subtract(r: Operand):
                 is_left = (d.row("unused")[r] > 0.5) & d.row("index")[r].is_not(d.spread(pivot))
-                row[r] = along = f.select(is_left, combine_rows(d, q, r), 0.0)
-                use_column(d, used, r, add_to_rows(d, q, -along, r))
+                row[r] = product = f.select(is_left, combine_rows(d, q, r), 0.0)
+                use_column(d, used, r, add_to_rows(d, q, -product, r))
 
-            d.over_registers(row.registers, take_out)
+            d.over_registers(row.registers, subtract)
             with f.if_(f.any_of(goes_on)):
                 row.put_at(place, f.select(goes_on, norm, row.at(place)))
                 if self.twice:
                     with f.each(k) as j:
                         earlier = d.row("r", j)
-                        more = f.select(goes_on, above.entry(j), 0.0)
-                        earlier.put_at(place, earlier.at(place) + more)
+                        correction = f.select(goes_on, above.entry(j), 0.0)
+                        earlier.put_at(place, earlier.at(place) + correction)
         d.row("rank").put(0, rank.value)
 
     def _orthogonalize_rows(self, d: DenseMatrices):
@@ -107,9 +107,9 @@ class GramSchmidtCode(DenseMethod):
             d.over_registers(row.registers, unit)
             with f.each(d.steps, k + 1) as i:
                 later = d.row("r", i)
-                along = d.dot(row, later)
-                d.row("l", i).put(k, along)
-                d.axpy(-along, row, later)
+                product = d.dot(row, later)
+                d.row("l", i).put(k, product)
+                d.axpy(-product, row, later)
 
     def solve(self, d: DenseMatrices):
         f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")

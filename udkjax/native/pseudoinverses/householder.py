@@ -65,20 +65,20 @@ class HouseholderCode(DenseMethod):
         d.row("free").put(0, free)
         column = f.variable(-1.0)
         with f.each(self._count(d)) as k:
-            is_there = d.number(k) < d.row("free").entry(0)
-            following = f.variable(0.0)
+            is_used = d.number(k) < d.row("free").entry(0)
+            next_free = f.variable(0.0)
             with reversed_each(d, d.n) as j:
                 number = d.number(j)
-                following.where((d.row("unused").entry(j) > 0.5) & (number > column.value), number)
-            column.value = following.value
+                next_free.where((d.row("unused").entry(j) > 0.5) & (number > column.value), number)
+            column.value = next_free.value
             place, vector = d.whole(column.value), d.row("null", k)
             vector.clear()
             with f.each(d.steps) as i:
                 vector.put_at(d.whole(d.row("order").entry(i)), -d.row("D", i).at(place))
-            vector.put_at(place, f.select(is_there, d.wide(1.0), 0.0))
+            vector.put_at(place, f.select(is_used, d.wide(1.0), 0.0))
             with f.each(k) as j:
                 apply_reflector(d, "z", "tau_z", j, "null", k)
-            reflect_row(d, "null", k, is_there, "z", "tau_z")
+            reflect_row(d, "null", k, is_used, "z", "tau_z")
 
     def _count(self, d: DenseMatrices) -> Value:
         """Return the maximum over lanes of the number of free columns."""
@@ -99,7 +99,7 @@ class HouseholderCode(DenseMethod):
             apply_reflector(d, "z", "tau_z", k, "x")
         free = d.row("free").entry(0)
         with f.each(count.value) as k:
-            is_there = d.number(k) < free
-            x.put(k, f.select(is_there, 0.0, x.entry(k)))
+            is_used = d.number(k) < free
+            x.put(k, f.select(is_used, 0.0, x.entry(k)))
         with reversed_each(d, count.value) as k:
             apply_reflector(d, "z", "tau_z", k, "x")

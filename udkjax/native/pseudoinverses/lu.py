@@ -40,9 +40,9 @@ class LUCode(DenseMethod):
             d.row("order").put(k, pivot.value)
             with f.each(d.m) as i:
                 row = d.row("D", i)
-                left = f.select(d.number(i).is_(pivot.value), 0.0, unused.entry(i))
-                unused.put(i, left)
-                factor = f.select(left > 0.5, row.entry(k) * inverse, 0.0)
+                remains = f.select(d.number(i).is_(pivot.value), 0.0, unused.entry(i))
+                unused.put(i, remains)
+                factor = f.select(remains > 0.5, row.entry(k) * inverse, 0.0)
                 lower.put(i, factor)
                 with f.if_(f.any_of(factor.is_not(0.0))):
                     wide = d.spread(-factor)
@@ -52,9 +52,9 @@ class LUCode(DenseMethod):
     def solve(self, d: DenseMatrices):
         f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
         with f.each(d.m) as k:
-            found = b.at(d.whole(d.row("order").entry(k)))
-            y.put(k, found)
-            d.axpy(-found, d.row("lower", k), b)
+            entry = b.at(d.whole(d.row("order").entry(k)))
+            y.put(k, entry)
+            d.axpy(-entry, d.row("lower", k), b)
         x.clear()
         with reversed_each(d, d.m) as k:  # entries left of the diagonal multiply coordinates that are still zero
             x.put(k, (y.entry(k) - d.dot(d.row("upper", k), x)) * d.row("inverse").entry(k))

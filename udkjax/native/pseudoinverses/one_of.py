@@ -14,11 +14,11 @@ class OneOfCode(DenseMethod):
     methods: tuple[DenseMethod, ...]
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
-        found = {"rank": (1, 1)}
+        matrices = {"rank": (1, 1)}
         for k, method in enumerate(self.methods):
-            own = {"D": (m, n), "b": (1, m), "x": (1, n), **method.matrices(m, n)}
-            found |= {_prefix(k) + name: shape for name, shape in own.items()}
-        return found
+            shapes = {"D": (m, n), "b": (1, m), "x": (1, n), **method.matrices(m, n)}
+            matrices |= {_prefix(k) + name: shape for name, shape in shapes.items()}
+        return matrices
 
     def factor(self, d: DenseMatrices):
         rank = d.row("rank")

@@ -53,9 +53,9 @@ def choose_pivot(d: DenseMatrices) -> tuple[Value, Value]:
 def use_column(d: DenseMatrices, pivot: Value, r: Operand, square: Value):
     """Store the squared lengths of a register of columns, with -1 for used ones, and mark the pivot as used."""
     f, unused, squares = d.f, d.row("unused"), d.row("squares")
-    left = f.select(d.row("index")[r].is_(d.spread(pivot)), 0.0, unused[r])
-    unused[r] = left
-    squares[r] = f.select(left > 0.5, square, -1.0)
+    remains = f.select(d.row("index")[r].is_(d.spread(pivot)), 0.0, unused[r])
+    unused[r] = remains
+    squares[r] = f.select(remains > 0.5, square, -1.0)
 
 
 def combine_rows(d: DenseMatrices, weights: MatrixRow, r: Operand, start: Operand = 0) -> Value:
@@ -67,7 +67,7 @@ def combine_rows(d: DenseMatrices, weights: MatrixRow, r: Operand, start: Operan
 
 
 def add_to_rows(d: DenseMatrices, weights: MatrixRow, change: Value, r: Operand, start: Operand = 0) -> Value:
-    """Add multiples of `change` to the rows of D from `start` on; return the squared lengths of the columns below."""
+    """Add multiples of `change` to the rows of D from `start` on; return the squared lengths of the columns in these rows."""
     square = d.f.variable(0.0, width=d.vector)
     with d.f.each(d.m, start) as i:
         row = d.row("D", i)
@@ -77,17 +77,17 @@ def add_to_rows(d: DenseMatrices, weights: MatrixRow, change: Value, r: Operand,
 
 
 def pivoted_qr(d: DenseMatrices, threshold: Callable[[Value], Value]):
-    """Write D = Q R without moving columns: D becomes R; each step takes the longest unused column.
+    """Write D = Q R without moving columns: D becomes R; each step uses the longest unused column.
 
     Rows of `v` are the reflectors of Q. Each lane stops when the longest column is at most the threshold; `threshold` returns its
     square from the square of the longest column of D.
     """
     f = d.f
-    least = f.variable(threshold(start_pivoting(d)))
+    limit = f.variable(threshold(start_pivoting(d)))
     going, rank = f.variable(d.yes(), BOOL), f.variable(0.0)
     with f.each(d.steps) as k:
         square, pivot = choose_pivot(d)
-        goes_on = going.value & (square > least.value)
+        goes_on = going.value & (square > limit.value)
         going.value = goes_on
         rank.value = rank.value + f.select(goes_on, d.wide(1.0), 0.0)
         place, norm, used = d.whole(pivot), d.sqrt(square), f.select(goes_on, pivot, -1.0)

@@ -14,7 +14,7 @@ from udkjax.native.base.ir import INT, Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q, apply_q_transposed, pivoted_qr, qr_matrices
 
-SWEEPS = 30  # maximum; six to eight are usual
+SWEEPS = 30  # maximum number of sweeps; six to eight are usual
 ORTHOGONAL = 1e-15  # largest cosine of the angle between rows that count as orthogonal
 
 
@@ -33,26 +33,26 @@ class SVDCode(DenseMethod):
             row = d.row("u", i)
             row.clear()
             row.put(i, d.wide(1.0))
-        turned, sweep = f.variable(1, INT, 1), f.variable(0, INT, 1)
-        with f.while_(lambda: (turned.value > 0) & (sweep.value < SWEEPS)):
-            turned.value = 0
+        has_rotated, sweep = f.variable(1, INT, 1), f.variable(0, INT, 1)
+        with f.while_(lambda: (has_rotated.value > 0) & (sweep.value < SWEEPS)):
+            has_rotated.value = 0
             sweep.value = sweep.value + 1
             with f.each(d.steps) as i:
                 row = d.row("D", i)
                 squares.put(i, d.dot(row, row))
             with f.each(d.steps) as i, f.each(d.steps, i + 1) as j:
-                one, two = d.row("D", i), d.row("D", j)
-                a, c, g = squares.entry(i), squares.entry(j), d.dot(one, two)
-                turns = g * g > a * c * (ORTHOGONAL * ORTHOGONAL)
-                with f.if_(f.any_of(turns)):
-                    turned.value = 1
-                    zeta = (c - a) / f.select(turns, g * 2.0, 1.0)
+                row_i, row_j = d.row("D", i), d.row("D", j)
+                a, c, g = squares.entry(i), squares.entry(j), d.dot(row_i, row_j)
+                rotates = g * g > a * c * (ORTHOGONAL * ORTHOGONAL)
+                with f.if_(f.any_of(rotates)):
+                    has_rotated.value = 1
+                    zeta = (c - a) / f.select(rotates, g * 2.0, 1.0)
                     root = d.sqrt(f.fma(zeta, zeta, 1.0))
                     tangent = f.select(zeta < 0.0, -1.0, d.wide(1.0)) / (f.abs(zeta) + root)
-                    tangent = f.select(turns, tangent, 0.0)
+                    tangent = f.select(rotates, tangent, 0.0)
                     cosine = 1.0 / d.sqrt(f.fma(tangent, tangent, 1.0))
                     sine = cosine * tangent
-                    self._turn(d, one, two, cosine, sine)
+                    self._turn(d, row_i, row_j, cosine, sine)
                     self._turn(d, d.row("u", i), d.row("u", j), cosine, sine)
                     squares.put(i, a - tangent * g)
                     squares.put(j, f.fma(tangent, g, c))
@@ -70,15 +70,15 @@ class SVDCode(DenseMethod):
             squares.put(i, f.select(counts, 1.0 / f.select(counts, square, 1.0), 0.0))
         d.row("rank").put(0, rank.value)
 
-    def _turn(self, d: DenseMatrices, one: MatrixRow, two: MatrixRow, cosine: Value, sine: Value):
+    def _turn(self, d: DenseMatrices, row_i: MatrixRow, row_j: MatrixRow, cosine: Value, sine: Value):
         f, c, s = d.f, d.spread(cosine), d.spread(sine)
 
         def turn(r: Operand):
-            p, q = one[r], two[r]
-            one[r] = f.fma(c, p, -(s * q))
-            two[r] = f.fma(s, p, c * q)
+            p, q = row_i[r], row_j[r]
+            row_i[r] = f.fma(c, p, -(s * q))
+            row_j[r] = f.fma(s, p, c * q)
 
-        d.over_registers(one.registers, turn)
+        d.over_registers(row_i.registers, turn)
 
     def solve(self, d: DenseMatrices):
         b, x = d.row("b"), d.row("x")
