@@ -69,8 +69,8 @@ class RowTerms:
 
     def psi(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Return Psi (m,)."""
-        position, _, found = self._latest
-        return found[0] if position == _key(t, q) else self._arrays_at(t).psi(t, q)
+        position, _, results = self._latest
+        return results[0] if position == _key(t, q) else self._arrays_at(t).psi(t, q)
 
 
 class DenseTerms(RowTerms):

@@ -30,7 +30,7 @@ UNIQUE_TOL = 1e-6
 
 
 class Uniqueness(NamedTuple):
-    """Which multipliers are unique, how indeterminate each one is, and the rank."""
+    """Marks of unique multipliers, the degree of indeterminacy of each multiplier, and the rank."""
 
     unique: Bool[Array, "m"]
     share: Float[Array, "m"]  # the length of each row of N, 0 (unique) to 1 (arbitrary)

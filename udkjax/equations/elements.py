@@ -123,12 +123,12 @@ def _trace_piece_number(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, .
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
 
-    def found(leaves, numbers):
+    def piece(leaves, numbers):
         element = jax.tree.unflatten(tree, leaves)
         v = numbers[1 + n :] if isinstance(element, ForceElement) else None
         return jnp.asarray(element.piece(numbers[0], *_frames(ground, numbers[1 : 1 + n], v)), number.dtype)
 
-    return trace(found, leaves, [number] * (1 + 2 * n))
+    return trace(piece, leaves, [number] * (1 + 2 * n))
 
 
 def _residual(element: Constraint, ground: tuple[bool, ...], t: Array, q: Sequence[Array]) -> Array:

@@ -98,9 +98,9 @@ def element_loads(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray
         return None if result is None else jnp.stack([vector(list(load)) for load in result])
 
     total = jnp.zeros((len(mechanism.body_names), 3))
-    for kind, found in _evaluate_forces(loads, mechanism, q, v):
-        if found is not None:
-            total = total.at[kind.bodies.T].add(found[:, ~np.array(kind.structure.ground)])
+    for kind, values in _evaluate_forces(loads, mechanism, q, v):
+        if values is not None:
+            total = total.at[kind.bodies.T].add(values[:, ~np.array(kind.structure.ground)])
     return total.ravel()
 
 

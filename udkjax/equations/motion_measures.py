@@ -57,64 +57,64 @@ class MotionMeasures:
         d: Sequence[Scalar],
     ):
         self._graph, self._factors, n = graph, factors, len(q)
-        self._own, self._known = Graph(), {}
-        zero = self._own.constant(0.0)
+        self._local_graph, self._known = Graph(), {}
+        zero = self._local_graph.constant(0.0)
         X, S, Q = self._let("x", x), self._let("s", [s]), self._let("q", q)
-        (psi,) = _read(self._own, model.psi, X, S[0], Q)
-        moved = Differential(self._own, psi, [*S, *Q])
+        (psi,) = _read(self._local_graph, model.psi, X, S[0], Q)
+        d_psi = Differential(self._local_graph, psi, [*S, *Q])
         u = self._inputs("u", n)
-        first = [moved.row(r).get(S[0].index, zero) + _along(moved.row(r), Q, u, zero) for r in psi]
+        first = [d_psi.row(r).get(S[0].index, zero) + _along(d_psi.row(r), Q, u, zero) for r in psi]
         self._set(u, self._solved(first, u))
-        bent = Differential(self._own, first, [*S, *Q])
+        d_first = Differential(self._local_graph, first, [*S, *Q])
         w = self._inputs("w", n)
         second = [
-            bent.row(f).get(S[0].index, zero) + _along(bent.row(f), Q, u, zero) + _along(moved.row(r), Q, w, zero)
+            d_first.row(f).get(S[0].index, zero) + _along(d_first.row(f), Q, u, zero) + _along(d_psi.row(r), Q, w, zero)
             for f, r in zip(first, psi, strict=True)
         ]
         self._set(w, self._solved(second, w))
-        (b,) = _read(self._own, model.loads, X, S[0], Q, u, w)
+        (b,) = _read(self._local_graph, model.loads, X, S[0], Q, u, w)
         y = [self._inputs(f"y{k}", len(psi)) for k in range(len(b))]
         for row, right in zip(y, b, strict=True):
             self._set(row, factors.solve_transposed(self._copy(list(right))))
-        shaped = np.array(y, object).reshape(len(b), len(psi))
-        (g,) = _read(self._own, model.measures, X, S[0], Q, u, w, shaped, self._let("d", d))
+        y_array = np.array(y, object).reshape(len(b), len(psi))
+        (g,) = _read(self._local_graph, model.measures, X, S[0], Q, u, w, y_array, self._let("d", d))
         self.values = self._copy(list(g.flat))
         adjoint_residuals = [
-            [_column(moved, psi, row, v, zero) - right[k] for k, v in enumerate(Q)] for row, right in zip(y, b, strict=True)
+            [_column(d_psi, psi, row, v, zero) - right[k] for k, v in enumerate(Q)] for row, right in zip(y, b, strict=True)
         ]
         self._parts = list(g.flat), list(psi), first, second, adjoint_residuals
-        self._by = (*S, *X), Q, u, w, y
+        self._variables = (*S, *X), Q, u, w, y
 
     def slopes(self) -> list[list[Scalar]]:
         """Return the derivatives of each measure with respect to s and x."""
         g, psi, first, second, adjoint_residuals = self._parts
-        moved, Q, u, w, y = self._by
+        parameters, Q, u, w, y = self._variables
         z = [self._inputs(f"z{k}", len(psi)) for k in range(3)]
         z3 = [self._inputs(f"z3{k}", len(Q)) for k in range(len(y))]
-        constraint_terms = self._own.constant(0.0)
+        constraint_terms = self._local_graph.constant(0.0)
         for rows, multipliers_of_rows in ((psi, z[0]), (first, z[1]), (second, z[2]), *zip(adjoint_residuals, z3, strict=True)):
             for row, multiplier in zip(rows, multipliers_of_rows, strict=True):
                 constraint_terms = constraint_terms + row * multiplier
         result, zero = [], self._graph.constant(0.0)
         for measure in g:
             L = measure - constraint_terms
-            inputs = [*moved, *Q, *u, *w, *(v for row in y for v in row)]
-            row = Differential(self._own, [L], inputs).row(L)
+            inputs = [*parameters, *Q, *u, *w, *(v for row in y for v in row)]
+            row = Differential(self._local_graph, [L], inputs).row(L)
             for k in (*z[0], *z[1], *z[2], *(v for right in z3 for v in right)):
                 self._known[k.index] = zero
             for variables, multipliers in zip(y, z3, strict=True):
                 self._set(multipliers, self._factors.solve(self._slope(row, variables)))
             for variables, multipliers in ((w, z[2]), (u, z[1]), (Q, z[0])):
                 self._set(multipliers, self._factors.solve_transposed(self._slope(row, variables)))
-            result.append(self._slope(row, moved))
+            result.append(self._slope(row, parameters))
         return result
 
     def _slope(self, row: SparseRow, variables: Scalars) -> list[Scalar]:
-        zero = self._own.constant(0.0)
+        zero = self._local_graph.constant(0.0)
         return self._copy([row.get(v.index, zero) for v in variables])
 
     def _inputs(self, name: str, count: int) -> np.ndarray:
-        return np.array([self._own.input((name, k), name) for k in range(count)], object)
+        return np.array([self._local_graph.input((name, k), name) for k in range(count)], object)
 
     def _let(self, name: str, values: Sequence[Scalar]) -> np.ndarray:
         variables = self._inputs(name, len(values))
@@ -130,8 +130,8 @@ class MotionMeasures:
         return [-v for v in self._factors.solve(self._copy(rows))]
 
     def _copy(self, outputs: Sequence[Scalar]) -> list[Scalar]:
-        inputs = [Scalar(self._own, k) for k in self._known]
-        return self._graph.copy(ScalarProgram(self._own, inputs, list(outputs)), self._known)
+        inputs = [Scalar(self._local_graph, k) for k in self._known]
+        return self._graph.copy(ScalarProgram(self._local_graph, inputs, list(outputs)), self._known)
 
 
 def _read(graph: Graph, function: Callable[..., jax.Array], *arguments: Scalar | np.ndarray) -> list[np.ndarray]:
@@ -144,6 +144,6 @@ def _along(row: SparseRow, variables: Scalars, tangents: Scalars, zero: Scalar) 
     return sum((row[v.index] * t for v, t in zip(variables, tangents, strict=True) if v.index in row), zero)
 
 
-def _column(moved: Differential, rows: Scalars, y: Scalars, variable: Scalar, zero: Scalar) -> Scalar:
+def _column(d_rows: Differential, rows: Scalars, y: Scalars, variable: Scalar, zero: Scalar) -> Scalar:
     """Return the derivative of y^T rows with respect to one variable."""
-    return sum((moved.row(r)[variable.index] * k for r, k in zip(rows, y, strict=True) if variable.index in moved.row(r)), zero)
+    return sum((d_rows.row(r)[variable.index] * k for r, k in zip(rows, y, strict=True) if variable.index in d_rows.row(r)), zero)

@@ -131,8 +131,8 @@ def _solve_dependent(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) ->
 
     def step(state):
         q, _, k = state
-        following = _newton(fixed, t, q)
-        return following, fixed.equations.size(following - q), k + 1
+        corrected = _newton(fixed, t, q)
+        return corrected, fixed.equations.size(corrected - q), k + 1
 
     q, change, _ = jax.lax.while_loop(goes_on, step, (q, jnp.array(jnp.inf, q.dtype), 0))
     q = jnp.where(change <= tol, q, jnp.nan)

@@ -129,18 +129,18 @@ class PositionPrograms:
 
     def _slopes(self) -> list[list[Scalar]]:
         """Return dg/ds and dg/dx, with a linear solve for each measure or, if there are fewer, for each number."""
-        graph, moved = self._graph, [self._s, *self._x]
-        differential = Differential(graph, self._measures, [*moved, *self._q])
+        graph, parameters = self._graph, [self._s, *self._x]
+        differential = Differential(graph, self._measures, [*parameters, *self._q])
         zero = graph.constant(0.0)
-        partial = [[differential.row(g).get(v.index, zero) for v in (*moved, *self._q)] for g in self._measures]
+        partial = [[differential.row(g).get(v.index, zero) for v in (*parameters, *self._q)] for g in self._measures]
         if self._transmission is not None:
             partial.append(self._transmission[1])
-        columns = [self._column(v) for v in moved]
-        if len(partial) > len(moved):
+        columns = [self._column(v) for v in parameters]
+        if len(partial) > len(parameters):
             changes = [[-x for x in self._factors.solve(column)] for column in columns]
-            by_position = [[_dot(row[len(moved) :], change, zero) for change in changes] for row in partial]
+            by_position = [[_dot(row[len(parameters) :], change, zero) for change in changes] for row in partial]
         else:
-            adjoints = [self._factors.solve_transposed(row[len(moved) :]) for row in partial]
+            adjoints = [self._factors.solve_transposed(row[len(parameters) :]) for row in partial]
             by_position = [[-_dot(y, column, zero) for column in columns] for y in adjoints]
         slopes = [
             [a + b for a, b in zip(row, indirect, strict=False)] for row, indirect in zip(partial, by_position, strict=True)

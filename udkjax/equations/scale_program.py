@@ -27,7 +27,7 @@ RANK_TOL = 1e-4
 MAX_MASS_RATIO = 100.0  # for larger ratios the tolerance is lowered: see `Scales`
 
 LENGTH, ARM, RATE, MASS, THRESHOLD, ROWS = range(6)  # indices in the array `scales`
-RADIUS, MOVED, CHANGE, YIELD, LARGEST = range(5)  # indices in the array `largest`, and its size
+RADIUS, MOVED, CHANGE, INVERSE_MASS, LARGEST = range(5)  # indices in the array `largest`, and its size
 PAIR, PAIR_ROW, PAIR_MASS, PAIR_INERTIA = range(4)  # columns of the table of pairs
 
 
@@ -54,10 +54,10 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
     row_table, pair_table = np.arange(layout.row_count)[:, None], np.zeros((0, 4), int)
     elements = []
     for group in layout.constraints:
-        meets = _row_body_pairs(group)
-        first = len(pair_table) + len(meets) * np.arange(len(group.table))
-        elements.append(_over_elements(terms, group, meets, first))
-        for k, (row, body) in enumerate(meets):
+        row_bodies = _row_body_pairs(group)
+        first = len(pair_table) + len(row_bodies) * np.arange(len(group.table))
+        elements.append(_over_elements(terms, group, row_bodies, first))
+        for k, (row, body) in enumerate(row_bodies):
             columns = first + k, group.table[:, ROW] + row, *masses[group.bodies[body]].T
             pair_table = np.concatenate([pair_table, np.stack(columns, 1)])
     loops = [
@@ -70,7 +70,7 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
         KernelLoop(_kernel(_write_change), pair_table),
         KernelLoop(_kernel(_write_largest_change), row_table),
         KernelLoop(_kernel(_write_row), row_table),
-        KernelLoop(_kernel(_write_yield), pair_table),
+        KernelLoop(_kernel(_write_inverse_mass), pair_table),
         terms.over_bodies("scale of rates", lambda w: _write_rate(w, [terms.read_free(w, k) for k in range(3)])),
         KernelLoop(_kernel(_write_threshold), np.zeros((1, 1), int)),
     ]
@@ -91,13 +91,13 @@ def _entries(group: ConstraintGroup) -> np.ndarray:
     return np.array(group.programs.outputs["psi_q"], object).reshape(group.programs.row_count, len(group.bodies), 3)
 
 
-def _over_elements(terms: SceneTerms, group: ConstraintGroup, meets: list[tuple[int, int]], first: np.ndarray) -> KernelLoop:
+def _over_elements(terms: SceneTerms, group: ConstraintGroup, row_bodies: list[tuple[int, int]], first: np.ndarray) -> KernelLoop:
     """Compute `moved` and `turned` of the pairs, and psi_t and gamma of the rows; `first` is each element's first pair."""
     programs, base = group.programs, group.table.shape[1]
 
     def write(w: KernelWriter):
         entries = _entries(group)
-        for k, (row, body) in enumerate(meets):
+        for k, (row, body) in enumerate(row_bodies):
             x, y, angle = entries[row, body]
             moved = w.graph.sqrt(x * x + y * y)
             w.write(moved, "moved", base, k)
@@ -165,8 +165,8 @@ def _write_guess(w: KernelWriter) -> None:
 def _write_arm(w: KernelWriter) -> None:
     """Compute the longest lever arm of all pairs; 0 without pairs."""
     moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
-    by_place = greater(moved, w.read("largest", None, MOVED) * ROUNDING)
-    arm = where(by_place, turned / where(by_place, moved, w.graph.constant(1.0)), w.graph.constant(0.0))
+    is_moved = greater(moved, w.read("largest", None, MOVED) * ROUNDING)
+    arm = where(is_moved, turned / where(is_moved, moved, w.graph.constant(1.0)), w.graph.constant(0.0))
     w.write(_finite(arm), "scales", None, ARM, MAXIMUM)
 
 
@@ -191,18 +191,18 @@ def _write_row(w: KernelWriter) -> None:
     """Compute the scale of each row, and the rates at which rows change."""
     change = _finite(w.read("change", 0))
     moves = greater(change, w.read("largest", None, CHANGE) * ROUNDING)
-    scale = where(moves, change, w.read("scales", None, LENGTH))  # no body moves this row at the guess
+    scale = where(moves, change, w.read("scales", None, LENGTH))  # L if no body moves the row at the guess
     w.write(scale, "scales", 0, ROWS)
     for rate in (absolute(_finite(w.read("psi_t", 0) / scale)), _swing(w.read("gamma", 0) / scale)):
         w.write(rate, "scales", None, RATE, MAXIMUM)
 
 
-def _write_yield(w: KernelWriter) -> None:
+def _write_inverse_mass(w: KernelWriter) -> None:
     """Compute the largest diagonal entry (1/kg) of the weighted D D^T that a single body contributes."""
     moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
     weight = w.read("scales", None, LENGTH) / w.read("scales", PAIR_ROW, ROWS)
     entry = moved * moved / w.read("numbers", PAIR_MASS) + turned * turned / w.read("numbers", PAIR_INERTIA)
-    w.write(absolute(_finite(entry * (weight * weight))), "largest", None, YIELD, MAXIMUM)
+    w.write(absolute(_finite(entry * (weight * weight))), "largest", None, INVERSE_MASS, MAXIMUM)
 
 
 def _write_rate(w: KernelWriter, free: list[Scalar]) -> None:
@@ -214,5 +214,5 @@ def _write_rate(w: KernelWriter, free: list[Scalar]) -> None:
 
 
 def _write_threshold(w: KernelWriter) -> None:
-    ratio = w.read("largest", None, YIELD) * w.read("scales", None, MASS) / MAX_MASS_RATIO
+    ratio = w.read("largest", None, INVERSE_MASS) * w.read("scales", None, MASS) / MAX_MASS_RATIO
     w.write(RANK_TOL / w.graph.sqrt(maximum(w.graph.constant(1.0), ratio)), "scales", None, THRESHOLD)

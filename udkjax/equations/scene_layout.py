@@ -148,22 +148,22 @@ class SceneLayout:
         names = zip(self._mechanism.constraints, sizes, strict=True)
         self.row_names = [(name, k) for name, size in names for k in range(size)]
         independent = ~np.isin(np.arange(self.row_count), redundant_rows)
-        ends = zip(self.row_starts, self.row_starts[1:], strict=False)
-        return [tuple(np.flatnonzero(independent[i:j]).tolist()) for i, j in ends]
+        spans = zip(self.row_starts, self.row_starts[1:], strict=False)
+        return [tuple(np.flatnonzero(independent[i:j]).tolist()) for i, j in spans]
 
     def _constraint_group(self, kind: ElementKind, rows: list[tuple[int, ...]], every_row: bool) -> ConstraintGroup:
         programs, size = self._programs(kind), len(kind.members)
-        chosen = tuple(range(programs.row_count)) if every_row else rows[kind.members[0]]
+        eliminated = tuple(range(programs.row_count)) if every_row else rows[kind.members[0]]
         index: dict[int, int] = {}
         for s in programs.outputs["psi_q"]:
             if s.constant is None:
                 index.setdefault(s.index, len(index))
         starts = self._own_constants(programs, size), self.reserve("psi_q", len(index) * size), self._eliminated
-        steps = len(programs.constants), len(index), len(chosen)
-        self._eliminated += len(chosen) * size
+        steps = len(programs.constants), len(index), len(eliminated)
+        self._eliminated += len(eliminated) * size
         columns = [start + step * np.arange(size) for start, step in zip(starts, steps, strict=True)]
         table = self._table(kind, [*columns, self.row_starts[kind.members]])
-        return ConstraintGroup(programs, kind.members, kind.bodies, table, chosen, index)
+        return ConstraintGroup(programs, kind.members, kind.bodies, table, eliminated, index)
 
     def _force_group(self, kind: ElementKind) -> ForceGroup:
         programs, size = force_programs(kind.structure), len(kind.members)

@@ -53,13 +53,16 @@ class SceneSolver:
         step = [*self.solve(), self.terms.add(f"{x}1", start=x, solution=0, sign=-1)]
         return [*self.position_terms("psi_q", residual), *factorize, *step]
 
-    def refined_solve(self, solve: int, further: int) -> ProgramParts:
-        """Solve a linear system with iterative refinement (corrected seminormal equations, Bjorck 1987)."""
+    def refined_solve(self, solve: int, correction: int) -> ProgramParts:
+        """Solve the system `solve` with iterative refinement (corrected seminormal equations, Bjorck 1987).
+
+        The system `correction` has the residual of the first one as its right-hand side.
+        """
         yield from self.solve(solve)
         for _ in range(REFINEMENTS):
-            yield from self.terms.remainder(solve, further)
-            yield from self.solve(further)
-            yield self.terms.add(f"jt_x{solve}", start=f"jt_x{further}", update=ADD)
+            yield from self.terms.remainder(solve, correction)
+            yield from self.solve(correction)
+            yield self.terms.add(f"jt_x{solve}", start=f"jt_x{correction}", update=ADD)
 
     @property
     def project(self) -> list[KernelLoop | Reset]:

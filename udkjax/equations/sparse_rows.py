@@ -221,7 +221,7 @@ def split_dependent_rows(positions: list[SparsePosition]) -> list[tuple[np.ndarr
 
 
 def _row_subset(position: SparsePosition, members: np.ndarray) -> RowSubset:
-    touched = position.D[members]
-    u, sigma, _ = np.linalg.svd(touched[:, np.unique(touched.indices)].toarray())
+    D = position.D[members]
+    u, sigma, _ = np.linalg.svd(D[:, np.unique(D.indices)].toarray())
     rank = len(members) - int(np.isin(members, position.dependent).sum())
     return RowSubset(float(sigma[rank - 1] / sigma[0]) if rank else 1.0, u[:, rank:])

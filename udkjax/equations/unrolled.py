@@ -67,16 +67,18 @@ class Unrolled:
             name: _entries(self._unroll(getattr(programs, name)), (*RESULTS, "psi_q") if name in WITH_ENTRIES else RESULTS)
             for name in names
         }
-        moved = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
-        self.moving = [k for k, s in sorted(layout.items()) if s.index in moved]
+        active_nodes = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
+        self.moving = [k for k, s in sorted(layout.items()) if s.index in active_nodes]
         """The constants that depend on active numbers; derivatives index only these."""
         self._derivatives = {x: self._differentiate(programs.differentiable[x], n, mode) for x in differentiated}
-        wanted = [
-            s for found in (*self._results.values(), *(x for d in self._derivatives.values() for x in d)) for s in found.values()
+        outputs = [
+            s
+            for result in (*self._results.values(), *(x for d in self._derivatives.values() for x in d))
+            for s in result.values()
         ]
-        self.constants = frontier(graph, wanted, lambda node: node.depends <= {"parameter"})
+        self.constants = frontier(graph, outputs, lambda node: node.depends <= {"parameter"})
         drop_tol = self.numbers[-2]
-        if drop_tol.index in graph.dependencies([s.index for s in wanted]):
+        if drop_tol.index in graph.dependencies([s.index for s in outputs]):
             self.constants.append(drop_tol)
         self.drop_tol_index = next((k for k, s in enumerate(self.constants) if s.index == drop_tol.index), None)
         self.prologue = ScalarProgram(graph, self.numbers, self.constants)
@@ -132,13 +134,13 @@ class Unrolled:
         program = ScalarProgram(graph, [*numbers, *seeds], list(outputs.values()))
         return UnrolledProgram(program, [*numbers.values(), *seeds.values()], list(outputs))
 
-    def _program(self, outputs: dict[ArrayPlace, Scalar], further: dict[Scalar, ArrayPlace]) -> UnrolledProgram:
-        inputs = self._inputs | further
+    def _program(self, outputs: dict[ArrayPlace, Scalar], more_inputs: dict[Scalar, ArrayPlace]) -> UnrolledProgram:
+        inputs = self._inputs | more_inputs
         program = ScalarProgram(self.graph, list(inputs), list(outputs.values()))
         return UnrolledProgram(program, list(inputs.values()), list(outputs))
 
-    def _unroll(self, program: LoopProgram, further: Arrays | None = None, linear: str | None = None) -> Arrays:
-        return unroll(program, self._arrays | (further or {}), self.graph, linear)
+    def _unroll(self, program: LoopProgram, more_arrays: Arrays | None = None, linear: str | None = None) -> Arrays:
+        return unroll(program, self._arrays | (more_arrays or {}), self.graph, linear)
 
     @cached_property
     def _seeds(self) -> dict[Scalar, ArrayPlace]:
@@ -154,16 +156,16 @@ class Unrolled:
         variables = {"constants": self.moving, "q": range(n), "v": range(n)}
         prefixes, program = PREFIXES[mode], differentiable.in_mode(mode)
         group = "cotangent" if mode == REVERSE else "tangent"
-        seeded, sought = (results, variables) if mode == REVERSE else (variables, results)
+        sources, targets = (results, variables) if mode == REVERSE else (variables, results)
         seeds: Arrays = {}
-        for prefix, x in product(prefixes, seeded):
-            seeds[prefix + x] = {k: self.graph.input((prefix + x, k), group) for k in seeded[x]}
+        for prefix, x in product(prefixes, sources):
+            seeds[prefix + x] = {k: self.graph.input((prefix + x, k), group) for k in sources[x]}
         self._seeds |= {s: (x, i) for x, scalars in seeds.items() for i, s in enumerate(scalars.values())}
         derivatives = self._unroll(program, arrays | seeds, None if mode == TWICE else group)
         changes = {}
-        for prefix, x in product(prefixes, sought):
+        for prefix, x in product(prefixes, targets):
             by_index = derivatives.get(prefix + x, {})
-            changes |= {(prefix + x, i): by_index.get(k, self.graph.constant(0.0)) for i, k in enumerate(sought[x])}
+            changes |= {(prefix + x, i): by_index.get(k, self.graph.constant(0.0)) for i, k in enumerate(targets[x])}
         return _entries(arrays, ("a", "safe")), changes
 
 

@@ -28,10 +28,10 @@ class Differential:
 
     def __init__(self, graph: Graph, outputs: Iterable[Scalar], inputs: Sequence[Scalar], fixed: Iterable[Scalar] = ()):
         self.graph, self.inputs = graph, list(inputs)
-        given = {s.index for s in (*self.inputs, *fixed)}
+        leaves = {s.index for s in (*self.inputs, *fixed)}
         self._rows: dict[int, SparseRow] = {s.index: {s.index: graph.constant(1.0, s.node.dtype)} for s in self.inputs}
         self._calls: dict[int, list[int]] = {}  # opaque nodes that are not constant, and their results
-        for index in graph.dependencies((s.index for s in outputs), given):
+        for index in graph.dependencies((s.index for s in outputs), leaves):
             row = self._differentiate(index)
             if row:
                 self._rows[index] = row
@@ -43,23 +43,23 @@ class Differential:
 
     def forward(self, tangents: Mapping[int, Scalar]) -> SparseRow:
         """Return the tangents of all nodes that rows refer to, by index, from those of inputs; other inputs are constant."""
-        known = {k: t for k, t in tangents.items() if not t.is_zero}
+        all_tangents = {k: t for k, t in tangents.items() if not t.is_zero}
         for call, results in self._calls.items():
-            arguments = [product(self.row(a), known, self.graph) for a in self.graph.nodes[call].arguments]
-            known.update(_push_forward(self.graph, call, results, arguments))
-        return known
+            arguments = [product(self.row(a), all_tangents, self.graph) for a in self.graph.nodes[call].arguments]
+            all_tangents.update(_push_forward(self.graph, call, results, arguments))
+        return all_tangents
 
     def reverse(self, cotangents: SparseRow) -> list[Scalar]:
         """Return the cotangents of the inputs from the cotangents, by index, of all nodes that rows refer to."""
-        known = dict(cotangents)
+        all_cotangents = dict(cotangents)
         for call, results in reversed(self._calls.items()):
-            seeds = {k: known.pop(k) for k in results if k in known}
+            seeds = {k: all_cotangents.pop(k) for k in results if k in all_cotangents}
             if seeds:
                 arguments = self.graph.nodes[call].arguments
                 cotangents_of_arguments = _pull_back(self.graph, call, seeds, [bool(self.row(a)) for a in arguments])
                 for argument, cotangent in zip(arguments, cotangents_of_arguments, strict=True):
-                    accumulate(known, self.row(argument), cotangent)
-        return [known.get(s.index, self.graph.constant(0.0, s.node.dtype)) for s in self.inputs]
+                    accumulate(all_cotangents, self.row(argument), cotangent)
+        return [all_cotangents.get(s.index, self.graph.constant(0.0, s.node.dtype)) for s in self.inputs]
 
     def _differentiate(self, index: int) -> SparseRow:
         graph, node = self.graph, self.graph.nodes[index]

@@ -28,7 +28,7 @@ _BY_FLOATS = {  # NaN propagates
 }
 _NEUTRAL = {ADD: 0.0, MAXIMUM: -math.inf, ALL: math.inf}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
-MOST_TURNS = 8  # number of updates of one place that JAX unrolls; more become a loop
+MAX_UPDATES = 8  # number of updates of one place that JAX unrolls; more become a loop
 
 
 class Address(NamedTuple):
@@ -254,7 +254,7 @@ def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.A
     first = np.searchsorted(places[order], places[order])
     earlier = np.empty(len(places), int)
     earlier[order] = np.arange(len(places)) - first  # number of earlier updates of the same place
-    if earlier.max() >= MOST_TURNS:
+    if earlier.max() >= MAX_UPDATES:
         selected = x.at[places]
         write = {SET: selected.set, ADD: selected.add, MAXIMUM: selected.max, ALL: selected.min}[update]
         return write(new, mode="promise_in_bounds")

@@ -18,7 +18,7 @@ from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 from udkjax.expressions.written_steps import Operand, WrittenSteps
 
 _SINE_AND_COSINE = ("sin", "cos")
-_LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # which have the same names in `math` and NumPy
+_LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # they have the same names in `math` and NumPy
 # Other primitives on Python numbers: calling JAX instead takes about a hundred times as long.
 _NUMBER_FUNCTIONS: dict[str, Callable] = {
     **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_")},

@@ -15,13 +15,13 @@ class WrittenSteps:
     """Functions called one after another; the arguments of each are given numbers or earlier results.
 
     Args:
-        given: the number of given numbers.
+        input_count: the number of given numbers.
         steps: each function with the indices of its arguments, which count the given numbers first, then the results.
         outputs: the indices of the results that are returned.
     """
 
-    def __init__(self, given: int, steps: list[tuple[Callable, list[int]]], outputs: list[int]):
-        self._given, self._steps, self._outputs = given, steps, outputs
+    def __init__(self, input_count: int, steps: list[tuple[Callable, list[int]]], outputs: list[int]):
+        self._input_count, self._steps, self._outputs = input_count, steps, outputs
         self._runs, self._function = 0, None
 
     def __call__(self, values: Sequence[Operand]) -> list[Operand]:
@@ -38,10 +38,10 @@ class WrittenSteps:
     def _write(self) -> Callable[[Sequence[Operand]], list[Operand]]:
         """Return the steps as one Python function."""
         lines = ["def run(values):"]
-        if self._given:
-            lines.append(f" {''.join(f'x{k}, ' for k in range(self._given))} = values")
+        if self._input_count:
+            lines.append(f" {''.join(f'x{k}, ' for k in range(self._input_count))} = values")
         functions: dict[str, Any] = {}
-        for k, (function, places) in enumerate(self._steps, self._given):
+        for k, (function, places) in enumerate(self._steps, self._input_count):
             arguments = [f"x{p}" for p in places]
             if function in _SYMBOLS:
                 expression = f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}"

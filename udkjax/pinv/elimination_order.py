@@ -10,11 +10,11 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
 
     Ties go to the row that waits for the fewest earlier rows, then to the first: rows that do not wait can run in parallel.
     """
-    meets: dict[int, set[int]] = {}
+    rows_of_column: dict[int, set[int]] = {}
     for i, row in enumerate(rows):
         for k in row:
-            meets.setdefault(k, set()).add(i)
-    neighbours = [set().union(*(meets[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
+            rows_of_column.setdefault(k, set()).add(i)
+    neighbours = [set().union(*(rows_of_column[k] for k in row)) - {i} if row else set() for i, row in enumerate(rows)]
     order: list[int] = []
     wait = [0] * len(rows)  # length of the longest chain of earlier rows
     queue, remaining = [(len(others), 0, i) for i, others in enumerate(neighbours)], set(range(len(rows)))
@@ -41,18 +41,18 @@ class Fronts(NamedTuple):
     later: list[list[int]]  # the later blocks that each block meets, in the order of elimination
 
 
-def order_blocks(sizes: Sequence[int], holds: Sequence[Set[int]]) -> list[Fronts]:
+def order_blocks(sizes: Sequence[int], entries_of_blocks: Sequence[Set[int]]) -> list[Fronts]:
     """Return an elimination order of least fill, grouped into runs of equal blocks. Two blocks meet if they share an entry.
 
     A block waits only for the earlier blocks that it meets. The next run is the largest group of equal blocks that are ready.
     """
-    position = {k: i for i, k in enumerate(minimum_degree([set(h) for h in holds]))}
+    position = {k: i for i, k in enumerate(minimum_degree([set(h) for h in entries_of_blocks]))}
     order = sorted(position, key=lambda k: position[k])
-    meets: dict[int, list[int]] = {}
-    for k, entries in enumerate(holds):
+    blocks_of_entry: dict[int, list[int]] = {}
+    for k, entries in enumerate(entries_of_blocks):
         for x in entries:
-            meets.setdefault(x, []).append(k)
-    neighbours = [{j for x in entries for j in meets[x]} - {k} for k, entries in enumerate(holds)]
+            blocks_of_entry.setdefault(x, []).append(k)
+    neighbours = [{j for x in entries for j in blocks_of_entry[x]} - {k} for k, entries in enumerate(entries_of_blocks)]
     later: list[list[int]] = [[] for _ in sizes]
     waits, parent = [0] * len(sizes), [-1] * len(sizes)
     filled: list[set[int]] = [{j for j in n if position[j] > position[k]} for k, n in enumerate(neighbours)]

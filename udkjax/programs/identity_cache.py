@@ -45,9 +45,9 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
                     cache.move_to_end(key)
             return stored[1]
         result = function(*args, **kwargs)
-        holds = [_reference(x, lambda _: forget(key)) for x in objects]
+        references = [_reference(x, lambda _: forget(key)) for x in objects]
         with lock:
-            cache[key] = holds, result
+            cache[key] = references, result
             while len(cache) > CACHE_SIZE:
                 cache.popitem(last=False)
         return result

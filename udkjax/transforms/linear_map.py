@@ -125,20 +125,20 @@ class CotangentMap(TangentMap):
 
     def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
         del run
-        (inputs, bars), (of_x, of_w) = self.parts(inputs), self.parts(active)
+        (inputs, ws), (of_x, of_w) = self.parts(inputs), self.parts(active)
         dxs, dws = tangents[: sum(of_x)], tangents[sum(of_x) :]
         result = [jnp.zeros(x.shape) for x in select(inputs, self.active)]
         if dxs:
-            result = _by_rows(lambda units: self.of.twice(inputs, of_x, dxs, self.active, units), inputs, self.active, bars)
+            result = _by_rows(lambda units: self.of.twice(inputs, of_x, dxs, self.active, units), inputs, self.active, ws)
         if dws:
-            dws = replaced([jnp.zeros(x.shape) for x in bars], of_w, dws)
+            dws = replaced([jnp.zeros(x.shape) for x in ws], of_w, dws)
             result = [a + b for a, b in zip(result, self.of.backward(inputs, self.active, dws, None), strict=True)]
         return result
 
     def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
         del run
-        (inputs, bars), (of_x, of_w) = self.parts(inputs), self.parts(active)
-        by_inputs = _by_rows(lambda units: self.of.twice(inputs, self.active, cotangents, of_x, units), inputs, of_x, bars)
+        (inputs, ws), (of_x, of_w) = self.parts(inputs), self.parts(active)
+        by_inputs = _by_rows(lambda units: self.of.twice(inputs, self.active, cotangents, of_x, units), inputs, of_x, ws)
         return [*by_inputs, *(select(self.of.forward(inputs, self.active, cotangents, None), of_w) if any(of_w) else [])]
 
     def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:

@@ -37,13 +37,13 @@ def split_jvp(
     def flat(form: SplitFunction) -> Callable[..., list[Array]]:
         def function(*xs: Array) -> list[Array]:
             arguments = point_tree.unflatten(xs[: len(start)]), direction_tree.unflatten(xs[len(start) :])
-            return [x for found in form(*eqx.combine(arguments, static)) for x in found]
+            return [x for part in form(*eqx.combine(arguments, static)) for x in part]
 
         return function
 
-    both = SplitForms(flat(seen), flat(run), len(start), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in changes], shapes)
-    found = along_p.bind(*start, *changes, both=both)
-    return list(found[: both.values]), list(found[both.values :])
+    forms = SplitForms(flat(seen), flat(run), len(start), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in changes], shapes)
+    results = along_p.bind(*start, *changes, forms=forms)
+    return list(results[: forms.values]), list(results[forms.values :])
 
 
 class SplitForms:
@@ -54,40 +54,40 @@ class SplitForms:
         seen: Callable[..., list[Array]],
         run: Callable[..., list[Array]],
         start: int,
-        ways: Sequence[jax.ShapeDtypeStruct],
+        direction_types: Sequence[jax.ShapeDtypeStruct],
         shapes: OutputShapes,
     ):
-        self.seen, self.run, self.start, self.ways, self.shapes = seen, run, start, ways, shapes
+        self.seen, self.run, self.start, self.direction_types, self.shapes = seen, run, start, direction_types, shapes
         self.values = len(shapes[0])
 
     def mapped(self, axes: Sequence[int | None], size: int) -> "SplitForms":
         """Return both forms for a batch."""
         seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
-        ways = [
+        direction_types = [
             x if axis is None else jax.ShapeDtypeStruct((*x.shape[:axis], size, *x.shape[axis:]), x.dtype)
-            for x, axis in zip(self.ways, axes[self.start :], strict=True)
+            for x, axis in zip(self.direction_types, axes[self.start :], strict=True)
         ]
-        return SplitForms(seen, run, self.start, ways, (value, change))
+        return SplitForms(seen, run, self.start, direction_types, (value, change))
 
 
-def _avals(*xs: Array, both: SplitForms) -> list[jax.core.ShapedArray]:
-    return [result_type(x.shape, xs, x.dtype) for part in both.shapes for x in part]
+def _avals(*xs: Array, forms: SplitForms) -> list[jax.core.ShapedArray]:
+    return [result_type(x.shape, xs, x.dtype) for part in forms.shapes for x in part]
 
 
-def _batched(xs: Sequence[Array], axes: Sequence[int | None], both: SplitForms) -> tuple[list[Array], list[int | None]]:
+def _batched(xs: Sequence[Array], axes: Sequence[int | None], forms: SplitForms) -> tuple[list[Array], list[int | None]]:
     size = next(x.shape[axis] for x, axis in zip(xs, axes, strict=True) if axis is not None)
-    results = along_p.bind(*xs, both=both.mapped(axes, size))
-    if any(axis is not None for axis in axes[: both.start]):
+    results = along_p.bind(*xs, forms=forms.mapped(axes, size))
+    if any(axis is not None for axis in axes[: forms.start]):
         return results, [0] * len(results)
-    value, change = results[: both.values], results[both.values :]
+    value, change = results[: forms.values], results[forms.values :]
     return [*(x[0] for x in value), *change], [*[None] * len(value), *[0] * len(change)]
 
 
 def _derivative(
-    primals: Sequence[Array], tangents: Sequence[Array], both: SplitForms
+    primals: Sequence[Array], tangents: Sequence[Array], forms: SplitForms
 ) -> tuple[list[Array], list[Array | ad.Zero]]:
-    return _jvp(both.seen, primals, tangents)
+    return _jvp(forms.seen, primals, tangents)
 
 
 def _jvp(
@@ -107,47 +107,47 @@ def _jvp(
     ]
 
 
-def _part(trace: Any, *xs: Array, both: SplitForms) -> list[Array]:
+def _part(trace: Any, *xs: Array, forms: SplitForms) -> list[Array]:
     with set_current_trace(trace):
-        return both.seen(*xs)
+        return forms.seen(*xs)
 
 
 def _checkpointed(saveable: Any, unknown: Sequence[bool], instantiated: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
     """Split under `jax.checkpoint`: if only directions are unknown the value is computed; the backward pass recomputes both."""
     del saveable
-    both: SplitForms = eqn.params["both"]
+    forms: SplitForms = eqn.params["forms"]
     inputs = [x for x, t in zip(eqn.invars, instantiated, strict=True) if not t and not isinstance(x, Literal)]
-    if any(unknown[: both.start]):
+    if any(unknown[: forms.start]):
         return None, eqn, [True] * len(eqn.outvars), [True] * len(eqn.outvars), inputs
-    value = new_jaxpr_eqn(eqn.invars[: both.start], eqn.outvars[: both.values], value_p, {"both": both}, no_effects)
-    changes = len(eqn.outvars) - both.values
-    return value, eqn, [*[False] * both.values, *[True] * changes], [True] * len(eqn.outvars), inputs
+    value = new_jaxpr_eqn(eqn.invars[: forms.start], eqn.outvars[: forms.values], value_p, {"forms": forms}, no_effects)
+    changes = len(eqn.outvars) - forms.values
+    return value, eqn, [*[False] * forms.values, *[True] * changes], [True] * len(eqn.outvars), inputs
 
 
-def _value(*xs: Array, both: SplitForms) -> list[Array]:
-    return both.seen(*xs, *(jnp.zeros(x.shape, x.dtype) for x in both.ways))[: both.values]
+def _value(*xs: Array, forms: SplitForms) -> list[Array]:
+    return forms.seen(*xs, *(jnp.zeros(x.shape, x.dtype) for x in forms.direction_types))[: forms.values]
 
 
-def _value_batched(xs: Sequence[Array], axes: Sequence[int | None], both: SplitForms) -> tuple[list[Array], list[int]]:
-    results = jax.vmap(partial(_value, both=both), in_axes=tuple(axes))(*xs)
+def _value_batched(xs: Sequence[Array], axes: Sequence[int | None], forms: SplitForms) -> tuple[list[Array], list[int]]:
+    results = jax.vmap(partial(_value, forms=forms), in_axes=tuple(axes))(*xs)
     return results, [0] * len(results)
 
 
 value_p = Primitive("value_along_no_direction")
 value_p.multiple_results = True
 value_p.def_impl(_value)
-value_p.def_abstract_eval(lambda *xs, both: _avals(*xs, both=both)[: both.values])
+value_p.def_abstract_eval(lambda *xs, forms: _avals(*xs, forms=forms)[: forms.values])
 batching.primitive_batchers[value_p] = _value_batched
-ad.primitive_jvps[value_p] = lambda xs, dxs, both: _jvp(partial(_value, both=both), xs, dxs)
+ad.primitive_jvps[value_p] = lambda xs, dxs, forms: _jvp(partial(_value, forms=forms), xs, dxs)
 mlir.register_lowering(value_p, mlir.lower_fun(_value))
 
 along_p = Primitive("along")
 along_p.multiple_results = True
-along_p.def_impl(lambda *xs, both: both.seen(*xs))
+along_p.def_impl(lambda *xs, forms: forms.seen(*xs))
 along_p.def_abstract_eval(_avals)
 batching.primitive_batchers[along_p] = _batched
 ad.primitive_jvps[along_p] = _derivative
 partial_eval.custom_partial_eval_rules[along_p] = _part
 partial_eval.partial_eval_jaxpr_custom_rules[along_p] = _checkpointed
-mlir.register_lowering(along_p, lambda ctx, *values, both: mlir.lower_fun(both.run)(ctx, *values))
-expand_as(along_p, lambda both: both.run)
+mlir.register_lowering(along_p, lambda ctx, *values, forms: mlir.lower_fun(forms.run)(ctx, *values))
+expand_as(along_p, lambda forms: forms.run)
