@@ -21,6 +21,6 @@ Time: TypeAlias = Float[ArrayLike, ""]  # s
 Vector: TypeAlias = Float[Array, "n"]  # flat coordinates, velocities or states
 TimeSeries: TypeAlias = Float[Array, "T n"]  # one row per time
 
-TreeDef: TypeAlias = Any  # jax.tree_util.PyTreeDef, which type checkers take for a variable
+TreeDef: TypeAlias = Any  # jax.tree_util.PyTreeDef, which type checkers mistake for a variable
 JsonObject: TypeAlias = dict[str, Any]
 TomlTable: TypeAlias = Mapping[str, Any]

@@ -97,7 +97,7 @@ def _is_stored(leaf: object) -> bool:
 
 
 def format_number(value: Any, unit: str = "", scale: float = 0.0) -> str:
-    """Return one number with six digits and its unit; 0 if it is rounding relative to `scale`, in the same unit."""
+    """Return one number with six digits and its unit; 0 if it is a rounding error relative to `scale`."""
     number = complex(value) if np.iscomplexobj(value) else float(value)
     text = f"{0.0 if abs(number) <= PRINTED_AS_ZERO * scale else number:.{DIGITS}g}"
     return f"{text} {unit}" if unit else text

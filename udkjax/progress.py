@@ -80,7 +80,7 @@ def report_progress(
         The function `report(done, message="")`, to be called as the computation proceeds.
 
     Raises:
-        TypeError: `progress` is none of these.
+        TypeError: `progress` is anything else.
     """
     if callable(progress):
         yield Report(progress, what, total)

@@ -31,14 +31,13 @@ COMMANDS = (
     "doctor",
 )
 
-GARBAGE_EVERY = (
-    50_000  # new objects between garbage collections: most objects live to the end of a command, and scanning them takes 0.1 s
-)
+# New objects between garbage collections: most objects live to the end of a command, and scanning them takes 0.1 s.
+GARBAGE_EVERY = 50_000
 PROGRAM_CACHE_BYTES = 200_000_000  # limit of stored JAX programs; the least recently used are removed
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command, and exit with one of the codes of `udkjax.cli.exits`."""
+    """Run a command, and exit with a code of `udkjax.cli.exits`."""
     gc.set_threshold(GARBAGE_EVERY)
     if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
         print(f"udkjax {version('udkjax')}")

@@ -127,7 +127,7 @@ def _run(file: Path, t1: float, dt: float) -> "ShownRun":
 
 
 def _measures(wanted: tuple[str, ...], runs: dict[str, "ShownRun"]) -> "dict[str, dict[str, np.ndarray] | None]":
-    """Return the measures by name: None for those to be computed, and the values in each run's file for others."""
+    """Return the measures by name: None if a measure is to be computed, else its values in the file of each run."""
     measures: dict[str, dict[str, np.ndarray] | None] = {}
     for name in wanted:
         by_run = {

@@ -117,7 +117,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
 
 
 def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
-    """Return the channels with the given names; exit with a message if one is invalid."""
+    """Return the channels with the given names; exit with a message if a name is invalid."""
     from udkjax.positions.channels import channel_of
 
     channels = []
@@ -143,7 +143,7 @@ def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Seque
 
 
 def choose_driver(mech: "Mechanism", given: str | None) -> str:
-    """Return the given driver, or the scene's only one; exit with a message if there are several or none."""
+    """Return the given driver, or the scene's only one; exit with a message if it has several drivers or none."""
     if given is None and len(mech.driver_names) > 1:
         refuse(f"--driver: the scene has {len(mech.driver_names)} drivers; name one of {', '.join(mech.driver_names)}")
     if given is None and not mech.driver_names:

@@ -78,7 +78,7 @@ def design(
 
 
 def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
-    """Find all solutions of a goal; show their numbers, and the first ones."""
+    """Find all solutions of a goal; show how many there are, and list the first."""
     import udkjax as udk
     from udkjax.show.summary import table
 

@@ -123,7 +123,7 @@ def kinematics(
 
 
 def _end(travel: "Travel", side: int) -> str:
-    """Return an end of travel in words: its value, that there is no limit, or that it could not be found."""
+    """Return an end of travel as text: its value, or that it has no limit, or that the limit was not found."""
     import numpy as np
 
     import udkjax as udk

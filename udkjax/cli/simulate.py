@@ -55,13 +55,13 @@ def simulate(
         method: pseudoinverse of the weighted constraint Jacobian.
         rank_tol: relative threshold of the rank; by default, one that suits the method.
         formulation: formulation of the accelerations; partitioning integrates independent coordinates only, without Baumgarte.
-        solver: integrator; verner65, adams and bdf are udkjax's own, the others diffrax's.
+        solver: integrator; verner65, adams and bdf are of udkjax, the others of diffrax.
         stabilization: projection of each step on the constraints, Baumgarte's terms, or none.
         alpha: Baumgarte's gain on the rate of the constraints (1/s).
         beta: Baumgarte's gain on the constraints (1/s).
         dt0: first step to try (s); by default it is estimated.
         max_steps: maximum number of steps, after which the run fails.
-        channels: further channels to write, such as pin.C.x, joint.A.fx or driver.motor.load, with a picture of their own.
+        channels: further channels to write, such as pin.C.x, joint.A.fx or driver.motor.load, and to draw in a separate picture.
         plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png with the name of the file.
     """
     ts = output_times(t0, t1, dt)
@@ -144,7 +144,7 @@ def _stopwatch() -> Iterator[dict[str, float]]:
     def listen(event: str, duration_secs: float, **_: object) -> None:
         if event.startswith("/jax/core/compile/"):
             end = time.perf_counter()
-            while spans and spans[-1][0] > end - duration_secs:  # inner traces are included in this one
+            while spans and spans[-1][0] > end - duration_secs:  # inner traces are included in this trace
                 spans.pop()
             spans.append((end - duration_secs, end))
 

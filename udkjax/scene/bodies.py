@@ -160,7 +160,7 @@ def between(points: Float[Array, "2 2"] | Sequence[PlaneVector], one: Frame, two
     """Return the vector from `points[0]` of body 1 to `points[1]` of body 2.
 
     Args:
-        points: The two points, each in its body's own frame (m).
+        points: The two points, each in the frame of its body (m).
         one: The frame of body 1.
         two: The frame of body 2.
 

@@ -1,6 +1,6 @@
 """Numbers of a drawn mechanism that were changed directly, not through its drawing: they stay when the drawing changes.
 
-`Mechanism.changed` has a mark for each entry of each number of the elements: one if it was changed, zero if it follows from the
+`Mechanism.changed` has a mark for each entry of each number of the elements: 1 if it was changed, 0 if it follows from the
 drawing. Marks are numbers, not structure: mechanisms with and without changes share one program, and may be stacked.
 """
 
@@ -59,7 +59,7 @@ def mark_changes(mechanism: Marked, groups: ElementGroups, names: Collection[str
             changed = np.zeros(marks[name].shape)
             changed[index] = 1.0
             marks[name] = (jnp if is_traced(marks[name]) else np).maximum(marks[name], changed)
-    return number(_joined(list(marks.values())))
+    return number(_concatenated(list(marks.values())))
 
 
 def directly_changed(mechanism: Marked, redrawn: Sections) -> dict[str, Any]:
@@ -87,6 +87,6 @@ def _present(groups: ElementGroups) -> Mapping[str, NumberField]:
     return {name: field for name, field in parameters_in(groups).items() if field.value is not None}
 
 
-def _joined(arrays: Sequence[Any]) -> Any:
+def _concatenated(arrays: Sequence[Any]) -> Any:
     xp = jnp if is_traced(arrays) else np
     return xp.concatenate([xp.ravel(x) for x in arrays]) if arrays else np.zeros(0)

@@ -101,7 +101,7 @@ class Driver(Constraint):
         bodies: the names of the two bodies; "ground" is the fixed frame.
         coordinate: "angle", "x", "y" or "distance".
         motion: the prescribed value as a function of time: `Polynomial`, `Sine`, `Spline`, or a `Motion` of your own.
-        points: for x, y and distance: point 1 and point 2, each in its own body's frame (m); by default the origins.
+        points: for x, y and distance: point 1 and point 2, each in the frame of its body (m); by default the origins.
         axis: for x and y: the direction of x in body 1's frame, as an angle (rad) or a vector; by default the frame's x axis.
     """
 

@@ -86,9 +86,9 @@ def _as_static(leaf: object) -> object:
 
 def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
     """Return a constraint with its missing numbers taken from the initial guess of the bodies."""
-    its_own = type(constraint).complete
-    filled = getattr(its_own, "fills", None)
-    if its_own is Constraint.complete or (filled and getattr(constraint, filled) is not None):
+    method = type(constraint).complete
+    number_name = getattr(method, "fills", None)
+    if method is Constraint.complete or (number_name and getattr(constraint, number_name) is not None):
         return constraint  # the usual case; the sines and cosines of the bodies are not needed
     places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
     is_concrete = not is_traced((constraint, places))

@@ -90,7 +90,7 @@ def dumps(mechanism: Mechanism | Drawing) -> str:
         The text.
 
     Raises:
-        SceneError: The format cannot hold the mechanism: classes of the user's own, traced numbers, batches of numbers.
+        SceneError: The format cannot hold the mechanism: user-written classes, traced numbers, batches of numbers.
     """
     drawing = mechanism if isinstance(mechanism, Drawing) else mechanism.drawing
     if isinstance(mechanism, Mechanism) and (mechanism.departs_from_drawing or not isinstance(drawing, Drawing)):

@@ -1,8 +1,8 @@
 """Force elements: springs, dampers, applied loads and friction, each defined by a potential energy, by loads, or by both.
 
 Conventions that hold throughout: forces are in ground axes (N), torques are positive anticlockwise and about the centre of mass
-of the body that they act on (N m). Each element lists the loads on its bodies in their order; those on body 1 are the reactions
-to those on body 2.
+of the body that they act on (N m). Each element lists the loads on its bodies in the order of `bodies`; the loads on body 1 are
+the reactions to the loads on body 2.
 """
 
 from collections.abc import Sequence
@@ -71,7 +71,7 @@ class Spring(ForceElement):
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: the ends, each in its own body's frame (m).
+        points: the ends, each in the frame of its body (m).
         stiffness: in N/m, not negative.
         length: free length (m), not negative.
         damping: in N s/m, not negative; None: no damper.

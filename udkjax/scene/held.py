@@ -1,6 +1,6 @@
 """Numbers that are held between samples: the output of a digital controller, or a table of measured forces.
 
-Sampled numbers, including splines, are constant or cubic between breakpoints: programs contain one such interval, and a run
+Sampled numbers, including splines, are constant or cubic between breakpoints: a program contains one interval, and a run
 replaces the numbers of the interval when it restarts after a breakpoint.
 """
 
@@ -28,7 +28,7 @@ class Held(PrintsLine):
 
     The value is the first one before t0, and the last one after the last sample. Steps of the integrator end at the samples. The
     values may be traced and differentiated; code and time per step do not depend on their number. Any field of a force element
-    may hold one; in this package, `torque.value`, `force.vector` and `torsion_spring.angle` accept it.
+    may be a `Held`; in this package, `torque.value`, `force.vector` and `torsion_spring.angle` accept it.
 
     Args:
         values: the samples (N,), or (N, 2) for a vector, in the unit of the number that they replace.

@@ -1,7 +1,7 @@
 """One class per joint. A joint defines only its position residual; everything else is derived from it.
 
 Conventions that hold throughout: body 1 and body 2 are the first and second of `bodies`, and `residual` takes their frames in
-this order; `points` are point 1 on body 1 and point 2 on body 2, each in its body's own frame (m); `axis` is the direction of a
+this order; `points` are point 1 on body 1 and point 2 on body 2, each in the frame of its body (m); `axis` is the direction of a
 line in body 1's frame, as an angle (rad) or a vector (x, y), and its normal points to the left of it; angles are in rad,
 anticlockwise positive, and not wrapped; rows are in the order in which `residual` returns them. The joint's force on a body is
 -Psi_q^T lambda. A number left out ("as in the initial guess") is None until the mechanism fills it in.
@@ -36,7 +36,7 @@ class Constraint(PrintsLine):
     """A constraint Psi(t, q) = 0: a joint or a driver. A subclass need only define `residual`.
 
     Args:
-        bodies: the names of the bodies whose frames `residual` takes.
+        bodies: the names of the bodies whose frames `residual` receives.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
@@ -48,7 +48,7 @@ class Constraint(PrintsLine):
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """The bodies whose frames `residual` takes, in order."""
+        """The bodies whose frames `residual` receives, in order."""
         return self.bodies
 
     @property
@@ -86,7 +86,7 @@ class Joint(Constraint):
     """A constraint that does not depend on time. Subclass it to write your own joint.
 
     Args:
-        bodies: the names of the bodies whose frames `residual` takes; "ground" is the fixed frame.
+        bodies: the names of the bodies whose frames `residual` receives; "ground" is the fixed frame.
     """
 
 
@@ -97,7 +97,7 @@ class Revolute(Joint):
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: the pin in both bodies, in each body's own frame (m).
+        points: the pin in both bodies, in the frame of each body (m).
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=given_number)
@@ -115,7 +115,7 @@ class Prismatic(Joint):
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: a point of the line on body 1, and the point of body 2 that slides on it, each in its own body's frame (m).
+        points: a point of the line on body 1, and the point of body 2 that slides on it, each in the frame of its body (m).
         axis: the direction of the line in body 1's frame, as an angle (rad) or a vector.
         angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
@@ -141,7 +141,7 @@ class Slot(Joint):
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: a point of the line on body 1, and the pin on body 2, each in its own body's frame (m).
+        points: a point of the line on body 1, and the pin on body 2, each in the frame of its body (m).
         axis: the direction of the line in body 1's frame, as an angle (rad) or a vector.
     """
 
@@ -157,7 +157,7 @@ class Weld(Joint):
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: the common point, in each body's own frame (m).
+        points: the common point, in the frame of each body (m).
         angle: theta2 - theta1 (rad); by default as in the initial guess.
     """
 
@@ -182,7 +182,7 @@ class Distance(Joint):
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
-        points: the ends of the rod, each in its own body's frame (m).
+        points: the ends of the rod, each in the frame of its body (m).
         length: length of the rod (m), greater than zero; by default as in the initial guess.
     """
 
@@ -281,8 +281,8 @@ class Rack(Joint):
         return _replace(self, "constant", self._rolling_distance(*frames))
 
     def _rolling_distance(self, frame1: Frame, frame2: Frame) -> Number:
-        along = frame1.vector((jnp.cos(self.axis), jnp.sin(self.axis)))
-        return along.dot(Point(frame2.x - frame1.x, frame2.y - frame1.y)) + self.radius * (frame2.angle - frame1.angle)
+        direction = frame1.vector((jnp.cos(self.axis), jnp.sin(self.axis)))
+        return direction.dot(Point(frame2.x - frame1.x, frame2.y - frame1.y)) + self.radius * (frame2.angle - frame1.angle)
 
 
 class Profile(PrintsLine):
@@ -318,7 +318,7 @@ class Cam(Joint):
 
     Args:
         bodies: the names of the cam and of the follower.
-        points: the centre of the profile on body 1, and the point of body 2 that stays on it, each in its own body's frame (m).
+        points: the centre of the profile on body 1, and the point of body 2 that stays on it, each in the frame of its body (m).
         profile: a `Profile`, or a table of its angles and radii.
     """
 

@@ -72,7 +72,7 @@ class AbstractDrawing(PrintsTable):
 
     @abstractmethod
     def shapes(self) -> dict[str, Array]:
-        """Return the points (n, 2) through which each body is drawn, in its own frame (m), by name."""
+        """Return the points (n, 2) through which each body is drawn, in the frame of the body (m), by name."""
 
     @property
     @abstractmethod
@@ -168,7 +168,7 @@ class Mechanism(PrintsTable):
 
     @property
     def joints(self) -> Mapping[str, Any]:
-        """The joints by name, each with the attributes of its own class."""
+        """The joints by name, each with the attributes of its class."""
         return _by_name(self.joint_names, self._joints)
 
     @property
@@ -178,7 +178,7 @@ class Mechanism(PrintsTable):
 
     @property
     def forces(self) -> Mapping[str, Any]:
-        """The force elements by name, each with the attributes of its own class."""
+        """The force elements by name, each with the attributes of its class."""
         return _by_name(self.force_names, self._forces)
 
     @property
@@ -220,7 +220,7 @@ class Mechanism(PrintsTable):
         return {location: getattr(sections[location[0]][location[1]], location[2]) for location in locations}
 
     def with_samples(self, samples: Mapping[tuple[str, int, str], Any]) -> "Mechanism":
-        """Return the mechanism with other values in place of `samples`, without checks."""
+        """Return the mechanism with other values of `samples`, without checks."""
         if not samples:
             return self
         changed = {section: list(getattr(self, section)) for section in ("_drivers", "_forces")}

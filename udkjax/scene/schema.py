@@ -59,7 +59,7 @@ class Key(NamedTuple):
 
 
 def keys(cls: type) -> dict[str, Key]:
-    """Return the keys of a class: the fields that its constructor takes, in order."""
+    """Return the keys of a class: the fields that its constructor accepts, in order."""
     keys_by_name = {}
     for field in dataclasses.fields(cls):
         if field.init:

@@ -46,15 +46,15 @@ def _far_points(mechanism: Mechanism) -> Iterator[str]:
     for number, reach in reaches.items():
         size = max(gyration, *(other_reach for other, other_reach in reaches.items() if other != number), 0.0)
         if reach > FAR_OUT * size:
-            yield f"{number} is {reach:.3g} m from the centre of mass of {quote(owner[number])}{_beside(size)}"
+            yield f"{number} is {reach:.3g} m from the centre of mass of {quote(owner[number])}{_comparison(size)}"
     places, size = np.asarray(mechanism.q0)[:, :2], max(gyration, *reaches.values(), 0.0)
     for number, point in attachments(mechanism, GROUND):
         distance = float(np.min(np.hypot(*(places - np.asarray(point)).T)))
         if distance > FAR_OUT * size:
-            yield f"{number} is {distance:.3g} m from the nearest body{_beside(size)}"
+            yield f"{number} is {distance:.3g} m from the nearest body{_comparison(size)}"
 
 
-def _beside(size: float) -> str:
+def _comparison(size: float) -> str:
     return f", and no body reaches farther than {size:.3g} m: is it in metres?"
 
 
@@ -68,7 +68,7 @@ def _degrees(mechanism: Mechanism) -> Iterator[str]:
 
 
 def _loose_bodies(mechanism: Mechanism) -> Iterator[str]:
-    """Iterate over bodies without joint or driver, if other bodies have one."""
+    """Iterate over bodies without joint or driver, if any body has a joint or driver."""
     connected = {name for element in mechanism.constraints.values() for name in mechanism.frames_of(element)}
     for name in mechanism.body_names if connected else ():
         if name not in connected:

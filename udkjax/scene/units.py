@@ -1,7 +1,7 @@
 """Units of parameters, settings of a run, data, and numbers in drawings.
 
 pint knows more units, but importing it takes 0.2 s in every command, and it treats a radian as dimensionless: a frequency in 1/s
-would pass for an angular velocity. Here angle is a dimension of its own.
+would pass for an angular velocity. Here angle is a separate dimension.
 """
 
 import math

@@ -74,7 +74,7 @@ class _Draft:
         fastest = max((float(np.abs(v).max()) for v in velocities.values()), default=0.0)
         moving = {pin: v for pin, v in velocities.items() if np.abs(v).max() > SAME_PLACE * fastest}
         return Drawing(
-            pins={name: place.tolist() for name, place in self.places.items()},
+            pins={name: position.tolist() for name, position in self.places.items()},
             links=links,
             ground=ground,
             velocities=moving,

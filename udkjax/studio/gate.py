@@ -1,8 +1,8 @@
 """The gate of the server: checks of every request, and security headers of every answer.
 
 A page of another site can reach a server on this machine in three ways: through a host name that it points here (so Host is
-checked), through requests of its own (so Origin is checked, and the body must be JSON, which no form sends), and by guessing (so
-each request to the interface needs a random token, which is in the fragment of the address, which browsers never send).
+checked), through requests from its scripts (so Origin is checked, and the body must be JSON, which no form sends), and by guessing
+(so each request to the interface needs a random token, which is in the fragment of the address, which browsers never send).
 """
 
 import hmac

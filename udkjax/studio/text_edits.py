@@ -15,8 +15,8 @@ from udkjax.scene.mechanism_tables import parse_toml
 from udkjax.studio.limits import require_few, require_size
 
 Document = dict[str, Any]
-NEW_TABLES = ("pins", "velocities")  # tables that get a header of their own
-HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries each get a header
+NEW_TABLES = ("pins", "velocities")  # tables that are written with a header
+HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries are written with a header
 
 
 def read_document(text: object) -> Document:

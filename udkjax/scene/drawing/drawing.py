@@ -52,7 +52,7 @@ class Drawing(AbstractDrawing):
         slots: Pins that are guided by a line.
         gears: Pairs of links that mesh.
         cams: Pins that stay on the profile of a link.
-        motors: Prescribed motions of a link relative to another one, or torques between them.
+        motors: Prescribed motions of a link relative to another link, or torques between them.
         springs: Springs between pins, or torsion springs at pins.
         dampers: Dampers between pins, or rotational dampers at pins.
         loads: Constant forces and torques on links.
@@ -150,7 +150,7 @@ class Drawing(AbstractDrawing):
         return [name for name, link in self.links.items() if link.kind in ("plate", "outline")]
 
     def shapes(self) -> dict[str, Array]:
-        """Return the pins or the outline (n, 2) of each link, in its own frame (m), by name."""
+        """Return the pins or the outline (n, 2) of each link, in the frame of the link (m), by name."""
         placement, shapes = placement_of(concrete_elements(self.groups), self.ground), {}
         for name, link in placement.links.items():
             positions = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)

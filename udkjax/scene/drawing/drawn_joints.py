@@ -69,7 +69,7 @@ class PinInSlot(DrawnElement):
 
 
 class GearPair(DrawnElement):
-    """Two wheels mesh. Their centres are the pins by which they turn on the `carrier`; `teeth` or `radii` give the ratio."""
+    """Two wheels mesh. Their centres are the pins about which they turn on the `carrier`; `teeth` or `radii` give the ratio."""
 
     links: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=LINK)
     teeth: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)
@@ -94,8 +94,8 @@ class GearPair(DrawnElement):
         radii = self.radii
         if radii is None:  # chosen so that the wheels touch
             assert self.teeth is not None
-            one, two = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
-            radii = self.teeth * (placement.distance(one, two) / self._apart(self.teeth))
+            centre1, centre2 = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
+            radii = self.teeth * (placement.distance(centre1, centre2) / self._apart(self.teeth))
         return Parts(joint=Gear(self.links, radii, self.internal, self.carrier))
 
     def misfit(self, placement: Placement) -> tuple[float, float] | None:

@@ -149,7 +149,7 @@ class Units:
     ) -> dict[str, Any]:
         """Convert the table of an element of a class to SI units; mistakes in numbers are added to the problems.
 
-        `variant` is the name under which the units of its fields are listed, by default the class; `law` is that of a motion law.
+        The units of its fields are listed under the name `variant`, by default the class. `law` is the unit of a motion law.
         """
         expected, converted = keys(cls), {}
         for name, value in table.items():

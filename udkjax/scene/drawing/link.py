@@ -21,7 +21,7 @@ PointArray = Float[Array, "n 2"] | np.ndarray
 class Shape(NamedTuple):
     """A plane figure of uniform thickness.
 
-    All formulas are exact. They take NumPy or JAX numbers, and are differentiable unless the shape has zero length.
+    All formulas are exact. They accept NumPy or JAX numbers, and are differentiable unless the shape has zero length.
     """
 
     area: Number  # m^2

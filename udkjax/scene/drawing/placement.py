@@ -46,7 +46,7 @@ class PinLayout:
         return tuple(self.members(pin)[0] for pin in between)
 
     def centre(self, wheel: str, carrier: str) -> str | None:
-        """Return the pin by which a wheel turns on its carrier; None unless there is exactly one."""
+        """Return the pin about which a wheel turns on its carrier; None unless there is exactly one such pin."""
         pins = self.ground if wheel == GROUND else self.links[wheel].pins if wheel in self.links else ()
         shared = [pin for pin in pins if carrier in self.members(pin)]
         return shared[0] if len(shared) == 1 else None

@@ -50,10 +50,10 @@ def excavator(
     determines their angles. `lengths` (m) and `masses` (kg) are in the order of the bodies; the bucket's length is from its pin
     to its teeth, and attachment points of cylinders scale with the lengths. Inertias are those of rods.
 
-    By default valves were shut while the arm moved at `angular_velocities`: the oil in the cylinders of boom, stick and bucket
-    acts as springs of `stiffness` (N/m) and `damping` (N s/m), with lengths that put the arm in equilibrium at `angles`.
-    `driven`: cylinders at rest begin to extend by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces are
-    reactions. With the default numbers neither motion meets a singular configuration within 20 s.
+    By default the valves shut while the arm moves at `angular_velocities`, and the oil in the cylinders of boom, stick and bucket
+    acts as springs of `stiffness` (N/m) and `damping` (N s/m), with lengths that put the arm in equilibrium at `angles`. If
+    `driven`, the cylinders start at rest and extend by `strokes` / 2 (1 - cos(`frequencies` t)) (m, rad/s), and their forces
+    are reactions. With the default numbers neither motion meets a singular configuration within 20 s.
     """
     boom, stick, rocker, link, bucket = lengths
     on_boom, on_stick, on_bucket = _points(BOOM, boom), _points(STICK, stick), _points(BUCKET, bucket)
@@ -66,21 +66,19 @@ def excavator(
     }
 
     def pose(s):
-        arm = _pose_from_point(on_boom["foot"], np.zeros(2), s[0])
-        fore = _pose_from_point(on_stick["tip"], _spot(arm, on_boom["tip"]), s[1])
-        shovel = _pose_from_point(on_bucket["bucket"], _spot(fore, on_stick["bucket"]), s[2])
-        start, end = _spot(fore, on_stick["rocker"]), _spot(shovel, on_bucket["link"])
+        boom_pose = _pose_from_point(on_boom["foot"], np.zeros(2), s[0])
+        stick_pose = _pose_from_point(on_stick["tip"], _world_point(boom_pose, on_boom["tip"]), s[1])
+        bucket_pose = _pose_from_point(on_bucket["bucket"], _world_point(stick_pose, on_stick["bucket"]), s[2])
+        start, end = _world_point(stick_pose, on_stick["rocker"]), _world_point(bucket_pose, on_bucket["link"])
         knee = apex(start, end, rocker, link)
-        return [arm, fore, bar_pose(start, knee), bar_pose(knee, end), shovel]
+        return [boom_pose, stick_pose, bar_pose(start, knee), bar_pose(knee, end), bucket_pose]
 
     def extents_and_energy(s):
         """Return the lengths of the cylinders (m) and the potential energy of the weights (J)."""
-        placed = pose(s)
-        frames = {GROUND: GROUND_FRAME} | {
-            name: Frame.at(*pose_of_body) for name, pose_of_body in zip(names, placed, strict=True)
-        }
+        poses = pose(s)
+        frames = {GROUND: GROUND_FRAME} | {name: Frame.at(*pose_of_body) for name, pose_of_body in zip(names, poses, strict=True)}
         vectors = [between(points, *(frames[n] for n in pair)) for pair, points in cylinders.values()]
-        energy = gravity * sum(mass * position[1] for mass, (position, _) in zip(masses, placed, strict=True))
+        energy = gravity * sum(mass * position[1] for mass, (position, _) in zip(masses, poses, strict=True))
         squares = as_array([vector.dot(vector) for vector in vectors])
         return array_namespace(squares).sqrt(squares), energy
 
@@ -122,10 +120,10 @@ def _points(places, length) -> dict[str, Numbers]:
     return {name: length * (np.array(point) - np.array(places["centre"])) for name, point in places.items()}
 
 
-def _spot(placed, local):
-    return as_array(Frame.at(*placed).point(local))
+def _world_point(body_pose, local):
+    return as_array(Frame.at(*body_pose).point(local))
 
 
-def _pose_from_point(local, spot, angle):
+def _pose_from_point(local, point, angle):
     """Return position and angle of a body, given the position of one of its points."""
-    return spot - as_array(Frame.at((0.0, 0.0), angle).vector(local)), angle
+    return point - as_array(Frame.at((0.0, 0.0), angle).vector(local)), angle

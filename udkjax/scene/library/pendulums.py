@@ -116,9 +116,9 @@ def chain(
     mass: ArrayLike = 1.0,
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return n uniform rods in a chain of `length` and `mass`, hung up at one end: an n-fold pendulum.
+    """Return n uniform rods in a chain of `length` and `mass`, suspended at one end: an n-fold pendulum.
 
-    Bodies link0, ... from the top, all at one `angle` from straight down; joints pin0 (on the ground), pin1, ...
+    Bodies link0, ... from the top, all at the same `angle` from straight down; joints pin0 (on the ground), pin1, ...
     """
     half = 0.5 * length / n
 

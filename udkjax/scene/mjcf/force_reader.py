@@ -14,9 +14,8 @@ from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 from udkjax.wording import quote
 
 LEFT_OUT = ("limits", "frictionloss", "forceranges", "contacts")  # parts of a model that a caller may leave out
-FAR_AWAY = (
-    16.0  # sizes of a model: the distance of a point that a slide cannot reach, but not so large that it looks like a mistake
-)
+# Sizes of a model: the distance of a point that no slide reaches, but not so large that it looks like a mistake.
+FAR_AWAY = 16.0
 
 
 class LinearForce(NamedTuple):
@@ -159,10 +158,10 @@ class ForceReader:
         elif kinds == "s":
             for body, sign in ((other, 1), (owner, -1)):
                 local_push = sign * push * np.exp(-1j * self.model.bodies[body].angle)
-                pushed = Force(
+                force_on_body = Force(
                     self.model.bodies[body].name, (local_push.real, local_push.imag), self.model.local(body, pin), "body"
                 )
-                self._put(name, pushed)
+                self._put(name, force_on_body)
         else:
             read.refuse("acts on a slide between two moving bodies that turn against each other: not taken over")
 

@@ -166,8 +166,9 @@ def _add_armature(
 ) -> None:
     """Add the rotor of a joint, with energy 1/2 A w^2, w the rate of the joint and A its `armature`.
 
-    On the ground it adds to the inertia, or mass, of the body. Between body 1 and body 2 it is a rotor pinned to the centre of
-    body 1 and geared to turn N = 1 + 2 A / I2 times as fast relative to it as body 2. With inertia J = A / (N (N - 1)) it has
+    If the ground holds the body, the armature is added to the inertia, or mass, of the body. Between body 1 and body 2, a rotor is
+    pinned to the centre of body 1; relative to body 1 it turns N = 1 + 2 A / I2 times as fast as body 2. With the inertia
+    J = A / (N (N - 1)) its energy is
 
         1/2 J (w1 + N (w2 - w1))^2 = 1/2 A (w2 - w1)^2 - 1/2 (A / N) w1^2 + 1/2 (A / (N - 1)) w2^2,
 

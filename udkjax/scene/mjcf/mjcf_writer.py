@@ -33,7 +33,7 @@ Attributes = dict[str, str]
 
 
 class _TreeJoint(NamedTuple):
-    """The text of a hinge or a slide, and its initial rate (rad/s, m/s)."""
+    """The name and attributes of a hinge or a slide, and its initial rate (rad/s, m/s)."""
 
     name: str
     attributes: Attributes
@@ -258,10 +258,10 @@ class _Writer:
             factors = {joint: direction * factor for joint, factor in hinges.items()}
             self._add_fixed(name, factors, "force", springlength=_numbers(abs(free_angle)), **spring)
 
-    def _hinges(self, parts: dict[str, float]) -> dict[str, float]:
+    def _hinges(self, factors: dict[str, float]) -> dict[str, float]:
         """Return a weighted sum of angles of bodies as a weighted sum of hinges."""
         hinges: dict[str, float] = {}
-        for body, factor in parts.items():
+        for body, factor in factors.items():
             for hinge, weight in self.turns[body].items():
                 hinges[hinge] = hinges.get(hinge, 0.0) + factor * weight
         threshold = EVEN * max(map(abs, hinges.values()), default=0.0)

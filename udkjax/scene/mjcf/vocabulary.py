@@ -9,16 +9,8 @@ from typing import NamedTuple
 from udkjax.scene.mjcf.xml_tree import XmlElement
 from udkjax.wording import quote
 
-WITHOUT_EFFECT = (
-    "visual",
-    "statistic",
-    "asset",
-    "sensor",
-    "custom",
-    "size",
-    "light",
-    "camera",
-)  # elements without effect on motions
+# Elements without effect on motions.
+WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")
 CONTEXTS = ("equality", "spatial", "fixed")  # parents that determine the meaning of the tags of their children
 ACTUATORS = ("motor", "position", "velocity", "general")
 SHAPELESS = ("material", "mesh", "texture", "pair")  # only in defaults
