@@ -166,7 +166,7 @@ def _add_armature(
 ) -> None:
     """Add the rotor of a joint, with energy 1/2 A w^2, w the rate of the joint and A its `armature`.
 
-    If the ground holds the body, the armature is added to the inertia, or mass, of the body. Between body 1 and body 2, a rotor is
+    If the ground holds the body, the armature adds to its inertia, or mass. Between body 1 and body 2, a rotor is
     pinned to the centre of body 1; relative to body 1 it turns N = 1 + 2 A / I2 times as fast as body 2. With the inertia
     J = A / (N (N - 1)) its energy is
 
