@@ -5,7 +5,7 @@ parameters, unknowns                               parameters to identify, and t
 prediction, fit_problem, shooting                  predictions and residuals
 loop_consistency                                   parameters that keep closed loops closed
 least_squares, optimizer                           minimization
-growing_records, search                            search for the right minimum
+growing_records, search                            search for the global minimum
 uncertainty, profile_likelihood                    standard errors and confidence intervals
 gradient_check                                     check of derivatives against differences
 identification, estimate, experiment_design        the public functions and their results

@@ -31,7 +31,7 @@ from udkjax.wording import join_names, plural, quote, suggestion
 if TYPE_CHECKING:
     import xarray
 
-FORMAT = "udkjax identification 1"  # of the dataset
+FORMAT = "udkjax identification 1"  # format of the dataset
 
 
 class Row(NamedTuple):
@@ -58,15 +58,15 @@ class Estimate:
         predicted, residuals, noise: for each record, by channel, at its times (T,): predicted values; measured minus predicted;
             and standard deviations, given or estimated.
         outliers: measured values too far from the prediction to be noise; `noise` is that of the other values.
-        whiteness: test of the residuals of each record's channels for white noise, if they exceed integration errors.
+        whiteness: test for white noise of the residuals of each record's channels that exceed integration errors.
         converged: True if the fit converged.
-        agreeing: number of first guesses that led to this fit, out of `guesses`.
+        agreeing: number of first guesses, out of `guesses`, that led to this fit.
         ways: strategies that were tried.
         history: cost and Gauss-Newton step of each evaluation of the best fit.
         evaluations: number of simulated records, each with its derivatives.
         seconds: duration of the identification (s).
         tol: tolerances of the integration.
-        z: all K unknowns of the fitted `problem`, minimizing the squares of `loss`.
+        z: all K unknowns of the fitted `problem`, which minimize the sum of squares of the residuals transformed by `loss`.
     """
 
     names: tuple[str, ...]
@@ -104,7 +104,7 @@ class Estimate:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Standard errors by name; inf if the records do not determine the parameter."""
+        """Standard errors by name; inf for parameters that the records do not determine."""
         return dict(zip(self.names, self.uncertainty.standard_errors.tolist(), strict=True))
 
     @cached_property
@@ -212,16 +212,17 @@ class Estimate:
 
         Returns:
             A dataset with `measured`, `predicted`, `residual` (measured minus predicted) and `noise` along record, sample and
-            channel, at `time` (record, sample), s; NaN where nothing was measured. `correlated` is the probability that white
-            noise leaves residuals as correlated as these. `cost` and `change` (the largest change of an unknown in the next step)
-            are those of each trial. With profiles, `rise` is twice the increase of the cost above its minimum, relative to the
-            noise, at `profile_value`, and `interval` is where it is below the `limit` of the confidence level.
+            channel, at `time` (record, sample), s; NaN where nothing was measured. `correlated` is the probability that
+            residuals are at least as correlated if the noise is white. `cost` and `change` (the largest change of an unknown in
+            the next step) are those of each trial. With profiles, `rise` is twice the increase of the cost above its minimum,
+            relative to the noise, at `profile_value`, and `interval` is the range in which it is below the `limit` of the
+            confidence level.
         """
         with OptionalImport():
             import xarray
         problem, uncertainty, P = self.problem, self.uncertainty, "parameter"
         records, names = problem.records, problem.channel_names
-        found = dataset_of_fit(records, names, self.predicted, self.residuals, self.noise)
+        dataset = dataset_of_fit(records, names, self.predicted, self.residuals, self.noise)
         white = [[getattr(self.whiteness.get((k, name)), "p", np.nan) for name in names] for k in range(len(records))]
         cost, change = np.array(self.history, float).reshape(-1, 2).T
         data = {
@@ -247,8 +248,8 @@ class Estimate:
             **{f"version_{name}": value for name, value in versions().items()},
             "scene": scene_text(self.mechanism),
         }
-        found = found.merge(xarray.Dataset(data, coords)).assign_attrs(attributes)
-        return found.merge(profiles_dataset(profiles, self.parameters, uncertainty, level)) if profiles else found
+        dataset = dataset.merge(xarray.Dataset(data, coords)).assign_attrs(attributes)
+        return dataset.merge(profiles_dataset(profiles, self.parameters, uncertainty, level)) if profiles else dataset
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results as plain numbers, lists and strings, for JSON."""

@@ -35,8 +35,8 @@ class Candidate:
     """A possible experiment.
 
     Args:
-        conditions: numbers of the scene that differ in it, by name.
-        initial_state: its initial state; by default that of the scene.
+        conditions: numbers of the scene that differ in this experiment, by name.
+        initial_state: initial state of this experiment; by default that of the scene.
         name: its name in tables.
     """
 
@@ -47,18 +47,18 @@ class Candidate:
 
 @prints_table
 class Design(NamedTuple):
-    """A ranking of N candidate experiments by how well each, with the prior information, determines P parameters.
+    """A ranking of N candidate experiments by the accuracy with which each, with prior information, determines P parameters.
 
     Attributes:
         criterion: criterion of the ranking.
         names: names of the parameters.
         candidates: names of the candidates.
-        scores: value of the criterion, the larger the better: log det M, -trace M^-1, or the smallest eigenvalue; -inf, or 0,
-            where a combination of parameters is not determined.
-        standard_errors: standard errors in the units of the parameters; inf where a candidate does not determine one.
+        scores: value of the criterion (larger is better): log det M, -trace M^-1, or the smallest eigenvalue; -inf or 0 if a
+            combination of parameters is not determined.
+        standard_errors: standard errors in the units of the parameters; inf if a candidate does not determine the parameter.
         order: indices of the candidates, the best first.
         chosen: candidates to carry out together, the most useful first.
-        together: standard errors after the first of them, the first two, and so on.
+        together: standard errors after the first chosen candidate, the first two, and so on.
     """
 
     criterion: Criterion
@@ -96,18 +96,18 @@ def design_experiment(
     tol: float = MEDIUM_TOL,
     **settings: Any,
 ) -> Design:
-    """Rank experiments by how well they would determine parameters, and pick some to be carried out together.
+    """Rank experiments by how well they would determine parameters, and choose some to be carried out together.
 
     Args:
         mechanism: mechanism with the parameter values at which the experiments are predicted.
-        candidates: each a `Candidate`, its conditions (a driver's amplitude and frequency by name), or its initial state.
+        candidates: `Candidate`s; or the conditions (such as a driver's amplitude and frequency by name) or initial state of each.
         parameters: parameters to identify, as for `identify`, with their priors.
-        channels: channels that would be measured in each.
+        channels: channels that would be measured in each experiment.
         ts: times (T,) of the measurements, s.
         noise: standard deviation, of all channels or by channel.
         criterion: "D", the largest det M; "A", the smallest trace M^-1; "E", the largest smallest eigenvalue of M.
-        pick: number of candidates to choose in sequence, each the best together with the previous ones.
-        of: names of the parameters that matter; by default all.
+        pick: number of candidates to choose in sequence; each is the best addition to the previous ones.
+        of: names of the parameters to determine; by default all.
         given: an estimate, whose values are used and whose records count as prior information.
         tol: tolerance of the integration.
         settings: further arguments of `simulate`.
@@ -132,13 +132,13 @@ def design_experiment(
     problem = build_problem(mechanism if given is None else given.mechanism, records, parameters, settings)
     names = problem.unknowns.names
     wanted = _select_parameters(names, of)
-    before = _prior_information(problem, given)
+    prior_rows = _prior_information(problem, given)
     dx_dz = problem.unknowns.dx_dz(np.zeros(len(names)))[wanted]
     roots = _information_of_records(problem, (tol, tol))
-    floor = INVISIBLE_RATIO * np.linalg.norm(np.concatenate([before, *roots]), 2)
+    floor = INVISIBLE_RATIO * np.linalg.norm(np.concatenate([prior_rows, *roots]), 2)
 
     def evaluate(which: Sequence[int]) -> tuple[tuple[int, float], np.ndarray]:
-        every = np.concatenate([before, *(roots[k] for k in which)])
+        every = np.concatenate([prior_rows, *(roots[k] for k in which)])
         return _score(_eliminate(every, np.setdiff1d(np.arange(len(names)), wanted), floor), criterion, floor)
 
     alone = [evaluate([k]) for k in range(len(experiments))]
@@ -161,14 +161,14 @@ def design_experiment(
 
 
 def _candidate(given: Candidate | Mapping[str, ArrayLike] | Start | State, k: int) -> Candidate:
-    found = given if isinstance(given, Candidate) else None
+    candidate = given if isinstance(given, Candidate) else None
     if isinstance(given, Mapping):
-        found = Candidate(given, name=", ".join(f"{name} = {value}" for name, value in given.items()))
+        candidate = Candidate(given, name=", ".join(f"{name} = {value}" for name, value in given.items()))
     elif isinstance(given, Start | State):
-        found = Candidate(initial_state=given)
-    if found is None:
+        candidate = Candidate(initial_state=given)
+    if candidate is None:
         raise IdentificationError([f"candidate {k + 1}: must be a Candidate, conditions or a start, is {type(given).__name__}"])
-    return found if found.name else Candidate(found.conditions, found.initial_state, f"candidate {k + 1}")
+    return candidate if candidate.name else Candidate(candidate.conditions, candidate.initial_state, f"candidate {k + 1}")
 
 
 def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.ndarray:
@@ -180,21 +180,23 @@ def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.nda
 
 
 def _information_of_records(problem: FitProblem, tol: TolerancePair) -> list[np.ndarray]:
-    """Return rows J (., P) for each record whose J^T J is its information; no rows if it cannot be computed."""
+    """Return rows J (., P) for each record, whose information is J^T J; no rows if a record cannot be computed."""
     P = len(problem.unknowns.names)
     J = problem.evaluate(np.zeros((1, problem.K)), tol).J[0, : len(problem.index)]
-    found = []
+    information = []
     for k in range(len(problem.records)):
-        own = J[problem.index[:, 0] == k]
-        fine = np.isfinite(own).all()
-        found.append(
-            _eliminate(own, np.arange(P, problem.K), INVISIBLE_RATIO * np.linalg.norm(own, 2)) if fine else np.zeros((0, P))
+        of_record = J[problem.index[:, 0] == k]
+        fine = np.isfinite(of_record).all()
+        information.append(
+            _eliminate(of_record, np.arange(P, problem.K), INVISIBLE_RATIO * np.linalg.norm(of_record, 2))
+            if fine
+            else np.zeros((0, P))
         )
-    return found
+    return information
 
 
 def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarray:
-    """Return rows J whose J^T J is the prior information: from the records of an estimate, and from priors."""
+    """Return rows J; J^T J is the prior information, from the records of an estimate and from priors."""
     u = problem.unknowns
     which = problem.priors
     priors = np.zeros((len(which), len(u.names)))
@@ -203,26 +205,26 @@ def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarra
         return priors
     if given.names != u.names:
         raise IdentificationError([f"given: is an estimate of {', '.join(given.names)}, not of {', '.join(u.names)}"])
-    P, old = len(u.names), given.problem.unknowns
+    P, earlier = len(u.names), given.problem.unknowns
     scale = np.append(given.uncertainty.noise, 1.0)[given.problem.noise_groups()]
     J = given.problem.evaluate(given.z[None], given.tol).J[0] / scale[:, None]
     rows = _eliminate(J, np.arange(P, given.problem.K), INVISIBLE_RATIO * np.linalg.norm(J, 2))
-    same = u.dx_dz(np.zeros(P)) / old.dx_dz(given.z[:P])  # the two sets of unknowns have different first guesses
-    return rows * same  # the priors of the estimate are among its rows
+    factor = u.dx_dz(np.zeros(P)) / earlier.dx_dz(given.z[:P])  # the two sets of unknowns have different first guesses
+    return rows * factor  # these include the priors of the estimate
 
 
 def _eliminate(J: np.ndarray, columns: np.ndarray, floor: float) -> np.ndarray:
-    """Return the other columns of J, projected on the complement of these columns."""
-    rest = np.delete(J, columns, axis=1)
+    """Return J without `columns`, projected on the complement of these."""
+    others = np.delete(J, columns, axis=1)
     if not len(columns) or not len(J):
-        return rest
+        return others
     u, s, _ = np.linalg.svd(J[:, columns], full_matrices=False)
     u = u[:, s > floor]
-    return rest - u @ (u.T @ rest)
+    return others - u @ (u.T @ others)
 
 
 def _score(rows: np.ndarray, criterion: Criterion, floor: float) -> tuple[tuple[int, float], np.ndarray]:
-    """Return the number of determined directions and their score; and the standard errors of the unknowns."""
+    """Return the number of determined directions and their score, and the standard errors of the unknowns."""
     K = rows.shape[1]
     _, s, vt = np.linalg.svd(np.concatenate([rows, np.zeros((K, K))]))
     determined = s > floor

@@ -30,11 +30,12 @@ from udkjax.study.identify.records import Estimated, IdentificationError, Noise,
 from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
 from udkjax.wording import suggestion
 
-STILL_DEVIATION = 1e-12  # relative to the largest number in a channel: with a smaller deviation the channel is constant
-# Relative to the largest singular value of a Jacobian: measurements do not determine directions with smaller ones. A change that
-# leaves the equations of motion unchanged has 1e-16, at any tolerance; derivatives integrated at 1e-7 have errors of 1e-8.
+STILL_DEVIATION = 1e-12  # standard deviation below which a channel is constant, relative to its largest number
+# Singular values below this, relative to the largest of a Jacobian, belong to directions that measurements do not determine. A
+# change that does not affect the equations of motion has 1e-16, at any tolerance; derivatives integrated at 1e-7 have errors of
+# 1e-8.
 INVISIBLE_RATIO = 1e-8
-RESIDUALS_PER_UNKNOWN = 3.0  # in the first fitted part of a record, and in a piece: fewer would fit the noise
+RESIDUALS_PER_UNKNOWN = 3.0  # least number in the first fitted part of a record, and in a piece; fewer would fit the noise
 # Arguments of `simulate` that `identify` sets itself.
 DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress", "analysis")
 Strategy = Literal["auto", "pieces"]
@@ -54,24 +55,24 @@ class Residuals(NamedTuple):
 
 
 class FitProblem:
-    """The residuals to be minimized, as a function of the unknowns z (K,): P of parameters, then those of initial states.
+    """The residuals to be minimized, as a function of the unknowns z (K,): P parameters, then the unknowns of initial states.
 
     Attributes:
         ts: times (records, times) of the records, from their beginning (s).
         y: measured values (records, times, channels), NaN where nothing was measured.
-        present: mask of the measured values; `index` (R, 3) is the record, time and channel of each of the R residuals.
-        sigma: standard deviations (R,) of the residuals; `noise_given` (R,) marks those that were given.
+        present: mask of the measured values; the R rows of `index` (R, 3) are record, time and channel of each residual.
+        sigma: standard deviations (R,) of the residuals; `noise_given` (R,) marks the given ones.
         channel_scale: scale of the values of each channel (C,).
-        runs: runs to simulate; `run` and `time` (R,) are the run and the index of the time of each residual.
+        runs: runs to simulate; `run` and `time` (R,) are the indices of run and time of each residual.
         state_sizes: change of each initial-state unknown, in its units, per unit of z (K - P,).
         columns: indices in z of the unknowns of each run's initial state (N, S); -1 for unused entries.
         beginnings: the run that each record begins with (records,).
-        priors: indices of the parameters with a prior; their residuals follow the R measured ones.
+        priors: indices of the parameters with a prior; the residuals of priors follow the R measured ones.
         predictor: computes the values of the channels, and counts evaluations.
     """
 
-    extra_rows: int  # residuals after the measured ones
-    constrained: int = 0  # unknowns that are determined by extra rows, not by measurements
+    extra_rows: int  # number of residuals after the measured ones
+    constrained: int = 0  # number of unknowns that are determined by extra rows, not by measurements
 
     def __init__(
         self, mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any] | None = None
@@ -110,32 +111,34 @@ class FitProblem:
         return [places for k, c in pairs if len(places := np.flatnonzero((record == k) & (channel == c)))]
 
     def noise_groups(self) -> Int[np.ndarray, "R"]:
-        """Return the group of each residual, including priors, that shares an unknown noise level; -1 if the noise was given."""
+        """Return, for each residual including priors, its group with a common unknown noise; -1 if the noise was given."""
         _, group = np.unique(np.where(self.noise_given, -1, self.index[:, 2]), return_inverse=True)
         group = group - 1 if self.noise_given.any() else group
         return np.concatenate([group, np.full(self.extra_rows, -1)])
 
     def by_record(self, rows: Float[np.ndarray, "R"]) -> tuple[dict[str, np.ndarray], ...]:
-        """Arrange one number per residual in a table for each record: channels at its times, NaN where nothing was measured."""
-        full = np.full(self.y.shape, np.nan)
-        full[self.present] = rows
-        found = []
+        """Arrange a number per residual in a table for each record: channels at its times, NaN where nothing was measured."""
+        table = np.full(self.y.shape, np.nan)
+        table[self.present] = rows
+        tables = []
         for k, record in enumerate(self.records):
             ts, first = output_times(record)
-            part = full[k, first : len(ts)]
-            found.append({name: part[:, c] for c, name in enumerate(self.channel_names) if np.isfinite(part[:, c]).any()})
-        return tuple(found)
+            of_record = table[k, first : len(ts)]
+            tables.append(
+                {name: of_record[:, c] for c, name in enumerate(self.channel_names) if np.isfinite(of_record[:, c]).any()}
+            )
+        return tuple(tables)
 
     def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
-        """Return the members of B sets of unknowns: all runs of the first set, then those of the next."""
+        """Return the members of B sets of unknowns: all runs of the first set, then all runs of the next."""
         sets, (N, S) = len(z), self.columns.shape
         x = np.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)]), N, axis=0)
         shift = np.where(self.columns < 0, 0.0, z[:, self.columns]).reshape(sets * N, S)
-        found = self.members_of(np.tile(np.arange(N), sets), x, shift)
+        all_members = self.members_of(np.tile(np.arange(N), sets), x, shift)
         if horizon is None:
-            return found
+            return all_members
         ts = np.tile([_times_until(ts, horizon) for ts in self.runs.ts], (sets, 1))
-        return found._replace(runs=found.runs._replace(ts=ts))
+        return all_members._replace(runs=all_members.runs._replace(ts=ts))
 
     def members_of(self, runs: Int[np.ndarray, "M"], x: Float[np.ndarray, "M P"], shift: Float[np.ndarray, "M S"]) -> Members:
         """Return the members of some runs with given parameters and unknowns of their initial states."""
@@ -149,29 +152,29 @@ class FitProblem:
             tol: tolerances of the integration.
             horizon: duration of the part of each record that is used (s); later residuals are zero. None: the whole record.
         """
-        found = self.predictor(self.members(z, horizon), tol)
-        found = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), found)
-        at = self.run, self.time, self.index[:, 2]
-        r = (found.y[:, *at] - self.y[self.present]) / self.sigma
-        J = self.by_unknowns(found.dy[:, *at] / self.sigma[:, None], self.run, z)
+        prediction = self.predictor(self.members(z, horizon), tol)
+        prediction = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), prediction)
+        entries = self.run, self.time, self.index[:, 2]
+        r = (prediction.y[:, *entries] - self.y[self.present]) / self.sigma
+        J = self.by_unknowns(prediction.dy[:, *entries] / self.sigma[:, None], self.run, z)
         if horizon is not None:
             record, time, _ = self.index.T
             beyond = self.ts[record, time] - self.ts[record, 0] > horizon
             r[:, beyond], J[:, beyond] = 0.0, 0.0
-        for more_r, more_J in self.further_rows(found, z):
+        for more_r, more_J in self.further_rows(prediction, z):
             r, J = np.concatenate([r, more_r], axis=1), np.concatenate([J, more_J], axis=1)
-        return Residuals(r, J, found.code.max(1))
+        return Residuals(r, J, prediction.code.max(1))
 
     def first_states(self, mechanism: Mechanism, z: Float[np.ndarray, "K"]) -> tuple[State, ...]:
         """Return the closed initial states of the records for a mechanism with the parameters of z."""
-        members, found = self.members(z[None]), []
+        members, states = self.members(z[None]), []
         for record, run in zip(self.records, self.beginnings, strict=True):
             guess = self.predictor.guess(members, int(run))
-            found.append(assemble(with_conditions(mechanism, record), record.t0, guess, throw=False))
-        return tuple(found)
+            states.append(assemble(with_conditions(mechanism, record), record.t0, guess, throw=False))
+        return tuple(states)
 
-    def further_rows(self, found: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Iterate over the residuals after the measured ones, with their Jacobians: those of priors, (x - mean) / sigma."""
+    def further_rows(self, prediction: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Iterate over further residuals with their Jacobians: those of priors, (x - mean) / sigma."""
         which, u = self.priors, self.unknowns
         if not len(which):
             return
@@ -192,9 +195,9 @@ class FitProblem:
 
 def _size_of(values: np.ndarray) -> float:
     """Return the scale of a channel: its standard deviation; if it is constant, its absolute value; if it is zero, 1."""
-    found = values[np.isfinite(values)]
-    size = np.abs(found).max(initial=0.0)
-    deviation = found.std() if found.size else 0.0
+    finite = values[np.isfinite(values)]
+    size = np.abs(finite).max(initial=0.0)
+    deviation = finite.std() if finite.size else 0.0
     return float(deviation if deviation > STILL_DEVIATION * size else size or 1.0)
 
 
@@ -222,7 +225,7 @@ def build_problem(
     """Build the problem from the arguments of `identify`.
 
     Raises:
-        IdentificationError: lists every mistake in them.
+        IdentificationError: lists every mistake in the arguments.
         AssemblyError: the mechanism cannot be closed with the first guess or any guess near it.
     """
     unknowns, records = _collect(
@@ -234,16 +237,16 @@ def build_problem(
 
 
 def _collect(*steps: Callable[[], Any]) -> list[Any]:
-    """Return the results of some steps; if any raise `IdentificationError`, raise a single one with all mistakes."""
-    found, problems = [], []
+    """Return the results of steps; if some raise `IdentificationError`, raise a single error with all mistakes."""
+    results, problems = [], []
     for step in steps:
         try:
-            found.append(step())
+            results.append(step())
         except IdentificationError as error:
             problems += error.problems
     if problems:
         raise IdentificationError(problems)
-    return found
+    return results
 
 
 def _with_initial_state(records: Sequence[Record], given: Start | Estimated | None) -> Sequence[Record]:
@@ -270,7 +273,7 @@ def _closable_problem(
 ) -> FitProblem:
     """Build the problem at the first guess, or at the nearest guess that can be closed.
 
-    A mechanism without redundant rows is checked by its first run, with which the fit begins: a separate check would cost more.
+    A mechanism without redundant rows is checked by its first run, which the fit needs anyway; a separate check would cost more.
     """
     if unknowns.at_scene_values and analyse(mechanism).redundant_rows == ():
         try:

@@ -1,13 +1,13 @@
 """Check of the derivatives that identification uses against finite differences.
 
 With y(z) the values predicted with the unknowns z, J d is compared with differences of y along directions d: each unknown by
-itself, and some random combinations of all. Each evaluation closes the mechanism again. J has an integration error, estimated by
-its change at another tolerance. The floor up to which both can agree is the sum of this error and those of the differences, noise
-and truncation (see `differences`), at the step where they are smallest. It does not depend on the discrepancy: if that exceeds
-the floor, the derivative is wrong, or does not exist.
+itself, and some random combinations of all. Each evaluation closes the mechanism again. The integration error
+of J is estimated by its change at another tolerance. The floor up to which J d and differences can agree is the sum of this error
+and the errors of differences, noise and truncation (see `differences`), at the step where these are smallest. It does not depend
+on the discrepancy: if the discrepancy exceeds the floor, the derivative is wrong, or does not exist.
 
-Along a chaotic motion even the smallest step leads to an entirely different motion, with which there is nothing to compare. So
-steps are excluded for which h J d exceeds the values of a channel, if it moves at all.
+Along a chaotic motion even the smallest step leads to an entirely different motion, which cannot be compared. Steps are
+therefore excluded if h J d exceeds the values of a channel and the channel changes.
 """
 
 from collections.abc import Sequence
@@ -31,11 +31,11 @@ from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.wording import join_names
 
-AGREEMENT = 3.0  # floors up to which a discrepancy is agreement: the parts of a floor are single samples of errors
-USEFUL_PRECISION = 0.1  # relative to the derivative: with a higher floor agreement means little
-RANDOM_DIRECTIONS = 3  # directions in which all unknowns change
-OTHER_TOL = 0.01, 10.0  # relative to the tolerance: at which errors are estimated; the second if runs fail at the first
-SMALLEST_TOL = 1e-14  # below it, the step controller follows rounding errors
+AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
+USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which agreement is meaningful
+RANDOM_DIRECTIONS = 3  # number of directions in which all unknowns change
+OTHER_TOL = 0.01, 10.0  # tolerances, relative to the given one, to estimate errors; the second is used if runs fail at the first
+SMALLEST_TOL = 1e-14  # below this, the step controller responds to rounding errors
 
 
 class DisagreementPlace(NamedTuple):
@@ -50,7 +50,7 @@ class DisagreementPlace(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GradientCheck:
-    """A comparison of derivatives with finite differences, in D directions of z and S series (one channel of one record).
+    """A comparison of derivatives with finite differences, in D directions of z and S series (a channel of a record each).
 
     All sizes are root mean squares over the times of a series, in the channel's units per unit of z; NaN if runs failed. `print`
     shows the series with the worst agreement for each direction.
@@ -64,7 +64,7 @@ class GradientCheck:
         discrepancy: discrepancy between derivatives and differences, by step.
         noise, truncation: errors of the differences, by step.
         derivative_error: errors of the derivatives.
-        size: size of the derivatives.
+        size: root mean squares of the derivatives.
         places: times of the worst disagreement (D, S).
         tol: tolerances of the integration.
         other_tol: tolerances at which errors were estimated.
@@ -113,12 +113,12 @@ class GradientCheck:
 
     @property
     def floor(self) -> Float[np.ndarray, "D S"]:
-        """Discrepancy that errors explain: noise, truncation, and the error of the derivative."""
+        """The discrepancy that errors explain: noise, truncation, and the error of the derivative."""
         return self.at_best(self.noise + self.truncation) + self.derivative_error
 
     @property
     def ratio(self) -> Float[np.ndarray, "D S"]:
-        """The discrepancy over the floor; NaN where one of them is unknown."""
+        """The ratio of the discrepancy to the floor; NaN where either is unknown."""
         discrepancy, floor = self.at_best(self.discrepancy), self.floor
         return np.where(discrepancy == 0.0, 0.0, discrepancy / np.where(floor == 0.0, np.finfo(float).tiny, floor))
 
@@ -155,12 +155,12 @@ def check_gradients(
 ) -> GradientCheck:
     """Compare the derivatives that `identify` uses with finite differences, at the first guess of the parameters.
 
-    The directions are each unknown by itself, and a few random combinations; in each, the mechanism is closed and simulated forty
-    times. For the same check at an estimate, see `Estimate.check_gradients`.
+    The directions are each unknown by itself, and some random combinations; in each direction, the mechanism is closed and
+    simulated forty times. For the same check at an estimate, see `Estimate.check_gradients`.
 
     Args:
         mechanism: mechanism with the first guesses.
-        data: records, as for `identify`; only times, names of channels and initial states matter.
+        data: records, as for `identify`; only times, names of channels and initial states are used.
         parameters: parameters, as for `identify`.
         tol: tolerance of the integration, relative and absolute.
         ignore: columns of tables that are not read.
@@ -168,10 +168,10 @@ def check_gradients(
         settings: further arguments of `simulate`.
 
     Returns:
-        The comparison: `ok` is True if all derivatives agree, `print` shows a table.
+        The comparison; `ok` is True if all derivatives agree, and `print` shows a table.
 
     Raises:
-        IdentificationError: as for `identify`, and if the motion itself cannot be simulated to its end.
+        IdentificationError: as for `identify`, or the motion cannot be simulated to its end.
     """
     problem = build_problem(mechanism, data, parameters, settings, ignore=ignore, seed=seed)
     return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed)
@@ -182,19 +182,21 @@ def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Toler
     rows, names = len(problem.index), problem.all_names[: problem.K - problem.constrained]
     _, residuals = _evaluate_first(problem, z, [tol])
     smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
-    others = [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger]
-    other, with_other = _evaluate_first(problem, z, others)
+    other_tols = [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger]
+    other_tol, with_other = _evaluate_first(problem, z, other_tols)
     series = problem.series()
     random = np.random.default_rng(seed).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
     directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
-    J, error = (problem.sigma[:, None] * part[0, :rows] for part in (residuals.J, residuals.J - with_other.J))
+    J, error = (problem.sigma[:, None] * rows_of[0, :rows] for rows_of in (residuals.J, residuals.J - with_other.J))
     derivatives = directions @ J.T
-    found, places = [], []
+    by_direction, places = [], []
     for d, slope in zip(directions, derivatives, strict=True):
         points = z + np.concatenate([DIFFERENCE_STEPS, -DIFFERENCE_STEPS])[:, None] * d
-        y, y_other = (_predict(problem, points, by).reshape(2, len(DIFFERENCE_STEPS), rows).swapaxes(0, 1) for by in (tol, other))
-        found.append(leave_out_far_steps(differences(y, y - y_other, series), sizes(slope, series), series))
-        places.append(_places(problem, series, slope, found[-1]))
+        y, y_other = (
+            _predict(problem, points, by).reshape(2, len(DIFFERENCE_STEPS), rows).swapaxes(0, 1) for by in (tol, other_tol)
+        )
+        by_direction.append(leave_out_far_steps(differences(y, y - y_other, series), sizes(slope, series), series))
+        places.append(_places(problem, series, slope, by_direction[-1]))
     keys = [(int(problem.index[p[0], 0]), problem.channels[problem.index[p[0], 2]]) for p in series]
     prefixes = label_prefixes(problem.records)
     return GradientCheck(
@@ -204,25 +206,25 @@ def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Toler
         series=tuple((k, channel.name) for k, channel in keys),
         labels=tuple(prefixes[k] + channel.name for k, channel in keys),
         units=tuple(channel.units for _, channel in keys),
-        steps=found[0].steps,
-        discrepancy=np.stack([sizes(f.values - slope, series).T for f, slope in zip(found, derivatives, strict=True)]),
-        noise=np.stack([f.noise.T for f in found]),
-        truncation=np.stack([f.truncation.T for f in found]),
+        steps=by_direction[0].steps,
+        discrepancy=np.stack([sizes(f.values - slope, series).T for f, slope in zip(by_direction, derivatives, strict=True)]),
+        noise=np.stack([f.noise.T for f in by_direction]),
+        truncation=np.stack([f.truncation.T for f in by_direction]),
         derivative_error=sizes(directions @ error.T, series),
         size=sizes(derivatives, series),
         places=tuple(places),
         tol=tol,
-        other_tol=other,
+        other_tol=other_tol,
     )
 
 
 def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[TolerancePair]) -> tuple[TolerancePair, Residuals]:
-    """Return the first of some tolerances at which all runs are completed, and the residuals at it."""
+    """Return the first of the tolerances at which all runs are completed, and the residuals at this tolerance."""
     for tol in tols:
-        found = problem.evaluate(z[None], tol)
-        if found.code[0] == Result.successful and np.isfinite(found.r[0]).all():
-            return tol, found
-    code = Result(int(found.code[0]))
+        residuals = problem.evaluate(z[None], tol)
+        if residuals.code[0] == Result.successful and np.isfinite(residuals.r[0]).all():
+            return tol, residuals
+    code = Result(int(residuals.code[0]))
     cause = "some channels are NaN" if code == Result.successful else CAUSES[code]
     raise IdentificationError([f"there are no derivatives to check: {cause}"])
 
@@ -230,20 +232,20 @@ def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[Tolerance
 def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B R"]:
     """Return the predicted values of channels, in their units; NaN if a run fails."""
     rows = len(problem.index)
-    # So few at a time that they are computed one by one: vector lanes would have to be compiled.
+    # Batches small enough to be computed one by one, since a program with vector lanes would have to be compiled.
     together = max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns))
-    parts = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
-    r, code = np.concatenate([part.r for part in parts]), np.concatenate([part.code for part in parts])
+    batches = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
+    r, code = np.concatenate([batch.r for batch in batches]), np.concatenate([batch.code for batch in batches])
     values = r[:, :rows] * problem.sigma + problem.y[problem.present]
     return np.where((code == Result.successful)[:, None], values, np.nan)
 
 
 def _places(
-    problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, found: Differences
+    problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, differences: Differences
 ) -> tuple[DisagreementPlace, ...]:
     places = []
-    for rows, best in zip(series, best_steps((found.noise + found.truncation).T), strict=True):
-        difference = found.values[best][rows]
+    for rows, best in zip(series, best_steps((differences.noise + differences.truncation).T), strict=True):
+        difference = differences.values[best][rows]
         worst = int(np.argmax(np.abs(difference - slope[rows])))
         record, time, channel = problem.index[rows[worst]]
         name, t = problem.channel_names[channel], float(problem.ts[record, time])
@@ -251,16 +253,16 @@ def _places(
     return tuple(places)
 
 
-# --- words
+# --- text
 
 
 def _sentences(check: GradientCheck) -> list[str]:
-    found: dict[str, list[str]] = {}
+    directions: dict[str, list[str]] = {}
     for d, (name, s) in enumerate(zip(check.names, check.worst, strict=True)):
         if sentence := _sentence(check, d, s):
-            found.setdefault(sentence, []).append(name)
+            directions.setdefault(sentence, []).append(name)
     count = len(check.names)
-    return [f"{'all directions' if len(names) == count > 1 else join_names(names)}: {text}" for text, names in found.items()]
+    return [f"{'all directions' if len(names) == count > 1 else join_names(names)}: {text}" for text, names in directions.items()]
 
 
 def _sentence(check: GradientCheck, d: int, s: int) -> str:
@@ -287,11 +289,11 @@ def _table(check: GradientCheck) -> PrintedTable:
     several = len(check.series) > 1
     where = ["worst in"] if several else []
     cells, heads = [], ("direction", *where, "size", "differs by", "noise", "truncation", "its error", "step", "")
-    parts = [check.at_best(x) for x in (check.discrepancy, check.noise, check.truncation)]
+    errors = [check.at_best(x) for x in (check.discrepancy, check.noise, check.truncation)]
     for d, (name, s) in enumerate(zip(check.names, check.worst, strict=True)):
         size = check.size[d, s]
-        whole = np.fmax(size, parts[0][d, s]) or 1.0  # a zero derivative differs by the whole difference
-        relative = [f"{part[d, s] / whole:.1e}" for part in (*parts, check.derivative_error)]
+        scale = np.fmax(size, errors[0][d, s]) or 1.0  # a zero derivative differs by the whole difference
+        relative = [f"{values[d, s] / scale:.1e}" for values in (*errors, check.derivative_error)]
         verdict = "agrees" if check.agrees[d, s] else "unknown" if check.best[d, s] < 0 else "DIFFERS"
         where = [check.labels[s]] if several else []
         cells.append((name, *where, f"{size:.3g} {check.units[s]}".rstrip(), *relative, f"{check.step[d, s]:.0e}", verdict))

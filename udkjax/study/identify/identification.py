@@ -25,9 +25,9 @@ from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
 from udkjax.study.noise import Whiteness, whiteness_of
 
-MOST_REWEIGHTINGS = 2  # further fits, each weighted by the residuals of the previous one
-SAME_WEIGHT_RATIO = 1.05  # change of relative weights that shifts an estimate by a negligible part of its standard error
-INTEGRATION_ERROR = 1e-8  # relative to a channel's scale: smaller residuals are integration errors, not noise
+MOST_REWEIGHTINGS = 2  # number of further fits, each weighted by the residuals of the previous one
+SAME_WEIGHT_RATIO = 1.05  # change of relative weights that shifts an estimate by a negligible fraction of its standard error
+INTEGRATION_ERROR = 1e-8  # residuals below this, relative to a channel's scale, are integration errors, not noise
 
 
 @checked
@@ -53,9 +53,9 @@ def identify(
 
     With y the measured and yhat(z) the predicted values, sum ((yhat(z) - y) / sigma)^2 is minimized by SciPy's `least_squares`,
     with exact forward derivatives through the closure of all loops. If the fit from the first guess does not explain the records,
-    as when a predicted oscillation gets out of phase, growing parts of the records are fitted, each as long as the previous fit
-    can predict; then the same from other guesses, up to a factor of 2.5 away. If no guess leads to a fit, as with chaotic motion,
-    the records are cut into pieces (multiple shooting).
+    for example because a predicted oscillation gets out of phase, growing parts of the records are fitted, each as long as the
+    previous fit can predict; then the same is done from other guesses, up to a factor of 2.5 away. If no guess leads to a fit,
+    as with chaotic motion, the records are cut into pieces (multiple shooting).
 
     Args:
         mechanism: the scene, with first guesses.
@@ -65,14 +65,14 @@ def identify(
             bounds and priors.
         noise: standard deviation, in SI units, of all channels or of each by channel; by default estimated from the residuals of
             the fit.
-        initial_state: the `Start` of every record, or the parts of it to estimate ("position", "velocity", "both"); by default
-            the records' own, and for tables the scene's.
-        n_starts: maximum number of further first guesses to follow, the best of eight times as many samples; may be 0.
+        initial_state: the `Start` of every record, or the parts of the initial state to estimate ("position", "velocity",
+            "both"); by default that of each record, and for tables that of the scene.
+        n_starts: largest number of further first guesses to fit, chosen from eight times as many samples; may be 0.
         guesses: further first guesses (B, P), instead of `n_starts`.
         loss: "least_squares"; "huber" or "soft_l1", which reduce the influence of outliers; or a JAX function of the weighted
             residuals (R,), whose standard errors are those of least squares.
         optimizer: an optax optimizer without a line search; by default SciPy's least squares, or L-BFGS for a function `loss`.
-        strategy: "pieces" cuts the records into pieces at once; "auto" does so only if nothing else leads to a fit.
+        strategy: "pieces" cuts the records into pieces from the start; "auto" does so only if nothing else leads to a fit.
         tol: tolerance of the final integration, relative and absolute.
         seed: seed of the further first guesses.
         ignore: columns of tables that are not read.
@@ -93,17 +93,17 @@ def identify(
     method = choose_method(optimizer, loss)
     with report_progress(progress, None, "identify") as report:
         minimizer = Minimizer(method, residual_loss, lambda text: report(report.state.done + 1, text))
-        found = search(problem, first, (tol, tol), minimizer, 0 if guesses is not None else n_starts, seed, strategy)
-        _require_finite(problem, found)
-        fit, history = _refit(found, (tol, tol), minimizer)
-    return _estimate_of(fit, found, history, (tol, tol), residual_loss, time.perf_counter() - start)
+        result = search(problem, first, (tol, tol), minimizer, 0 if guesses is not None else n_starts, seed, strategy)
+        _require_finite(problem, result)
+        fit, history = _refit(result, (tol, tol), minimizer)
+    return _estimate_of(fit, result, history, (tol, tol), residual_loss, time.perf_counter() - start)
 
 
-MOST_STARTS = 10**6  # first guesses: more would not fit into memory
+MOST_STARTS = 10**6  # largest number of first guesses; more would not fit into memory
 
 
 def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:
-    """Return first guesses of all unknowns, those of initial states being zero."""
+    """Return first guesses of all unknowns; those of initial states are zero."""
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
     if not 0 <= n_starts <= MOST_STARTS:
         raise IdentificationError([f"n_starts: must be a number of guesses between 0 and {MOST_STARTS:,}, is {n_starts}"])
@@ -146,36 +146,38 @@ def _refit(found: SearchResult, tol: TolerancePair, minimizer: Minimizer) -> tup
 
 
 def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, loss: Loss, least: float = 0.0) -> bool:
-    """Set the noise of channels for which it was not given from their residuals, but to at least `least` times their scale.
+    """Set the noise of channels without given noise from their residuals, but to at least `least` times the channel's scale.
 
     Returns:
         True if the relative weights of residuals changed, so that another fit is needed.
     """
-    before = problem.sigma.copy()
+    old_sigma = problem.sigma.copy()
     rows = len(problem.index)
     r = problem.evaluate(z[None], tol).r[0, :rows]
     residuals, inliers = r * problem.sigma, ~find_outlier_rows(problem, r)
     for c in range(len(problem.channels)):
-        own = (problem.index[:, 2] == c) & ~problem.noise_given & inliers
-        if own.any():
-            # Each channel loses its part of the degrees of freedom to the unknowns.
-            freedom = own.sum() * (1.0 - (problem.K - problem.constrained) / rows)
-            size = np.sqrt(residuals[own] @ residuals[own] / max(freedom, 1.0))
-            every = (problem.index[:, 2] == c) & ~problem.noise_given
-            problem.sigma[every] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
-    ratio = problem.sigma / before
+        measured_inliers = (problem.index[:, 2] == c) & ~problem.noise_given & inliers
+        if measured_inliers.any():
+            # Each channel loses a share of the degrees of freedom to the unknowns.
+            freedom = measured_inliers.sum() * (1.0 - (problem.K - problem.constrained) / rows)
+            size = np.sqrt(residuals[measured_inliers] @ residuals[measured_inliers] / max(freedom, 1.0))
+            measured = (problem.index[:, 2] == c) & ~problem.noise_given
+            problem.sigma[measured] = max(size, max(least, np.finfo(float).tiny ** 0.25) * problem.channel_scale[c])
+    ratio = problem.sigma / old_sigma
     return bool(ratio.max() > SAME_WEIGHT_RATIO * ratio.min()) or loss is not squares or bool(len(problem.priors))
 
 
-def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: TolerancePair, loss: Loss, seconds: float) -> Estimate:
+def _estimate_of(
+    fit: Fit, search_result: SearchResult, history: CostHistory, tol: TolerancePair, loss: Loss, seconds: float
+) -> Estimate:
     """Return the estimate of a fit."""
-    problem = found.problem
+    problem = search_result.problem
     unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z
     x, states = unknowns.values(z[:P]), problem.state_sizes * z[P:]
     plain, rows = problem.evaluate(z[None], tol), len(problem.index)
     weighted = loss(plain)
     outlying, robust = find_outlier_rows(problem, plain.r[0, :rows]), loss is not squares
-    # Outliers hardly count in a robust loss and are left out here; least squares counts them, and so do standard errors.
+    # Outliers hardly affect a robust loss and are left out here; in least squares they count, also for standard errors.
     inliers = np.concatenate([~outlying | (not robust), np.ones(problem.extra_rows, bool)])
     groups = problem.noise_groups()
     values = UnknownValues(
@@ -193,11 +195,13 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
     residual = -plain.r[0, :rows] * problem.sigma
     sigma, whitened = problem.sigma * scale[:rows], weighted.r[0, :rows]
     if outlying.any():
-        others = _residuals_of_others(problem, plain, outlying)
+        inlier_residuals = _residuals_of_others(problem, plain, outlying)
         for g in np.unique(groups[:rows][outlying & (groups[:rows] >= 0)]):
-            own = groups[:rows] == g
-            sigma[own] = problem.sigma[own] * np.sqrt(np.nanmean(others[own] ** 2) / (1.0 - problem.K / inliers.sum()))
-        whitened = others
+            in_group = groups[:rows] == g
+            sigma[in_group] = problem.sigma[in_group] * np.sqrt(
+                np.nanmean(inlier_residuals[in_group] ** 2) / (1.0 - problem.K / inliers.sum())
+            )
+        whitened = inlier_residuals
     white: dict[tuple[int, str], Whiteness] = {}
     for places in problem.series():
         record, _, channel = problem.index[places[0]]
@@ -220,9 +224,9 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
         outliers=list_outliers(problem, outlying, residual, sigma),
         whiteness=white,
         converged=fit.converged,
-        agreeing=found.agreeing,
-        guesses=found.guesses,
-        ways=found.ways,
+        agreeing=search_result.agreeing,
+        guesses=search_result.guesses,
+        ways=search_result.ways,
         history=tuple(history),
         evaluations=problem.predictor.evaluations,
         seconds=seconds,
@@ -233,8 +237,8 @@ def _estimate_of(fit: Fit, found: SearchResult, history: CostHistory, tol: Toler
     )
 
 
-def _residuals_of_others(problem: FitProblem, found: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
+def _residuals_of_others(problem: FitProblem, fitted: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
     """Return the residuals of a fit without the outliers, to first order; NaN at the outliers."""
-    r, J, inliers = found.r[0], found.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
+    r, J, inliers = fitted.r[0], fitted.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
     residuals = r - J @ np.linalg.lstsq(J[inliers], r[inliers], rcond=INVISIBLE_RATIO)[0]
     return np.where(outlying, np.nan, residuals[: len(outlying)])

@@ -17,21 +17,22 @@ from scipy.linalg import lstsq
 from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
 from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN
 
-# Gauss-Newton steps (largest change of a dimensionless unknown) at which a fit has converged: of a part of the records; with
-# loose integration; with costs exact to the square of the step; and of the final fit, where smaller steps have no visible effect.
+# Gauss-Newton steps (largest change of a dimensionless unknown) at which a fit has converged: for a part of the records; with
+# loose integration; with costs exact to the square of the step; and for the final fit, where smaller steps have no visible
+# effect.
 COARSE_STEP, LOOSE_STEP, FINE_STEP, EXACT_STEP = 1e-3, 1e-5, 1e-6, 1e-10
-# Maximum number of steps: of a part of the records, or near a minimum; from a first guess, which is hopeless if it has not
-# converged by then; and of the final fit.
+# Maximum number of steps: for a part of the records, or near a minimum; from a first guess, which is given up if it has not
+# converged by then; and for the final fit.
 FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
-# Cosine of the angle between the residuals and the range of J at which a fit has converged: times the square root of the number
-# of residuals it is the Gauss-Newton step in standard errors, of which a thousandth is negligible.
+# Cosine of the angle between the residuals and the range of J at which a fit has converged. Multiplied by the square root of the
+# number of residuals, it is the Gauss-Newton step in standard errors, of which a thousandth is negligible.
 ORTHOGONAL_COSINE = 1e-5
-MOST_REFUSED_STEPS = 8  # successive rejected steps before a fit is given up
-ROUNDING = 4 * float(np.finfo(float).eps)  # relative to the unknowns: shorter steps are rounding
+MOST_REFUSED_STEPS = 8  # number of successive rejected steps after which a fit is given up
+ROUNDING = 4 * float(np.finfo(float).eps)  # steps below this, relative to the unknowns, are rounding errors
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
 ReportStep: TypeAlias = Callable[[str], None]  # called with a message after each step
-CostHistory: TypeAlias = list[tuple[float, float]]  # after each step: cost, and largest change of an unknown in the next step
+CostHistory: TypeAlias = list[tuple[float, float]]  # cost after each step, and largest change of an unknown in the next step
 
 
 class Fit(NamedTuple):
@@ -54,7 +55,7 @@ def minimize_squares(
     from scipy.optimize import least_squares
 
     fit = _TrustRegionFit(evaluate, z, step_tol, report)
-    # `Descent` decides when a fit ends, except for the number of steps.
+    # `Descent` ends a fit by all conditions except the number of steps.
     choices: dict[str, Any] = {"jac": fit.jacobian, "ftol": None, "gtol": None, "xtol": ROUNDING, "max_nfev": steps}
     with suppress(StopIteration):
         least_squares(fit.residuals, np.zeros(len(z)), **choices)
@@ -85,7 +86,7 @@ class Descent:
 class _TrustRegionFit(Descent):
     """Residuals and Jacobians at changes of a guess, as callbacks of SciPy."""
 
-    refused = 0  # trials since the last improvement
+    refused = 0  # number of trials since the last improvement
 
     def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R"]:
         """Return the residuals; infinite if they cannot be computed."""
@@ -97,7 +98,7 @@ class _TrustRegionFit(Descent):
             self.end, self.refused = self.end._replace(z=z, cost=cost), 0
             return r
         self.refused += 1
-        is_finest = self.size <= FINE_STEP and self.refused >= 2  # further improvements are rounding
+        is_finest = self.size <= FINE_STEP and self.refused >= 2  # further improvements are rounding errors
         if not self.end.history or is_finest or self.refused >= MOST_REFUSED_STEPS:
             self.stop(is_finest)
         return r if ok else np.full_like(r, np.inf)
@@ -113,7 +114,7 @@ class _TrustRegionFit(Descent):
 
 
 def gauss_newton(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[float, float]:
-    """Return the largest entry of the Gauss-Newton step in determined directions, and the cosine of the angle between r and J."""
+    """Return the largest entry of the Gauss-Newton step in determined directions, and the cosine between r and the range of J."""
     step, _, rank, _ = lstsq(J, r, cond=INVISIBLE_RATIO, lapack_driver="gelsy")
     if not rank:
         return np.inf, np.inf

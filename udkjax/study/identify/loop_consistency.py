@@ -1,14 +1,14 @@
-"""Parameters that may vary: those that keep the loops of an overconstrained mechanism closed.
+"""Check that the loops of an overconstrained mechanism remain closed when parameters vary.
 
-Redundant rows of Psi are consistent for certain values of the parameters only: three cranks carry one coupler only if they are
-equally long. With N the left null space of Psi_q at a closed position, a change dp of parameters keeps it closed to first order
-if and only if
+Redundant rows of Psi are consistent only for certain values of the parameters: three cranks can carry one coupler only if they
+are equally long. With N the left null space of Psi_q at a closed position, a change dp of parameters keeps it closed to first
+order if and only if
 
     N^T (dPsi/dp) dp = 0        with dPsi/dp at fixed q.
 
 This must hold at all positions, and it is not sufficient: cranks of l + d, l and l - d satisfy it, and violate the constraints to
-second order. So a change that is consistent to first order is verified by a finite step: the mechanism must close with the same
-rank. Everything is NumPy on the programs of the rows; without redundant rows there is nothing to do.
+second order. A change that is consistent to first order is therefore verified by a finite step: the mechanism must close with the
+same rank. All of this is NumPy on the programs of the rows; without redundant rows nothing is checked.
 """
 
 import dataclasses
@@ -32,18 +32,18 @@ from udkjax.study.identify.unknowns import Unknowns, apply_values, sample_guesse
 from udkjax.study.report import ratio
 from udkjax.wording import join_names, quote
 
-# Part of a parameter's effect on Psi along N that counts as zero. Differences at positions that are closed to 1e-11 leave 5e-12;
-# a parameter that opens a loop has a tenth or more.
+# Fraction of a parameter's effect on Psi along N that counts as zero. Differences at positions that are closed to 1e-11 have
+# errors of 5e-12; a parameter that opens a loop has a fraction of a tenth or more.
 DEPENDENT_PART = 1e-6
-DIFFERENCE_STEP = 1e-5  # relative to a parameter's value: the step of the central differences
-# Relative to a parameter's size (its value, or less if that changes a row by more than the row's own size): the step after which
-# a mechanism must close again. A loop that opens to second order does so by 1e-4 of the size, ten million times the tolerance of
+DIFFERENCE_STEP = 1e-5  # step of the central differences, relative to a parameter's value
+# Step after which a mechanism must close again, relative to a parameter's size (its value, or less if that changes a row by more
+# than the row's size). A loop that opens to second order does so by 1e-4 of the size, ten million times the tolerance of
 # closing (`position_closure.CLOSED_TOL`).
 CLOSING_STEP = 1e-2
-SMALL_VALUE = 1e-5  # relative to the size by effect: smaller values, such as coordinates, count as zero
-MOST_POSITIONS = 4  # positions that are closed again
-NEARBY_GUESSES = 64  # guesses to try if the first cannot be closed
-MOST_STORED = 256  # stored structures of mechanisms whose parameters keep all loops closed
+SMALL_VALUE = 1e-5  # values below this count as zero, relative to the size by effect; coordinates can be so small
+MOST_POSITIONS = 4  # number of positions that are closed again
+NEARBY_GUESSES = 64  # number of guesses to try if the first cannot be closed
+MOST_STORED = 256  # number of stored structures of mechanisms whose parameters keep all loops closed
 SAME_CHANGE = 1e-3  # relative difference of changes that count as equal or proportional
 SAME_VALUE = 1e-9  # relative difference of values that count as equal
 _consistent: set[Hashable] = set()
@@ -54,19 +54,19 @@ def loop_problems(
 ) -> list[str]:
     """Return a message for each set of parameters that cannot vary independently without opening a loop.
 
-    `apply` assigns values (P,), which may be traced, to a mechanism that closes; x are the values to vary. A message names the
-    constraints that close a loop, the parameters that would open it, and the ties that keep it closed.
+    `apply` assigns values (P,), which may be traced, to a mechanism that can be closed; x are the values to vary. A message
+    names the constraints that close a loop, the parameters that would open it, and the ties that keep it closed.
     """
     redundant = analyse(mechanism).redundant_rows
     if redundant == () or not names:
         return []
-    placed = deferred(lambda x: apply(mechanism, x).without_origin)  # traced, so that no difference step is refused for its sign
+    placed = deferred(lambda x: apply(mechanism, x).without_origin)  # traced, since a concrete step may be refused for its sign
     x = np.asarray(x, float)
     steps = DIFFERENCE_STEP * np.where(x != 0.0, np.abs(x), min(_length(placed(x)), 1.0))
     moving = [
         i for i, step in enumerate(np.diag(steps)) if _constraint_bytes(placed(x + step)) != _constraint_bytes(placed(x - step))
     ]
-    if not moving:  # all of them are masses or forces
+    if not moving:  # all parameters are masses or forces
         return []
     names = [names[i] for i in moving]
     at = np.eye(len(x))[moving]
@@ -80,7 +80,7 @@ def loop_problems(
 
 
 def nearest_closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Analysis, Unknowns]:
-    """Return the analysis of the mechanism at its first guess, or at the nearest that can be closed, and the unknowns there."""
+    """Return the mechanism's analysis and the unknowns, at the first guess or the nearest guess that can be closed."""
     z = sample_guesses(unknowns, np.zeros(len(unknowns.names)), NEARBY_GUESSES, seed)
     nearby = unknowns.values(z[np.argsort(np.linalg.norm(z, axis=1))])
     for k, x in enumerate([unknowns.guess, *nearby]):
@@ -98,7 +98,7 @@ def nearest_closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tup
 def require_consistent_loops(mechanism: Mechanism, unknowns: Unknowns) -> None:
     """Check that the parameters keep all loops closed.
 
-    The result is stored by the structure of the mechanism, since it does not depend on its numbers.
+    The result is stored by the structure of the mechanism, since the numbers do not affect it.
 
     Raises:
         IdentificationError: some parameters would open a loop.
@@ -126,7 +126,7 @@ def _constraint_bytes(mechanism: Mechanism) -> list[bytes]:
 class RedundantLoops:
     """Closed positions of a mechanism with redundant rows, and the effect of parameters on these rows.
 
-    `changed` maps changes (P,) of the parameters, whose values are x, to mechanisms; `steps` (P,) are the difference steps.
+    `changed` maps changes (P,) of the parameters x to mechanisms; `steps` (P,) are the steps of differences.
     """
 
     def __init__(self, mechanism: Mechanism, changed: Callable[[np.ndarray], Mechanism], x: np.ndarray, steps: np.ndarray):
@@ -134,43 +134,43 @@ class RedundantLoops:
         original = changed(np.zeros(len(x)))
         self.x, rows = x, kinematic_rows(original)
         with np.errstate(all="ignore"):
-            found = sample_positions(rows, np.asarray(original.q0, float).ravel())
-        self.redundant = rows.count - found[0].rank if found else 0
+            positions = sample_positions(rows, np.asarray(original.q0, float).ravel())
+        self.redundant = rows.count - positions[0].rank if positions else 0
         if not self.redundant:
             return
         self._drivers = mechanism.driver_names
-        self._positions = [p for p in found if p.smallest > GENERIC_TOL] or found
+        self._positions = [p for p in positions if p.smallest > GENERIC_TOL] or positions
         self._names = [name for name, _ in rows.names]
-        self._redundant_rows = list(choose_redundant_rows(rows, found))
+        self._redundant_rows = list(choose_redundant_rows(rows, positions))
         self._measure(rows, steps, _length(original))
 
     def _measure(self, rows: PositionRows, steps: np.ndarray, length_scale: float):
         """Differentiate Psi by each parameter, and project on the left null space, which no motion can compensate."""
-        at = [rows.at(p.t, p.q) for p in self._positions]
+        evaluated = [rows.at(p.t, p.q) for p in self._positions]
         columns = []
         for step in np.diag(steps):
             ahead, behind = self._rows(step), self._rows(-step)
             moved = [ahead.at(p.t, p.q)[0] - behind.at(p.t, p.q)[0] for p in self._positions]
             columns.append(np.array(moved) / (2 * step.sum()))
         slope = np.stack(columns, -1)  # (positions, rows, P)
-        # The natural size of a row is the longest arm by which it rotates a body, which is 1 for angular rows.
-        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in at], axis=0)
-        most = np.abs(slope / np.where(arms > 0.0, arms, length_scale)[:, None]).max((0, 1))
-        by_effect = 1.0 / np.where(most > 0.0, most, np.inf)
-        own = np.abs(self.x)
-        self._size = np.where(own < SMALL_VALUE * by_effect, by_effect, np.minimum(own, by_effect))
-        effect = slope / np.array([length for _, length, _ in at])[:, :, None]
+        # The natural size of a row is the longest lever arm of its rotations, which is 1 for angular rows.
+        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in evaluated], axis=0)
+        largest = np.abs(slope / np.where(arms > 0.0, arms, length_scale)[:, None]).max((0, 1))
+        by_effect = 1.0 / np.where(largest > 0.0, largest, np.inf)
+        magnitude = np.abs(self.x)
+        self._size = np.where(magnitude < SMALL_VALUE * by_effect, by_effect, np.minimum(magnitude, by_effect))
+        effect = slope / np.array([length for _, length, _ in evaluated])[:, :, None]
         total = np.sqrt((effect**2).sum((0, 1)) / len(effect))
-        self._unit = 1.0 / np.where(total > 0, total, 1.0)  # change of each parameter that has an effect of one
+        self._unit = 1.0 / np.where(total > 0, total, 1.0)  # change of each parameter whose effect is one
         self._effect = effect * self._unit
         null_spaces = [dense(p.null_space) for p in self._positions]
         self._unclosed = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])
-        # One combination of rows for each redundant row, which expresses it by the others.
+        # A combination of rows for each redundant row: it expresses this row by the others.
         self._circuits = np.array([N @ np.linalg.inv(N[self._redundant_rows]) for N in null_spaces])
 
     def problems(self, names: Sequence[str]) -> list[str]:
         """Return a message for each set of parameters that cannot vary independently."""
-        found = []
+        messages = []
         relations = row_space(self._unclosed, DEPENDENT_PART)
         sets = connected_columns(relations)
         free = sorted(set(range(len(self.x))) - {i for members in sets for i in members})
@@ -179,11 +179,11 @@ class RedundantLoops:
             for part in connected_columns(row_space(null_space(ties, SMALLEST_COEFFICIENT), SMALLEST_COEFFICIENT)):
                 members = [free[i] for i in part]
                 inside = [i for i in range(len(ties)) if np.any(ties[i, part])]
-                found.append(self._message(names, members, ties[np.ix_(inside, part)]))
+                messages.append(self._message(names, members, ties[np.ix_(inside, part)]))
         for members in sets:
             ties = self._ties(members, null_space(self._unclosed[:, members], DEPENDENT_PART))
-            found.append(self._message(names, members, ties))
-        return found
+            messages.append(self._message(names, members, ties))
+        return messages
 
     def _closes(self, directions: np.ndarray) -> bool:
         """Return True if the mechanism closes with the same rank after a step along a combination of all directions."""
@@ -192,8 +192,8 @@ class RedundantLoops:
         step = np.random.default_rng(1).uniform(0.5, 1.0, len(directions)) @ directions
         step = step * CLOSING_STEP / np.max(np.abs(step * self._unit) / self._size) * self._unit
         rows = self._rows(step)
-        every = max(1, len(self._positions) // MOST_POSITIONS)
-        for p in self._positions[::every]:
+        stride = max(1, len(self._positions) // MOST_POSITIONS)
+        for p in self._positions[::stride]:
             with np.errstate(all="ignore"):
                 closed = rows.close(p.t, p.q)
             if closed is None or closed.rank != p.rank:
@@ -211,16 +211,16 @@ class RedundantLoops:
             trial = np.vstack([chosen, candidate / size])
             if np.linalg.svd(trial)[1][-1] < SMALLEST_COEFFICIENT:
                 continue
-            every = np.zeros((len(trial), len(self.x)))
-            every[:, members] = trial
-            if self._closes(every):
+            directions = np.zeros((len(trial), len(self.x)))
+            directions[:, members] = trial
+            if self._closes(directions):
                 chosen = trial
             if len(chosen) == len(closed):
                 break
         return chosen
 
     def _candidates(self, members: Sequence[int], closed: np.ndarray) -> Iterator[np.ndarray]:
-        """Iterate over candidate ties: each parameter, two or all by the same amount or factor, and others that are `closed`."""
+        """Iterate over candidate ties: each parameter alone; two or all by the same amount or factor; and a basis of `closed`."""
         x, unit, n = self.x[members], self._unit[members], len(members)
         each = np.eye(n)
         yield from each
@@ -233,10 +233,10 @@ class RedundantLoops:
     def _message(self, names: Sequence[str], members: Sequence[int], ties: np.ndarray) -> str:
         ties = np.where(np.abs(ties) > SMALLEST_COEFFICIENT, ties, 0.0)
         ties = ties[np.count_nonzero(ties, axis=1) > 1] * self._unit[members]
-        own, x = [names[i] for i in members], self.x[members]
-        who = join_names(own)
-        stuck = [name for name, tied in zip(own, np.any(ties, axis=0), strict=True) if not tied]
-        if len(own) == 1:
+        own_names, x = [names[i] for i in members], self.x[members]
+        who = join_names(own_names)
+        stuck = [name for name, tied in zip(own_names, np.any(ties, axis=0), strict=True) if not tied]
+        if len(own_names) == 1:
             return (
                 f"{who} cannot vary by itself: {self._loop_text(members)} that only closes for its present value; "
                 "keep it fixed, or tie it to the parameters that must vary with it"
@@ -246,7 +246,7 @@ class RedundantLoops:
                 f"{who} cannot vary, neither independently nor together: {self._loop_text(members)} that only closes for their "
                 "present values; keep them fixed"
             )
-        condition = ", for ".join(tie_text(own, x, u) for u in ties)
+        condition = ", for ".join(tie_text(own_names, x, u) for u in ties)
         cure = f"tie them, and keep {join_names(stuck)} fixed" if stuck else "tie them, or keep them fixed"
         return f"{who} cannot vary independently: {self._loop_text(members)} that only closes for {condition}; {cure}"
 

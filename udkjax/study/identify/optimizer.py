@@ -26,14 +26,14 @@ from udkjax.study.identify.least_squares import (
 from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.identify.records import IdentificationError
 
-if TYPE_CHECKING:  # imported only when needed: it takes a second
+if TYPE_CHECKING:  # imported only when needed, since this takes a second
     import optax
 
 GRADIENT_STEPS = 2000  # maximum number of steps of a first-order optimizer
-FAILED_COST = 100.0  # times the first cost, substituted for a cost that cannot be computed
-TUNING_CONSTANT = 1.345  # standard deviations: for Gaussian noise, estimates lose 5 % of their efficiency
+FAILED_COST = 100.0  # substituted for a cost that cannot be computed, relative to the first cost
+TUNING_CONSTANT = 1.345  # in standard deviations; with it, estimates lose 5 % of their efficiency for Gaussian noise
 
-Loss: TypeAlias = Callable[[Residuals], Residuals]  # transforms plain residuals into those whose squares are minimized
+Loss: TypeAlias = Callable[[Residuals], Residuals]  # transforms plain residuals into residuals whose squares are minimized
 UserLoss: TypeAlias = Callable[[Array], Array]
 Optimizer: TypeAlias = "optax.GradientTransformation | None"
 
@@ -49,7 +49,7 @@ def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> GradientMethod 
     """Return the gradient method for an optimizer and a loss; None for least squares.
 
     Raises:
-        IdentificationError: the optimizer has a line search, for which it would have to call the loss itself.
+        IdentificationError: the optimizer has a line search, which would have to call the loss.
     """
     if optimizer is None:
         return GradientMethod(None, loss) if callable(loss) else None
@@ -71,7 +71,7 @@ def squares(found: Residuals) -> Residuals:
 
 
 def named_loss(name: str, residuals: int) -> Loss:
-    """Return the loss with a name, for the first `residuals` of a problem: priors are not outliers."""
+    """Return the loss with a name, applied to the first `residuals` of a problem, since priors are not outliers."""
     if name == "least_squares":
         return squares
     if name in ROBUST:
@@ -80,7 +80,7 @@ def named_loss(name: str, residuals: int) -> Loss:
 
 
 def robust(found: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:
-    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J: its sum of squares and their gradient are those of rho.
+    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J; s.s and its gradient equal those of the sum of rho.
 
     `rho` returns rho(|r|) and half of its derivative.
     """
@@ -89,10 +89,10 @@ def robust(found: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.nd
     value, half_slope = rho(size)
     s = np.sqrt(value)
     slope = np.where(s > 0.0, half_slope / np.where(s > 0.0, s, 1.0), 1.0)
-    rest = found.r[:, residuals:], found.J[:, residuals:]
+    further = found.r[:, residuals:], found.J[:, residuals:]
     return Residuals(
-        np.concatenate([np.sign(r) * s, rest[0]], 1),
-        np.concatenate([slope[..., None] * found.J[:, :residuals], rest[1]], 1),
+        np.concatenate([np.sign(r) * s, further[0]], 1),
+        np.concatenate([slope[..., None] * found.J[:, :residuals], further[1]], 1),
         found.code,
     )
 
@@ -147,7 +147,7 @@ class Minimizer:
         steps: int = STEPS,
         step_tol: float = EXACT_STEP,
     ) -> Fit:
-        """Fit the first `horizon` seconds of each record (None: all of it) from a first guess: see `minimize_squares`."""
+        """Fit the first `horizon` seconds of each record (None: the whole record) from a first guess: see `minimize_squares`."""
         evaluate = weighted_residuals(problem, tol, self.loss, horizon)
         if self.method is not None:
             return minimize_by_gradient(self.method, evaluate, z, step_tol=step_tol, report=self.report)
@@ -168,9 +168,9 @@ def minimize_by_gradient(
 ) -> Fit:
     """Minimize a loss rho(r) by its gradient J^T d rho / dr, from a first guess.
 
-    A fit has converged if (J^T J)^-1 J^T d rho / dr is at most `step_tol`, but at least as large as first-order methods reach.
-    Derivatives are forward here, too: with 20 unknowns a gradient in reverse mode takes a fifth of the time, but 20 to 40 s to
-    compile.
+    A fit has converged if (J^T J)^-1 J^T d rho / dr is at most `step_tol`, which is raised to what first-order methods can reach.
+    Derivatives are in forward mode here too: with 20 unknowns, reverse mode takes a fifth of the time for a gradient, but 20 to
+    40 s to compile.
     """
     descent = _LossDescent(method.loss or _half_square, evaluate, z, max(step_tol, FINE_STEP), report)
     with suppress(StopIteration):
@@ -185,10 +185,10 @@ def _descend(optimizer: Optimizer, descent: "_LossDescent", steps: int) -> None:
         options = {"maxiter": steps, "maxfun": 20 * steps, "ftol": 0.0, "gtol": 0.0}
         scipy.optimize.minimize(descent, descent.guess, jac=True, method="L-BFGS-B", options=options)
         return
-    at = jnp.asarray(descent.guess)
-    state, update = optimizer.init(at), jax.jit(partial(_update, optimizer))
+    unknowns = jnp.asarray(descent.guess)
+    state, update = optimizer.init(unknowns), jax.jit(partial(_update, optimizer))
     for _ in range(steps):
-        at, state = update(state, at, *descent(np.asarray(at)))
+        unknowns, state = update(state, unknowns, *descent(np.asarray(unknowns)))
 
 
 def _update(optimizer: "optax.GradientTransformation", state, at, value, gradient):

@@ -11,8 +11,8 @@ from udkjax.study.identify.records import label_prefixes, output_times
 from udkjax.study.noise import outlier_rows
 from udkjax.wording import plural
 
-NOISE_FLOOR = 1e-6  # relative to a channel's scale: least noise of measurements
-MOST_OUTLIERS_NAMED = 5  # outliers listed per channel, the largest; the others are counted
+NOISE_FLOOR = 1e-6  # least noise of measurements, relative to a channel's scale
+MOST_OUTLIERS_NAMED = 5  # number of listed outliers per channel, the largest; the others are counted
 
 
 class Outlier(NamedTuple):
@@ -24,47 +24,50 @@ class Outlier(NamedTuple):
     time: float
     residual: float
     units: str
-    deviations: float  # residual over the noise of the channel's other values
+    deviations: float  # ratio of the residual to the noise of the channel's other values
 
 
 def find_outlier_rows(problem: FitProblem, r: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R"]:
     """Return a mask of the outliers from weighted residuals, channel by channel over all records."""
-    found, channel = np.zeros(len(problem.index), bool), problem.index[:, 2]
+    mask, channel = np.zeros(len(problem.index), bool), problem.index[:, 2]
     shows = np.abs(r * problem.sigma) > NOISE_FLOOR * problem.channel_scale[channel]
     for c in range(len(problem.channels)):
-        own = np.flatnonzero(channel == c)
-        found[own] = outlier_rows(r[own]) & shows[own]
-    return found
+        of_channel = np.flatnonzero(channel == c)
+        mask[of_channel] = outlier_rows(r[of_channel]) & shows[of_channel]
+    return mask
 
 
 def list_outliers(
     problem: FitProblem, rows: Bool[np.ndarray, "R"], residuals: Float[np.ndarray, "R"], sigma: Float[np.ndarray, "R"]
 ) -> tuple[Outlier, ...]:
     """Return the outliers, with residuals in the units of their channels and the noise of the other values."""
-    found = []
+    outliers = []
     for k in np.flatnonzero(rows).tolist():
         record, time, c = problem.index[k].tolist()
-        channel, before = problem.channels[c], output_times(problem.records[record])[1]
-        place = record, channel.name, time - before, float(problem.ts[record, time])
-        found.append(Outlier(*place, float(residuals[k]), channel.units, float(abs(residuals[k]) / sigma[k])))
-    return tuple(found)
+        channel, padding = problem.channels[c], output_times(problem.records[record])[1]
+        location = record, channel.name, time - padding, float(problem.ts[record, time])
+        outliers.append(Outlier(*location, float(residuals[k]), channel.units, float(abs(residuals[k]) / sigma[k])))
+    return tuple(outliers)
 
 
 def outlier_sentences(problem: FitProblem, outliers: Sequence[Outlier], robust: bool) -> Iterator[str]:
     """Iterate over sentences that list the outliers of each channel of each record, with advice."""
     prefixes = label_prefixes(problem.records)
-    for k, name in dict.fromkeys((one.record, one.channel) for one in outliers):
-        own = sorted((one for one in outliers if (one.record, one.channel) == (k, name)), key=lambda one: -one.deviations)
+    for k, name in dict.fromkeys((outlier.record, outlier.channel) for outlier in outliers):
+        of_channel = sorted(
+            (outlier for outlier in outliers if (outlier.record, outlier.channel) == (k, name)),
+            key=lambda outlier: -outlier.deviations,
+        )
         named = [
-            f"row {one.row} ({one.time:.6g} s) by {f'{one.residual:.3g} {one.units}'.rstrip()}, "
-            f"{one.deviations:.3g} standard deviations"
-            for one in own[:MOST_OUTLIERS_NAMED]
+            f"row {outlier.row} ({outlier.time:.6g} s) by {f'{outlier.residual:.3g} {outlier.units}'.rstrip()}, "
+            f"{outlier.deviations:.3g} standard deviations"
+            for outlier in of_channel[:MOST_OUTLIERS_NAMED]
         ]
-        more = f" and {len(own) - MOST_OUTLIERS_NAMED} more" if len(own) > MOST_OUTLIERS_NAMED else ""
+        more = f" and {len(of_channel) - MOST_OUTLIERS_NAMED} more" if len(of_channel) > MOST_OUTLIERS_NAMED else ""
         cure = (
             "the robust loss gives outliers little weight"
             if robust
             else "outliers shift the estimate and enlarge the standard errors: replace them by nan, or use loss='huber'"
         )
-        where = f"{prefixes[k]}{name}: {plural(len(own), 'outlier')} far from the prediction"
+        where = f"{prefixes[k]}{name}: {plural(len(of_channel), 'outlier')} far from the prediction"
         yield f"{where}, {'; '.join(named)}{more}: {cure}"

@@ -1,4 +1,4 @@
-"""Parameters to be identified: how users name them, and the numbers of the mechanism that they set."""
+"""Parameters to be identified: their names, and the numbers of the mechanism that they set."""
 
 import re
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ from udkjax.wording import quote, suggestion
 
 
 def length(*bodies: str, as_rod: bool = False) -> Length:
-    """Return the length of a link as a parameter, or the common length of several; it moves attachments and centre of mass.
+    """Return the length of a link, or the common length of several, as a parameter; it moves attachments and centre of mass.
 
     Args:
         *bodies: the names of the links.
-        as_rod: whether mass and inertia change with the length as those of a uniform rod; see `udkjax.with_length`.
+        as_rod: whether mass and inertia change with the length as for a uniform rod; see `udkjax.with_length`.
 
     Returns:
         A `Length`, to be given to `identify` as a parameter.
@@ -40,14 +40,15 @@ class Parameter:
 
     Attributes:
         of: the name of a number of the scene (`body.link1.mass`, `joint.A.points[1][0]`), a `length`, several tied names or
-            lengths, or a pure function (mechanism, value) -> mechanism. As text, ties are written with equals signs
-            (`body.a.mass = body.b.mass`, `length(a) = length(b)`), a shared factor as `scale(body.a.mass, body.b.mass)`.
-        name: its name; by default the text.
-        guess: the first guess, in SI units; by default the scene's value. A function needs one.
-        bounds: (low, high), between which the value stays.
+            lengths, or a pure function (mechanism, value) -> mechanism. In strings, ties are written with equals signs
+            (`body.a.mass = body.b.mass`, `length(a) = length(b)`), and a shared factor as `scale(body.a.mass, body.b.mass)`.
+        name: name of the parameter; by default its text.
+        guess: the first guess, in SI units; by default the scene's value. A function needs a guess.
+        bounds: (low, high), the range of the value.
         prior: (mean, standard deviation) of the prior knowledge.
-        transform: "positive", "bounded" or "free"; by default "bounded" with bounds, and "positive" for numbers that must be.
-        scale: typical size of a change of a free parameter; by default its own size, or 1 SI unit.
+        transform: "positive", "bounded" or "free"; by default "bounded" with bounds, and "positive" for numbers that must be
+            positive.
+        scale: typical size of a change of a free parameter; by default its absolute value, or 1 SI unit.
         share: "value": tied parameters have the same value; "scale": the scene's values are multiplied by the same factor.
     """
 
@@ -81,40 +82,40 @@ def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
     """
     items = [given] if isinstance(given, str | Length | Parameter) or callable(given) else list(given)
     problems: list[str] = []
-    found = [unknown for item in items for unknown in _entries(mechanism, item, problems)]
+    unknowns = [unknown for item in items for unknown in _entries(mechanism, item, problems)]
     if not items:
         problems.append("parameters: the list is empty; name at least one, such as body.link1.mass")
-    names = [unknown.name for unknown in found]
+    names = [unknown.name for unknown in unknowns]
     problems += [f"{quote(n)}: is given {names.count(n)} times" for n in dict.fromkeys(names) if names.count(n) > 1]
-    owner: dict[str, str] = {}  # the parameter that contains each number of the scene
-    for unknown in found:
+    owner: dict[str, str] = {}  # name of the parameter that sets each number of the scene
+    for unknown in unknowns:
         for number in unknown.target.names:
-            other = owner.setdefault(number, unknown.name)
-            if other != unknown.name:
-                problems.append(f"{quote(unknown.name)}: {number} is also part of {quote(other)}; tie them, or give only one")
+            earlier = owner.setdefault(number, unknown.name)
+            if earlier != unknown.name:
+                problems.append(f"{quote(unknown.name)}: {number} is also part of {quote(earlier)}; tie them, or give only one")
     if problems:
         raise IdentificationError(problems)
-    return Unknowns.of(found)
+    return Unknowns.of(unknowns)
 
 
 def _entries(mechanism: Mechanism, item: ParameterLike, problems: list[str]) -> list[Unknown]:
-    """Return the unknowns of a parameter: one for each entry of an array."""
+    """Return the unknowns of a parameter, one for each entry of an array."""
     p = item if isinstance(item, Parameter) else Parameter(item)
     try:
         parts = _parts(mechanism, p)
     except (SceneError, ValueError) as problem:
         problems.append(f"parameters: {f'{quote(p.name)}: ' * bool(p.name)}{problem}")
         return []
-    found = []
+    unknowns = []
     for part in parts:
         name = p.name or _name(part.target)
         if p.name and len(parts) > 1:
             name += "".join(re.findall(r"\[\d+\]", part.target.names[0].rpartition(".")[2]))
         try:
-            found.append(_unknown(mechanism, p, name, part))
+            unknowns.append(_unknown(mechanism, p, name, part))
         except (TypeError, ValueError) as problem:
             problems.append(f"parameters: {quote(name)}: {problem}")
-    return found
+    return unknowns
 
 
 def _name(target: Target) -> str:
@@ -124,7 +125,7 @@ def _name(target: Target) -> str:
 
 
 def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unknown:
-    """Return one unknown.
+    """Return the unknown of a number.
 
     Raises:
         ValueError: its first guess, bounds, prior, transform or scale is invalid.
@@ -185,7 +186,7 @@ def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
 
 
 def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
-    """Return the numbers that a parameter refers to: each entry of an array."""
+    """Return the numbers that a parameter refers to; an array has one for each entry."""
     of, scaled = p.of, p.share == "scale"
     if p.share not in ("value", "scale"):
         raise ValueError(f'share must be "value" or "scale", is {p.share!r}')
@@ -214,11 +215,11 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
         return [_Part(Target(names, True), 1.0, True)]
     return [
         _Part(
-            Target(tuple(name + "".join(f"[{i}]" for i in at) for name in names)),
-            float(values[0][at]),
-            all(v[at] == values[0][at] for v in values),
+            Target(tuple(name + "".join(f"[{i}]" for i in index) for name in names)),
+            float(values[0][index]),
+            all(v[index] == values[0][index] for v in values),
         )
-        for at in np.ndindex(values[0].shape)
+        for index in np.ndindex(values[0].shape)
     ]
 
 

@@ -2,7 +2,7 @@
 
 A member is one run: a mechanism with its own parameters along one record. Parameters, initial states, times and tolerances are
 inputs of a compiled program; the mechanism's structure, the targets, the channels and the length of a record are static.
-Derivatives are forward, of all members together.
+Derivatives are in forward mode, for all members together.
 """
 
 from collections import OrderedDict
@@ -25,11 +25,11 @@ from udkjax.study.channel_values import measure
 from udkjax.study.identify.unknowns import Target, apply_values
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Program
 
-# Tolerances of the integration, relative and absolute: of final estimates (the accuracy of parameters without noise); where only
-# singular values or the continuity of pieces matter; and during the search for a fit.
+# Relative and absolute tolerances of the integration: for final estimates (the accuracy of parameters without noise); for
+# singular values and the continuity of pieces; and for the search for a fit.
 TIGHT_TOL, MEDIUM_TOL, LOOSE_TOL = 1e-11, 1e-9, 1e-7
-FEWEST_IN_LANES = 1024  # fewer members are computed one by one, not in vector lanes, which needs no second compilation
-CACHE_SIZE, CACHE_BYTES = 6, 2**24  # number of stored predictions (a fit returns to its best one), and the largest size of one
+FEWEST_IN_LANES = 1024  # fewer members are computed one by one, without compiling another program for vector lanes
+CACHE_SIZE, CACHE_BYTES = 6, 2**24  # number of stored predictions (a fit returns to its best one), and their largest size
 
 TolerancePair: TypeAlias = tuple[float, float]  # relative and absolute
 
@@ -37,7 +37,7 @@ TolerancePair: TypeAlias = tuple[float, float]  # relative and absolute
 class Runs(NamedTuple):
     """N runs, each along a record or a piece of one, with S >= 0 unknowns of the initial state."""
 
-    ts: np.ndarray  # (N, T) s; the motion begins at the first
+    ts: np.ndarray  # (N, T) s; the motion begins at the first time
     q: np.ndarray | None  # (N, bodies, 3) guess of the initial state; None: that of the scene
     v: np.ndarray | None
     bases: np.ndarray  # (N, 2, 3 bodies, S) derivatives of q and v by the unknowns of the initial state
@@ -45,7 +45,7 @@ class Runs(NamedTuple):
 
 
 class Members(NamedTuple):
-    """The inputs of a compiled prediction for M members: parameters, and the run of each."""
+    """The inputs of a compiled prediction for M members: parameters, initial-state unknowns and runs."""
 
     x: NumericArray  # (M, P) parameters
     shift: NumericArray  # (M, S) unknowns of the initial state
@@ -59,7 +59,7 @@ class Prediction(NamedTuple):
     dy: Float[np.ndarray, "M T C P+S"]
     code: Int[np.ndarray, "M"]
     ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies): states at the first and last time, if requested
-    d_ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies, P + S): their derivatives
+    d_ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies, P + S): derivatives of `ends`
 
 
 class Predictor:
@@ -103,7 +103,7 @@ class Predictor:
 
 
 class _MemberRun:
-    """The computation of one member, hashable by its static part: equal ones share programs."""
+    """The computation of a member, hashable by its static part; equal computations share programs."""
 
     def __init__(self, static: PyTree, *choices: Hashable):
         leaves, structure = jax.tree.flatten(static)
@@ -119,16 +119,16 @@ class _MemberRun:
         return self is other or (isinstance(other, _MemberRun) and self._key == other._key)
 
     def place(self, arrays: PyTree, member: Members) -> tuple[Mechanism, State, dict[str, Any]]:
-        """Return the mechanism of a member, the guess from which its initial state is closed, and settings."""
+        """Return the mechanism of a member, the guess from which its initial state is closed, and the settings."""
         run = member.runs
         mechanism, settings = eqx.combine(arrays, self._static)
         base = mechanism.with_parameters(run.conditions) if run.conditions else mechanism
-        found = guess = apply_values(base, self.targets, member.x)
+        assigned = guess = apply_values(base, self.targets, member.x)
         if run.q is not None and run.v is not None:
-            # Lengths move the record's guess, too; constants are computed from the scene's own.
+            # Length parameters also move the record's guess; constants are computed from the scene's guess.
             guess = apply_values(_with_state(base, run.q, run.v), self.targets, member.x)
         q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", run.bases, member.shift))
-        return found, State(guess.q0 + q, guess.v0 + v), settings
+        return assigned, State(guess.q0 + q, guess.v0 + v), settings
 
     def __call__(self, shared: tuple[PyTree, Array], member: Members, shift: Array) -> dict[str, Array]:
         P = member.x.shape[0]

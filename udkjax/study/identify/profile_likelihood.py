@@ -1,11 +1,11 @@
-"""The profile likelihood of one unknown: the rise of the cost as it is varied and all others are refitted.
+"""The profile likelihood of an unknown: the rise of the cost as the unknown varies and all others are refitted.
 
-With C(z) = r.r / 2, one unknown z_k fixed and the others refitted, the curve
+With C(z) = r.r / 2, an unknown z_k fixed and the others refitted, the curve
 
     psi = +-(2 (C(z_k) - C_min) / s^2)^(1/2)
 
 is a straight line for a linear model, psi = (z_k - estimate) / standard error. All z_k with psi^2 below the quantile of chi^2
-with one degree of freedom form a confidence interval that needs no linear model; it may be asymmetric, and it may be open.
+with one degree of freedom form a confidence interval that does not assume a linear model; it may be asymmetric or open.
 (Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.)
 """
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     import xarray
 
 CONFIDENCE = 0.95  # default level: about two standard errors to either side
-STEPS_TO_END = 4.0  # steps from the estimate to the end of the interval, if the curve is a straight line
-UNKNOWN_ERROR = 0.5  # of a dimensionless unknown: substituted for an unknown standard error
+STEPS_TO_END = 4.0  # number of steps from the estimate to the end of the interval if the curve is a straight line
+UNKNOWN_ERROR = 0.5  # substituted for an unknown standard error of a dimensionless unknown
 MOST_STRETCH, MOST_SHRINK = 2.0, 0.1  # limits of the ratio of successive steps
-END_DISTANCE = 1e-3  # relative to psi at the end of the interval: tolerance on the end
-MOST_FITS = 30  # on each side: a straight curve takes STEPS_TO_END of them, a bent one more
-BETTER_FIT = 1e-6  # relative to the rise: a cost lower than the estimate's by this is not rounding
+END_DISTANCE = 1e-3  # tolerance on the end of the interval, relative to psi there
+MOST_FITS = 30  # largest number on each side; a straight curve needs STEPS_TO_END fits, a bent one more
+BETTER_FIT = 1e-6  # decrease of the cost below the estimate's that is not rounding, relative to the rise
 
 _AT_BOUND = "the limit of the search"
 
@@ -39,14 +39,14 @@ FitOthers: TypeAlias = Callable[[int, float, np.ndarray], tuple[np.ndarray, floa
 
 
 class ProfileLikelihood(NamedTuple):
-    """The curve of one unknown, from its smallest value to its largest, and the confidence interval."""
+    """The curve of an unknown, from its smallest value to its largest, and the confidence interval."""
 
     name: str
     values: Float[np.ndarray, "N"]  # x
     costs: Float[np.ndarray, "N"]  # r.r / 2
     z: Float[np.ndarray, "N K"]  # all unknowns
     interval: tuple[float, float]  # an end is infinite if the curve does not rise to the limit
-    best: int  # index of the lowest cost: that of the estimate unless a better fit was found
+    best: int  # index of the lowest cost; that of the estimate unless a better fit was found
     text: str
 
 
@@ -61,7 +61,7 @@ class _Side(NamedTuple):
 
 
 def fix_unknown(evaluate: Objective, index: int, value: float) -> Objective:
-    """Return the residuals as a function of all unknowns but one, which is fixed at `value`."""
+    """Return the residuals as a function of all unknowns except one, which is fixed at `value`."""
 
     def evaluate_others(z: Float[np.ndarray, "B K-1"]) -> Residuals:
         found = evaluate(np.insert(z, index, value, axis=-1))
@@ -109,7 +109,7 @@ def _cost(found: Residuals) -> float:
 def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:
     """Return the noise relative to the assumed noise, and the degrees of freedom if it was estimated.
 
-    If several channels have their own estimated noise, residuals were divided by it, and the factors are 1 up to rounding.
+    If the noise of several channels was estimated, residuals were divided by it, and the factors are 1 up to rounding.
     """
     scales = uncertainty.noise
     return (float(scales.mean()), uncertainty.degrees_of_freedom) if scales.size else (1.0, None)
@@ -122,21 +122,21 @@ def profiles_dataset(
     with OptionalImport():
         import xarray
     noise, freedom = estimated_noise(uncertainty)
-    parts = np.full((2, len(profiles), max(len(found.values) for found in profiles)), np.nan)
-    for k, found in enumerate(profiles):
-        own = np.argmin(np.abs(found.values - values[found.name]))
-        parts[:, k, : len(found.values)] = found.values, 2.0 * (found.costs - found.costs[own]) / noise**2
+    curves = np.full((2, len(profiles), max(len(profile.values) for profile in profiles)), np.nan)
+    for k, profile in enumerate(profiles):
+        at_estimate = np.argmin(np.abs(profile.values - values[profile.name]))
+        curves[:, k, : len(profile.values)] = profile.values, 2.0 * (profile.costs - profile.costs[at_estimate]) / noise**2
     along = "profile", "point"
     data = {
-        "profile_value": (along, parts[0]),
-        "rise": (along, parts[1]),
+        "profile_value": (along, curves[0]),
+        "rise": (along, curves[1]),
         "interval": (
             ("profile", "end"),
-            np.array([found.interval for found in profiles]),
+            np.array([profile.interval for profile in profiles]),
             {"level": level, "limit": quantile(level, freedom)},
         ),
     }
-    return xarray.Dataset(data, {"profile": [found.name for found in profiles], "end": ["low", "high"]})
+    return xarray.Dataset(data, {"profile": [profile.name for profile in profiles], "end": ["low", "high"]})
 
 
 # --- the curve
@@ -163,22 +163,23 @@ def trace_profile(
     Args:
         fit: (index, value, z0) -> (z, cost) minimizes the cost over all other unknowns, starting from z0; the walk ends before a
             failed fit, whose cost is not finite.
-        index: index of the unknown, whose standard error is about a first `step`.
-        noise: ratio of the estimated to the assumed noise; if estimated, it has `degrees_of_freedom`, and the quantile is that
-            of F.
+        index: index of the unknown.
+        step: standard error of the unknown, approximately.
+        noise: ratio of the estimated to the assumed noise.
+        degrees_of_freedom: those of the estimated noise, for the quantile of F; None if the noise is known.
         value: x as a function of z_k, increasing between the `bounds` of z_k.
         steps: maximum number of fits on each side.
     """
     limit = quantile(level, degrees_of_freedom)
     rise = limit * noise**2
-    ways = []
+    sides = []
     for sign, bound in zip((-1.0, 1.0), bounds, strict=True):
         length = min(np.sqrt(limit) * (step if 0 < step < np.inf else UNKNOWN_ERROR), abs(bound - z[index]))
-        ways.append(_walk(fit, index, np.asarray(z, float), cost, sign * length, bound, rise, steps))
-    low, high = ways
+        sides.append(_walk(fit, index, np.asarray(z, float), cost, sign * length, bound, rise, steps))
+    low, high = sides
     fixed = np.array([*low.fixed[::-1], z[index], *high.fixed])
     costs = np.array([*low.costs[::-1], cost, *high.costs])
-    every = np.array([*low.z[::-1], z, *high.z])
+    unknowns = np.array([*low.z[::-1], z, *high.z])
     values = np.array([value(x) for x in fixed])
     ends = -np.inf if low.open else value(low.end), np.inf if high.open else value(high.end)
     best = int(np.argmin(costs))
@@ -186,7 +187,7 @@ def trace_profile(
     text = _text(name, units, level, ends, (low, high), value)
     if better:
         text += f"; a better fit was found at {values[best]:.6g}{f' {units}' if units else ''}: identify again from that guess"
-    return ProfileLikelihood(name, values, costs, every, ends, best if better else len(low.fixed), text)
+    return ProfileLikelihood(name, values, costs, unknowns, ends, best if better else len(low.fixed), text)
 
 
 def quantile(level: float, degrees_of_freedom: float | None) -> float:
@@ -195,11 +196,11 @@ def quantile(level: float, degrees_of_freedom: float | None) -> float:
 
 
 def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, bound: float, rise: float, steps: int) -> _Side:
-    """Walk along one side by steps that raise psi equally; once past the end, search between the two points around it."""
+    """Walk along one side by steps that raise psi equally; beyond the end, search between the two points around it."""
     end, sign = np.sqrt(rise), np.sign(step)
     inside: tuple[np.ndarray, float] = z, 0.0  # the last point inside the interval, and its psi
-    before, outside = None, None  # the previous point inside; the nearest point outside
-    found: list[tuple[np.ndarray, float]] = []
+    previous, outside = None, None  # the previous point inside; the nearest point outside
+    points: list[tuple[np.ndarray, float]] = []
     reason = f"not reached in {steps} steps"
     step = step / STEPS_TO_END
     if sign == 0.0:
@@ -212,8 +213,8 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
                 max((end - psi) / (beyond - psi), MOST_SHRINK) if np.isfinite(beyond) else 0.5
             )
         fixed = sign * min(sign * (current[index] + step), sign * bound)
-        part = 0.0 if before is None else (fixed - current[index]) / (current[index] - before[index])
-        guess = current + part * (current - before) if before is not None else current.copy()
+        fraction = 0.0 if previous is None else (fixed - current[index]) / (current[index] - previous[index])
+        guess = current + fraction * (current - previous) if previous is not None else current.copy()
         guess[index] = fixed
         narrow = outside is not None and abs(fixed - current[index]) <= END_DISTANCE * abs(fixed - z[index])
         trial, value = fit(index, float(fixed), guess)
@@ -222,7 +223,7 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
             if narrow:
                 break
             continue
-        found.append((trial, value))
+        points.append((trial, value))
         reached = np.sqrt(max(2.0 * (value - cost), 0.0))
         if abs(reached - end) <= END_DISTANCE * end:
             inside, reason = (trial, reached), ""
@@ -236,13 +237,13 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
         # A falling curve may lead to another minimum: do not lengthen the step.
         wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, np.finfo(float).tiny)
         step = sign * np.clip(wanted, MOST_SHRINK * abs(step), MOST_STRETCH * abs(step))
-        before, inside = current, (trial, reached)
+        previous, inside = current, (trial, reached)
         if fixed == bound:
             reason = _AT_BOUND
             break
-    found.sort(key=lambda point: sign * point[0][index])
+    points.sort(key=lambda point: sign * point[0][index])
     return _Side(
-        [float(p[index]) for p, _ in found], [p for p, _ in found], [c for _, c in found], float(inside[0][index]), reason
+        [float(p[index]) for p, _ in points], [p for p, _ in points], [c for _, c in points], float(inside[0][index]), reason
     )
 
 

@@ -1,4 +1,4 @@
-"""Reads measurements into records, from any kind of table; every mistake is reported with its file, row and column."""
+"""Reads measurements from any kind of table into records; every mistake is reported with its file, row and column."""
 
 import math
 import os
@@ -16,7 +16,7 @@ from udkjax.study.identify.tables import NOISE, RECORD, TIME, Table, TableData, 
 from udkjax.wording import abbreviate, quote, suggestion
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
-MOST_SHOWN = 3  # mistakes of one kind listed per column; the others are counted
+MOST_SHOWN = 3  # number of listed mistakes of a kind per column; the others are counted
 T = TypeVar("T")
 
 
@@ -29,17 +29,17 @@ def records_of(
 
     * a heading may name units in brackets, `time [ms]`, `body.crank.angle [deg]` (in xarray: the attribute `units`);
     * an empty cell, or one that is not a number ("nan"), is a gap;
-    * `CHANNEL.noise` is the standard deviation of a channel, in the channel's units unless it names its own;
+    * `CHANNEL.noise` is the standard deviation of a channel, in the channel's units unless the heading names others;
     * `record` is the name of the record that a row belongs to (in xarray: a dimension).
 
     Args:
-        mechanism: the mechanism whose bodies, joints and drivers headings name.
+        mechanism: the mechanism with the bodies, joints and drivers that headings name.
         data: a `Record`; a mapping of "time" and channels to numbers (T,); a pandas DataFrame with such columns; an xarray
             Dataset with such variables along "time", or with q and v as written by `Solution.to_xarray`; the path of a .csv or
             .nc file; or a list of these.
         noise: standard deviation, in SI units, of channels without noise in the data: of all channels, or by channel.
         ignore: columns that are not read; any other column that is not a channel is a mistake.
-        quantities: user-defined channels that headings may name; in Python they may also be used in place of names.
+        quantities: user-defined channels that headings may name; in Python they may also be used instead of names.
 
     Raises:
         IdentificationError: lists every mistake with its file, line and column.
@@ -91,7 +91,7 @@ class _TableReader:
                 yield from self.record(label, places, times, values, noise)
 
     def channels(self, headings: Sequence[str]) -> tuple[dict[ChannelKey, np.ndarray], dict[ChannelKey, np.ndarray]]:
-        """Return the values of each channel, and the standard deviations where they have a column."""
+        """Return the values of each channel, and the standard deviations of channels with a column for these."""
         found: dict[ChannelKey, tuple[str, str]] = {}  # headings and units
         for heading in headings:
             of = heading.removesuffix(NOISE)
@@ -113,7 +113,7 @@ class _TableReader:
         return values, {key: self.numbers(h + NOISE, units, self.columns[h].units) for key, (h, units) in with_noise.items()}
 
     def numbers(self, heading: str, wanted: str, units: str | None = None) -> np.ndarray:
-        """Return the numbers of a column, given in its own or these `units`, in SI units; gaps are NaN."""
+        """Return the numbers of a column in SI units, from the column's units or else from `units`; gaps are NaN."""
         cells, own = self.columns[heading]
         scale, count, units = 1.0, len(self.table.rows), own or units
         try:
@@ -154,7 +154,7 @@ class _TableReader:
         values: dict[ChannelKey, np.ndarray],
         noise: dict[ChannelKey, np.ndarray],
     ) -> Iterator[Record]:
-        """Make a record of some rows, with the channels that were measured in them."""
+        """Return a record of some rows, with the channels that were measured in them."""
         measured = [name for name, x in values.items() if not np.isnan(x[places]).all()]
         if self.table.padded and measured:
             some = np.flatnonzero(~np.isnan(np.stack([values[name][places] for name in measured])).all(0))
@@ -170,7 +170,7 @@ class _TableReader:
         self.problems.append(f"{self.table.source}, column {quote(heading)}: {problem}")
 
     def add_each(self, heading: str, rows: Sequence[int] | np.ndarray, problem: Callable[[int], str]) -> None:
-        """Report the same mistake in several rows: the first few, and the number of the others."""
+        """Report the same mistake in several rows: the first ones, and the number of the others."""
         for k in rows[:MOST_SHOWN]:
             self.problems.append(f"{self.table.source}, {self.table.rows[k]}, column {quote(heading)}: {problem(k)}")
         if len(rows) > MOST_SHOWN:
@@ -194,11 +194,11 @@ def _label(cell: str | float | None) -> str:
     return "" if cell is None or cell != cell else f"{cell:g}"
 
 
-# --- anything that holds tables
+# --- any kind of data
 
 
 def _quantities_by_name(given: Iterable[Hashable]) -> dict[str, Quantity]:
-    """Return the user-defined channels among some, by name."""
+    """Return the user-defined channels among `given`, by name."""
     return {quantity.name: quantity for quantity in given if isinstance(quantity, Quantity)}
 
 
@@ -223,7 +223,7 @@ class _DataReader:
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
     def channel(self, given: ChannelKey) -> Channel | Quantity:
-        """Return the channel with a name, or the user-defined one.
+        """Return the channel with a name, or a user-defined channel.
 
         Raises:
             ValueError: there is no such channel.
@@ -232,7 +232,7 @@ class _DataReader:
         return channel_of(self.mechanism, str(given)) if own is None else own
 
     def by_channel(self, given: ByChannel[T], place: str) -> dict[ChannelKey, T]:
-        """Return the values by the canonical names of the channels; user-defined channels are their own keys."""
+        """Return the values by the canonical names of the channels; user-defined channels are keys themselves."""
         found: dict[ChannelKey, T] = {}
         for text, value in given.items():
             try:
@@ -255,7 +255,7 @@ class _DataReader:
         return record.changed(values=values, noise=noise)
 
     def with_noise(self, record: Record, given: dict[ChannelKey, ArrayLike | None]) -> Record:
-        """Return the record with the `given` standard deviations for channels without their own."""
+        """Return the record with the `given` standard deviations for channels that have none."""
         if all(own is not None or given.get(channel) is None for channel, own in record.noise.items()):
             return record
         noise = {channel: given.get(channel) if own is None else own for channel, own in record.noise.items()}

@@ -19,14 +19,14 @@ from udkjax.wording import quote
 if TYPE_CHECKING:
     import xarray
 
-PADDING = 1e-9  # relative to the length of a record: the spacing of times that pad it, so short that their steps cost nothing
+PADDING = 1e-9  # spacing of times that pad a record, relative to its length; so short that their steps cost almost nothing
 Estimated = Literal["nothing", "position", "velocity", "both"]
 ChannelKey: TypeAlias = str | Quantity  # the name of a channel, or a user-defined quantity
 T = TypeVar("T")
 ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[ChannelKey, T]
 Noise = TypeAliasType(
     "Noise", ByChannel[ArrayLike] | ByChannel[ArrayLike | None] | float | None
-)  # standard deviations, or one for all
+)  # standard deviations, by channel or one for all
 
 
 class IdentificationError(Mistakes):
@@ -42,13 +42,13 @@ class IdentificationError(Mistakes):
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The initial state of a record: a guess, and which parts of it to estimate.
+    """The initial state of a record: a guess, and the parts of the state to estimate.
 
     Attributes:
-        state: the guess, closed before use; by default the scene's own.
+        state: the guess, closed before use; by default that of the scene.
         estimate: "nothing", "position", "velocity" or "both". The unknowns are one coordinate (position) or rate (velocity) for
             each degree of freedom.
-        name: starts of the same name are one state, estimated from all of their records.
+        name: starts with the same name are one state, estimated from all records with this start.
     """
 
     state: State | None = None
@@ -69,11 +69,11 @@ class Record:
         times: increasing (T,), s.
         values: arrays (T,) by channel, NaN where nothing was measured. Channels are named as in `udkjax.positions.channels`
             ("body.crank.angle"), or are user-defined `Quantity`s.
-        noise: standard deviation of all channels, or of each by channel, a number or (T,); by default estimated from the
+        noise: standard deviation of all channels, or a mapping by channel, each a number or (T,); by default estimated from the
             residuals of the fit.
-        initial_state: the `State` or `Start` at t0; by default the scene's own.
-        t0: time when the motion begins (s); by default the first time.
-        conditions: values of parameters, by name, in this record only: a payload, a driver's amplitude.
+        initial_state: the `State` or `Start` at t0; by default that of the scene.
+        t0: start of the motion (s); by default the first time.
+        conditions: values of parameters, by name, in this record only, such as a payload or a driver's amplitude.
         name: name in messages.
 
     Raises:
@@ -163,12 +163,12 @@ def labels(records: Sequence[Record]) -> list[str]:
 
 
 def output_times(record: Record) -> tuple[Float[np.ndarray, "T"], int]:
-    """Return the times of a record starting with that of its initial state, and the index of the first measurement."""
+    """Return the times of a record, from that of its initial state, and the index of the first measurement."""
     return (record.times, 0) if record.t0 == record.times[0] else (np.concatenate([[record.t0], record.times]), 1)
 
 
 def pad_times(ts: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "length"]:
-    """Return the times padded to a length with slightly later ones."""
+    """Return the times, padded with slightly later times to a length."""
     span = max(ts[-1] - ts[0], PADDING)
     return np.concatenate([ts, ts[-1] + PADDING * span * np.arange(1, length - len(ts) + 1)])
 
@@ -188,7 +188,7 @@ def tabulate(records: Sequence[Record], keys: Sequence[ChannelKey]) -> tuple[np.
 
 
 def label_prefixes(records: Sequence[Record]) -> list[str]:
-    """Return the prefix of channel names in messages for each record: its name, if there are several records."""
+    """Return, for each record, the prefix of channel names in messages: its name if there are several records."""
     return [f"{label}, " for label in labels(records)] if len(records) > 1 else [""]
 
 
@@ -203,16 +203,16 @@ def dataset_of_fit(
     with OptionalImport():
         import xarray
     shape = len(records), max(len(record.times) for record in records), len(channels)
-    time, parts = np.full(shape[:2], np.nan), np.full((4, *shape), np.nan)
+    time, tables = np.full(shape[:2], np.nan), np.full((4, *shape), np.nan)
     for k, record in enumerate(records):
         count = len(record.times)
         time[k, :count] = record.times
         for channel, shown in predicted[k].items():
             residual = residuals[k][channel]
-            parts[:, k, :count, channels.index(channel)] = shown + residual, shown, residual, noise[k][channel]
-    along = "record", "sample", "channel"
-    data = {name: (along, part) for name, part in zip(("measured", "predicted", "residual", "noise"), parts, strict=True)}
-    return xarray.Dataset(data, {"record": labels(records), "time": (along[:2], time, {"units": "s"}), "channel": list(channels)})
+            tables[:, k, :count, channels.index(channel)] = shown + residual, shown, residual, noise[k][channel]
+    dims = "record", "sample", "channel"
+    data = {name: (dims, table) for name, table in zip(("measured", "predicted", "residual", "noise"), tables, strict=True)}
+    return xarray.Dataset(data, {"record": labels(records), "time": (dims[:2], time, {"units": "s"}), "channel": list(channels)})
 
 
 def key_of(channel: ChannelKey | Channel) -> ChannelKey:

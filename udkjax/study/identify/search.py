@@ -1,8 +1,8 @@
 """Search for a fit that explains the records, by strategies of increasing cost.
 
 If the fit of the whole records from the first guess does not explain them, since phases are wrong by too much, growing parts of
-the records are fitted: see `growing_records`. If that fails, too, the same is done from other guesses, until one explains the
-records. For records of chaotic motion, where all of these fail, see `shooting`.
+the records are fitted: see `growing_records`. If this fails too, the same is done from other guesses, until one of them explains
+the records. For records of chaotic motion, where all of these fail, see `shooting`.
 """
 
 from collections.abc import Sequence
@@ -19,29 +19,29 @@ from udkjax.study.identify.prediction import LOOSE_TOL, MEDIUM_TOL, TolerancePai
 from udkjax.study.identify.shooting import PieceFailed, fit_pieces
 from udkjax.study.identify.unknowns import sample_guesses
 
-N_STARTS = 15  # further guesses, if the first does not lead to a fit
-MOST_GUESSES_IN_PIECES = 4  # guesses from which the records are fitted in pieces
-SAMPLES_PER_GUESS = 8  # sampled guesses for each that is followed: sampling costs one evaluation, a fit some fifty
-ENOUGH_AGREEING = 4  # guesses that lead to the best fit: if it reproduces most of the motion, a better one is unlikely
-SHOWN_PART = 0.3  # relative to the channels' scales: a fit with smaller residuals reproduces most of the motion
+N_STARTS = 15  # number of further guesses if the first does not lead to a fit
+MOST_GUESSES_IN_PIECES = 4  # number of guesses from which the records are fitted in pieces
+SAMPLES_PER_GUESS = 8  # number of sampled guesses for each fitted one; a sample costs one evaluation, a fit about fifty
+ENOUGH_AGREEING = 4  # number of guesses with the same best fit from which a better one is unlikely
+SHOWN_PART = 0.3  # a fit with residuals below this, relative to the channels' scales, reproduces most of the motion
 PART_GROWTH = 2.0  # ratio of successive parts of the records by which guesses are ranked
-SHORTEST_PART = 1e-6  # relative to the records: the first part, if everything was measured at the beginning
-CHAOTIC_GROWTH = 100.0  # growth of derivatives from the first half of a record to the second: for t^2 it is 4
-EXPLAINED_PART = 1e-3  # relative to the channels' scales: smaller residuals are a fit, if the noise is unknown
-LIKELY_SQUARE = 2.0  # mean square of residuals with known noise up to which they are a fit
-WHITE_CORRELATION = 4.0  # standard deviations of the correlation of neighbours up to which residuals are noise
-SAME_MINIMUM_DISTANCE = 1e-4  # change of an unknown: closer fits are at the same minimum
+SHORTEST_PART = 1e-6  # least duration of the first part, relative to the records
+CHAOTIC_GROWTH = 100.0  # growth of derivatives from the first half of a record to the second; for t^2 it is 4
+EXPLAINED_PART = 1e-3  # residuals up to which records with unknown noise are explained, relative to the channels' scales
+LIKELY_SQUARE = 2.0  # mean square of residuals up to which records with known noise are explained
+WHITE_CORRELATION = 4.0  # correlation of neighbours, in standard deviations, up to which residuals are noise
+SAME_MINIMUM_DISTANCE = 1e-4  # fits whose unknowns differ by less are at the same minimum
 
 
 class SearchResult(NamedTuple):
-    """The best fit, the number of first guesses that led to it out of all, and the strategies that were tried."""
+    """The best fit, how many of the first guesses led to it, and the strategies that were tried."""
 
     fit: Fit
     agreeing: int
     guesses: int
     ways: tuple[str, ...]
     history: CostHistory
-    problem: FitProblem  # the problem that the fit is of
+    problem: FitProblem  # the fitted problem
 
 
 def search(
@@ -53,36 +53,36 @@ def search(
     seed: int = 0,
     strategy: Strategy = "auto",
 ) -> SearchResult:
-    """Find the unknowns that explain the records best.
+    """Find the unknowns that best explain the records.
 
-    If the guesses z do not lead to a fit, `more` others are tried. If these fail, too, and do not agree or the motion is chaotic,
-    the records are cut into pieces; with the strategy "pieces" at once. `tol` are the final tolerances; those of the search are
-    looser.
+    If the guesses z do not lead to a fit, `more` others are tried. If these also fail, and do not agree or the motion is chaotic,
+    the records are cut into pieces. With the strategy "pieces" they are cut from the start. `tol` are the final tolerances; the
+    search uses looser ones.
     """
     loose = max(tol[0], LOOSE_TOL), max(tol[1], LOOSE_TOL)
     if strategy == "pieces":
-        along = fit_growing_records(problem, z[0], loose, minimizer)
-        if found := fit_in_pieces(problem, np.array([along.z, *z]), tol, minimizer):
-            return found._replace(history=along.history + found.history)
+        grown_first = fit_growing_records(problem, z[0], loose, minimizer)
+        if in_pieces := fit_in_pieces(problem, np.array([grown_first.z, *z]), tol, minimizer):
+            return in_pieces._replace(history=grown_first.history + in_pieces.history)
     ways, tried = ["whole records"], list(z)
     earlier: EarlierFits = []
-    whole = minimizer.with_label("whole records")
-    fits = [whole.minimize(problem, guess, loose, None, SOME_STEPS, LOOSE_STEP) for guess in z]
+    labelled = minimizer.with_label("whole records")
+    fits = [labelled.minimize(problem, guess, loose, None, SOME_STEPS, LOOSE_STEP) for guess in z]
     history = list(_best(fits).history)
     if not explains(problem, _best(fits), loose):
         ways.append("growing records")
         grown = [fit_growing_records(problem, guess, loose, minimizer, earlier) for guess in z]
-        tried += [one.z for one in grown]
-        history += [row for one in grown for row in one.history]
+        tried += [grown_fit.z for grown_fit in grown]
+        history += [row for grown_fit in grown for row in grown_fit.history]
         fits = [_best(pair) for pair in zip(fits, grown, strict=True)]
     if more and not explains(problem, _best(fits), loose):
         ways.append("more first guesses")
         sampled = sample_guesses(problem.unknowns, z[0], SAMPLES_PER_GUESS * more, seed)
         for guess in rank_guesses(problem, sampled, loose):
-            one = fit_growing_records(problem, guess, loose, minimizer, earlier)
-            history += one.history
-            tried.append(one.z)
-            fits.append(one)
+            grown_fit = fit_growing_records(problem, guess, loose, minimizer, earlier)
+            history += grown_fit.history
+            tried.append(grown_fit.z)
+            fits.append(grown_fit)
             if (
                 explains(problem, _best(fits), loose)
                 or len(earlier) >= len(z) + more
@@ -94,9 +94,9 @@ def search(
         # If half of the guesses agree, the model itself cannot reproduce the records.
         chaotic = is_chaotic(problem, best.z, loose)
         pieces = MOST_GUESSES_IN_PIECES if chaotic else 2 * agreeing < len(fits)
-        found = fit_in_pieces(problem, np.array(tried), tol, minimizer, pieces)
-        if found:
-            return found._replace(guesses=len(fits), ways=(*ways, *found.ways), history=history + found.history)
+        in_pieces = fit_in_pieces(problem, np.array(tried), tol, minimizer, pieces)
+        if in_pieces:
+            return in_pieces._replace(guesses=len(fits), ways=(*ways, *in_pieces.ways), history=history + in_pieces.history)
     return SearchResult(best, agreeing, len(fits), tuple(ways), history, problem)
 
 
@@ -105,7 +105,7 @@ def _best(fits: Sequence[Fit]) -> Fit:
 
 
 def _count_agreeing(fits: Sequence[Fit]) -> int:
-    """Return the number of fits that are at the best minimum."""
+    """Return the number of fits at the best minimum."""
     best = _best(fits).z
     near = SAME_MINIMUM_DISTANCE * (1.0 + np.abs(best).max())
     return sum(bool(np.isfinite(fit.cost)) and bool(np.abs(fit.z - best).max() <= near) for fit in fits)
@@ -120,9 +120,9 @@ def _shows_most(problem: FitProblem, fit: Fit) -> bool:
 def fit_in_pieces(
     problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair, minimizer: Minimizer, most: int = MOST_GUESSES_IN_PIECES
 ) -> SearchResult | None:
-    """Fit the records in pieces, from the `most` promising guesses until one explains them; None if they all fail.
+    """Fit the records in pieces, from the `most` best guesses in turn, until one explains the records; None if all fail.
 
-    The fit returned is that of the whole records, unless the motion is too chaotic to integrate them accurately.
+    The fit is of the whole records, unless the motion is too chaotic to integrate these accurately.
     """
     loose = max(tol[0], MEDIUM_TOL), max(tol[1], MEDIUM_TOL)
     for k, guess in enumerate(rank_guesses(problem, z, loose)[:most] if most else ()):
@@ -131,17 +131,17 @@ def fit_in_pieces(
         except PieceFailed:
             continue
         if explains(pieces, fit, loose):
-            found = SearchResult(fit, 1, k + 1, ("records in pieces",), fit.history, pieces)
-            along = fit.z[: problem.K]
-            whole = minimizer.with_label("whole records").minimize(problem, along, tol, None, SOME_STEPS, LOOSE_STEP)
-            if explains(problem, whole, tol):
-                return found._replace(fit=whole, history=fit.history + whole.history, problem=problem)
-            return found
+            result = SearchResult(fit, 1, k + 1, ("records in pieces",), fit.history, pieces)
+            unknowns = fit.z[: problem.K]
+            whole_fit = minimizer.with_label("whole records").minimize(problem, unknowns, tol, None, SOME_STEPS, LOOSE_STEP)
+            if explains(problem, whole_fit, tol):
+                return result._replace(fit=whole_fit, history=fit.history + whole_fit.history, problem=problem)
+            return result
     return None
 
 
 def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair) -> bool:
-    """Return True if derivatives grow along a record faster than t or t^2, as they do for motions that only change phase."""
+    """Return True if derivatives grow along a record faster than t^2, the fastest growth for motions that only change phase."""
     record, time, _ = problem.index.T
     late = problem.ts[record, time] > 0.5 * (problem.ts[record, 0] + problem.ts[record, -1])
     J = np.abs(problem.evaluate(z[None], tol).J[0, : len(problem.index), : len(problem.unknowns.names)])
@@ -150,18 +150,18 @@ def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePai
 
 
 def rank_guesses(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B K"]:
-    """Return guesses sorted from the best: by the residuals of the records and of their first parts, all weighted equally."""
+    """Return guesses, the best first, sorted by the residuals of the records and of their first parts, with equal weights."""
     record, time, _ = problem.index.T
     r, since = problem.evaluate(z, tol).r[:, : len(record)], problem.ts[record, time] - problem.ts[record, 0]
     with np.errstate(divide="ignore"):
-        logs = [np.log(np.sum(np.square(r[:, since <= part]), axis=1)) for part in horizons(problem)]
-    # A failed run counts as one that predicts nothing.
+        logs = [np.log(np.sum(np.square(r[:, since <= duration]), axis=1)) for duration in horizons(problem)]
+    # A failed run counts as a prediction without any motion.
     worst = np.log(np.sum((problem.channel_scale[problem.index[:, 2]] / problem.sigma) ** 2))
     return z[np.argsort(np.sum(np.nan_to_num(logs, nan=worst), axis=0), kind="stable")]
 
 
 def horizons(problem: FitProblem) -> list[float]:
-    """Return increasing durations (s) of parts of the records from their beginning; the last is that of the whole records."""
+    """Return increasing durations (s) of the first parts of the records; the last is that of the whole records."""
     record, time, _ = problem.index.T
     passed = np.sort(problem.ts[record, time] - problem.ts[record, 0])
     enough = min(int(RESIDUALS_PER_UNKNOWN * problem.K), len(passed) - 1)
@@ -175,13 +175,13 @@ def explains(problem: FitProblem, fit: Fit, tol: TolerancePair) -> bool:
     """Return True if the residuals of a fit are only noise."""
     if not (np.isfinite(fit.cost) and fit.converged):
         return False
-    found = problem.evaluate(fit.z[None], tol)
-    if not found.ok[0]:
+    residuals = problem.evaluate(fit.z[None], tol)
+    if not residuals.ok[0]:
         return False
-    r = found.r[0, : len(problem.index)]
+    r = residuals.r[0, : len(problem.index)]
     size = np.mean(r[problem.noise_given] ** 2) <= LIKELY_SQUARE if problem.noise_given.any() else True
-    rest = r[~problem.noise_given]
-    if size and (not rest.size or np.sqrt(np.mean(rest**2)) <= EXPLAINED_PART):
+    unknown_noise = r[~problem.noise_given]
+    if size and (not unknown_noise.size or np.sqrt(np.mean(unknown_noise**2)) <= EXPLAINED_PART):
         return True
     return all(is_white(r[places]) for places in problem.series())
 

@@ -1,12 +1,13 @@
 """Multiple shooting: records cut into pieces, each with its own initial state, and fitted with penalties on the gaps.
 
-Along a chaotic record errors grow like exp(lambda t), so the cost of a whole record has very many minima in a parameter. A piece
-shorter than 1 / lambda has one. With s_p the initial state of piece p, and F_p its final state, the fit minimizes
+Along a chaotic record errors grow like exp(lambda t); the cost of a whole record therefore has very many minima in a parameter.
+A piece shorter than 1 / lambda has a single minimum. With s_p the initial state of piece p, and F_p its final state, the fit
+minimizes
 
     sum r_p(z, s_p)^2 + w^2 sum (F_p(z, s_p) - s_{p+1})^2,
 
-with a weight w that grows from nearly independent pieces to one motion, continuous up to integration errors. The first state is
-that of the record; of each other one, a position and a rate are unknown for each degree of freedom.
+with a weight w that grows until the nearly independent pieces are one motion, continuous up to integration errors. The first
+state is that of the record; each other state has an unknown position and rate for each degree of freedom.
 H. G. Bock, Recent advances in parameter identification techniques for ODE, 1983; the growing weight: H. Voss, J. Timmer and
 J. Kurths, Nonlinear dynamical system identification from uncertain and indirect measurements, 2004.
 """
@@ -34,11 +35,11 @@ from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import Prediction, Predictor, Runs, TolerancePair
 from udkjax.study.identify.unknowns import InitialStateUnknowns, apply_values, state_unknowns, with_conditions
 
-MOST_PIECES = 60  # pieces of all records: the linear algebra is dense
-# Relative to the largest singular value: components of a piece's initial state that it determines less stay where the previous
-# piece ends.
+MOST_PIECES = 60  # largest number of pieces of all records, since the linear algebra is dense
+# Singular values below this, relative to the largest, belong to components of a piece's initial state that stay close to the end
+# of the previous piece.
 CONTINUED_PART = 1e-2
-LEAST_MOTION = 1e-3  # relative to the largest: least motion of a coordinate in a piece
+LEAST_MOTION = 1e-3  # least motion of a coordinate in a piece, relative to the largest
 # w, with gaps relative to the motion of coordinates in a piece, and residuals relative to the scales of their channels.
 WEIGHTS = tuple(10.0**k for k in range(-2, 5))
 
@@ -52,20 +53,20 @@ class Piece(NamedTuple):
 
 
 class MultipleShooting(FitProblem):
-    """A problem in pieces. Its first residuals are those of the whole problem, in the same order, followed by the defects (gaps).
+    """A problem in pieces. Its residuals are those of the whole problem, in the same order, followed by the defects (gaps).
 
     The unknowns z are those of the whole problem, followed by those of the initial states of pieces.
 
     Attributes:
         whole: the problem that is cut into pieces.
         weight: weight w of the defects, relative to the motion of coordinates in a piece.
-        pieces: N parts of records, one run each; `following` are the indices of those that continue another.
-        guess: the first guess (K,), with pieces along the records.
+        pieces: N parts of records, each with a run; `following` are the indices of pieces that continue another one.
+        guess: the first guess (K,), with initial states of pieces along the records.
         scale: typical motion of the coordinates in a piece (S,).
     """
 
     def __init__(self, whole: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, samples: float = RESIDUALS_PER_UNKNOWN):
-        """Cut the records, and find initial states of all pieces along them with the unknowns z of the whole problem."""
+        """Cut the records, and compute initial states of all pieces along them from the unknowns z of the whole problem."""
         super().__init__(whole.mechanism, whole.unknowns, whole.records, whole.settings)
         self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.settings, ends=True)
         self.whole, self.weight = whole, WEIGHTS[0]
@@ -88,7 +89,7 @@ class MultipleShooting(FitProblem):
         self.columns[self.following] = whole.K + np.arange(self.constrained).reshape(-1, self.S)
         q, v, conditions = jax.tree.map(lambda leaf: leaf[records], (whole.runs.q, whole.runs.v, whole.runs.conditions))
         if q is None:
-            q, v = (np.tile(np.asarray(part), (N, 1, 1)) for part in (self.mechanism.q0, self.mechanism.v0))
+            q, v = (np.tile(np.asarray(state), (N, 1, 1)) for state in (self.mechanism.q0, self.mechanism.v0))
         self.runs = Runs(times, q, v, bases, conditions)
         self.inverse = np.zeros((N, self.S, 2 * n))
         self.guess, self.scale = self._guess_along(z, tol)
@@ -105,33 +106,33 @@ class MultipleShooting(FitProblem):
         self.runs.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
         assert self.runs.q is not None and self.runs.v is not None
         self.runs.q[p], self.runs.v[p] = q, v
-        for _ in range(2):  # compensate for the change of the guess by the parameters
-            found = self.predictor.guess(self.members_of(np.array([p]), x[None], np.zeros((1, self.S))), 0)
-            self.runs.q[p] += q - found.q
-            self.runs.v[p] += v - found.v
+        for _ in range(2):  # compensate for parameters that change the guess
+            guess = self.predictor.guess(self.members_of(np.array([p]), x[None], np.zeros((1, self.S))), 0)
+            self.runs.q[p] += q - guess.q
+            self.runs.v[p] += v - guess.v
 
     def _guess_along(self, z: np.ndarray, tol: TolerancePair) -> tuple[np.ndarray, np.ndarray]:
-        """Return initial states of the pieces, found in sequence, and the typical motion of the coordinates in a piece (S,).
+        """Return unknowns with initial states of the pieces, computed in sequence, and the typical motion of coordinates (S,).
 
-        Each is the final state of the previous piece, corrected to fit the piece's measurements.
+        Each initial state is the final state of the previous piece, corrected to fit the piece's measurements.
         """
         P = len(self.unknowns.names)
         x = self.unknowns.values(z[:P])
-        found, moved = np.concatenate([z, np.zeros(self.K - len(z))]), []
+        unknowns, moved = np.concatenate([z, np.zeros(self.K - len(z))]), []
         ends = np.zeros((2, 2, 0))
         for p, piece in enumerate(self.pieces):
             columns = self.columns[p]
             if piece.first:
-                self._begin_at(p, ends[1], x)  # the previous piece is of the same record
+                self._begin_at(p, ends[1], x)  # the previous piece belongs to the same record
                 fit = minimize_squares(self._residuals_of_piece(p, x, tol), np.zeros(self.S), FEW_STEPS, COARSE_STEP)
-                found[columns] = fit.z if np.isfinite(fit.cost) else 0.0
-            ends = np.asarray(self._predict_piece(p, x, np.where(columns < 0, 0.0, found[columns])[None], tol).ends)[0]
+                unknowns[columns] = fit.z if np.isfinite(fit.cost) else 0.0
+            ends = np.asarray(self._predict_piece(p, x, np.where(columns < 0, 0.0, unknowns[columns])[None], tol).ends)[0]
             if not np.isfinite(ends).all():
                 raise PieceFailed
             if piece.first:
                 moved.append(self.inverse[p] @ (ends[1] - ends[0]).ravel())
         size = np.sqrt(np.mean(np.square(moved), axis=0)) if moved else np.ones(self.S)
-        return found, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
+        return unknowns, np.maximum(size, LEAST_MOTION * size.max(initial=0.0))
 
     def _predict_piece(self, p: int, x: np.ndarray, shift: Float[np.ndarray, "B S"], tol: TolerancePair) -> Prediction:
         return self.predictor(self.members_of(np.full(len(shift), p), np.tile(x, (len(shift), 1)), shift), tol)
@@ -139,28 +140,28 @@ class MultipleShooting(FitProblem):
     def _residuals_of_piece(self, p: int, x: np.ndarray, tol: TolerancePair) -> Objective:
         """Return the residuals of a piece as a function of its initial state, damped towards the end of the previous piece."""
         rows, S, damping = np.flatnonzero(self.run == p), self.S, None
-        at, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.y[self.present][rows]
+        entries, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.y[self.present][rows]
 
         def evaluate(shift: Float[np.ndarray, "B S"]) -> Residuals:
             nonlocal damping
-            found = self._predict_piece(p, x, shift, tol)
-            r, J = (found.y[:, *at] - measured) / sigma, found.dy[:, *at, len(x) :] / sigma[:, None]
+            prediction = self._predict_piece(p, x, shift, tol)
+            r, J = (prediction.y[:, *entries] - measured) / sigma, prediction.dy[:, *entries, len(x) :] / sigma[:, None]
             damping = float(CONTINUED_PART * np.linalg.norm(J[0], 2)) if damping is None else damping
             damped = np.broadcast_to(damping * np.eye(S), (len(shift), S, S))
-            return Residuals(np.concatenate([r, damping * shift], 1), np.concatenate([J, damped], 1), found.code)
+            return Residuals(np.concatenate([r, damping * shift], 1), np.concatenate([J, damped], 1), prediction.code)
 
         return evaluate
 
-    def further_rows(self, found: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Iterate over the residuals of priors, and those of continuity, (F_p - s_{p+1}) / scale * weight."""
-        yield from super().further_rows(found, z)
-        sets, before, following = len(z), self.following - 1, self.following
-        ends, d_ends, inverse = np.asarray(found.ends), np.asarray(found.d_ends), self.inverse[following]
+    def further_rows(self, prediction: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Iterate over the residuals of priors and of continuity, (F_p - s_{p+1}) / scale * weight."""
+        yield from super().further_rows(prediction, z)
+        sets, preceding, following = len(z), self.following - 1, self.following
+        ends, d_ends, inverse = np.asarray(prediction.ends), np.asarray(prediction.d_ends), self.inverse[following]
         weight = self._defect_weight / self.scale
-        gap = (ends[:, before, 1] - ends[:, following, 0]).reshape(sets, len(following), -1)
+        gap = (ends[:, preceding, 1] - ends[:, following, 0]).reshape(sets, len(following), -1)
         defects = np.einsum("psn,bpn->bps", inverse, gap) * weight
         J = 0.0
-        for sign, pieces, which in ((1.0, before, 1), (-1.0, following, 0)):
+        for sign, pieces, which in ((1.0, preceding, 1), (-1.0, following, 0)):
             flat = d_ends[:, pieces, which].reshape(sets, len(following), -1, d_ends.shape[-1])
             by_both = sign * weight[:, None] * np.einsum("psn,bpnk->bpsk", inverse, flat)
             J = J + self.by_unknowns(by_both.reshape(sets, -1, d_ends.shape[-1]), np.repeat(pieces, self.S), z)
@@ -178,7 +179,7 @@ class MultipleShooting(FitProblem):
 
 
 class PieceFailed(Exception):
-    """A piece cannot be simulated with the first guess, so that the initial state of the next is unknown."""
+    """A piece cannot be simulated with the first guess; the initial state of the next piece is therefore unknown."""
 
 
 def fit_pieces(
@@ -188,7 +189,7 @@ def fit_pieces(
     minimizer: Minimizer,
     samples: float = RESIDUALS_PER_UNKNOWN,
 ) -> tuple[MultipleShooting, Fit]:
-    """Fit the records in pieces, from unknowns z of the problem; return the problem in pieces, and the fit of its unknowns.
+    """Fit the records in pieces, from unknowns z of the problem; return the problem in pieces and its fit.
 
     Each piece has at least `samples` residuals for each unknown of its initial state.
 
@@ -199,18 +200,18 @@ def fit_pieces(
     fit, history = Fit(shooting.guess, np.inf, False, []), []
     for weight in WEIGHTS:
         shooting.weight = weight
-        one = minimizer.with_label(f"pieces, weight of the gaps {weight:.0e}")
+        labelled = minimizer.with_label(f"pieces, weight of the gaps {weight:.0e}")
         steps, step_tol = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
-        fit = one.minimize(shooting, fit.z, tol, None, steps, step_tol)
+        fit = labelled.minimize(shooting, fit.z, tol, None, steps, step_tol)
         history += fit.history
-        if weight > WEIGHTS[0] and not fit.converged:  # larger weights would only be farther from a minimum
+        if weight > WEIGHTS[0] and not fit.converged:  # with larger weights, the fit would be even farther from a minimum
             break
     return shooting, fit._replace(history=history)
 
 
 def cut_records(problem: FitProblem, least: float) -> tuple[Piece, ...]:
     """Cut the records into pieces of at least `least` residuals."""
-    found = []
+    pieces = []
     for k in range(len(problem.records)):
         numbers = problem.present[k].sum(1)
         last, first, count = int(np.flatnonzero(numbers)[-1]), 0, 0
@@ -219,21 +220,21 @@ def cut_records(problem: FitProblem, least: float) -> tuple[Piece, ...]:
             count += numbers[i - 1]
             left -= numbers[i - 1]
             if count >= least and left >= least:
-                found.append(Piece(k, first, i))
+                pieces.append(Piece(k, first, i))
                 first, count = i, 0
-        found.append(Piece(k, first, last))
-    return tuple(found)
+        pieces.append(Piece(k, first, last))
+    return tuple(pieces)
 
 
 def _piece_tables(problem: FitProblem, pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the padded times of all pieces, each ending where the next begins; and the piece and time index of each residual."""
+    """Return the padded times of pieces, each ending where the next begins, and the piece and time index of each residual."""
     length = max(piece.end - piece.first for piece in pieces) + 1
     record, time, _ = problem.index.T
-    ts, which, at = [], np.zeros(len(record), int), np.zeros(len(record), int)
+    ts, which, time_index = [], np.zeros(len(record), int), np.zeros(len(record), int)
     for p, piece in enumerate(pieces):
-        own = problem.ts[piece.record, piece.first : piece.end + 1]
-        between = np.linspace(own[-2], own[-1], length - len(own) + 2)
-        ts.append(np.concatenate([own[:-2], between]))
-        own_rows = (record == piece.record) & (time >= piece.first) & (time <= piece.end)  # the next piece overwrites its own
-        which[own_rows], at[own_rows] = p, np.where(time[own_rows] == piece.end, length - 1, time[own_rows] - piece.first)
-    return np.stack(ts), which, at
+        piece_times = problem.ts[piece.record, piece.first : piece.end + 1]
+        between = np.linspace(piece_times[-2], piece_times[-1], length - len(piece_times) + 2)
+        ts.append(np.concatenate([piece_times[:-2], between]))
+        own_rows = (record == piece.record) & (time >= piece.first) & (time <= piece.end)  # the next piece overwrites its rows
+        which[own_rows], time_index[own_rows] = p, np.where(time[own_rows] == piece.end, length - 1, time[own_rows] - piece.first)
+    return np.stack(ts), which, time_index

@@ -1,6 +1,6 @@
 """Tables of measurements from files, pandas, xarray and mappings: columns by their headings, without interpretation.
 
-CSV files are read by the standard library so that messages name the line of each mistake; pandas does not give it.
+CSV files are read by the standard library, because messages name the line of each mistake, which pandas does not provide.
 """
 
 import csv
@@ -19,12 +19,12 @@ from udkjax.scene.bodies import COORDINATES
 from udkjax.study.identify.records import ByChannel
 from udkjax.wording import abbreviate, quote, suggestion
 
-if TYPE_CHECKING:  # imported only if one of their tables is given
+if TYPE_CHECKING:  # imported only if their tables are given
     import pandas
     import xarray
 
 TableData: TypeAlias = "ByChannel[ArrayLike] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
-TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings, and the suffix of a channel's noise
+TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings of times and record names, and the suffix of a channel's noise
 _DELIMITERS = (";", "\t", ",")
 # Coordinates in files written by `Solution.to_xarray`, as channels of bodies.
 _STATES = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
@@ -69,7 +69,7 @@ def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterat
         elif path.suffix.lower() == ".nc":
             with OptionalImport():
                 import xarray
-            data = xarray.load_dataset(path, decode_times=False)  # otherwise xarray converts seconds to durations
+            data = xarray.load_dataset(path, decode_times=False)  # without this, xarray converts seconds to durations
             yield from _read_dataset(data, bodies, str(path), problems, path.stem)
         else:
             problems.append(f"{path}: must be a .csv or a .nc file")
@@ -101,7 +101,7 @@ def _read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
 
 
 def _cut_empty_end(cells: list[str]) -> list[str]:
-    """Remove empty cells from the end of a row, as spreadsheets write them."""
+    """Remove empty cells at the end of a row, which spreadsheets write."""
     return cells[: max((k + 1 for k, cell in enumerate(cells) if cell.strip()), default=0)]
 
 
@@ -117,7 +117,7 @@ def _join_points(cells: Sequence[str], delimiter: str) -> list[str]:
 
 
 def _table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) -> Table:
-    """Return the table of a pandas DataFrame; its index is a column if it is named as a time or a record."""
+    """Return the table of a pandas DataFrame; the index is a column if its name is that of a time or a record."""
     indexed = data.index.name is not None and _heading(str(data.index.name))[0] in (*TIME, RECORD)
     columns = [data.index.to_series()] if indexed else []
     columns += [data.iloc[:, k] for k in range(data.shape[1])]
@@ -128,7 +128,7 @@ def _table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) 
 def _table_of_columns(
     source: str, given: Sequence[tuple[str, ArrayLike]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
 ) -> Table:
-    """Return the table of columns whose headings may name units; a single value stands for all rows."""
+    """Return a table from columns whose headings may name units; a single value applies to all rows."""
     columns: dict[str, TableColumn] = {}
     for text, values in given:
         heading, units = _heading(text)

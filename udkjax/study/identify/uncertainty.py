@@ -2,9 +2,9 @@
 
 With r the residuals (R,) divided by the standard deviations of the noise, and J = dr/dz (R, K), the Fisher information is J^T J,
 and the covariance of the unknowns z is its inverse, both computed from the singular values of J = U S V^T. A direction of z whose
-singular value is as small as the errors of J is not determined by the measurements. A parameter that takes part in such a
-direction is unknown; the variance of the others follows from the pseudoinverse. Nuisance unknowns, such as those of initial
-states, are columns of J like all others: omitting them from the covariance afterwards is the Schur complement.
+singular value is as small as the errors of J is not determined by the measurements. A parameter with a component in such
+a direction is unknown; the variance of the others follows from the pseudoinverse. Nuisance unknowns, such as those of initial
+states, are columns of J like all others; to omit them from the covariance afterwards is equivalent to the Schur complement.
 
 If the noise of some residuals is unknown, it is estimated from them, s^2 = chi^2 / (R - gamma), with gamma the number of unknowns
 that these residuals determine (MacKay, Neural Computation 4 (1992) 415): all K if there are no other residuals.
@@ -23,12 +23,12 @@ from udkjax.study.identify.fit_problem import INVISIBLE_RATIO
 from udkjax.study.noise import SIGNIFICANCE
 from udkjax.wording import join_names
 
-POOR_ERROR = 0.5  # standard error relative to the value, or to the scale of a parameter of either sign
-HIGH_CORRELATION = 0.98  # of two parameters: one combination of them is ten times less accurate than the other
-LEAST_NOISE = 1e-15  # relative to the assumed noise: smaller noise is rounding
-NOISE_ITERATIONS, EQUAL_NOISE = 50, 1e-10  # alternating updates of the noise and of gamma, and their relative tolerance
-# Relative to the largest coefficient of a direction: unknowns with smaller ones take no part in it. Directions are as accurate as
-# this if their singular value exceeds the errors of the Jacobian by the inverse factor.
+POOR_ERROR = 0.5  # standard error reported as large, relative to the value or to the scale of a parameter of either sign
+HIGH_CORRELATION = 0.98  # correlation at which a combination of two parameters is ten times less accurate than the other
+LEAST_NOISE = 1e-15  # noise below this, relative to the assumed noise, is rounding
+NOISE_ITERATIONS, EQUAL_NOISE = 50, 1e-10  # alternating updates of noise and gamma: largest number, relative tolerance
+# Coefficients below this, relative to the largest of a direction, count as zero. Directions are as accurate as this if their
+# singular value exceeds the errors of the Jacobian by the inverse factor.
 SMALLEST_PART = 1e-3
 COMMON_FACTOR_TOL = 1e-2  # relative difference of factors that are called a common factor
 
@@ -46,7 +46,7 @@ class UnknownValues(NamedTuple):
     kinds: Sequence[str]
 
     def typical(self, k: int) -> float:
-        """Return the scale to compare a standard error with: the value, or the scale of a parameter of either sign."""
+        """Return the scales to compare standard errors with: the value, or the scale of a parameter of either sign."""
         return float(abs(self.x[k]) or abs(self.dx_dz[k])) if self.kinds[k] == "bounded" else float(abs(self.dx_dz[k]))
 
 
@@ -74,7 +74,7 @@ class Uncertainty:
         chi2: sum of squares of the residuals divided by their noise, given or estimated.
         degrees_of_freedom: number of residuals minus number of determined directions.
         noise: for each group of residuals with unknown noise, its estimate relative to the assumed noise.
-        projection: U, whose columns span the part of the residuals that the fit removes.
+        projection: U; its columns span the part of the residuals that the fit removes.
         state_errors: standard errors of the unknowns of initial states.
     """
 
@@ -138,19 +138,19 @@ def estimate_uncertainty(
     """Compute the uncertainty of unknowns: the covariance (J^T J)^-1, and the directions that J does not determine.
 
     `noise_group` is the group (0, 1, ...) of residuals with a common unknown noise, or -1 if the noise is known (the default).
-    The first `parameters` unknowns, by default all, are the parameters. The last rows are those of `priors`: directions that only
-    they determine have the priors' uncertainty, however well the other directions are measured.
+    The first `parameters` unknowns, by default all, are the parameters. The last rows are those of `priors`; directions that only
+    priors determine have the priors' uncertainty, however well other directions are measured.
     """
     K, P = len(values.names), len(values.names) if parameters is None else parameters
-    size, before = np.linalg.norm(J, axis=0), J[len(J) - priors :]
-    alive = np.flatnonzero((size > INVISIBLE_RATIO * size.max(initial=0.0)) | np.any(before != 0.0, axis=0))
+    size, prior_rows = np.linalg.norm(J, axis=0), J[len(J) - priors :]
+    alive = np.flatnonzero((size > INVISIBLE_RATIO * size.max(initial=0.0)) | np.any(prior_rows != 0.0, axis=0))
     group = np.full(len(r), -1) if noise_group is None else np.asarray(noise_group, int)
     noise = _noise_scales(J[:, alive], r, group)
     scale = np.append(noise, 1.0)[group]
     noise_known = np.isfinite(scale).all()
     u, sigma, vt = np.linalg.svd(J[:, alive] / (scale[:, None] if noise_known else 1.0), full_matrices=False)
     shown = sigma > INVISIBLE_RATIO * sigma.max(initial=0.0)
-    sigma, vt, u, shown = _with_priors(before[:, alive], sigma, vt, u, shown)
+    sigma, vt, u, shown = _with_priors(prior_rows[:, alive], sigma, vt, u, shown)
     x, dx_dz = (np.asarray(part, float)[alive] for part in (values.x, values.dx_dz))
     free = simplest_basis(null_space(vt[shown], 0.5), x, dx_dz, [values.kinds[k] for k in alive.tolist()])
     directions, flats = (_insert_columns(rows, alive, K) for rows in (vt, free))
@@ -182,41 +182,46 @@ def estimate_uncertainty(
 
 
 def _with_priors(
-    before: np.ndarray, sigma: np.ndarray, vt: np.ndarray, u: np.ndarray, shown: np.ndarray
+    prior_rows: np.ndarray, sigma: np.ndarray, vt: np.ndarray, u: np.ndarray, shown: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Add singular values and vectors of the directions that only priors determine, relative to the priors' own size."""
+    """Add singular values and vectors of the directions that only priors determine; the threshold is relative to the priors."""
     unshown = null_space(vt[shown], 0.5)
-    if not len(unshown) or not len(before):
+    if not len(unshown) or not len(prior_rows):
         return sigma, vt, u, shown
-    _, own, w = np.linalg.svd(before @ unshown.T, full_matrices=False)
-    some = own > INVISIBLE_RATIO * np.linalg.norm(before, axis=1).max(initial=0.0)
-    rows = np.concatenate([np.zeros((len(u) - len(before), int(some.sum()))), (before @ unshown.T @ w[some].T) / own[some]])
-    sigma, vt = np.concatenate([sigma[shown], own[some]]), np.concatenate([vt[shown], w[some] @ unshown])
+    _, prior_sigma, w = np.linalg.svd(prior_rows @ unshown.T, full_matrices=False)
+    determined = prior_sigma > INVISIBLE_RATIO * np.linalg.norm(prior_rows, axis=1).max(initial=0.0)
+    rows = np.concatenate(
+        [
+            np.zeros((len(u) - len(prior_rows), int(determined.sum()))),
+            (prior_rows @ unshown.T @ w[determined].T) / prior_sigma[determined],
+        ]
+    )
+    sigma, vt = np.concatenate([sigma[shown], prior_sigma[determined]]), np.concatenate([vt[shown], w[determined] @ unshown])
     return sigma, vt, np.concatenate([u[:, shown], rows], axis=1), np.ones(len(sigma), bool)
 
 
 def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.ndarray:
-    whole = np.zeros((len(rows), count))
-    whole[:, columns] = rows
-    return whole
+    table = np.zeros((len(rows), count))
+    table[:, columns] = rows
+    return table
 
 
 def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the factor s of each group of residuals; NaN if a group has no more residuals than unknowns that it determines."""
+    """Return the factor s of each group of residuals; NaN for groups that determine as many unknowns as they have residuals."""
     groups = [np.flatnonzero(group == g) for g in range(group.max(initial=-1) + 1)]
     sums, counts = np.array([r[g] @ r[g] for g in groups]), np.array([len(g) for g in groups], float)
-    # The factor R of QR replaces the rows of a group: only their J^T J is needed.
-    parts = [np.linalg.qr(J[g], mode="r") for g in (*groups, np.flatnonzero(group < 0))]
+    # The factor R of QR replaces the rows of a group, since only J^T J is needed.
+    factors = [np.linalg.qr(J[g], mode="r") for g in (*groups, np.flatnonzero(group < 0))]
     s2 = sums / np.maximum(counts, 1.0)
     for _ in range(NOISE_ITERATIONS if groups else 0):
-        scaled = [part / s for part, s in zip(parts, [*np.sqrt(np.where(s2 > 0, s2, 1.0)), 1.0], strict=True)]
+        scaled = [factor / s for factor, s in zip(factors, [*np.sqrt(np.where(s2 > 0, s2, 1.0)), 1.0], strict=True)]
         u, sigma, _ = np.linalg.svd(np.concatenate(scaled), full_matrices=False)
         leverage = np.sum(u[:, sigma > INVISIBLE_RATIO * sigma.max(initial=0.0)] ** 2, axis=1)
-        ends = np.cumsum([len(part) for part in parts])[:-1]
-        determined = np.array([part.sum() for part in np.split(leverage, ends)[: len(groups)]])
+        ends = np.cumsum([len(factor) for factor in factors])[:-1]
+        determined = np.array([factor.sum() for factor in np.split(leverage, ends)[: len(groups)]])
         left = counts - determined
-        before, s2 = s2, np.where(left > EQUAL_NOISE * counts, sums / np.where(left > 0, left, 1.0), np.nan)
-        if np.isnan(s2).any() or np.all(np.abs(s2 - before) <= EQUAL_NOISE * s2):
+        previous, s2 = s2, np.where(left > EQUAL_NOISE * counts, sums / np.where(left > 0, left, 1.0), np.nan)
+        if np.isnan(s2).any() or np.all(np.abs(s2 - previous) <= EQUAL_NOISE * s2):
             break
     return np.maximum(np.sqrt(s2), LEAST_NOISE)
 
@@ -224,21 +229,21 @@ def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray
 def simplest_basis(
     free: Float[np.ndarray, "D K"], x: Float[np.ndarray, "K"], dx_dz: Float[np.ndarray, "K"], kinds: Sequence[str]
 ) -> Float[np.ndarray, "D K"]:
-    """Return sparse rows with the same span as the orthonormal rows `free`, the first a common factor if that is in the span."""
-    found = echelon(free, SMALLEST_PART)
-    relative = np.array([kind != "free" for kind in kinds], bool) & (x != 0.0) & np.any(found != 0.0, axis=0)
-    if len(found) < 2 or not relative.any():
-        return found
+    """Return sparse rows with the span of the orthonormal rows `free`; the first is a common factor if the span contains it."""
+    basis = echelon(free, SMALLEST_PART)
+    relative = np.array([kind != "free" for kind in kinds], bool) & (x != 0.0) & np.any(basis != 0.0, axis=0)
+    if len(basis) < 2 or not relative.any():
+        return basis
     factor = np.where(relative, x / dx_dz, 0.0)
     outside = factor - free.T @ (free @ factor)
     if np.linalg.norm(outside) > SMALLEST_PART * np.linalg.norm(factor):
-        return found
+        return basis
     # The factor replaces the direction that contributes most to it.
-    share = np.abs(np.linalg.lstsq(found.T, factor, rcond=None)[0]) * np.linalg.norm(found, axis=1)
-    return np.concatenate([factor[None], np.delete(found, int(np.argmax(share)), axis=0)])
+    share = np.abs(np.linalg.lstsq(basis.T, factor, rcond=None)[0]) * np.linalg.norm(basis, axis=1)
+    return np.concatenate([factor[None], np.delete(basis, int(np.argmax(share)), axis=0)])
 
 
-# --- words
+# --- text
 
 
 def _sentences(found: Uncertainty) -> Iterator[str]:
@@ -280,7 +285,7 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
 
 
 def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Direction:
-    """Describe a direction of z: as a common factor if it is one, else by changes per one percent of the largest change."""
+    """Describe a direction of z, either as a common factor or by changes relative to one percent of the largest change."""
     nonzero = np.flatnonzero(coefficients).tolist()
     x, change = (np.asarray(a, float)[nonzero] for a in (values.x, values.dx_dz))
     change = change * coefficients[nonzero]

@@ -2,7 +2,7 @@
 
 A parameter x with first guess x0 is x0 exp(z) if it is positive; low + (high - low) / (1 + (1 / u0 - 1) exp(-z)) if it is
 bounded, with u0 = (x0 - low) / (high - low); and x0 + scale z otherwise. An initial state is closed from a guess plus changes of
-some coordinates and rates, one of each per degree of freedom.
+some coordinates and rates, one coordinate and one rate per degree of freedom.
 """
 
 from collections.abc import Hashable, Sequence
@@ -27,17 +27,17 @@ from udkjax.study.quantities import Setter, parameter_value
 from udkjax.wording import quote
 
 Transform = Literal["positive", "bounded", "free"]
-BOUND_DISTANCE = 1e-3  # relative to the distance between the bounds: a closer value is at a bound
-FARTHEST_UNKNOWN = 20.0  # largest |z|: a positive parameter a hundred million times too large
-# Distance of other guesses from the first: a factor for positive parameters, relative to the scale for others.
+BOUND_DISTANCE = 1e-3  # distance from a bound, relative to the range, at which a value is at the bound
+FARTHEST_UNKNOWN = 20.0  # largest |z|; for a positive parameter, about the first guess times 5e8
+# Distance of other guesses from the first: a factor for positive parameters, a fraction of the scale for others.
 GUESS_FACTOR, GUESS_RADIUS = 2.5, 0.5
-BOUND_MARGIN = 0.02  # relative to the distance between the bounds: least distance of a guess, as z is infinite at a bound
-SMALLEST_READABLE_PART = 1e-3  # relative to the largest: least pivot of coordinates chosen as unknowns of the free motions
-STATE_RADIUS = 0.05  # relative to the scene's length and time, and rad: distance of guesses of initial states from the first
+BOUND_MARGIN = 0.02  # least distance of a guess from a bound, relative to the range, since z is infinite at a bound
+SMALLEST_READABLE_PART = 1e-3  # least pivot, relative to the largest, of coordinates that are chosen as unknowns
+STATE_RADIUS = 0.05  # distance of guesses of initial states from the first, relative to the scene's length and time, and rad
 
 
 class Target(NamedTuple):
-    """The numbers of a scene that a value is assigned to: hashable, so that compiled programs serve all values."""
+    """The numbers of a scene that a value is assigned to. Targets are hashable, to share compiled programs among values."""
 
     names: tuple[str, ...] = ()
     scaled: bool = False
@@ -45,7 +45,7 @@ class Target(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """One parameter: its name, target, transform, first guess, bounds, and prior."""
+    """A parameter: its name, target, transform, first guess, bounds, and prior."""
 
     name: str
     units: str
@@ -53,10 +53,10 @@ class Unknown(NamedTuple):
     kind: Transform
     at_scene_value: bool  # True if the first guess is the scene's value
     guess: float
-    low: float  # NaN: no bounds
+    low: float  # NaN if there are no bounds
     high: float
     scale: float
-    mean: float  # NaN: no prior
+    mean: float  # NaN if there is no prior
     sigma: float
 
 
@@ -127,7 +127,7 @@ def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array
 
 
 def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample guesses around a first one: within a factor, or half of the scale; every second one anywhere between bounds.
+    """Sample guesses around a first one: within a factor, or half of the scale; every second guess anywhere between bounds.
 
     Unknowns of initial states, which follow the parameters, are changed only slightly.
     """
@@ -144,7 +144,7 @@ def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int
 
 
 def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample points of the unit cube, one in each of `count` parts of every coordinate; SciPy's takes a second to import."""
+    """Sample points of the unit cube, one in each of `count` parts of every coordinate; SciPy's function is slow to import."""
     random = np.random.default_rng(seed)
     parts = random.permuted(np.tile(np.arange(count), (dimensions, 1)), axis=1).T
     return (parts + random.random((count, dimensions))) / count
@@ -156,8 +156,8 @@ def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray
 class InitialStateUnknowns(NamedTuple):
     """The S dimensionless unknowns of one initial state, which tied records share.
 
-    `sizes` (S,) are the changes of the named coordinates and rates per unit of each unknown, in `units`; `basis` those of all q
-    and v (n,).
+    `sizes` (S,) are the changes of the named coordinates and rates per unit of each unknown, in `units`; `basis` has the
+    changes of all q and v (n,).
     """
 
     names: tuple[str, ...]
@@ -170,14 +170,14 @@ def initial_state_unknowns(
     mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record]
 ) -> tuple[tuple[InitialStateUnknowns, ...], Int[np.ndarray, "records S"], Float[np.ndarray, "records 2 n S"]]:
     """Return the unknowns of all initial states, their indices in z for each record (-1: unused), and the changes of q and v."""
-    found: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # by the name of a start, or the index of its record
-    at, problems = len(unknowns.names), []
+    by_start: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # key: the name of a start, or the index of its record
+    index, problems = len(unknowns.names), []
     for k, record in enumerate(records):
         start, key = record.start, record.start.name or k
         if start.estimate == "nothing":
             continue
-        if key in found:
-            if not _same(found[key][0], start):
+        if key in by_start:
+            if not _same(by_start[key][0], start):
                 problems.append(
                     f"{record.place}start {quote(start.name)} differs from that of an earlier record: give the same Start to both"
                 )
@@ -185,27 +185,27 @@ def initial_state_unknowns(
             label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
             try:
                 mech = apply_values(with_conditions(mechanism, record), unknowns.targets, unknowns.guess)
-                found[key] = start, at, state_unknowns(mech, record.t0, start.state, start.estimate, label)
+                by_start[key] = start, index, state_unknowns(mech, record.t0, start.state, start.estimate, label)
             except SceneError as problem:
                 raise IdentificationError([f"{record.place}{problem}"]) from None
-            at += len(found[key][2].names)
+            index += len(by_start[key][2].names)
     if problems:
         raise IdentificationError(problems)
-    states = tuple(state for _, _, state in found.values())
+    states = tuple(state for _, _, state in by_start.values())
     S = max((len(state.names) for state in states), default=0)
     columns, bases = np.full((len(records), S), -1), np.zeros((len(records), 2, 3 * len(mechanism.body_names), S))
     for k, record in enumerate(records):
         if record.start.estimate != "nothing":
-            _, first, state = found[record.start.name or k]
+            _, first, state = by_start[record.start.name or k]
             count = len(state.names)
             columns[k, :count], bases[k, ..., :count] = first + np.arange(count), state.basis
     return states, columns, bases
 
 
-def _same(one: Start, two: Start) -> bool:
-    a, b = one.state, two.state
+def _same(first: Start, second: Start) -> bool:
+    a, b = first.state, second.state
     equal = a is b or (a is not None and b is not None and np.array_equal(a.q, b.q) and np.array_equal(a.v, b.v))
-    return equal and one.estimate == two.estimate
+    return equal and first.estimate == second.estimate
 
 
 def with_conditions(mechanism: Mechanism, record: Record) -> Mechanism:
@@ -214,7 +214,7 @@ def with_conditions(mechanism: Mechanism, record: Record) -> Mechanism:
 
 
 def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Estimated, label: str) -> InitialStateUnknowns:
-    """Choose coordinates that parametrize the closed states near a guess (None: the scene's own): angles only, if possible.
+    """Choose coordinates that parametrize the closed states near a guess (None: the scene's guess), only angles if possible.
 
     The names of the unknowns begin with `label`.
     """
@@ -242,10 +242,10 @@ def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Es
 
 
 def _independent_rows(free: np.ndarray) -> list[int]:
-    """Choose as many well-conditioned rows as there are columns: rows of angles only, if possible."""
-    count, every = free.shape[1], np.arange(len(free))
-    chosen = every[:0]
-    for rows in (every[2::3], every):
+    """Choose as many well-conditioned rows as there are columns, only rows of angles if possible."""
+    count, all_rows = free.shape[1], np.arange(len(free))
+    chosen = all_rows[:0]
+    for rows in (all_rows[2::3], all_rows):
         factors: Any = qr(free[rows].T / np.linalg.norm(free, 2), mode="r", pivoting=True)
         R, order = factors
         chosen, sizes = rows[order[:count]], np.abs(np.diag(R))
@@ -258,19 +258,19 @@ def _independent_rows(free: np.ndarray) -> list[int]:
 
 
 def guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
-    """Return guesses q and v (records, bodies, 3) of initial states; None if all are the scene's own."""
+    """Return guesses q and v (records, bodies, 3) of initial states; None if all are the scene's guess."""
     states = [record.start.state for record in records]
     if all(state is None for state in states):
         return None, None
-    own = State(mechanism.q0, mechanism.v0)
-    q, v = (np.stack([np.asarray(getattr(state or own, part)) for state in states]) for part in "qv")
+    default = State(mechanism.q0, mechanism.v0)
+    q, v = (np.stack([np.asarray(getattr(state or default, field)) for state in states]) for field in "qv")
     return q, v
 
 
 def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray]:
-    """Return the values in all records of every parameter that differs between them."""
+    """Return the values in all records of each parameter that differs between records."""
     numbers, problems = parameters_of(mechanism), []
-    found: dict[str, np.ndarray] = {}
+    conditions: dict[str, np.ndarray] = {}
     for name in dict.fromkeys(name for record in records for name in record.conditions):
         owner, index = split_index(name, numbers)
         if owner not in numbers or numbers[owner].value is None:
@@ -278,11 +278,11 @@ def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, 
             continue
         usual = np.asarray(numbers[owner].value)[index]
         try:
-            found[name] = np.stack(
+            conditions[name] = np.stack(
                 [np.broadcast_to(np.asarray(r.conditions.get(name, usual), float), usual.shape) for r in records]
             )
         except ValueError:
             problems.append(f"conditions: {quote(name)} must be of shape {usual.shape} in each record")
     if problems:
         raise IdentificationError(problems)
-    return found
+    return conditions
