@@ -1,4 +1,4 @@
-"""Positions of mechanisms: closed, followed along a drive, in batches, and where their branches meet. Nothing moves in time."""
+"""Positions of mechanisms: closed, followed along a drive, in batches, and where their branches meet. No dynamics."""
 
 from udkjax.lazy_names import lazy_names
 

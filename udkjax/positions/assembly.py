@@ -4,11 +4,11 @@ Positions by damped Gauss-Newton in the mass metric, with Psi of all rows,
 
     q <- q - s M^(-1/2) D^+ Psi,       D = Psi_q M^(-1/2),
 
-the smallest change that removes the linearized residual; s limits the length of a step, so that the branch of the guess is kept,
-and is halved until the residual falls: no step makes a state worse. Velocities by v - M^(-1/2) D^+ Psi_dot, which leaves the free
-motion of the guess as it is and satisfies the drivers. D^+ is truncated, so redundant rows do no harm, and its derivative is the
-one that all pseudoinverses share: gradients of the assembled state are right wherever the closed mechanism's rank is constant.
-They take the characteristic length as fixed, although from a guess so far away that steps are limited it affects the result.
+the smallest change that removes the linearized residual. s limits the length of a step, to stay on the branch of the guess, and
+is halved until the residual decreases. Velocities are v - M^(-1/2) D^+ Psi_dot: the drivers are satisfied, and the free motion of
+the guess is unchanged. D^+ is truncated, so redundant rows do no harm, and has the derivative that all pseudoinverses share:
+gradients of the assembled state are right if the rank of the closed mechanism is constant. They treat the characteristic length
+as fixed, although it affects the result from guesses so far away that steps are limited.
 """
 
 from collections.abc import Iterator, Sequence
@@ -45,7 +45,7 @@ from udkjax.scene.suspicions import body_sizes, suspicions
 class State(PrintsTable):
     """Coordinates and velocities of all bodies: x, y (m) and angle (rad), and their rates, each (bodies, 3).
 
-    Of a `ConstrainedSystem`: (n,) each.
+    For a `ConstrainedSystem`: (n,) each.
 
     Args:
         q: coordinates (bodies, 3): x, y (m) and angle (rad).
@@ -96,8 +96,8 @@ def assemble(
 ) -> State:
     """Return a state with Psi(t, q) = 0 and Psi_dot(t, q, v) = 0, near a given one.
 
-    A state that satisfies all constraints is returned unchanged, up to rounding. Differentiable to second order with respect to
-    every number of the mechanism and the guess, also where constraints are redundant.
+    A state that satisfies all constraints is returned unchanged, up to rounding. The result has first and second derivatives by
+    every number of the mechanism and of the guess, even with redundant constraints.
 
     Args:
         mechanism: the mechanism.
@@ -127,7 +127,7 @@ def close(
 ) -> Closure:
     """Close a mechanism as `assemble` does, and return the residuals with the state instead of raising.
 
-    Concrete numbers give a concrete closure, also while something else is traced.
+    The closure of concrete numbers is concrete, even while something else is traced.
     """
     if not mechanism.is_concrete or is_traced((t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
@@ -137,7 +137,7 @@ def close(
             moment, t = from_moment(moment, t), 0.0
         return close(moment, analysis, t, state)
     if analysis is not None and isinstance(analysis.scales.length, Tracer):
-        analysis = None  # a traced one cannot be stored
+        analysis = None  # a traced analysis cannot be cached
     return _closure_of_concrete(mechanism, np.asarray(t).item(), state, analysis)
 
 
@@ -147,7 +147,7 @@ def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, an
         scales = (analyse(mechanism) if analysis is None else analysis).scales
         guess = State(mechanism.q0, mechanism.v0) if state is None else state
         q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
-        with np.errstate(all="ignore"):  # a state that is not finite does not close
+        with np.errstate(all="ignore"):  # non-finite states are reported as open
             q, v, psi, psi_dot, rank = _close_concrete(mechanism, scales, t, q, v)
             closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
         state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
@@ -179,7 +179,7 @@ _close_compiled = deferred(_close)
 
 
 def require_closed(mechanism: Mechanism, closure: Closure, t: NumberLike = 0.0, guess: State | None = None) -> None:
-    """Raise an `AssemblyError` where a closure at time t (s) from a guess is not closed; traced values pass."""
+    """Raise an `AssemblyError` if the closure of a guess at time t (s) is not closed; traced values are not checked."""
     closed = closure.is_closed
     if isinstance(closed, Tracer) or closed:
         return
@@ -199,13 +199,13 @@ class Check(NamedTuple):
     rank: int  # away from singular configurations
     degrees_of_freedom: int
     redundant: tuple[tuple[str, int], ...]  # rows that can be left out: the constraint and the row within it
-    dependent: tuple[str, ...]  # the constraints that depend on each other
+    dependent: tuple[str, ...]  # constraints that depend on each other
     residual_before: float  # the largest |Psi| (m, rad) as given, and assembled
     residual_after: float
     closed: bool
-    length: float  # m; characteristic, as in `analyse`
-    time: float  # s
-    mass: float  # kg
+    length: float  # characteristic length (m), as in `analyse`
+    time: float  # characteristic time (s)
+    mass: float  # characteristic mass (kg)
     moved: tuple[str, ...] = ()  # bodies moved far by assembly, relative to their sizes
     suspicious: tuple[str, ...] = ()  # likely mistakes
 
@@ -275,8 +275,8 @@ def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
     return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
 
 
-# Fraction of a body's size: rough drawings and numbers of three digits leave smaller gaps. Without a warning a mistyped number
-# would be closed silently.
+# Fraction of a body's size. Gaps from rough drawings or from numbers of three digits are smaller; larger moves may come from a
+# mistyped number, and are reported.
 WORTH_SAYING = 0.01
 
 
@@ -303,7 +303,7 @@ def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> I
 
 
 def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) -> str:
-    """Return a warning if assembly at time t (s) moved a body far; numbers are concrete."""
+    """Return a warning if assembly at time t (s) moved a body far, else an empty string; numbers are concrete."""
     if isinstance(t, Tracer) or (t and mechanism.drivers) or not closure.is_closed:
         return ""  # later the drivers decide where the bodies are
     moves = moves_of_assembly(mechanism, closure.state.q)
@@ -312,7 +312,7 @@ def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) 
 
 
 def poses_table(title: str, names: Sequence[str], q: ArrayLike, v: ArrayLike | None = None) -> PrintedTable:
-    """Return the table of coordinates, and velocities, (bodies, 3); bodies without names are numbered."""
+    """Return a table of coordinates and, if given, velocities (bodies, 3); bodies without names are numbered."""
     arrays = [np.asarray(x, float) for x in ((q,) if v is None else (q, v))]
     heads = ["body", "x (m)", "y (m)", "angle (rad)", "vx (m/s)", "vy (m/s)", "omega (rad/s)"][: 1 + 3 * len(arrays)]
     scales = [scale for x in arrays for scale in (size_of(x), size_of(x), float(np.nanmax(np.abs(x[..., 2]), initial=0.0)))]

@@ -29,9 +29,9 @@ def branches(
 ) -> Float[Array, "k bodies 3"]:
     """Return the positions that close a mechanism, Psi(s, q) = 0, for one value s of its driver: its assembly branches.
 
-    Random positions are closed, and equal results kept once: every branch returned is right, but one may be missing. Four-bars
-    have at most 2 branches, Watt's six-bars 4, Stephenson's 6. The same seed gives the same result; angles are within half a
-    turn of zero, and branches are sorted by the bodies' angles, the first body's first.
+    Random positions are closed, and duplicates removed: each position returned is a branch, but a branch may be missing.
+    Four-bars have at most 2 branches, Watt's six-bars 4, Stephenson's 6. The same seed leads to the same result. Angles are
+    within half a turn of zero, and branches are sorted by the angles of the bodies, in the order of the bodies.
 
     Args:
         mechanism: a mechanism of concrete numbers, without a degree of freedom once its driver is held.
@@ -50,10 +50,10 @@ def branches(
     driven = drive(mechanism, driver, 0.0, held)
     guesses = random_positions(mechanism, starts, seed)
     q, closed = _close(driven.mechanism, driven.analysis, number(value), guesses)
-    found = np.asarray(q)[distinct_positions(q, closed, driven.analysis.scales)]
-    found[..., 2] = np.angle(np.exp(1j * found[..., 2]))
-    order = np.lexsort(np.round(found[..., 2], 6).T[::-1])
-    return jnp.asarray(found[order])
+    positions = np.asarray(q)[distinct_positions(q, closed, driven.analysis.scales)]
+    positions[..., 2] = np.angle(np.exp(1j * positions[..., 2]))
+    order = np.lexsort(np.round(positions[..., 2], 6).T[::-1])
+    return jnp.asarray(positions[order])
 
 
 @deferred
@@ -64,25 +64,25 @@ def _close(
         found = close(mechanism, s, State(q, jnp.zeros_like(q)), analysis=analysis)
         return found.state.q, jnp.asarray(found.is_closed)
 
-    return jax.vmap(one)(guesses)
+    return jax.vmap(close_one)(guesses)
 
 
-SAME_POSITION = 1e-5  # relative to the characteristic length, or rad: closer positions are the same
+SAME_POSITION = 1e-5  # tolerance, relative to the characteristic length or in rad, within which positions are the same
 
 
 def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
-    """Return the given position, and others with random angles and places of all bodies within the mechanism's size."""
+    """Return the given position, and others with random angles and places of bodies within the size of the mechanism."""
     rng = np.random.default_rng(seed)
     q = np.asarray(mechanism.q0 if state is None else state.q)
-    found = np.tile(q, (count, 1, 1))
+    positions = np.tile(q, (count, 1, 1))
     spread = max(float(np.ptp(q[:, :2], axis=0).max()), float(analyse(mechanism).length))
-    found[1:, :, 2] += rng.uniform(-np.pi, np.pi, (count - 1, len(q)))
-    found[1:, :, :2] += rng.uniform(-0.5, 0.5, (count - 1, len(q), 2)) * spread
-    return jnp.asarray(found)
+    positions[1:, :, 2] += rng.uniform(-np.pi, np.pi, (count - 1, len(q)))
+    positions[1:, :, :2] += rng.uniform(-0.5, 0.5, (count - 1, len(q), 2)) * spread
+    return jnp.asarray(positions)
 
 
 def distinct_positions(q: Float[Array, "count bodies 3"], valid: Bool[Array, "count"], scales: Scales) -> list[int]:
-    """Return the indices of the valid positions that differ from all valid ones before them, apart from whole turns."""
+    """Return the indices of valid positions that differ, by more than whole turns, from all valid positions before them."""
     points = np.asarray(q, float)
     length, different = float(scales.length), []
     for k in np.flatnonzero(np.asarray(valid)):

@@ -27,13 +27,13 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote, suggestion
 
 Needs = Literal["states", "accelerations", "reactions"]
-LocalPoint = tuple[float, float]  # in a body's own frame (m)
-_CENTRE: LocalPoint = (0.0, 0.0)  # of mass: the origin of a body's frame
+LocalPoint = tuple[float, float]  # in the body's frame (m)
+_CENTRE: LocalPoint = (0.0, 0.0)  # the centre of mass, the origin of a body's frame
 POINT_UNITS = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s2", "ay": "m/s2"}
 _ANGLE_UNITS = {"angle": "rad", "omega": "rad/s", "alpha": "rad/s2"}
 LOADS = {"fx": "N", "fy": "N", "torque": "N m"}
 UNITS = {**POINT_UNITS, **_ANGLE_UNITS, **LOADS}
-RATES = ("vx", "vy", "omega")  # of the coordinates of a body
+RATES = ("vx", "vy", "omega")  # the rates of the coordinates of a body
 _ACCELERATIONS = ("ax", "ay", "alpha")
 
 
@@ -52,21 +52,21 @@ class StateHistory(Protocol):
 
 @dataclass(frozen=True)
 class Channel:
-    """One measured quantity: plain data, equal if the canonical names are, and thus static in a compiled program."""
+    """A measured quantity: plain data, equal if canonical names are equal, and thus static in compiled programs."""
 
     name: str
     units: str
     needs: Needs
     section: str  # body, joint, pin, driver or distance
-    owner: str  # the joint or driver; else empty
-    bodies: tuple[str, ...]  # its bodies: two for an angle at a joint or a distance
-    points: tuple[LocalPoint, ...] = ()  # of each body
+    owner: str  # name of the joint or driver; else empty
+    bodies: tuple[str, ...]  # names of its bodies: two for an angle at a joint or a distance
+    points: tuple[LocalPoint, ...] = ()  # a point of each body
     quantity: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """A user-defined channel, equal only to itself: created once and reused, it compiles once.
+    """A user-defined channel, equal only to itself: create it once and reuse it, so that it compiles once.
 
     Attributes:
         name: name in tables and messages.
@@ -102,9 +102,9 @@ def pins_of(mechanism: Mechanism) -> list[str]:
 
 
 def point_of_pin(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"]]:
-    """Return a body, or "ground", and the point (m) in its frame of a joint, or of a pin of the drawing.
+    """Return the point of a joint, or of a pin of the drawing: a body, or "ground", and the point (m) in its frame.
 
-    Joints with two points, such as a slot, a distance or a cam, have the point of their second body.
+    For joints with two points, such as a slot, a distance or a cam, this is the point of the second body.
     """
     if name in mechanism.joints:
         joint = mechanism.joints[name]
@@ -117,10 +117,10 @@ def point_of_pin(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"
 
 
 def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple[str, Float[Array, "2"]]:
-    """Return the body, or "ground", and the point (m) in its frame for a name and, if it is a body, a point.
+    """Return a body, or "ground", and a point (m) in its frame, from the name of a joint, or from a body and a point.
 
     Raises:
-        ValueError: no body or joint of this name, or a joint without a point; the message suggests another name.
+        ValueError: there is no such body or joint, or the joint has no point; the message suggests another name.
     """
     section, _, name = of.partition(".")
     known = {"body": (*mechanism.body_names, GROUND), "pin": pins_of(mechanism)}
@@ -155,7 +155,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def channel_of(mechanism: Mechanism, text: str) -> Channel:
-    """Return the channel of a name; names of bodies and joints may contain dots.
+    """Return the channel with a name; names of bodies and joints may contain dots.
 
     Raises:
         ValueError: no such channel; the message suggests another name.

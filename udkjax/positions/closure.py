@@ -1,4 +1,4 @@
-"""Closure of a mechanism as a function of its numbers: by machine code or JAX, with derivatives of any order."""
+"""Closure of a mechanism as a function of its numbers, by machine code or JAX, with derivatives of any order."""
 
 import operator
 
@@ -34,7 +34,7 @@ class MotionFrom(Motion):
 
 
 def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
-    """Return a mechanism whose drivers have at time zero their values of time t."""
+    """Return a mechanism whose drivers have, at time zero, the values that they had at time t."""
     if not mechanism.drivers:
         return mechanism
     motions = lambda x: [driver.motion for driver in x.drivers.values()]  # noqa: E731
@@ -49,7 +49,7 @@ def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], 
 def close_by_machine_code(
     mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
 ) -> Closed:
-    """Return the same as `close_by_jax`, by machine code."""
+    """Return the results of `close_by_jax`, by machine code."""
     guess, inputs = split_numbers((mechanism, analysis, t, q, v))
     return _close_by_code(AssemblyFunction(guess), inputs)
 
@@ -65,7 +65,7 @@ class AssemblyFunction(DifferentiableFunction):
 
     @property
     def _has_second(self) -> bool:
-        """True if machine code has second derivatives: if no rows contradict each other off the manifold."""
+        """True if machine code has second derivatives, for which no rows may contradict each other off the manifold."""
         return self.guess.rest[1].redundant_rows == ()
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
@@ -103,7 +103,7 @@ class AssemblyFunction(DifferentiableFunction):
         return list(native_closing.second_derivative(guess, _native_inputs(which), *changes))
 
     def _native(self, inputs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
-        """Return the arguments of machine code and the inputs with tangents; None if it lacks these derivatives."""
+        """Return the arguments of machine code and the inputs with tangents; None if machine code lacks these derivatives."""
         which = self.guess.marks(has_tangent)
         mechanism, analysis, t, q, v = self.guess(inputs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
@@ -141,8 +141,7 @@ def _close_position(rows: TracedRows, t: Array, q: Array) -> Array:
 def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
     """Take the steps of `_close_position` in a loop of fixed length, for reverse mode.
 
-    A step that no longer lowers the residual is taken nevertheless: at a closed state it only projects the tangent to the
-    manifold.
+    Even steps that no longer lower the residual are taken: at a closed state they only project the tangent to the manifold.
     """
 
     def body(q, _):

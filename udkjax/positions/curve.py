@@ -19,15 +19,15 @@ from udkjax.positions.drive import Driven
 from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.scene.mechanism import Mechanism
 
-NEWTON_STEPS = 8  # three are usual
+NEWTON_STEPS = 8  # largest number; three are usual
 _Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is closed
 
 
 class AbstractCurve(ABC):
     """Positions of a driven mechanism as a curve in scaled coordinates and value."""
 
-    weights: Any  # of the rows
-    units: Any  # of coordinates and value
+    weights: Any  # weights of the rows
+    units: Any  # units of the coordinates and the value
     rows: Any  # the scales of the rows
     independent: tuple[int, ...]  # indices of the independent rows
 
@@ -51,7 +51,7 @@ class AbstractCurve(ABC):
 
     @abstractmethod
     def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
-        """Return gamma: Psi_q a = gamma holds Psi_dot at zero."""
+        """Return gamma: accelerations with Psi_q a = gamma keep Psi_dot at zero."""
 
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
         """Return True if the residual is rounding."""
@@ -64,7 +64,7 @@ class AbstractCurve(ABC):
         return xp.max(xp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
 
     def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
-        """Return the nearest point of the curve, with the same value if `fixed`, and whether one was found."""
+        """Return the nearest point of the curve, with the same value if `fixed`, and whether Newton's method converged."""
         xp = self.by.xp
         if not len(self.rows):  # no constraints
             return X, xp.asarray(True)
@@ -75,7 +75,7 @@ class AbstractCurve(ABC):
             E = xp.where(fixed & (np.arange(len(X)) == len(X) - 1), 0.0, E)
             return X - self.plus(E) @ self.residual(X), k + 1, self.is_closed(X)
 
-        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last step corrects a point that is closed already
+        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last step corrects a closed point once more
             _, k, closed = state
             return (k < NEWTON_STEPS) & ~closed
 
@@ -83,7 +83,7 @@ class AbstractCurve(ABC):
         return X, closed
 
     def clearance(self, X: Float[Array, "n+1"]) -> Any:
-        """Return the distance of E from rank loss, as where branches meet: its n-th singular value over the largest."""
+        """Return the distance of E from rank loss, which occurs where branches meet: its n-th singular value over the largest."""
         xp, E = self.by.xp, self.slopes(X)
         if min(E.shape) < len(X) - 1:
             return xp.zeros(())
@@ -96,8 +96,8 @@ class AbstractCurve(ABC):
         """Return the tangent in the direction of the previous one, its side of a meeting of branches, and the clearance.
 
         The side is the sign of det [E; tau] of independent rows, +-1: along a branch it changes only where the branch meets
-        another, not at toggles. It is 1 if the independent rows are unknown. The clearance is `clearance(X)` by the same
-        decomposition, or zero where E^+ is truncated.
+        another, not at toggles. It is 1 if the independent rows are unknown. The clearance is `clearance(X)` from the same
+        decomposition, or zero if E^+ is truncated.
         """
         xp, E = self.by.xp, self.slopes(X)
         plus = self.plus(E)

@@ -1,7 +1,7 @@
-"""Coordinate that drives a mechanism through its positions: its value s replaces time.
+"""A coordinate that drives a mechanism through its positions: the value s of the coordinate replaces time.
 
 With a driver that prescribes `coordinate = t`, Psi(s, q) = 0 are the positions, Psi_dot = 0 gives dq/ds, and Psi_q a = gamma
-gives d2q/ds2, by the equations of every other mechanism.
+gives d2q/ds2, as for any other mechanism.
 """
 
 from collections.abc import Callable, Container, Mapping
@@ -34,19 +34,19 @@ from udkjax.wording import join_names, quote, suggestion
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
-MOVES = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians: less is rounding
+MOVES = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians; less is rounding
 
 
 class Coordinate(PrintsLine):
     """A coordinate of body 2 relative to body 1 that can be driven, like that of a `Driver`.
 
-    `angle`: theta2 - theta1 (rad), which counts turns; `x`, `y`: point 2 from point 1 in body 1's frame (m); `distance` (m).
+    `angle`: theta2 - theta1 (rad), including whole turns; `x`, `y`: point 2 minus point 1 in body 1's frame (m); `distance` (m).
 
     Args:
         bodies: the names of two bodies, or "ground".
         coordinate: "angle", "x", "y" or "distance".
-        points: each in its own body's frame (m); by default the origins.
-        axis: for x and y: the direction of x in body 1's frame (rad); by default its own.
+        points: one point of each body, in its frame (m); by default the origins.
+        axis: for x and y: the direction of x in body 1's frame (rad); by default that of the frame.
     """
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
@@ -65,7 +65,7 @@ class Coordinate(PrintsLine):
 
     @property
     def effort_unit(self) -> str:
-        """The unit of the effort along it."""
+        """The unit of the effort along the coordinate."""
         return self.driver(_constant(0.0)).effort_unit
 
 
@@ -82,13 +82,13 @@ class ValueMotion(Motion):
 
 
 class Driven(NamedTuple):
-    """A mechanism driven by a value s in place of time."""
+    """A mechanism driven by a value s instead of time."""
 
     mechanism: Mechanism
     analysis: Analysis
-    name: str  # of the driver; empty where s is time itself
-    row: int  # of the driver in Psi; -1 where s is time itself
-    unit: Float[Array, ""]  # the unit of s: one radian, the scale of a length, the mechanism's own time
+    name: str  # name of the driver; empty if s is time
+    row: int  # row of the driver in Psi; -1 if s is time
+    unit: Float[Array, ""]  # the unit of s: one radian, the characteristic length or the characteristic time
 
     @property
     def is_angle(self) -> bool:
@@ -108,9 +108,9 @@ class Driven(NamedTuple):
 
 
 def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mapping[str, NumberLike] | None = None) -> Driven:
-    """Return the mechanism driven by one coordinate; other drivers hold the value that they have at time t (s).
+    """Return the mechanism driven by one coordinate; other drivers keep their values of time t (s).
 
-    `held` gives other values, of drivers or of further coordinates, by name. Raises `SceneError` if there is no such driver or
+    `held` has other values for them, or values of further coordinates, by name. Raises `SceneError` if there is no such driver or
     coordinate, or positions do not follow from its value.
     """
     given = mechanism, driver, t, held
@@ -124,13 +124,13 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
             problem = "held is given with driver=None, which moves all drivers along time: name the one that drives"
             raise SceneError([problem], mechanism.name)
         analysis = analyse(mechanism)
-        if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # nor if it is unknown, as numbers are traced
+        if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # or unknown, since numbers are traced
             problem = "driver is None, and the scene has no driver: name a coordinate that drives it, such as"
             raise SceneError([f"{problem} {suggested_coordinate(mechanism)}"], mechanism.name)
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate
         return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
-    names: dict[str, str] = {}  # names of held coordinates, by the drivers that hold them
+    names: dict[str, str] = {}  # names of coordinates by the drivers that hold them
     for key, value in (held or {}).items():
         try:
             holder, element = _element(mechanism, key)
@@ -139,22 +139,22 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
         names[holder] = f"{quote(key)}, which `held` gives"
         mechanism = _with_driver(mechanism, holder, element, _constant(value))
     name, element = _element(mechanism, driver)
-    found = _add_driver(mechanism, name, element, t)
-    concrete = _from_guess(found, name)
+    driven = _add_driver(mechanism, name, element, t)
+    concrete = _from_guess(driven, name)
     analysis = analyse(concrete)
-    called = driver if isinstance(driver, str) else f"the {element.coordinate} of {' and '.join(element.bodies)}"
+    driver_text = driver if isinstance(driver, str) else f"the {element.coordinate} of {' and '.join(element.bodies)}"
     if concrete.is_concrete and analysis.redundant_rows != ():
-        with jax.ensure_compile_time_eval():  # while something else is traced, too
-            require_free(concrete, with_drivers(concrete, {}), name, called, names)
-    _require_determinate(found, analysis, called)
+        with jax.ensure_compile_time_eval():  # concrete even while something else is traced
+            require_free(concrete, with_drivers(concrete, {}), name, driver_text, names)
+    _require_determinate(driven, analysis, driver_text)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
     rows = analysis.scales.rows
     unit = rows[row] if isinstance(rows, Tracer) else number(np.asarray(rows)[row])
-    return Driven(found.without_origin, analysis, name, row, unit)
+    return Driven(driven.without_origin, analysis, name, row, unit)
 
 
 def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:
-    """Return the function of q (bodies, 3) that gives the value (rad, m) of a coordinate."""
+    """Return the value (rad, m) of a coordinate as a function of q (bodies, 3)."""
     element = element_of(mechanism, coordinate)
     places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
 
@@ -166,7 +166,7 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
 
 
 def constant_speed(mechanism: Mechanism, driver: str) -> float:
-    """Return the speed (rad/s, m/s) of a driver with a constant one; 0 for every other coordinate."""
+    """Return the constant speed (rad/s, m/s) of a driver; 0 if its speed is not constant, or for another coordinate."""
     motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
     return float(np.asarray(motion.coefficients)[1]) if isinstance(motion, Polynomial) and len(motion.coefficients) == 2 else 0.0
 
@@ -187,7 +187,7 @@ def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
 
 
 def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
-    """Return the coordinate of a driver, by the driver's name or its own. Raises `SceneError`."""
+    """Return a coordinate by the name of its driver, or by its name. Raises `SceneError`."""
     return _element(mechanism, driver)[1]
 
 
@@ -229,7 +229,7 @@ def choose_name(name: str, taken: Container[str]) -> str:
 
 
 def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberLike) -> Mechanism:
-    """Return the mechanism with a driver of this name that follows its own value; all others hold theirs."""
+    """Return the mechanism with a driver of this name that follows the value s; all other drivers hold their values."""
     concrete = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
         origin = concrete and Origin(_add_driver(concrete, name, _concrete_element(concrete, name, element), _value_or(t, 0.0)))
@@ -249,12 +249,13 @@ def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: P
     """Return the mechanism with one more driver, or with another motion of an existing one."""
     drivers = {**mechanism.drivers, name: element.driver(motion)}
     concrete = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
-    found = with_drivers(mechanism, drivers)
-    if concrete is None or found.is_concrete:
-        return found
+    result = with_drivers(mechanism, drivers)
+    if concrete is None or result.is_concrete:
+        return result
     with jax.ensure_compile_time_eval():
         element = _concrete_element(concrete, name, element)
-        motion = _constant(value_of(concrete, element)(concrete.q0))  # rows are counted as if the value of the guess were held
+        # For the analysis, the coordinate is held at its value of the guess.
+        motion = _constant(value_of(concrete, element)(concrete.q0))
         of_origin = {**concrete.drivers, name: element.driver(motion)}
         return with_drivers(mechanism, drivers, origin=Origin(with_drivers(concrete, of_origin)))
 
@@ -272,7 +273,7 @@ def with_drivers(
 
 
 def _concrete_element(concrete: Mechanism, name: str, element: Coordinate) -> Coordinate:
-    """Return the same coordinate with a concrete axis and concrete points."""
+    """Return a coordinate with a concrete axis and concrete points."""
     if name in concrete.drivers:
         return Coordinate.of(concrete.drivers[name])
     return jax.tree.map(lambda x: jnp.zeros(x.shape) if isinstance(x, Tracer) else x, element)
@@ -287,7 +288,7 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
 
 
 def _at_once(given: PyTree) -> AbstractContextManager:
-    """Compute with concrete numbers at once, also while something else is traced."""
+    """Compute at once with concrete numbers, even while something else is traced."""
     traced = is_traced(given)
     return nullcontext() if traced else jax.ensure_compile_time_eval()
 
@@ -325,15 +326,15 @@ def suggested_coordinate(mechanism: Mechanism) -> str:
 
 
 def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:
-    """Refuse a driver whose coordinate the joints and the other drivers hold.
+    """Raise an error if the joints and the other drivers hold the coordinate of a driver.
 
-    It is held if its row of Psi_q depends on theirs in a generic configuration.
+    The coordinate is held if its row of Psi_q depends on their rows in a generic configuration.
 
     Args:
         driven: the mechanism with the driver; its numbers are concrete.
-        bare: the same without any driver.
+        bare: the mechanism without drivers.
         name: name of the driver in the mechanism.
-        driver: its name in the message.
+        driver: the name of the driver in the message.
         names: names of other drivers in the message, if not their own.
 
     Raises:

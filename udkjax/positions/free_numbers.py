@@ -1,4 +1,4 @@
-"""Free numbers of a mechanism as one vector: those in which batches differ, and over which a design searches."""
+"""Free numbers of a mechanism as one vector: the numbers that differ in a batch, or that a design varies."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -23,7 +23,7 @@ class FreeNumbers:
         names: names of the free numbers.
 
     Raises:
-        SceneError: a name is not that of a number, or is given twice.
+        SceneError: a name does not belong to a number, or is given twice.
     """
 
     def __init__(self, mechanism: Mechanism, names: Sequence[str]):
@@ -92,7 +92,7 @@ def position_model(
     origin: Callable[[Mechanism], Array] | None = None,
     shifted: bool = False,
 ) -> Callable[..., dict[str, jax.Array]]:
-    """Return the model that position programs are traced from (equations/position_programs.py).
+    """Return the model from which position programs are traced (equations/position_programs.py).
 
     Args:
         free: the numbers x.

@@ -29,14 +29,14 @@ from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
-UNLIMITED_TRAVEL = 500.0  # in units of length: a length that gets farther without a toggle has no limit
+UNLIMITED_TRAVEL = 500.0  # in characteristic lengths: a coordinate that gets this far without a toggle has no limit
 FULL_TURN = 2.0 * np.pi  # rad
 
 
 class Kinematics(PrintsTable):
     """Positions, velocities and accelerations over the values of a driver; NaN at values that are not reached.
 
-    Where velocities do not follow from the driver's (status `not_determined`), they are NaN. `limit_q` has no derivative.
+    Where the driver does not determine velocities (status `not_determined`), they are NaN. `limit_q` has no derivative.
 
     Attributes:
         q: x, y (m) and angle (rad) of each body.
@@ -48,16 +48,16 @@ class Kinematics(PrintsTable):
         bodies: the names of the bodies, in the order of q.
     """
 
-    values: Float[Array, "T"]  # of the driver (rad, m), or of time (s)
+    values: Float[Array, "T"]  # values of the driver (rad, m), or times (s)
     q: Float[Array, "T bodies 3"]
     v: Float[Array, "T bodies 3"]
     a: Float[Array, "T bodies 3"]
-    rate: Float[Array, "T"]  # of the driver (1/s)
+    rate: Float[Array, "T"]  # s_dot of the driver
     status: Int[Array, "T"]
     limit: Float[Array, ""]
     limit_q: Float[Array, "bodies 3"]
     bodies: tuple[str, ...] = eqx.field(static=True)
-    unit: str = eqx.field(static=True, default="")  # of the values
+    unit: str = eqx.field(static=True, default="")  # unit of the values
 
     _units = units(q="m, m, rad", v="m/s, m/s, rad/s", a="m/s², m/s², rad/s²", limit_q="m, m, rad")
 
@@ -91,12 +91,12 @@ class Kinematics(PrintsTable):
         return frame_over_time(self.bodies, self.q, self.v, body)
 
     def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
-        """Return the path (m) of a point given in the body's own frame (m): a coupler curve. `udkjax.path` takes pins, too."""
+        """Return the path (m) of a point given in the body's own frame (m): a coupler curve. `udkjax.path` accepts pins, too."""
         return jnp.stack(self.frame(body).point(number(point)), -1)
 
 
 class Travel(PrintsTable):
-    """Values (rad, m) between which a coordinate can be driven.
+    """The values (rad, m) between which a coordinate can be driven.
 
     Attributes:
         lower: the lower end (rad, m); -inf without a toggle.
@@ -110,7 +110,7 @@ class Travel(PrintsTable):
     upper: Float[Array, ""]
     lower_q: Float[Array, "bodies 3"]
     upper_q: Float[Array, "bodies 3"]
-    status: Int[Array, "2"]  # a `Reached` of each: `beyond_limit` where a toggle was found
+    status: Int[Array, "2"]  # a `Reached` for each end: `beyond_limit` if a toggle was found
     unit: str = eqx.field(static=True, default="")
 
     _units = units(lower_q="m, m, rad", upper_q="m, m, rad")
@@ -150,13 +150,13 @@ def kinematics(
     With Psi_q q' = -Psi_s and Psi_q q'' = gamma, velocities are q' s_dot and accelerations q'' s_dot^2 + q' s_ddot.
 
     The branch is that of `state`, or of the initial guess, and is followed from there by its arc length. Where it cannot be
-    followed, the motion ends, with a `status` that says why. Branches closer than some 0.003 rad of transmission angle are taken
-    for branches that meet. Toggles, where the driver can get no farther, are found to rounding. Constraints may be redundant.
+    followed, the motion ends, with a `status` that says why. Branches closer than some 0.003 rad of transmission angle are
+    treated as meeting. Toggles, where the driver can go no farther, are located to rounding. Constraints may be redundant.
 
     Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any order by every number of the mechanism
     and by the values. Where branches meet (`Reached.singular`) they have first derivatives, but NaN by numbers that part the
-    branches, such as the length of one of two equal cranks; where velocities do not follow (`not_determined`), NaN by numbers
-    that move the position.
+    branches, such as the length of one of two equal cranks; where velocities are `not_determined`, derivatives by numbers
+    that move the position are NaN.
 
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold.
@@ -166,7 +166,7 @@ def kinematics(
         state: a position on the branch; by default the initial guess, assembled.
         rate: s_dot, for all values or each (rad/s, m/s; 1 for times).
         acceleration: s_ddot (rad/s^2, m/s^2).
-        held: values that other drivers or coordinates hold, by name; drivers hold the one that they have at time 0.
+        held: values that other drivers or coordinates hold, by name; by default drivers keep their values of time 0.
 
     Returns:
         A `Kinematics`: q, v, a (T, bodies, 3) and a status for each value.
@@ -217,7 +217,7 @@ def travel(
         driven, q = _start(mechanism, driver, 0.0, state, held)
         return solve(_travel, driven, q, FULL_TURN if driven.is_angle else UNLIMITED_TRAVEL * driven.unit)
     is_driver = isinstance(driver, str) and driver in mechanism.drivers
-    coordinate = driver if is_driver else element_of(mechanism, driver)  # a pin may be on a body that is left out
+    coordinate = driver if is_driver else element_of(mechanism, driver)  # a pin may be on a carried body
     start = assemble(mechanism, 0.0, state, throw=False).q
     rest = start[carried.kept(len(start))]
     found = travel(carried.without(mechanism), coordinate, State(rest, jnp.zeros_like(rest)), held)
@@ -298,22 +298,22 @@ def _solve(
 
 
 def _count_on_branch(
-    curve: AbstractCurve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], found: MarchResult
+    curve: AbstractCurve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], march_result: MarchResult
 ) -> Int[Array, ""] | int:
-    """Return the number of trusted positions on the first branch.
+    """Return the number of trusted positions that are on the first branch.
 
-    The side of a branch changes where it meets another, and where machine code jumps to a neighbouring one. Continuation with
-    shorter steps tells the two apart: from the value before for concrete numbers, from here on for traced ones.
+    The side changes where the branch meets another, and where machine code jumps to a neighbouring branch. Continuation with
+    shorter steps distinguishes the two: for concrete numbers from the previous value, for traced ones from this value on.
     """
     if isinstance(curve, Curve):
-        same = found.side == found.first_side
-        return jnp.sum(jnp.cumprod(same & (np.arange(len(values)) < found.trusted)))
-    trusted = int(found.trusted)
-    before = np.append(found.first_side, found.side[:-1])
-    for k in np.flatnonzero(found.side[:trusted] != before[:trusted]).tolist():
-        s, q = (values[k - 1], found.q[k - 1]) if k else (s, q)
+        is_same_side = march_result.side == march_result.first_side
+        return jnp.sum(jnp.cumprod(is_same_side & (np.arange(len(values)) < march_result.trusted)))
+    trusted = int(march_result.trusted)
+    previous_sides = np.append(march_result.first_side, march_result.side[:-1])
+    for k in np.flatnonzero(march_result.side[:trusted] != previous_sides[:trusted]).tolist():
+        s, q = (values[k - 1], march_result.q[k - 1]) if k else (s, q)
         reached = follow(curve, s, q, values[k : k + 1], no_points(1, len(q), np), 0)
-        distance = np.abs(reached.q[0] - found.q[k]) / curve.units[:-1]
+        distance = np.abs(reached.q[0] - march_result.q[k]) / curve.units[:-1]
         if not (Reached.has_position(reached.status[0]) and np.max(distance) <= SAME_POSITION):
             return k
     return trusted
@@ -323,8 +323,8 @@ def _with_derivatives(curve: Curve, q: Float[Array, "n"], values: Float[Array, "
     has_position = Reached.has_position(points.status)
     safe = jnp.where(has_position[:, None], points.q, jax.lax.stop_gradient(q))
     regular = ~has_position | (points.status == Reached.closed)
-    found = with_derivatives(curve, values, points._replace(q=safe), regular)
-    q, dq, ddq = (jnp.where(has_position[:, None], x, jnp.nan) for x in found)
+    derivatives = with_derivatives(curve, values, points._replace(q=safe), regular)
+    q, dq, ddq = (jnp.where(has_position[:, None], x, jnp.nan) for x in derivatives)
     limited = jnp.isfinite(points.limit)
     X = jnp.where(limited, jnp.append(points.limit_q, points.limit), jax.lax.stop_gradient(jnp.append(safe[0], values[0])))
     limit = jnp.where(limited, with_derivative(curve, X), jnp.inf)

@@ -19,15 +19,15 @@ from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
 APPROACH = 16  # steps from the initial position to the first value
-MOST_KNOTS = 100  # of spline motions: their programs are whole, and compile for 10 ms per knot
-DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; march ends long before
+MOST_KNOTS = 100  # largest number of knots of spline motions: compiling their programs takes 10 ms per knot
+DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; a march ends long before
 
 
 class MarchResult(NamedTuple):
-    """Positions and their derivatives by the value; the first `trusted` of them are closed, and on one smooth course.
+    """Positions and their derivatives by the value; the first `trusted` of them are closed and on one smooth curve.
 
-    `side` is the sign of det Psi_q, or 1 if Psi_q is not square or the independent rows are unknown; `first_side` is that of the
-    start.
+    `side` is the sign of det Psi_q, or 1 if Psi_q is not square or the independent rows are unknown; `first_side` is the side
+    of the start.
     """
 
     q: Float[Array, "T n"]
@@ -51,7 +51,7 @@ def march(
 ) -> MarchResult:
     """Follow the positions over the values, from the closed position q at the value s, without derivatives.
 
-    Time is the value of the mechanism's driver; `unit` is the unit of the values.
+    The value of the driver replaces time; `unit` is the unit of the values.
     """
     inputs = _inputs(mechanism, analysis, unit, s, q, values, jnp)
     return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
@@ -60,7 +60,7 @@ def march(
 def march_at_once(
     mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
 ) -> MarchResult:
-    """Follow the positions of concrete numbers by NumPy; nothing is traced or compiled."""
+    """Follow positions as `march` does, for concrete numbers, by NumPy; nothing is traced or compiled."""
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
     inputs = _inputs(mechanism, analysis, unit, s, q, values, np)

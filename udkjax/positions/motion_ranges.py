@@ -14,11 +14,11 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.joints import Prismatic, Revolute
 from udkjax.scene.mechanism import Mechanism
 
-FULL_TURN = 2 * np.pi * (1 - 1e-9)  # rad: a link with a larger swing turns all the way round; the margin is for rounding
+FULL_TURN = 2 * np.pi * (1 - 1e-9)  # (rad) a link with a larger swing makes full turns; the margin is for rounding
 
 
 class MotionRanges(PrintsTable):
-    """The ranges of a motion over its positions; between them links may go a little farther.
+    """The ranges of a motion at its positions; between positions links may go slightly farther.
 
     Attributes:
         swings: the swing angle (rad) of each body that a revolute joint connects to the ground.
@@ -45,8 +45,8 @@ def motion_ranges(mechanism: Mechanism, motion: StateHistory, driver: Drive = No
     Args:
         mechanism: the linkage.
         motion: anything with q (T, bodies, 3), a `Kinematics` or a `Solution`.
-        driver: the driver or coordinate, as for `kinematics`: pins of the links that it drives have no transmission angle. None:
-            every pin of two moving links, each with one other pin, has one.
+        driver: the driver or coordinate, as for `kinematics`; pins of the links that it drives have no transmission angle. None:
+            every pin of two moving links with one other pin each has a transmission angle.
 
     Returns:
         A `MotionRanges`; NaN where the motion has no position.
@@ -70,7 +70,7 @@ def motion_ranges(mechanism: Mechanism, motion: StateHistory, driver: Drive = No
         elif isinstance(joint, Revolute) and not set(moving) & set(driven):
             try:
                 found.transmission_angles[name] = _ends(transmission_angle(mechanism, motion, name))
-            except SceneError:  # links with more than two pins have none
+            except SceneError:  # links with more than two pins have no transmission angle
                 continue
     return found
 

@@ -9,11 +9,11 @@ from udkjax.equations.redundancy import kinematic_rows
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 
-MOST_NAMED = 8  # in one sentence
+MOST_NAMED = 8  # constraints named in one sentence
 
 
 def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarray, tol: float) -> str:
-    """Name the constraints whose residuals exceed `tol` of their scales, the widest first, with the residual."""
+    """Name the constraints whose residuals exceed `tol` times their scales, the largest first, with the residual."""
     worst: dict[str, tuple[float, float]] = {}  # residual over the row's scale, and residual
     for name, r, unit in zip(names, np.abs(residual), scales, strict=True):
         if not r / unit <= tol:  # also NaN
@@ -24,7 +24,7 @@ def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarra
 
 
 def name_not_finite(mechanism: Mechanism, x: np.ndarray, labels: Sequence[str] = COORDINATES) -> str:
-    """Name the entries of q or v (n,) that are not finite, as one text."""
+    """Return the names of the non-finite entries of q or v (n,), as one string."""
     bad = [(body, label) for body in mechanism.body_names for label in labels]
     named = [f'{label} of "{body}"' for (body, label), value in zip(bad, x, strict=True) if not np.isfinite(value)]
     return ", ".join(named[:MOST_NAMED]) + (", ..." if len(named) > MOST_NAMED else "")

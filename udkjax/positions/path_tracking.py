@@ -1,7 +1,7 @@
 """Path tracking of solutions of polynomial systems over their parameters: many paths in lanes, each with its own steps.
 
 H(z, p) = 0 has the solutions z(s) for p = p0 + s (p1 - p0). Each is predicted by the cubic through its last two points and
-their rates, and corrected by Newton's method; a step is accepted if Newton converges as fast as it does near a solution. s goes
+their rates, and corrected by Newton's method; a step is accepted if Newton's method converges as fast as near a solution. s goes
 from 0 to 1 on a curve in the complex plane, s = t + i c t (1 - t), so that another c bypasses the parameters at which solutions
 meet on another side.
 """
@@ -13,12 +13,12 @@ import numpy as np
 from udkjax.expressions import ScalarProgram
 from udkjax.native.closing.batch_program import BatchProgram
 
-FIRST_STEP = 0.02  # of t, predicted along the tangent; shortened if too long
-SHORTEST_STEP = 1e-10  # of t: a path that needs shorter steps ends
+FIRST_STEP = 0.02  # first step of t, predicted along the tangent; shortened if too long
+SHORTEST_STEP = 1e-10  # shortest step of t: a path that needs shorter ones ends
 LEAST_SIZE = 1e-2  # least scale of an unknown
-LARGEST = 1e12  # a larger unknown has gone to infinity; generic solutions reach 1e8
-END_TOL = 1e-12  # last Newton step, relative to the unknowns; rounding alone explains it where F' is well conditioned
-END_CORRECTIONS = 12  # Newton steps at the end: far more than a regular solution takes
+LARGEST = 1e12  # a larger unknown is at infinity; generic solutions reach 1e8
+END_TOL = 1e-12  # bound on the last Newton step, relative to the unknowns: rounding errors if F' is well conditioned
+END_CORRECTIONS = 12  # Newton steps at the end: many more than regular solutions need
 GROWTH = 2.0  # largest growth of a step
 # Near the end of a path to infinity an unknown varies as a power of 1 - t, an integer or a fraction such as 1/3; on a path to a
 # finite point it does not. If the power is within these bounds, at 1 - t below NEAR_END, the path goes to infinity.
@@ -30,7 +30,7 @@ ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3  # codes of the ends of paths
 class Precision(NamedTuple):
     """Bounds of the aimed-at prediction error and of the first and second correction, relative to the unknowns.
 
-    The smaller they are, the less likely is a jump from one path to another.
+    The smaller the bounds, the less likely is a jump from one path to another.
     """
 
     aim: float = 1e-3
@@ -44,7 +44,7 @@ class TrackedPaths(NamedTuple):
     Attributes:
         z: unknowns (N, M).
         status: status of each path (M,): ACCEPTED at a regular solution; INFINITE if an unknown goes to infinity or 0; SINGULAR
-            near a point where Newton's method does not converge to rounding; LOST short of the end.
+            near a point where Newton's method does not converge to rounding; LOST if it stopped before the end.
         t: last t of each path (M,), up to 1.
         steps: number of steps of each path (M,).
     """
@@ -150,7 +150,7 @@ class PathTracker:
         return step, rate * (1.0 + 1j * bend * (1.0 - 2.0 * t))
 
     def _advance(self, p: _Points, bend: float, shared: np.ndarray, precision: Precision) -> _Points:
-        """Try a step of each path; take it, or shorten it."""
+        """Try a step of each path; accept or shorten it."""
         step = np.minimum(p.step, 1.0 - p.t)
         t = np.where(p.step >= 1.0 - p.t, 1.0, p.t + step)
         guess = _predict(p, step)
@@ -190,6 +190,6 @@ def _predict(p: _Points, step: np.ndarray) -> np.ndarray:
 
 
 def _relative(step: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return the largest step of an unknown relative to it (M,); infinite for NaN."""
+    """Return the largest step of an unknown, relative to the unknown (M,); infinite for NaN."""
     size = np.max(np.abs(step) / np.maximum(np.abs(z), LEAST_SIZE), axis=0)
     return np.where(np.isfinite(size), size, np.inf)

@@ -1,4 +1,4 @@
-"""Positions of batches of mechanisms that differ in some numbers, with exact derivatives by these, by machine code in lanes."""
+"""Positions of batches of mechanisms that differ in free numbers, with exact derivatives, by machine code in SIMD lanes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -55,7 +55,7 @@ class BatchPositions(PrintsTable):
 class PositionBatch:
     """Positions of a driven mechanism for batches of its numbers, compiled once.
 
-    Each member follows its branch from its own closed initial guess, as far as the branch leads; members run in vector lanes and
+    Each member follows its branch from its closed initial guess as far as the branch extends; members run in vector lanes and
     on all cores. Psi(s, q) = 0 is solved to rounding; with E = Psi_q, dq/ds = -E^+ Psi_s and dq/dx = -E^+ Psi_x, by one
     elimination. Constraints may be redundant.
 

@@ -1,14 +1,15 @@
 """Derivatives of the positions of a driven mechanism, q(s), q' and q'', by the values and by all numbers of the mechanism.
 
-In a generic configuration they are those of one step of Newton's method. Where branches meet, Psi_q loses rank, and a change
-p of a number of the constraints changes q(s) near the value s* of the meeting by
+In a generic configuration they are the derivatives of one step of Newton's method. Where branches meet, Psi_q loses rank, and a
+change p of a number of the constraints changes q(s) near the value s* of the meeting by
 
     dq/dp = R / (s - s*) + a smooth part.
 
-If the residue R is zero, the branch is moved by the smooth part; otherwise the branches part, by the root of the change, and no
-derivative exists. Both parts are interpolated from points of the branch on both sides (crossing.py). R is linear in the change:
-numbers that part the branches one by one may not part them if changed together, such as the lengths of two equal cranks. Forward
-mode has the derivative of such a change; reverse mode, which treats each number alone, returns NaN.
+If the residue R is zero, the smooth part is the derivative of the branch; otherwise the branches separate, by the square root of
+the change, and no derivative exists. Both parts are interpolated from points of the branch on both sides (crossing.py). R is
+linear in the change:
+numbers that each separate the branches, such as the lengths of two equal cranks, may not do so if changed together. Forward mode
+returns the derivative by such a change; reverse mode, which treats each number alone, returns NaN.
 """
 
 from typing import Any
@@ -31,9 +32,9 @@ from udkjax.programs.control_flow import sequential
 from udkjax.programs.varying_axes import result_type
 from udkjax.transforms.gradients import stop_gradients
 
-# Relative to the largest (s - s*) dq/dp: smaller residues are rounding errors, which E^+ multiplies by a hundred at most.
+# Bound on residues, relative to the largest (s - s*) dq/dp: smaller ones are rounding errors, amplified by E^+ up to 100 times.
 RESIDUE = 1e-6
-MOST_MEETINGS = 8  # of branches, in one call: at further ones, derivatives by numbers of the constraints are NaN
+MOST_MEETINGS = 8  # largest number of meetings in one call; at further ones, derivatives by numbers of the constraints are NaN
 
 Three = tuple[TimeSeries, TimeSeries, TimeSeries]  # of q, q' and q''
 
@@ -79,14 +80,14 @@ def _by_numbers(
     if not changes:
         return zero, zero, zero
     active = jax.tree.map(lambda x: x is not None, _constraints(moved.mechanism), is_leaf=lambda x: x is None)
-    which = jnp.flatnonzero(~regular, size=min(MOST_MEETINGS, len(values)), fill_value=0)
-    given = curve, values[which], tuple(x[which] for x in found), spacing[which], ~regular[which]
-    operator = sequential(_matrices, *stop_gradients(given), active)
+    meetings = jnp.flatnonzero(~regular, size=min(MOST_MEETINGS, len(values)), fill_value=0)
+    arguments = curve, values[meetings], tuple(x[meetings] for x in found), spacing[meetings], ~regular[meetings]
+    operator = sequential(_matrices, *stop_gradients(arguments), active)
     change = jnp.concatenate([jnp.ravel(x) for x in changes])
-    at_some = _bind(_Operator(*operator), change).reshape(len(which), 3, -1)
-    missed = jnp.where(regular, 0.0, jnp.nan).at[which].set(0.0)
-    rest = missed + _ends_here(jnp.where(regular, 0.0, jnp.nan), curve, values)
-    return tuple(zero.at[which].add(at_some[:, k]) + (rest * jnp.sum(change))[:, None] for k in range(3))
+    at_meetings = _bind(_Operator(*operator), change).reshape(len(meetings), 3, -1)
+    is_missed = jnp.where(regular, 0.0, jnp.nan).at[meetings].set(0.0)
+    nan_factor = is_missed + _ends_here(jnp.where(regular, 0.0, jnp.nan), curve, values)
+    return tuple(zero.at[meetings].add(at_meetings[:, k]) + (nan_factor * jnp.sum(change))[:, None] for k in range(3))
 
 
 def _constraints(mechanism: Any) -> list[Any]:
@@ -101,21 +102,21 @@ def _matrices(
     Args:
         curve: the positions.
         values: K values at which branches meet.
-        found: q, q' and q'' at these.
-        spacing: spacing of the neighbouring points of the branch; zero without any.
-        counts: mask of the values of interest.
+        found: q, q' and q'' at these values.
+        spacing: spacing of the neighbouring points of the branch; zero without neighbours.
+        counts: mask of the values that are meetings.
         active: mask of the leaves of joints and drivers that are the P numbers.
     """
     chosen = jax.tree.leaves(eqx.filter(_constraints(curve.mechanism), active))
     K, n, P = len(values), curve.units.size - 1, sum(x.size for x in chosen)
     nothing = jnp.zeros((K, 3, n, P)), jnp.zeros((K, P, n))
-    given = curve, values, found, spacing, active
-    matrix, residue = jax.lax.cond(jnp.any(counts), lambda: call_seldom(_at_meetings, *given), lambda: nothing)
+    arguments = curve, values, found, spacing, active
+    matrix, residue = jax.lax.cond(jnp.any(counts), lambda: call_seldom(_at_meetings, *arguments), lambda: nothing)
     return jnp.where(counts[:, None, None, None], matrix, 0.0), jnp.where(counts[:, None, None], residue, 0.0)
 
 
 def _at_meetings(curve: Curve, values: Array, found: Three, spacing: Array, active: PyTree) -> tuple[Array, Array]:
-    """Return `_matrices` for values that are all of interest; NaN without neighbouring points."""
+    """Return `_matrices` for values that are all meetings; NaN without neighbouring points."""
     W, unit, steps = curve.units[:-1], curve.units[-1], nodes(FARTHEST_NODE)
     chosen, rest = eqx.partition(_constraints(curve.mechanism), active)
     numbers, unravel = ravel_pytree(chosen)
@@ -129,10 +130,10 @@ def _at_meetings(curve: Curve, values: Array, found: Three, spacing: Array, acti
     q = X[..., :-1] * W
 
     def moved(numbers: Array) -> list[Array]:
-        parts = eqx.combine(unravel(numbers), rest)
-        other = eqx.tree_at(lambda c: _constraints(c.mechanism), curve, parts)
-        three = jax.vmap(jax.vmap(lambda s, q: _newton(other, s, q)))(s, q)
-        return [x / W * unit**k for k, x in enumerate(three)]
+        varied = eqx.combine(unravel(numbers), rest)
+        varied_curve = eqx.tree_at(lambda c: _constraints(c.mechanism), curve, varied)
+        derivatives = jax.vmap(jax.vmap(lambda s, q: _newton(varied_curve, s, q)))(s, q)
+        return [x / W * unit**k for k, x in enumerate(derivatives)]
 
     changes = jax.jacfwd(moved)(numbers)  # (K, 12, n, P) each
     ends = offset[:, :, None, None] * changes[0]
@@ -156,13 +157,13 @@ def _apply(operator: _Operator, vector: Array) -> Array:
     if operator.is_transposed:
         out = vector.reshape(matrix.shape[:3])
         wanted = jnp.any(out != 0, (1, 2))
-        parts = jnp.any(wanted[:, None] & jnp.any(residue != 0, 2), 0)
-        found = jnp.einsum("kinp,kin->p", jnp.where(wanted[:, None, None, None], matrix, 0.0), out)
-        return jnp.where(parts, jnp.nan, found)
-    moved = jnp.where(vector != 0, matrix, 0.0)
-    whole, terms = (jnp.einsum("kpn,p->kn", x, y) for x, y in ((residue, vector), (jnp.abs(residue), jnp.abs(vector))))
-    parts = jnp.any(jnp.abs(whole) > RESIDUE * jnp.max(terms, 1, keepdims=True), 1)
-    return jnp.where(parts[:, None, None], jnp.nan, jnp.einsum("kinp,p->kin", moved, vector)).ravel()
+        separates = jnp.any(wanted[:, None] & jnp.any(residue != 0, 2), 0)
+        cotangent = jnp.einsum("kinp,kin->p", jnp.where(wanted[:, None, None, None], matrix, 0.0), out)
+        return jnp.where(separates, jnp.nan, cotangent)
+    used = jnp.where(vector != 0, matrix, 0.0)
+    total, terms = (jnp.einsum("kpn,p->kn", x, y) for x, y in ((residue, vector), (jnp.abs(residue), jnp.abs(vector))))
+    separates = jnp.any(jnp.abs(total) > RESIDUE * jnp.max(terms, 1, keepdims=True), 1)
+    return jnp.where(separates[:, None, None], jnp.nan, jnp.einsum("kinp,p->kin", used, vector)).ravel()
 
 
 @eqxi.filter_primitive_def
@@ -181,8 +182,8 @@ def _derivative(primals, tangents):
 @eqxi.filter_primitive_transpose(materialise_zeros=True)  # pyright: ignore
 def _transpose(inputs, cotangent):
     operator, _ = inputs
-    other = _Operator(operator.matrix, operator.residue, not operator.is_transposed)
-    return jax.tree.map(lambda _: None, operator), _bind(other, cotangent)
+    transposed = _Operator(operator.matrix, operator.residue, not operator.is_transposed)
+    return jax.tree.map(lambda _: None, operator), _bind(transposed, cotangent)
 
 
 _moving_p = linear_primitive("where_branches_meet", _apply, _shape, _derivative, _transpose)
@@ -194,7 +195,7 @@ def _bind(operator: _Operator, vector: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def _ends_here(factor: Float[Array, "T"], curve: Curve, values: Float[Array, "T"]) -> Float[Array, "T"]:
-    """Return zeros whose derivatives by the positions are the factor: zero or NaN."""
+    """Return zeros whose derivatives by all numbers of the curve and values are the factor, zero or NaN."""
     return jnp.zeros_like(factor)
 
 

@@ -41,7 +41,7 @@ class Workspace(NamedTuple):
 def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -> Float[Array, "T"]:
     """Return the angle (rad, 0 to pi) at a pin between the two links that it joins: acos(u . w / (|u| |w|)).
 
-    u and w point from the pin to the other pin of each link. Force is transmitted best at pi/2, and not at all at 0 and pi.
+    u and w point from the pin to the other pin of each link. Force is transmitted best at pi/2, and not at 0 and pi.
 
     Args:
         mechanism: the linkage.
@@ -52,7 +52,7 @@ def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -
         The angle (T,) in rad.
 
     Raises:
-        SceneError: no such pin, or links with other numbers of pins.
+        SceneError: no such pin, or a link that does not have exactly two pins.
     """
     pins = {name: pin for name, pin in mechanism.joints.items() if isinstance(pin, Revolute)}
     if joint not in pins:
@@ -129,7 +129,7 @@ def workspace(
     point: Numbers = (0.0, 0.0),
     state: State | None = None,
 ) -> Workspace:
-    """Return the places of a point of a body over all pairs of values of two drivers, each reached along the branch of `state`.
+    """Return the places of a point of a body over all pairs of values of two drivers, all reached along the branch of `state`.
 
     Args:
         mechanism: a mechanism of two degrees of freedom once its drivers hold.
