@@ -16,9 +16,10 @@ class Constrained(Wrapper):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
     With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would store for the next
-    step (FSAL) belongs to the state before projection; a solver that is told of the jump computes a new one. (A multistep method
-    would forget its whole history and is not told: it notices by itself that its newest point was moved.) The part of an
-    error that projection removes hardly counts. Where only some coordinates are integrated, only their errors count.
+    step (FSAL) belongs to the state before projection: with `made_jump`, the solver computes a new derivative. (A multistep
+    method would then forget its whole history. Its `made_jump` stays as it is, because the method detects that its newest point
+    moved.) The part of an error that projection removes hardly counts. Where only some coordinates are integrated, only their
+    errors count.
     Error estimates, with their counts, and interpolation are the wrapped solver's.
     """
 
