@@ -4,7 +4,7 @@
     prologue_reverse(numbers, constants, constants_bar, numbers_bar)    cotangents of the numbers, from those of the constants
     prologue_twice(numbers, constants, dnumbers, enumbers, denumbers, dconstants, econstants, deconstants)
 
-for all numbers and the moving constants. `prologue_twice` is along two directions and along both.
+for all numbers and the moving constants. The last function computes the derivatives along two directions, and the mixed ones.
 """
 
 from collections.abc import Sequence
