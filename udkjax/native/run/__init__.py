@@ -3,6 +3,7 @@
 A *member* is one run of a batch; it is loaded into a *lane*, one of W that take steps together, and replaced by the next member
 when complete. An *attempt* is a step before the controller accepts or rejects it. *Points* 0 to 3 are the latest accepted
 states, through which the polynomial of dense output passes; an *output* is a state at a requested time. A *breakpoint* is a
-time at which the motion is not smooth, a *piece* a part of the state space in which it is smooth: at the end of either a step
-ends and the run *begins* anew. The *fallback* takes steps whose pivots are too small for elimination.
+time at which the motion is not smooth, a *piece* a part of the state space in which it is smooth: a step ends at
+each breakpoint and at the end of each piece, and the run *begins* anew. The *fallback* takes steps whose pivots are too small for
+elimination.
 """

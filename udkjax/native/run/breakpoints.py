@@ -26,14 +26,14 @@ def aim(module: Module, f: Function, s: Lane):
         stop = f.min(end, crossing)
         rest = f.min(stop, s.end) - start
         parts = f.max(float(POINTS - 1) - s.steps, 1.0)
-        share = start + rest / parts
-        several = (s.steps < float(POINTS - 2)) & (t1 > share) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
-        several = several & (s.next < stop - s.smallest)  # only if outputs are due in between
+        split = start + rest / parts
+        splits = (s.steps < float(POINTS - 2)) & (t1 > split) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
+        splits = splits & (s.next < stop - s.smallest)  # only if outputs are due in between
         if module.pieces:
-            several = several & s.aim.is_not(float(AIM_ACROSS))
-        t1 = where(several, share, t1 if module.pieces else halve(f, s, t1, begin | last | several))
+            splits = splits & s.aim.is_not(float(AIM_ACROSS))
+        t1 = where(splits, split, t1 if module.pieces else halve(f, s, t1, begin | last | splits))
         reaches = (t1 >= stop - s.smallest * 2.0) & (stop < s.end - s.smallest) & ~begin
-        last = last & ~reaches & ~several
+        last = last & ~reaches & ~splits
         final = s.end - f.max(s.end - end, 0.0)
         t1 = where(reaches, stop, where(last, final, t1))
         t1 = where(begin, s.behind, t1)
@@ -51,16 +51,16 @@ def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
     return f.select(short, s.point3_t + (s.end - s.point3_t) * 0.5, t1)
 
 
-def next_breakpoint(module: Module, f: Function, s: Lane, here: Value):
+def next_breakpoint(module: Module, f: Function, s: Lane, now: Value):
     """Set `t1` just before the next breakpoint, and `behind` just after all breakpoints at the time `here`."""
     work, call = f.given["work"], f.given["call"]
     f.call("next_breakpoint", work, call)
-    with f.while_(lambda: f.any_of(s.due <= here + s.smallest)):
-        here_too = s.due <= here + s.smallest
-        s.where(here_too, knot=s.knot + 1.0, passed=s.due)
+    with f.while_(lambda: f.any_of(s.due <= now + s.smallest)):
+        is_passed = s.due <= now + s.smallest
+        s.where(is_passed, knot=s.knot + 1.0, passed=s.due)
         f.call("next_breakpoint", work, call)
     s.t1 = s.due - s.smallest * ENDS_BEFORE
-    s.behind = f.max(s.passed + s.smallest * BEGINS_BEHIND, here)
+    s.behind = f.max(s.passed + s.smallest * BEGINS_BEHIND, now)
     if module.plan.sampled:
         with f.each(f.width) as k:
             stale = (s.active > 0.5) & s.row.is_not(s.knot)

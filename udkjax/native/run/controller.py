@@ -4,10 +4,10 @@ Numbers of a lane `s` (layout.py has them all):
 
     point3_t, t1            time of the latest accepted state, and end of the attempted step (s)
     h, behind               step length chosen by the controller (s); scratch
-    error, rate             error of the attempt over the tolerance; error of the previous step over length^order
+    error, rate             error of the attempt, relative to the tolerance; error of the previous step divided by length^order
     begin, last, lands      one if the attempt begins a run, ends it, ends at a breakpoint
     fallback, fallback_due  one if the attempt is made by the fallback, if the next one must be
-    retries, distance       successive attempts shortened because of a pivot; distance from singular configurations
+    retries, distance       number of successive attempts shortened because of a pivot; distance from singular configurations
     distance0 to 2          distances of the accepted states before, the latest last
 """
 
@@ -40,10 +40,10 @@ def write_decide(module: Module):
     f, s = module.function("decide")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
     stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
-    bad = stepping & ~(error < np.inf)
-    dodge, repeats, left = f.const(False, BOOL, f.width), f.const(False, BOOL, f.width), inf
+    failed = stepping & ~(error < np.inf)
+    shortens, repeats, time_left = f.const(False, BOOL, f.width), f.const(False, BOOL, f.width), inf
     if module.falls_back:
-        stepping, dodge, left = _retry_or_fall_back(module, f, s, bad)
+        stepping, shortens, time_left = _retry_or_fall_back(module, f, s, failed)
     else:
         s.fallback_due = f.const(0.0, DOUBLE, f.width)
     tried = where(stepping, s.tried + 1.0, s.tried)
@@ -51,20 +51,20 @@ def write_decide(module: Module):
         s.again = where(stepping, yes, 0.0)
         f.call("leave", f.given["work"])
         repeats = s.again > 0.5
-    accept = stepping & (error < 1.0) & ~dodge & ~repeats
+    accept = stepping & (error < 1.0) & ~shortens & ~repeats
     stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
     factor, rate = _step_factor(module, f, s, accept, step)
-    h = where(stepping, step * where(dodge, f.const(FACTORS.safety, DOUBLE, f.width), factor), s.h)
+    h = where(stepping, step * where(shortens, f.const(FACTORS.safety, DOUBLE, f.width), factor), s.h)
     h = where(repeats, s.h, h)
     if module.falls_back:
-        h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, left, step, h), h)
+        h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, time_left, step, h), h)
     s.behind = h
     with f.if_(f.any_of(begun)):
         s.behind = where(begun, first_step(module, f, s), s.behind)
     h = s.behind
     code = where(stepping & (h < s.smallest), f.const(Status.STEP_TOO_SMALL, DOUBLE, f.width), s.code)
     code = where(code.is_(float(Status.RUNNING)) & stepping & (tried >= s.max_steps), Status.STEP_LIMIT, code)
-    code = where(stepping & bad & begin & ~accept, where(code.is_(float(Status.RUNNING)), Status.STEP_TOO_SMALL, code), code)
+    code = where(stepping & failed & begin & ~accept, where(code.is_(float(Status.RUNNING)), Status.STEP_TOO_SMALL, code), code)
     code = where(accept & (s.last > 0.5), Status.DONE, code)
     lost = _accept_step(module, f, s, accept)
     code = where((lost > 0.5) & code.is_(float(Status.RUNNING)), Status.LOST, code)
@@ -82,41 +82,43 @@ def write_decide(module: Module):
     s.where(accept, accepted=s.accepted + 1.0)
 
 
-def _retry_or_fall_back(module: Module, f: Function, s: Lane, bad: Value) -> tuple[Value, Value, Value]:
+def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value) -> tuple[Value, Value, Value]:
     """Shorten a step that encountered a pivot too small for elimination, or leave it to the fallback.
 
     Returns:
-        Masks of the lanes whose attempt is complete and of those that shorten it, and the time to the singular configuration.
+        Masks of the lanes whose attempt is complete, and of lanes that shorten it; and the time to the singular configuration.
     """
     where, stepping, fallback, error = f.select, s.stepping > 0.5, s.fallback > 0.5, s.error
-    fallback_due = bad & ~fallback
-    far_from_here = is_clear(module, f, s, s.distance2)
-    beside = stepping & ~fallback & (error < 1.0) & ~is_clear(module, f, s, s.distance) & (s.last < 0.5)
-    left = time_to_singularity(module, f, s)
-    past = (left > 0.0) & (left < s.h * SURE) & (s.distance * left > s.distance2 * EXPECTED * (s.h - left))
-    beside = beside & ~(past & (s.distance > NEAREST_STAGE))
-    dodge = (fallback_due | beside) & far_from_here & (s.retries < float(RETRIES)) & (s.begin < 0.5)
-    s.where(stepping, retries=where(dodge, s.retries + 1.0, where(error < 1.0, 0.0, s.retries)))
-    fallback_due = fallback_due & ~dodge
+    fallback_due = failed & ~fallback
+    was_clear = is_clear(module, f, s, s.distance2)
+    is_near = stepping & ~fallback & (error < 1.0) & ~is_clear(module, f, s, s.distance) & (s.last < 0.5)
+    time_left = time_to_singularity(module, f, s)
+    has_passed = (
+        (time_left > 0.0) & (time_left < s.h * SURE) & (s.distance * time_left > s.distance2 * EXPECTED * (s.h - time_left))
+    )
+    is_near = is_near & ~(has_passed & (s.distance > NEAREST_STAGE))
+    shortens = (fallback_due | is_near) & was_clear & (s.retries < float(RETRIES)) & (s.begin < 0.5)
+    s.where(stepping, retries=where(shortens, s.retries + 1.0, where(error < 1.0, 0.0, s.retries)))
+    fallback_due = fallback_due & ~shortens
     s.fallback_due = where(fallback_due, f.const(1.0, DOUBLE, f.width), 0.0)
-    return stepping & ~fallback_due, dodge, left
+    return stepping & ~fallback_due, shortens, time_left
 
 
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value) -> tuple[Value, Value]:
-    """Return the ratio of the next step to this one, and the error over the length to the power of the order."""
+    """Return the ratio of the next step to this one, and the error divided by (length of the step)^order."""
     where, order, error = f.select, module.method.order, s.error
     # Errors are bounded below by the one at which a step grows by GROW, as smaller ones may be rounding.
     size = where(f.is_finite(error), f.max(error, FACTORS.grow ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
     foreseen = size * (rate / s.rate)  # the error of an equal step if errors continue to grow (Gustafsson 1994)
-    steep = accept & (foreseen > 1.0)
-    factor = power(f, where(steep, foreseen, size), -1.0 / order) * FACTORS.safety
-    factor = f.max(factor, where(accept & ~steep, f.const(1.0, DOUBLE, f.width), FACTORS.shrink))
+    grows = accept & (foreseen > 1.0)
+    factor = power(f, where(grows, foreseen, size), -1.0 / order) * FACTORS.safety
+    factor = f.max(factor, where(accept & ~grows, f.const(1.0, DOUBLE, f.width), FACTORS.shrink))
     return f.min(factor, where(accept, f.const(FACTORS.grow, DOUBLE, f.width), FACTORS.safety)), rate
 
 
 def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
-    """Make the end of a step the latest point; return one in lanes in which it is off the constraint manifold."""
+    """Make the end of a step the latest point; return one in lanes whose new point is off the constraint manifold."""
     lost = f.variable(0.0)
     with f.if_(f.any_of(accept)):
         for k in range(POINTS - 1):
@@ -157,15 +159,15 @@ def first_step(module: Module, f: Function, s: Lane) -> Value:
     rtol, atol, omega = (module.broadcast(f, x) for x in (s.rtol, s.atol, s.omega))
 
     def relative(of_q: str, of_v: str, least: float) -> Any:
-        def both(r: Value) -> list[Value]:
-            per_unit, found = module.vector(f, "inverse unit", r), []
+        def ratios(r: Value) -> list[Value]:
+            per_unit, sizes = module.vector(f, "inverse unit", r), []
             for name, y, per in ((of_q, "state q", per_unit), (of_v, "result v", per_unit / omega)):
                 floor = f.select(per > 0.0, f.const(least, DOUBLE, module.plan.vector), 0.0)  # zero for the padding of registers
                 x = f.max(f.abs(module.vector(f, name, r)) * per, floor)
-                found.append(x / f.fma(rtol, f.abs(module.vector(f, y, r)) * per, atol))
-            return found
+                sizes.append(x / f.fma(rtol, f.abs(module.vector(f, y, r)) * per, atol))
+            return sizes
 
-        return both
+        return ratios
 
     size, rate = module.largest(f, relative("state q", "result v", 1.0)), module.largest(f, relative("result v", "result a", 0.0))
     span = s.end - s.start
@@ -188,9 +190,9 @@ def time_to_singularity(module: Module, f: Function, s: Lane) -> Value:
     return -d0 / (slope - curve * (d0 / slope))
 
 
-def step_around(module: Module, f: Function, s: Lane, left: Value, step: Value, otherwise: Value) -> Value:
-    """Return a step with the configuration ahead in the middle of a wide gap between its nodes, to replace a failed one."""
+def step_around(module: Module, f: Function, s: Lane, time_left: Value, step: Value, otherwise: Value) -> Value:
+    """Return a step, instead of a failed one, with the singular configuration in the middle of a wide gap between its nodes."""
     low, high = (float(x) for x in module.method.clearings)
-    share = left / step
-    found = left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
-    return f.select((found > step * FACTORS.shrink) & (found < step * FACTORS.safety), found, otherwise)
+    share = time_left / step
+    candidate = time_left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
+    return f.select((candidate > step * FACTORS.shrink) & (candidate < step * FACTORS.safety), candidate, otherwise)

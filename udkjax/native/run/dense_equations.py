@@ -5,7 +5,7 @@ With D = W Psi_q M^(-1/2), W the weights of the rows, and a method of pseudoinve
     a = a_F + M^(-1/2) D^+ W b,        q - M^(-1/2) D^+ W Psi,        v - M^(-1/2) D^+ W Psi_dot,
 
 and the tangent part of a small change, dq - M^(-1/2) D^+ W Psi_q dq. The functions have the names and results of the scene's
-programs by elimination. Systems of one state share one factorization.
+programs by elimination. All systems at one state share a factorization.
 """
 
 from collections.abc import Callable
@@ -75,7 +75,7 @@ class DenseEquations:
         self._in.invoke(f, "psi")
 
     def _at(self, f: Function, name: str, other: str, do: Callable[[], None]):
-        """Run `do` with the array `other` in place of `name`."""
+        """Run `do` with the array `other` instead of `name`."""
         module = self._in
         module.copy(f, name, "saved")
         module.copy(f, other, name)

@@ -13,9 +13,9 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
     inverse, used = _spacing(module, f, s)
     with f.each(module.registers(pointer)) as r:
-        known = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
-        column = [x for x in known["q"] for _ in range(3)]  # each point is a triple node, of its q, v and a (Hermite)
-        given = {1: known["v"], 2: [a * 0.5 for a in known["a"]]}
+        points = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
+        column = [x for x in points["q"] for _ in range(3)]  # each point is a triple node, of its q, v and a (Hermite)
+        given = {1: points["v"], 2: [a * 0.5 for a in points["a"]]}
         module.put(f, "difference0", r, column[0], pointer)
         for degree in range(1, 3 * POINTS):
             following = []
@@ -55,9 +55,9 @@ def write_differences_back(module: Module):
         bars: dict[str, list[Value]] = {x: [zero] * POINTS for x in "qva"}
         column: list[Value] = []
         for degree in reversed(range(count)):
-            mine, mask = module.vector(f, f"bar difference{degree}", r), used[degree // 3]
-            mine = mine if mask is None else f.select(mask, mine, 0.0)
-            here = [zero] * (count - degree)
+            leading, mask = module.vector(f, f"bar difference{degree}", r), used[degree // 3]
+            leading = leading if mask is None else f.select(mask, leading, 0.0)
+            bars_of_column = [zero] * (count - degree)
             for i, bar in enumerate(column):  # cotangents of the next column
                 first, last = i // 3, (i + degree + 1) // 3  # points
                 if first == last:
@@ -65,10 +65,10 @@ def write_differences_back(module: Module):
                     bars[x][first] = bars[x][first] + share
                 else:
                     part = bar * inverse[first, last]
-                    here[i + 1] = here[i + 1] + part
-                    here[i] = here[i] - part
-            here[0] = here[0] + mine
-            column = here
+                    bars_of_column[i + 1] = bars_of_column[i + 1] + part
+                    bars_of_column[i] = bars_of_column[i] - part
+            bars_of_column[0] = bars_of_column[0] + leading
+            column = bars_of_column
             module.put(f, f"bar difference{degree}", r, zero)
         for i, bar in enumerate(column):
             bars["q"][i // 3] = bars["q"][i // 3] + bar

@@ -1,12 +1,12 @@
 """Fallback steps: if a pivot is too small for elimination, a rank-revealing method on all rows takes the step.
 
-It has two functions of `work`, for the lanes that are `wanted`, at their state, with results in separate arrays:
+Two functions of `work` evaluate the states of lanes that are `wanted`; their results are in separate arrays:
 
-    fallback                 accelerations a, and q and v after a Newton step each
+    fallback                 accelerations a, and q and v after one Newton step
     fallback_tangent_part    the tangent parts of `state dq` and `state dv`
 
-For small scenes the method is the pseudoinverse by singular values, lane by lane; for large ones it is elimination of all rows
-with dependent ones left out, which near singular configurations has about half as many correct digits.
+For small scenes the method is the pseudoinverse by singular values, lane by lane. For large scenes it is elimination of all rows
+with dependent rows left out, which near singular configurations has about half as many correct digits.
 """
 
 import numpy as np
@@ -30,19 +30,19 @@ def write_fallback(module: Module):
         module.invoke(f, name)
 
     def close_position(f: Function, s: Lane, mask: Value):
-        def closer(active: Value):
+        def correct(active: Value):
             invoke(f, s, active)
             module.copy(f, "fallback q", "corrected q")
 
-        iterate_newton(module, f, s, mask, closer)
+        iterate_newton(module, f, s, mask, correct)
 
     # Accelerations of lanes whose pivots were not safe.
     f, s = module.function("accelerate_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     mask = (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5)
     invoke(f, s, mask)
     module.copy(f, "fallback a", "out", mask)
-    # The end of a fallback step: Newton's method in position, velocities and accelerations if the pivots are not safe; and in any
-    # case the tangent part of the errors.
+    # The end of a fallback step: Newton's method for positions, velocities and accelerations if the pivots are not safe; always
+    # the tangent part of the errors.
     f, s = module.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
     unsafe = fallback & (s.ok < 0.5)
@@ -66,12 +66,12 @@ def write_fallback(module: Module):
 
 def _write_elimination(module: Module):
     """Write `fallback` and `fallback_tangent_part` by elimination, with a copy of the constants for another threshold."""
-    every = module.code.with_all_rows
-    at = module.arrays | {x: ("work", module.places[f"fallback {x}"]) for x in (*every.scratch, "constants", "a")}
+    all_rows = module.code.with_all_rows
+    at = module.arrays | {x: ("work", module.places[f"fallback {x}"]) for x in (*all_rows.scratch, "constants", "a")}
     at |= {f"{x}1": ("work", module.places[f"fallback {x}"]) for x in ("q", "v", "dq", "dv")}
     at |= dict.fromkeys(("safe", "distance"), ("work", module.places["rank"]))
-    module.loops.write(every.corrections_and_accelerations, "fallback", ("work", "out"), at)
-    module.loops.write(every.tangent_part, "tangent_part_of_all_rows", ("work", "out"), at)
+    module.loops.write(all_rows.corrections_and_accelerations, "fallback", ("work", "out"), at)
+    module.loops.write(all_rows.tangent_part, "tangent_part_of_all_rows", ("work", "out"), at)
     module.write_prologue("fallback_prologue", None)
     f, _ = module.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
     place = module.places["fallback constants"] + module.code.drop_tol_index

@@ -85,7 +85,7 @@ class FormulatedAccelerations(ABC):
 
 @dataclass(frozen=True)
 class AugmentedCode(FormulationCode):
-    """x and lambda at once (`Augmented`)."""
+    """Solution for x and lambda together (`Augmented`)."""
 
     method: DenseMethod
 
@@ -94,7 +94,7 @@ class AugmentedCode(FormulationCode):
 
 
 class AugmentedAccelerations(FormulatedAccelerations):
-    """[M A^T; A 0] [x; lambda] = [0; b]."""
+    """Accelerations from [M A^T; A 0] [x; lambda] = [0; b]."""
 
     def __init__(self, module: Module, method: DenseMethod):
         size, self._method = module.n + module.m, method
@@ -128,7 +128,7 @@ class NullSpaceCode(FormulationCode):
 
 
 class NullSpaceAccelerations(FormulatedAccelerations):
-    """Accelerations by pivoted QR of vectors that span the rows of A, as columns; the remaining columns of Q are N.
+    """Accelerations by pivoted QR of columns that span the rows of A; the remaining columns of Q are N.
 
     The columns of N are made orthonormal in the metric of M, n_k, and x = x_p - sum_k n_k (n_k^T M x_p).
     """
@@ -153,9 +153,9 @@ class NullSpaceAccelerations(FormulatedAccelerations):
         with f.each(count.value) as k:
             vector, weighted = d.row("basis", k), d.row("weighted", k)
             place = d.row("rank").entry(0) + d.number(k)
-            is_there = place < float(d.m)
+            is_used = place < float(d.m)
             vector.clear()
-            vector.put_at(d.whole(f.select(is_there, place, 0.0)), f.select(is_there, d.wide(1.0), 0.0))
+            vector.put_at(d.whole(f.select(is_used, place, 0.0)), f.select(is_used, d.wide(1.0), 0.0))
             apply_q(d, "basis", k)
             with f.each(k) as j:
                 d.axpy(-d.dot(d.row("weighted", j), vector), d.row("basis", j), vector)
@@ -165,7 +165,7 @@ class NullSpaceAccelerations(FormulatedAccelerations):
 
             d.over_registers(vector.registers, weigh)
             square = d.dot(weighted, vector)
-            counts = is_there & (square > 0.0)
+            counts = is_used & (square > 0.0)
             scale = d.spread(f.select(counts, 1.0 / d.sqrt(f.select(counts, square, 1.0)), 0.0))
 
             def normalize(r: Operand):
@@ -198,11 +198,11 @@ class NullSpaceQRAccelerations(NullSpaceAccelerations):
         with f.each(d.steps) as k:
             counts = d.number(k) < d.row("rank").entry(0)
             place = d.whole(d.row("order").entry(k))
-            left = f.variable(right.at(place))
+            remainder = f.variable(right.at(place))
             with f.each(k) as i:
-                left.value = left.value - d.row("D", i).at(place) * x.entry(i)
+                remainder.value = remainder.value - d.row("D", i).at(place) * x.entry(i)
             end = d.row("diagonal").entry(k)
-            x.put(k, f.select(counts, left.value / f.select(counts, end, 1.0), 0.0))
+            x.put(k, f.select(counts, remainder.value / f.select(counts, end, 1.0), 0.0))
         apply_q(d)
 
 
@@ -216,28 +216,28 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
         self._rows = DenseLayout(module, self._method.matrices(m, n), (m, n), "null space rows", TOL)
 
     def solve_rows(self, d: DenseMatrices):
-        f, of = d.f, DenseMatrices(self._rows, d.f)
-        of.row("b").clear()
-        with f.each(of.m) as i:
-            of.row("D", i).clear()
-            of.row("b").put(i, self.right(f, i))
+        f, svd = d.f, DenseMatrices(self._rows, d.f)
+        svd.row("b").clear()
+        with f.each(svd.m) as i:
+            svd.row("D", i).clear()
+            svd.row("b").put(i, self.right(f, i))
         for row, column, value in self.each_entry(f):
-            of.row("D", row).put(column, value)
-        self._method.factor(of)
-        self._method.solve(of)
+            svd.row("D", row).put(column, value)
+        self._method.factor(svd)
+        self._method.solve(svd)
         with f.each(d.m) as i:
             row = d.row("D", i)
             row.clear()
-            with f.each(of.steps) as j:
-                row.put(j, of.row("D", j).entry(i) * d.sqrt(of.row("lengths").entry(j)))
+            with f.each(svd.steps) as j:
+                row.put(j, svd.row("D", j).entry(i) * d.sqrt(svd.row("lengths").entry(j)))
         pivoted_qr(d, lambda _: d.wide(0.25))  # lengths are one, or zero beyond the rank
         d.row("b").clear()
         with f.each(d.m) as i:
-            d.row("b").put(i, of.row("x").entry(i))
+            d.row("b").put(i, svd.row("x").entry(i))
 
 
 def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
-    """Return the machine code of a formulation; None if there is none."""
+    """Return the machine code of a formulation; None if it has none."""
     if isinstance(formulation, NullSpaceQR | NullSpaceSVD):
         return NullSpaceCode(isinstance(formulation, NullSpaceSVD))
     if not isinstance(formulation, Augmented):

@@ -9,22 +9,24 @@ from udkjax.native.base.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTP
 
 
 def newton(module: Module, f: Function, s: Lane):
-    """Take Newton steps to Psi = 0 in lanes that are `stepping`, until they are at rounding level."""
+    """Take Newton steps to Psi = 0 in lanes that are `stepping`, until the steps are at rounding level."""
 
-    def closer(active: Value):
+    def correct(active: Value):
         module.invoke(f, "newton_q")
         s.where(active & (s.safe < 0.5), ok=0.0)
 
-    iterate_newton(module, f, s, s.stepping > 0.5, closer)
+    iterate_newton(module, f, s, s.stepping > 0.5, correct)
 
 
-def iterate_newton(module: Module, f: Function, s: Lane, mask: Value, closer: Callable[[Value], None], steps: int = NEWTON_STEPS):
-    """Take Newton steps in some lanes: `closer` computes `corrected q` from `state q`."""
+def iterate_newton(
+    module: Module, f: Function, s: Lane, mask: Value, correct: Callable[[Value], None], steps: int = NEWTON_STEPS
+):
+    """Take Newton steps in some lanes: `correct` computes `corrected q` from `state q`."""
     s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
         active = s.iterating > 0.5
-        closer(active)
+        correct(active)
         change = take_newton_step(module, f, active)
         s.iterating = f.select(active & ~(change <= NEWTON_TOL), f.const(1.0, DOUBLE, f.width), 0.0)
         k.value = k.value + 1
@@ -42,7 +44,7 @@ def take_newton_step(module: Module, f: Function, active: Value) -> Value:
 
 
 def with_threshold(f: Function, place: int | None, threshold: Value, do: Callable[[], None]):
-    """Run `do` with another threshold of pivots, whose offset is `place`; None: pivots are not compared."""
+    """Run `do` with another threshold of pivots at the offset `place`; if that is None, just run `do`."""
     if place is None:
         do()
         return
@@ -59,7 +61,7 @@ def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value
 
 
 def project_output(module: Module, f: Function, s: Lane, which: str):
-    """Project the state to `state q` and `result v`; set `violated` to its largest violation of Psi before."""
+    """Project the state to `state q` and `result v`; set `violated` to the largest violation of Psi."""
     mask = getattr(s, which) > 0.5
 
     def iterate(lanes: Value):
@@ -69,14 +71,14 @@ def project_output(module: Module, f: Function, s: Lane, which: str):
     def project():
         module.invoke(f, "project")
         s.violated = largest_violation(module, f)
-        far = mask & ~(take_newton_step(module, f, mask) <= SINGLE_STEP_TOL)
-        with f.if_(f.any_of(far)):
+        is_far = mask & ~(take_newton_step(module, f, mask) <= SINGLE_STEP_TOL)
+        with f.if_(f.any_of(is_far)):
             with f.each(module.rowcount) as r:  # other lanes keep their states
                 module.put(f, "result dv", r, module.vector(f, "result v", r))
-            iterate(far)
+            iterate(is_far)
             with f.each(module.rowcount) as r:
-                module.put(f, "result v", r, f.select(far, module.vector(f, "result v", r), module.vector(f, "result dv", r)))
-            s.where(far, violated=largest_violation(module, f))
+                module.put(f, "result v", r, f.select(is_far, module.vector(f, "result v", r), module.vector(f, "result dv", r)))
+            s.where(is_far, violated=largest_violation(module, f))
         if module.falls_back:  # rows with small pivots are left out and may be violated
             s.open = f.select(mask & (s.violated > OPEN_OUTPUT), f.const(1.0, DOUBLE, f.width), 0.0)
             with f.if_(f.any_of(s.open > 0.5)):

@@ -114,7 +114,7 @@ def write_finish(module: Module):
 
 
 def _find_cause(module: Module, f: Function, s: Lane):
-    """Distinguish steps that became too small because of a non-finite number, at the end of the run or just ahead of it."""
+    """Mark runs whose steps became too small because of a non-finite number, where they stopped or just ahead."""
     stopped = (
         s.due.is_(1.0)
         & s.code.is_not(float(Status.DONE))
@@ -141,20 +141,20 @@ def _find_cause(module: Module, f: Function, s: Lane):
 
 
 def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
-    """Set the outputs of lane k to NaN that its run did not reach or that follow the first lost one."""
+    """Set to NaN the outputs of lane k that its run did not reach, or that follow the first lost output."""
     times, nan = module.field(f, "times"), f.const(np.nan)
     is_done = f.lane(s.code, k).is_(float(Status.DONE))
     reached = f.select(is_done, f.op(f"sitofp i64 {times.name} to double", DOUBLE), f.lane(s.written, k) + 1.0)
-    kept = module.to_int(f, f.min(f.lane(s.lost, k) + 1.0, reached))
-    row = module.to_int(f, f.lane(s.member, k)) * times + kept
+    valid = module.to_int(f, f.min(f.lane(s.lost, k) + 1.0, reached))
+    row = module.to_int(f, f.lane(s.member, k)) * times + valid
     to = [module.result_address(f, name, row, module.n) for name in ("qs", "vs")]
-    with f.each((times - kept) * module.n) as i:
+    with f.each((times - valid) * module.n) as i:
         for address in to:
             f.store(nan, address, i)
 
 
 def write_run(module: Module):
-    """Write `run(call)`: integrate members until none is left."""
+    """Write `run(call)`: integrate all members."""
     f = Function("run", [(POINTER, "call")], module.plan.width)
     module.functions.append(f)
     call, width = f.given["call"], module.plan.width

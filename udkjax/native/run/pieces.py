@@ -12,8 +12,8 @@ from udkjax.native.base.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, H
 def write_leave(module: Module):
     """Write `leave`: decide in lanes of `again` whether a step that ends in another piece is accepted or repeated.
 
-    It is repeated to end just before the end of the piece. A tiny step then leads across, and the run begins anew after it, so
-    that the accelerations of all points of an interpolation belong to one piece.
+    Such a step is repeated to end just before the end of the piece. A tiny step then leads across, and the run begins anew after
+    it: the accelerations of all points of an interpolation must belong to one piece.
     """
     f, s = module.function("leave")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
@@ -28,8 +28,8 @@ def write_leave(module: Module):
     def moved() -> Value:
         found = f.variable(f.const(False, BOOL, f.width), BOOL)
         with f.each(module.pieces) as k:
-            one, other = (module.entry(f, x, k) for x in ("pieces", "pieces before"))
-            found.value = found.value | one.is_not(other)
+            current, has_left = (module.entry(f, x, k) for x in ("pieces", "pieces before"))
+            found.value = found.value | current.is_not(has_left)
         return found.value
 
     with f.each(module.rowcount) as r:
@@ -45,26 +45,26 @@ def write_leave(module: Module):
         middle = (s.low + s.share) * 0.5
         s.behind = middle
         find_pieces(f.fma(middle, step, s.point3_t), lambda r: interpolate_step(module, f, s.behind, step, r))
-        other = moved()
-        s.where(leaves & other, share=s.behind)
-        s.where(leaves & ~other, low=s.behind)
+        has_left = moved()
+        s.where(leaves & has_left, share=s.behind)
+        s.where(leaves & ~has_left, low=s.behind)
     setattr(s, "state t", s.t1)
     with f.each(module.rowcount) as r:
         module.put(f, "state q", r, module.vector(f, "corrected q", r))
         module.put(f, "state v", r, module.vector(f, "result v", r))
-    share, aim, good = s.share, s.aim, s.error < 1.0
+    share, aim, is_accurate = s.share, s.aim, s.error < 1.0
     repeats = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
-    exact = f.min(share, yes - share) <= NEAR_END
+    is_near_end = f.min(share, yes - share) <= NEAR_END
     s.where(leaves & ~repeats, lands=1.0)
     short = (s.t1 < s.crossing - s.smallest) & (s.lands < 0.5)
-    reached = stepping & good & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
+    reached = stepping & is_accurate & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
     across = reached | (repeats & (share <= EDGE))
     before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
-    aim = where(repeats, where(exact, before, beyond), where(short, aim, beyond))
-    expected = f.fma(where(exact, share - EDGE / 2, share + NEAR_END / 2), step, s.point3_t)
+    aim = where(repeats, where(is_near_end, before, beyond), where(short, aim, beyond))
+    expected = f.fma(where(is_near_end, share - EDGE / 2, share + NEAR_END / 2), step, s.point3_t)
     crossing = where(repeats, expected, where(short, s.crossing, inf))
     crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.point3_t)), crossing)
-    tries = where(repeats, s.tries + 1.0, where(good, 0.0, s.tries))
+    tries = where(repeats, s.tries + 1.0, where(is_accurate, 0.0, s.tries))
     s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
     s.again = where(repeats, yes, 0.0)
 

@@ -1,10 +1,10 @@
 """Machine code that finds independent rows of Psi at run time, for mechanisms with traced numbers.
 
 Rows that depend on others everywhere must be distinguished from rows that do so only at the initial position, if it is singular.
-So the mechanism takes one step, along its velocity or, at rest, along some direction that its constraints allow, with its drivers
-slightly advanced; it is closed by Newton's method, and the rows that elimination retains are marked. If it does not close, or is
-led back, as at rest where two branches of its motion meet, all rows are marked: elimination then encounters small pivots, and the
-rank-revealing fallback takes every step.
+Therefore the mechanism is moved by one step: along its velocity or, at rest, along a random direction that its constraints allow,
+with its drivers slightly advanced. It is closed by Newton's method, and the rows that elimination retains are marked. If it does
+not close, or returns to the start, as it may at rest where two branches of its motion meet, all rows are marked: elimination then
+encounters small pivots, and the rank-revealing fallback takes every step.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from udkjax.native.run.manifold import iterate_newton, largest_violation
 from udkjax.native.run.members import write_begin, write_run
 
 # Length of the step in the scene's units. A row that depends on others only at the start of the step has a relative pivot of
-# about its square at the end: far above the threshold of dependence. It is also within the range of Newton's method.
+# about its square at the end: much more than the threshold of dependence. The step is also short enough for Newton's method.
 STEP = 0.03
 STAYS = 0.5  # smallest distance from the start, as a fraction of the step: where branches meet, Newton's method may lead back
 CORRECTIONS = 6  # Newton steps; four are usual, as convergence is quadratic
@@ -73,8 +73,8 @@ class RowMarks(Module):
         rate = self.largest(f, lambda r: [f.abs(self.vector(f, "state dq", r)) * self.vector(f, "inverse unit", r)])
         moves = f.like(rate > s.omega * FREE, BOOL, width)
         with f.each(self.n) as i:
-            along = f.like(f.load(Value(f, "@direction", POINTER), i), DOUBLE, width) / self.entry(f, "inverse unit", i)
-            self.put_entry(f, "state dq", i, f.select(moves, self.entry(f, "state dq", i) / s.omega, along))
+            random = f.like(f.load(Value(f, "@direction", POINTER), i), DOUBLE, width) / self.entry(f, "inverse unit", i)
+            self.put_entry(f, "state dq", i, f.select(moves, self.entry(f, "state dq", i) / s.omega, random))
         self.invoke(f, "tangent_part")
         size = self.largest(f, lambda r: [f.abs(self.vector(f, "result dq", r)) * self.vector(f, "inverse unit", r)])
         is_free = size > FREE
@@ -83,15 +83,15 @@ class RowMarks(Module):
         with f.each(self.n) as i:
             self.put_entry(f, "state q", i, f.fma(self.entry(f, "result dq", i), scale, self.entry(f, "state q", i)))
         setattr(s, "state t", s.start + STEP / s.omega)
-        everyone = s.active > 0.5
-        iterate_newton(self, f, s, everyone, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
+        active = s.active > 0.5
+        iterate_newton(self, f, s, active, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
         self.invoke(f, "psi")
-        closed = largest_violation(self, f) < CLOSED_TOL
+        is_closed = largest_violation(self, f) < CLOSED_TOL
         distance = self.largest(f, self._distance(f))
-        closed = closed & ((distance > STAYS * STEP) | ~f.like(is_free, BOOL, width))
+        is_closed = is_closed & ((distance > STAYS * STEP) | ~f.like(is_free, BOOL, width))
         self.invoke(f, "independent_rows")
         with f.each(self.m) as i:
-            self.put_entry(f, "independent", i, f.select(closed, self.entry(f, "independent", i), 1.0))
+            self.put_entry(f, "independent", i, f.select(is_closed, self.entry(f, "independent", i), 1.0))
         with self.each_lane(f, s.active) as k:
             to = self.result_address(f, "marks", self.to_int(f, f.lane(s.member, k)), self.m)
             self.copy_lane(f, to, 0, "independent", k, count=self.m)

@@ -16,8 +16,8 @@ def write_attempt(module: Module):
     """
     f, s = module.function("attempt")
     method, stages = module.method, module.method.stages
-    one = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
-    s.ok = one()
+    ones = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
+    s.ok = ones()
     s.distance = f.const(np.inf, DOUBLE, f.width)
     begins = f.all_of((s.begin > 0.5) | (s.stepping < 0.5))
 
@@ -29,7 +29,7 @@ def write_attempt(module: Module):
             module.record_stage(f, s, i)
 
     def clear_stages():
-        # They may hold NaN of a failed member, which would survive the multiplication by a step of zero.
+        # Stages may hold NaN of a failed member, which would survive multiplication by a step of zero.
         with f.each(module.rowcount) as r:
             for i in range(1, stages):
                 module.put(f, f"stage{i} a", r, f.const(0.0, DOUBLE, module.plan.vector))
@@ -60,11 +60,11 @@ def write_attempt(module: Module):
             threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
             with_threshold(f, module.drop_tol_place, threshold, lambda: module.invoke(f, "tangent_part"))
         if module.falls_back:
-            repeats = (s.stepping > 0.5) & (s.fallback > 0.5)
-            with f.if_(f.any_of(repeats)):
+            by_fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
+            with f.if_(f.any_of(by_fallback)):
                 module.invoke(f, "finish_by_fallback")
                 module.accelerate_end(f)
-                s.where(repeats, ok=1.0)
+                s.where(by_fallback, ok=1.0)
     _measure_error(module, f, s)
 
 
@@ -75,14 +75,14 @@ def _measure_error(module: Module, f: Function, s: Lane):
     weight = NORMAL_ERROR_WEIGHT if module.plan.projected else 0.0
 
     def relative(r: Value) -> list[Value]:
-        found = []
+        ratios = []
         for d, scale, y0, y1 in (("dq", "scale q", q0, q1), ("dv", "scale v", v0, v1)):
-            left = module.vector(f, f"result {d}", r)
+            tangent_error = module.vector(f, f"result {d}", r)
             if weight:
-                left = f.fma(module.vector(f, f"state {d}", r) - left, weight, left)
+                tangent_error = f.fma(module.vector(f, f"state {d}", r) - tangent_error, weight, tangent_error)
             size = f.max(f.abs(module.vector(f, y0, r)), f.abs(module.vector(f, y1, r)))
-            found.append(f.abs(left) / f.fma(rtol, size, module.vector(f, scale, r)))
-        return found
+            ratios.append(f.abs(tangent_error) / f.fma(rtol, size, module.vector(f, scale, r)))
+        return ratios
 
     # Maxima ignore NaN, so non-finite numbers are detected by their product with zero.
     check = f.variable(0.0, width=module.plan.vector)

@@ -1,6 +1,6 @@
 """Machine code of functions of single states, for other integrators, in batches.
 
-StateAccelerations    a of a state, by elimination or a dense method; by the fallback if pivots are too small
+StateAccelerations    accelerations of a state, by elimination or a dense method; by the fallback if pivots are too small
 StateProjection       q and v projected onto the constraint manifold
 StateTangentPart      the tangent part of small changes of q and v
 Evaluation            accelerations with multipliers, and energies, for pages
@@ -138,12 +138,12 @@ class StateTangentPart(StateFunction):
         with_threshold(f, self.drop_tol_place, threshold, lambda: self.invoke(f, "tangent_part"))
         if not self.falls_back:
             return
-        near = (s.active > 0.5) & ~(s.distance > NEAREST_STAGE)
-        with f.if_(f.any_of(near)):
-            s.wanted = f.select(near, f.const(1.0, DOUBLE, f.width), 0.0)
+        is_near = (s.active > 0.5) & ~(s.distance > NEAREST_STAGE)
+        with f.if_(f.any_of(is_near)):
+            s.wanted = f.select(is_near, f.const(1.0, DOUBLE, f.width), 0.0)
             self.invoke(f, "fallback_tangent_part")
             for x in ("dq", "dv"):
-                self.copy(f, f"fallback {x}", f"result {x}", near)
+                self.copy(f, f"fallback {x}", f"result {x}", is_near)
 
 
 INPUTS = ("t", "q", "v")
@@ -186,7 +186,7 @@ class Evaluation:
 
 
 class ScaleCode(Memory):
-    """The text of a module whose `run` finds the scales of members, by loops for any size of the scene.
+    """The text of a module whose `run` computes the scales of members, by loops for any size of the scene.
 
     Its functions are cold: optimization would not make them faster, but double the time of compiling.
     """

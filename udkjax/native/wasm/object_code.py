@@ -1,8 +1,8 @@
 """Conversion of LLVM's WebAssembly object code to a loadable module, with exports and without sections for linkers.
 
 In an object all functions have their final indices, and data begin at address 0, so nothing has to be relocated; the memory and
-the stack pointer are imports. It lacks an export section: the indices of its functions are in the symbol table, in the section
-"linking" (Linking.md of the tool conventions).
+the stack pointer are imports. An object has no export section: the indices of its functions are in the symbol table, in the
+section "linking" (Linking.md of the tool conventions).
 """
 
 from collections.abc import Iterator, Sequence
@@ -88,12 +88,12 @@ def link(code: bytes, exports: Sequence[str]) -> LinkedModule:
         raise ValueError(f"the module has no function {missing[0]!r}")
     entries = (leb128(len(name)) + name.encode() + b"\0" + leb128(numbers[name]) for name in exports)
     exported = leb128(len(exports)) + b"".join(entries)
-    kept = [(kind, body) for kind, body in sections if kind != CUSTOM]
-    place = next(k for k, (kind, _) in enumerate([*kept, (EXPORTS + 1, b"")]) if kind > EXPORTS)
-    kept.insert(place, (EXPORTS, exported))
-    whole = MAGIC + b"".join(bytes([kind]) + leb128(len(body)) + body for kind, body in kept)
-    bodies = dict(kept)
-    return LinkedModule(whole, tuple(_imported_functions(bodies[IMPORTS])), _data_end(bodies.get(DATA, b"\0")))
+    linked = [(kind, body) for kind, body in sections if kind != CUSTOM]
+    place = next(k for k, (kind, _) in enumerate([*linked, (EXPORTS + 1, b"")]) if kind > EXPORTS)
+    linked.insert(place, (EXPORTS, exported))
+    module = MAGIC + b"".join(bytes([kind]) + leb128(len(body)) + body for kind, body in linked)
+    bodies = dict(linked)
+    return LinkedModule(module, tuple(_imported_functions(bodies[IMPORTS])), _data_end(bodies.get(DATA, b"\0")))
 
 
 def _sections(code: bytes) -> Iterator[tuple[int, bytes]]:
@@ -106,7 +106,7 @@ def _sections(code: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _function_numbers(sections: Sequence[tuple[int, bytes]]) -> dict[str, int]:
     """Return the index of each defined function, from the symbol table."""
-    found = {}
+    numbers = {}
     for kind, body in sections:
         reader = Reader(body)
         if kind != CUSTOM or reader.name() != "linking":
@@ -119,8 +119,8 @@ def _function_numbers(sections: Sequence[tuple[int, bytes]]) -> dict[str, int]:
             for _ in range(table.number()):
                 symbol, name, number = _symbol(table)
                 if symbol == FUNCTION_SYMBOL and name:
-                    found[name] = number
-    return found
+                    numbers[name] = number
+    return numbers
 
 
 def _symbol(table: Reader) -> tuple[int, str, int]:

@@ -29,7 +29,7 @@ def wasm_module(operation: Operation) -> WasmModule:
     """Compile an operation for one member at a time; the module exports `run`, which takes the address of its call record.
 
     Args:
-        operation: Any of `native.operations`.
+        operation: An operation of `native.operations`.
 
     Returns:
         The module; `module.call_fields` are the fields of the record, 8 bytes each (memory.py).

@@ -17,7 +17,7 @@ from udkjax.native.watching.watch_memory import WatchMemory
 
 
 def write_classification(module: WatchMemory):
-    """Write `judge(work)`: classify two intervals after their last node, in lanes where `low` is one, and act accordingly."""
+    """Write `judge(work)`: classify two intervals at their last node, in lanes where `low` is one, and act accordingly."""
     f, s = module.function("judge")
     mask, length = s.low > 0.5, s.look - s.first_t
     unresolved = [f.variable(0.0), f.variable(0.0)]
@@ -27,17 +27,17 @@ def write_classification(module: WatchMemory):
     with f.each(module.conditions.count) as c:
         g = [module.condition(f, name, c) for name in ("g0", "g1", "g")]
         rate = [module.condition(f, name, c) for name in ("rate0", "rate1", "rate")]
-        finite = f.is_finite(g[1]) & f.is_finite(g[2]) & f.is_finite(g[0])
-        smooth = f.is_finite(rate[0]) & f.is_finite(rate[1]) & f.is_finite(rate[2])
+        is_finite = f.is_finite(g[1]) & f.is_finite(g[2]) & f.is_finite(g[0])
+        is_smooth = f.is_finite(rate[0]) & f.is_finite(rate[1]) & f.is_finite(rate[2])
         error = _error(f, g, rate, length, x)
         side, on, floor = module.condition(f, "side", c), module.condition(f, "on", c) > 0.5, module.condition(f, "floor", c)
         for k in range(2):
             after = f.select(f.abs(g[k + 1]) <= floor, side, _sign(f, g[k + 1]))
-            hit, sure = _classify_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)
-            bad = on & ~(sure & smooth)
+            hit, is_certain = _classify_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)
+            is_unclear = on & ~(is_certain & is_smooth)
             direction = module.condition(f, "direction", c)
             counts = hit & on & (direction.is_(0.0) | direction.is_(after))
-            fault = f.select(finite, f.select(bad, f.const(VARIES_FAST, DOUBLE, f.width), 0.0), UNDEFINED)
+            fault = f.select(is_finite, f.select(is_unclear, f.const(VARIES_FAST, DOUBLE, f.width), 0.0), UNDEFINED)
             unresolved[k].value = f.max(fault, unresolved[k].value)
             hits[k].value = f.select(counts, f.const(1.0, DOUBLE, f.width), hits[k].value)
             module.put_condition(f, f"hit{k + 1}", c, f.select(counts, after, f.const(0.0, DOUBLE, f.width)))
@@ -49,7 +49,7 @@ def write_classification(module: WatchMemory):
 def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved: list[Variable], hits: list[Variable]):
     """Continue after resolved intervals, locate crossings in them, and refine or stop at unresolved ones."""
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
-    behind_break = s.fresh > s.first_t  # the polynomial belongs to another piece of the motion
+    is_after_break = s.fresh > s.first_t  # the polynomial belongs to another piece of the motion
     span = s.look - s.first_t
     length, jumps = span * s.omega, f.variable(0.0)
     may_jump = (length <= SHORT_PAIR) & (s.jumps < float(MOST_JUMPS)) & (s.stuck < float(MOST_STUCK))
@@ -63,7 +63,7 @@ def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved:
         unclear = mask & (fault > 0.0) & ~is_jump
         finer = unclear & ~(is_finest | (fault.is_(VARIES_FAST) & (length <= SHORT_PAIR)))
         is_hit = mask & (hits[k].value > 0.5) & ~unclear
-        stops = (unclear & ~finer) | (is_hit & behind_break)
+        stops = (unclear & ~finer) | (is_hit & is_after_break)
         seeks = is_hit & ~stops
         s.where(stops, stops=one)
         s.where(seeks, seeks=one)
@@ -103,8 +103,8 @@ def _error(f: Function, g: list[Value], rate: list[Value], length: Value, x: Val
     square, cube = (b - a) * 3.0 - da * 2.0 - db, (a - b) * 2.0 + da + db
     value = a + x * (da + x * (square + x * cube))
     slope = da + x * (square * 2.0 + x * cube * 3.0)
-    of_value, of_rate = f.abs(g[1] - value), f.abs(rate[1] * length - slope) * RESOLUTION.miss
-    return f.select(of_value > of_rate, of_value, of_rate)
+    error_of_value, error_of_rate = f.abs(g[1] - value), f.abs(rate[1] * length - slope) * RESOLUTION.miss
+    return f.select(error_of_value > error_of_rate, error_of_value, error_of_rate)
 
 
 def _classify_interval(

@@ -13,13 +13,14 @@ class Resolution(NamedTuple):
 
     Attributes:
         per_time: number of intervals in T.
-        resolved: largest error of the cubic, as a fraction of the change of a condition in an interval; an interval with more is
-            too coarse. An oscillation then has at least 7 intervals in a period, and no two of its zeros lie in one; a smaller
-            fraction needs more windows for the same events.
-        miss: error in one interval, as a fraction of the error over two. In a fine interval it is 1/16, by the fourth power of
-            the length; four times that is safe in coarser ones. Rates that are computed by differences count with the full error.
-        far: distance from zero, in errors, beyond which a condition has no zero even in an interval that is too coarse: a change
-            as large would be resolved.
+        resolved: largest error of the cubic, as a fraction of the change of a condition in an interval; an interval with a larger
+            error is too coarse. A resolved oscillation has at least 7 intervals in a period, and no interval with two zeros; a
+            smaller fraction needs more windows for the same events.
+        miss: error in one interval, as a fraction of the error over two intervals. In fine intervals it is 1/16, by the fourth
+            power of the length; four times as much is safe in coarser intervals. With rates by differences, the full error
+            counts.
+        far: distance from zero, in errors, beyond which a condition has no zero even in an interval that is too coarse: so
+            large a change would be resolved.
         finer: factor by which an interval that is too coarse is refined.
         short: length of a window, in T, in which an unresolved condition has a jump or a kink, or varies throughout.
         finest: length of a window, in T, in which changes are no longer resolved.
@@ -38,9 +39,9 @@ class Resolution(NamedTuple):
     ) -> tuple[Any, Any]:
         """Classify an interval between two nodes: whether a condition crosses zero in it once for certain, or never for certain.
 
-        The condition is Hermite's cubic up to E x^2 (1 - x)^2, with 0 <= x <= 1. It crosses once where Bernstein's coefficients
-        of degree 4 of the cubic plus and minus this change their sign once (Descartes' rule), and never where they never do.
-        Written once, for lanes of machine code and for arrays of JAX.
+        The condition is Hermite's cubic up to E x^2 (1 - x)^2, with 0 <= x <= 1. It crosses zero once if the Bernstein
+        coefficients of degree 4 of the cubic, plus and minus this bound, change sign once (Descartes' rule), and never if they do
+        not change sign. The same code serves lanes of machine code and arrays of JAX.
 
         Args:
             arithmetic: `min` and `max` of two values; a `Function` has them.
@@ -54,9 +55,14 @@ class Resolution(NamedTuple):
             Two masks.
         """
         a, b = ends[0] * side, ends[2] * side
-        one, two = a + ends[1] * side * step * (1 / 3), b - ends[3] * side * step * (1 / 3)
-        # 16 x^2 (1 - x)^2 is 8/3 of the middle one.
-        second, fourth, middle, e = (a + one * 3.0) * 0.25, (two * 3.0 + b) * 0.25, (one + two) * 0.5, error * (8 / 3)
+        inner_start, inner_end = a + ends[1] * side * step * (1 / 3), b - ends[3] * side * step * (1 / 3)
+        # 16 x^2 (1 - x)^2 is 8/3 of the middle Bernstein polynomial.
+        second, fourth, middle, e = (
+            (a + inner_start * 3.0) * 0.25,
+            (inner_end * 3.0 + b) * 0.25,
+            (inner_start + inner_end) * 0.5,
+            error * (8 / 3),
+        )
         low = arithmetic.min(arithmetic.min(a, b), arithmetic.min(second, fourth))
         high = arithmetic.max(arithmetic.max(a, b), arithmetic.max(second, fourth))
         low, high = arithmetic.min(low, middle - e), arithmetic.max(high, middle + e)
@@ -64,7 +70,7 @@ class Resolution(NamedTuple):
         is_away = (low >= -floor) & (is_resolved | (low >= error * self.far - floor))
 
         def changes_once(x: Any) -> Any:
-            signs = [second > 0.0, x > 0.0, fourth > 0.0, b > 0.0]  # the one before counts as positive
+            signs = [second > 0.0, x > 0.0, fourth > 0.0, b > 0.0]  # the coefficient before them counts as positive
             found = ~signs[-1]
             for now, later in pairwise(signs):
                 found = found & (now | ~later)
@@ -76,13 +82,13 @@ class Resolution(NamedTuple):
 RESOLUTION = Resolution()
 SHORT_PAIR = RESOLUTION.short / 16  # length in T of two of the 32 intervals of such a window
 FINEST = 1e-9  # length of a window, in T, in which changes are no longer resolved
-MOST_JUMPS = 3  # jumps of conditions before intervals regain their length; more are an oscillation
+MOST_JUMPS = 3  # maximum number of jumps before intervals regain their length; more are an oscillation
 # Position of the middle node in two intervals; largest reduction of their length, as a fraction; and the increment of its phase,
 # the golden ratio, so that no oscillation is zero at all nodes.
 MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
-MOST_STUCK = 4  # successive refinements; before a jump, some of the finer intervals are resolved
+MOST_STUCK = 4  # maximum number of successive refinements; before a jump, some finer intervals are resolved
 FIRST, SECOND, THIRD = range(3)  # the next node of two intervals
-LAST_CHANGE = 1e-7  # largest last change of the event time, in T; Taylor's step has an error of its square
+LAST_CHANGE = 1e-7  # largest final correction of the event time, in T; as a Taylor step it has an error of its square
 MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; one is usual
 LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long
 WANTED, UNDER_WAY = 1, 2  # states of a landing: a step from the point before the crossing is requested, or has been planned

@@ -27,9 +27,9 @@ def write_locate(module: WatchMemory):
     with f.while_(wide):
         s.look = (s.low + s.high) * 0.5
         f.call("look", work)
-        due, is_behind = s.due > 0.5, crossed() >= 0.0
-        s.where(due & is_behind, high=s.look)
-        s.where(due & ~is_behind, low=s.look)
+        due, is_beyond = s.due > 0.5, crossed() >= 0.0
+        s.where(due & is_beyond, high=s.look)
+        s.where(due & ~is_beyond, low=s.look)
     s.look, s.due = s.high, s.seeks
     f.call("look", work)
     event, seeks = crossed(), s.seeks > 0.5
@@ -46,9 +46,9 @@ def write_approach(module: WatchMemory):
     f, s = module.function("approach")
     wanted, zero = s.landing.is_(float(WANTED)), f.const(0.0, DOUBLE, f.width)
     for k in range(POINTS):  # the latest point before the target
-        early = wanted & (s.target - getattr(s, f"point{k}_t") > s.smallest * LEAST_STEP)
-        module.copy_point(f, early, f"point{k}", "before")
-        s.where(early, low=getattr(s, f"point{k}_t"))
+        is_before = wanted & (s.target - getattr(s, f"point{k}_t") > s.smallest * LEAST_STEP)
+        module.copy_point(f, is_before, f"point{k}", "before")
+        s.where(is_before, low=getattr(s, f"point{k}_t"))
     module.copy_point(f, wanted, "before", f"point{POINTS - 1}")
     s.where(wanted, point3_t=s.low, landing=float(UNDER_WAY))
     lands, t1 = s.landing > 0.5, s.point3_t + s.h
@@ -67,21 +67,21 @@ def write_land(module: WatchMemory):
     f.call("conditions", f.given["work"])
     g, rate = f.variable(0.0), f.variable(0.0)
     with f.each(module.conditions.count) as c:
-        own = s.event.is_(f.like(c, DOUBLE, f.width))
-        g.where(own, module.condition(f, "g", c))
-        rate.where(own, module.condition(f, "rate", c))
+        is_event = s.event.is_(f.like(c, DOUBLE, f.width))
+        g.where(is_event, module.condition(f, "g", c))
+        rate.where(is_event, module.condition(f, "rate", c))
     change = -(g.value / f.select(rate.value.is_(0.0), one, rate.value))
     is_small = f.abs(change) * s.omega <= LAST_CHANGE
     goes_on = arrived & ~is_small & (s.landings < float(MOST_LANDINGS)) & (f.abs(change) < s.target - s.point2_t)
     s.where(goes_on, landing=float(WANTED), target=s.target + change, landings=s.landings + 1.0)
-    done, change = arrived & ~goes_on, f.select(is_small, change, zero)
+    is_complete, change = arrived & ~goes_on, f.select(is_small, change, zero)
     ahead = module.broadcast(f, change)
-    exact = done & is_small
-    s.where(exact, sure_t=s.point3_t + change)
+    is_exact = is_complete & is_small
+    s.where(is_exact, sure_t=s.point3_t + change)
     with f.each(module.rowcount) as r:
         q, v, a = (module.vector(f, f"point3 {x}", r) for x in "qva")
         module.put(f, "state q", r, f.fma(f.fma(a, ahead * 0.5, v), ahead, q))
         module.put(f, "result v", r, f.fma(a, ahead, v))
-    module.copy_state(f, exact, ("state q", "result v"), "sure")
-    s.where(done, stops=one)
+    module.copy_state(f, is_exact, ("state q", "result v"), "sure")
+    s.where(is_complete, stops=one)
     module.stop(f, s)
