@@ -2,6 +2,8 @@
 
 import os
 
+from udkjax.requirements import ArgumentError
+
 SETTING = "UDKJAX_THREADS"
 
 
@@ -16,7 +18,7 @@ def thread_limit() -> int | None:
     if not text:
         return None
     if not (text.isascii() and text.isdecimal() and int(text)):
-        raise ValueError(f"{SETTING} must be a whole number of threads, 1 or more, not {text!r}")
+        raise ArgumentError(f"{SETTING} must be a whole number of threads, 1 or more, not {text!r}")
     return int(text)
 
 
