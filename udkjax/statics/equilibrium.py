@@ -27,15 +27,15 @@ from udkjax.statics.linearization import Linearization, linearize, with_unit_mas
 from udkjax.statics.load_scale import LoadScale, load_scale
 from udkjax.transforms.gradients import stop_gradients
 
-MOST_NEWTON_STEPS = 100  # of limited length: ten are usual, a hundred cross any scene
+MOST_NEWTON_STEPS = 100  # steps of limited length: ten are usual, a hundred cross any scene
 FORCE_TOL = 1e-9  # tolerance of the loads along free directions, relative to the scale of forces; rounding leaves 1e-15
-FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # relative to the scale of forces: rounding, which no step reduces
-NEUTRAL_STIFFNESS = 1e-10  # relative to the largest stiffness: a smaller one resists nothing
-SMALLEST_STIFFNESS = 1e-12  # relative to the scale of stiffnesses: a smaller one is rounding, which leaves 1e-15
+FORCE_ROUNDING = 32 * float(np.finfo(float).eps)  # relative to the scale of forces: no step reduces such rounding errors
+NEUTRAL_STIFFNESS = 1e-10  # relative to the largest stiffness: smaller stiffnesses count as zero
+SMALLEST_STIFFNESS = 1e-12  # relative to the scale of stiffnesses: smaller values are rounding errors, usually 1e-15
 
-# The fraction of a step, the number of trials, whether it is better, q and the linearization there.
+# The fraction of a step, the number of trials, whether the last was better, its q and the linearization at q.
 Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
-Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization there, steps, whether the last was better
+Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization at q, steps, whether the last was better
 
 
 class Equilibrium(PrintsTable):
@@ -49,7 +49,7 @@ class Equilibrium(PrintsTable):
 
     q: Float[Array, "bodies 3"]
     multipliers: Float[Array, "m"]  # lambda of F = Psi_q^T lambda (N, N m), of least norm; rows as in `analyse`
-    omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: it moves away
+    omega2: Float[Array, "f"]  # (rad/s)^2: stiffness over mass along free directions, ascending; negative: unstable
     residual: Float[Array, ""]  # remaining loads along free directions, relative to the scale of forces
     balanced: Bool[Array, ""]
     neutral: Float[Array, ""]  # (rad/s)^2: a smaller |omega2| is rounding
@@ -85,7 +85,7 @@ class Equilibrium(PrintsTable):
 
     @property
     def indifferent(self) -> Bool[Array, ""]:
-        """True if the lowest stiffness vanishes: nothing moves it away, nothing brings it back."""
+        """True if the lowest stiffness vanishes: a displaced mechanism neither moves away nor returns."""
         xp = library_for(self)
         least = xp.min(xp.asarray(self.omega2), axis=-1, initial=np.inf)
         return stored(xp.asarray(self.balanced) & (xp.abs(least) <= xp.asarray(self.neutral)))
@@ -117,7 +117,7 @@ def equilibrium(
         mechanism: its drivers hold the values of time t.
         state: state to search from; by default the initial guess.
         t: time (s) of drivers and loads.
-        stable: go downhill only, to a stable equilibrium; otherwise to any nearby.
+        stable: search downhill only, for a stable equilibrium; otherwise for any equilibrium nearby.
         analysis: the mechanism's `Analysis`; needed where all numbers are traced.
 
     Returns:
@@ -137,7 +137,7 @@ def equilibrium(
 def equilibria(
     mechanism: Mechanism, starts: int = 64, seed: int = 0, t: NumberLike = 0.0, state: State | None = None
 ) -> list[Equilibrium]:
-    """Return the different equilibria found from several positions: the given one and random ones.
+    """Return the different equilibria found from several positions: the given position and random positions.
 
     Random positions turn every body by a random angle and are closed again, so that all branches are tried. Not exhaustive.
 
@@ -195,10 +195,10 @@ def _equilibrium(
         q = _rest_position(curve, analysis, t, q, free)
     xp, scale = by.xp, by.call(load_scale, mechanism, analysis.scales, t, q)
     at = by.call(linearize, mechanism, analysis, free, t, q)
-    left = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
-    balanced = curve.is_closed(xp.append(q, t) / curve.units) & (left <= FORCE_TOL)
+    unbalanced = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
+    balanced = curve.is_closed(xp.append(q, t) / curve.units) & (unbalanced <= FORCE_TOL)
     neutral, bodies = SMALLEST_STIFFNESS * scale.stiffness, mechanism.body_names
-    return Equilibrium(q.reshape(-1, 3), at.multipliers, _omega2(at, by), left, balanced, neutral, bodies)
+    return Equilibrium(q.reshape(-1, 3), at.multipliers, _omega2(at, by), unbalanced, balanced, neutral, bodies)
 
 
 def _settle(
@@ -211,7 +211,7 @@ def _settle(
     free: int,
     stable: bool,
 ) -> Float[Array, "n"]:
-    """Take Newton steps until none improves."""
+    """Take Newton steps until a step no longer improves the position."""
     if not free:
         return q
     by, xp = curve.by, curve.by.xp
@@ -220,33 +220,33 @@ def _settle(
         return by.call(linearize, mechanism, analysis, free, t, q)
 
     def is_unsettled(state: Settling) -> Bool[Array, ""]:
-        _, here, k, better = state
-        return better & (k < MOST_NEWTON_STEPS) & (xp.linalg.norm(here.force) > FORCE_ROUNDING * scale.force)
+        _, current, k, better = state
+        return better & (k < MOST_NEWTON_STEPS) & (xp.linalg.norm(current.force) > FORCE_ROUNDING * scale.force)
 
     def body(state: Settling) -> Settling:
-        q, here, k, _ = state
-        step = here.directions @ _towards_rest(here, scale, stable, curve)
+        q, current, k, _ = state
+        step = current.directions @ _towards_rest(current, scale, stable, curve)
         longest = xp.max(xp.abs(step / curve.units[:-1]))
         step = step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
-        size = xp.linalg.norm(here.force)
+        size = xp.linalg.norm(current.force)
 
         def trial(state: Trial) -> Trial:
             share, j, *_ = state
             X, closed = curve.correct(xp.append(q + share * step, t) / curve.units, fixed=True)
             new = (X * curve.units)[:-1]
             trial = at(new)
-            # Better: the loads do work (by the trapezoidal rule), or the unbalanced loads decrease.
-            work = 0.5 * (here.loads + trial.loads) @ (new - q)
+            # A position is better if the loads do work (by the trapezoidal rule), or the unbalanced loads decrease.
+            work = 0.5 * (current.loads + trial.loads) @ (new - q)
             better = (work > 0 if stable else False) | (xp.linalg.norm(trial.force) < size)
             return 0.5 * share, j + 1, closed & better, new, trial
 
         def worse(state: Trial) -> Bool[Array, ""]:
             return (state[1] < STEP_HALVINGS) & ~state[2]
 
-        first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, here
-        _, _, better, new, there = by.while_loop(worse, trial, first)
-        new, there = jax.tree.map(lambda x, y: xp.where(better, x, y), (new, there), (q, here))
-        return new, there, k + 1, better
+        first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, current
+        _, _, better, new, new_linearization = by.while_loop(worse, trial, first)
+        new, new_linearization = jax.tree.map(lambda x, y: xp.where(better, x, y), (new, new_linearization), (q, current))
+        return new, new_linearization, k + 1, better
 
     start = q, at(q), xp.asarray(0), xp.asarray(True)
     return by.while_loop(is_unsettled, body, start)[0]
@@ -266,7 +266,7 @@ def _towards_rest(here: Linearization, scale: LoadScale, stable: bool, curve: Ab
 
 @eqx.filter_custom_jvp
 def _rest_position(curve: Curve, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], free: int) -> Float[Array, "n"]:
-    """Return a position of rest, with the derivatives of one Newton step there."""
+    """Return the position of rest q, with the derivatives of one Newton step from q."""
     return q
 
 

@@ -1,6 +1,7 @@
 """Linearization about a position of rest, in the directions that constraints leave free: mass, damping, stiffness.
 
-At rest F = Psi_q^T lambda. Nearby, with q = q0 + N eta and Psi_q N = 0, the loads and the turning constraint forces give
+At rest F = Psi_q^T lambda. Nearby, with q = q0 + N eta and Psi_q N = 0, the loads and the constraint forces, which turn with the
+bodies, give
 
     N^T M N eta'' + N^T C N eta' + N^T K N eta = 0,      C = -F_v,      K = -F_q + (lambda^T Psi)_qq.
 
@@ -67,7 +68,7 @@ def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike,
 def _null_space(J: Float[Array, "m n"], free: int) -> Float[Array, "n free"]:
     """Return an orthonormal basis N of `free` directions with J N = 0: right singular vectors of the smallest singular values.
 
-    It has no derivatives: its projection by I - J^+ J supplies them.
+    The basis has no derivatives; the projection by I - J^+ J supplies them.
     """
     J = jax.lax.stop_gradient(J)
     n = J.shape[1]

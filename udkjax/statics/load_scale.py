@@ -1,7 +1,7 @@
 """The scale of a mechanism's forces, to which residual loads are compared, also if all loads vanish.
 
-Balanced loads leave rounding errors relative to their parts: gravity, each force element, and the change of the loads along a
-characteristic length, which is nonzero even for a spring at its natural length.
+The rounding errors of balanced loads are relative to their parts: gravity, each force element, and the change of the loads along
+a characteristic length, which is nonzero even for a spring at its natural length.
 """
 
 from typing import NamedTuple
@@ -46,15 +46,15 @@ def load_sizes(mechanism: Mechanism, t: Time, q: Float[Array, "n"], v: Float[Arr
             moved = [
                 f._replace(x=x, y=y, angle=a, cos=jnp.cos(a), sin=jnp.sin(a)) for f, (x, y, a) in zip(frames, places, strict=True)
             ]
-            found = element.potential(time, *moved)
-            return jnp.zeros(()) if found is None else jnp.asarray(found)
+            values = element.potential(time, *moved)
+            return jnp.zeros(()) if values is None else jnp.asarray(values)
 
         total = -jax.grad(potential)(jnp.stack([jnp.stack([jnp.asarray(x, float) for x in f[:3]]) for f in frames]))
-        stated = element.loads(time, *frames)
-        return jnp.abs(total if stated is None else total + jnp.asarray([[jnp.asarray(x) for x in load] for load in stated]))
+        explicit = element.loads(time, *frames)
+        return jnp.abs(total if explicit is None else total + jnp.asarray([[jnp.asarray(x) for x in load] for load in explicit]))
 
     total = jnp.abs(loads.mass(mechanism).reshape(-1, 3) * jnp.append(mechanism.gravity, 0.0))
     elements = [*mechanism.forces.values()]
-    for kind, found in evaluate_by_kind(sizes, mechanism, elements, bodies(q), bodies(v)):
-        total = total.at[kind.bodies.T].add(found[:, ~np.array(kind.structure.ground)])
+    for kind, values in evaluate_by_kind(sizes, mechanism, elements, bodies(q), bodies(v)):
+        total = total.at[kind.bodies.T].add(values[:, ~np.array(kind.structure.ground)])
     return total.ravel()

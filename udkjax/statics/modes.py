@@ -33,7 +33,7 @@ class Modes(PrintsTable):
     s: Complex[Array, "2f"]  # 1/s, with damping, by imaginary part and then by real part
     damped_shapes: Complex[Array, "2f bodies 3"]  # of s, of unit length
     q: Float[Array, "bodies 3"]
-    residual: Float[Array, ""]  # N/sqrt(kg): remaining loads along free directions: zero at rest
+    residual: Float[Array, ""]  # N/sqrt(kg): remaining loads along free directions, zero at rest
     bodies: tuple[str, ...] = eqx.field(static=True, default=())
 
     _units = units(omega2="(rad/s)²", s="1/s", q="m, m, rad", residual="N/sqrt(kg)")
@@ -45,8 +45,8 @@ class Modes(PrintsTable):
         for k, x in enumerate(np.asarray(self.omega2)):
             omega, turns = math.sqrt(abs(float(x))), np.abs(np.asarray(self.shapes)[k, :, 2])
             kind = f"{omega:.6g} rad/s, {omega / (2 * math.pi):.6g} Hz" if x >= 0 else f"grows as exp({omega:.6g} t)"
-            most = int(np.argmax(turns))
-            rows.append((f"mode {k + 1}", f"{kind}; mostly {self.bodies[most] if self.bodies else f'body {most}'}"))
+            largest = int(np.argmax(turns))
+            rows.append((f"mode {k + 1}", f"{kind}; mostly {self.bodies[largest] if self.bodies else f'body {largest}'}"))
         rows += [("s, damped", format_numbers(self.s, "1/s")), ("damping", format_numbers(self.damping))]
         return PrintedTable("modes about a position of rest", rows)
 
@@ -59,7 +59,7 @@ class Modes(PrintsTable):
 
     @property
     def damping(self) -> Float[Array, "2f"]:
-        """-Re s / |s| for each s: 0 undamped, 1 without oscillation, negative if it grows."""
+        """-Re s / |s| for each s: 0 undamped, 1 without oscillation, negative if the motion grows."""
         xp = library_for(self.s)
         s = xp.asarray(self.s)
         size = xp.abs(s)
@@ -71,8 +71,8 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
     """Return the modes about a position of rest: (s^2 N^T M N + s N^T C N + N^T K N) eta = 0, shape = N eta.
 
     C = -F_v, and K = -F_q + (lambda^T Psi)_qq includes preload, gravity and the constraints' curvature. K is symmetric if the
-    loads have a potential, which a load that turns with a body lacks: `s` and `damped_shapes` use all of K, flutter included,
-    `omega2` and `shapes` its symmetric part.
+    loads have a potential; a load that turns with a body has none. `s` and `damped_shapes` use all of K and include flutter;
+    `omega2` and `shapes` use the symmetric part of K.
 
     Pure, jittable and batched by `vmap`; eigenvalues and `shapes` have exact derivatives by every number of the mechanism, where
     they are simple (those of `equilibrium` include the change of position); `damped_shapes` have none.
@@ -93,15 +93,15 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
 
 
 def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, by: ControlFlow) -> Modes:
-    xp, at, rest = by.xp, by.call(linearize, mechanism, analysis, free, t, q), q.reshape(-1, 3)
+    xp, at, position = by.xp, by.call(linearize, mechanism, analysis, free, t, q), q.reshape(-1, 3)
     if not free:
-        none = xp.zeros((0, *rest.shape))
-        return Modes(xp.zeros(0), none, xp.zeros(0, complex), none + 0j, rest, xp.zeros(()), mechanism.body_names)
+        no_shapes = xp.zeros((0, *position.shape))
+        return Modes(xp.zeros(0), no_shapes, xp.zeros(0, complex), no_shapes + 0j, position, xp.zeros(()), mechanism.body_names)
     N = solver_of_mass(at, by)(at.directions.T).T  # N^T M N = 1
     C, K = with_unit_mass(at, by)
     omega2, eta = xp.linalg.eigh(0.5 * (K + K.T))
     shapes = (N @ eta).T.reshape(free, -1, 3)
-    # In units of the fastest mode: scales far from one cost the eigenvalues digits.
+    # In units of the fastest mode: at other scales the eigenvalues are less accurate.
     unit = stop_gradients(xp.sqrt(xp.max(xp.abs(K), initial=0.0)))
     unit = xp.where(unit > 0, unit, 1.0)
     companion = xp.block([[xp.zeros_like(K), xp.eye(free)], [-K / unit**2, -C / unit]])
@@ -114,7 +114,7 @@ def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, 
         shapes,
         unit * s[_order(s, xp)],
         damped.reshape(2 * free, -1, 3),
-        rest,
+        position,
         xp.max(xp.abs(at.force), initial=0.0),
         mechanism.body_names,
     )

@@ -4,8 +4,8 @@ A peak between two outputs is that of the parabola through the largest of |F| an
 
     |F|_max = y_1 - (y_2 - y_0)^2 / (8 (y_2 - 2 y_1 + y_0)),
 
-which is accurate to third order in the output step, and whose derivative is that of the motion at the instant of the peak. All
-of it is pure: differentiated through `simulate`, and mapped over mechanisms and runs by `jax.vmap`.
+which is accurate to third order in the output step, and whose derivative is that of the motion at the instant of the peak. Peaks
+and envelopes are pure functions: they can be differentiated through `simulate`, and batched by `jax.vmap`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -72,7 +72,7 @@ def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any)
 
     Args:
         mechanism: the mechanism.
-        solution: ts (T,), q and v (T, bodies, 3), T of at least 3.
+        solution: ts (T,), q and v (T, bodies, 3), T at least 3.
         **choices: those of `reactions`: frame, about, compliances, method, stabilization. `about` is the point of the torque,
             here "joint" by default.
 
@@ -103,61 +103,62 @@ def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) 
     Returns:
         Force x, force y (N), and the torque (N m) about the pin (T, 3), by pin and body. Joints without a point have no pin.
     """
-    found: dict[str, dict[str, Array]] = {}
+    by_pin: dict[str, dict[str, Array]] = {}
     loads = reactions(mechanism, solution, **{"about": "joint", **choices})
     for name, joint in mechanism.joints.items():
         if has_point(joint):
-            at = found.setdefault(_pin_of(mechanism, name), {})
+            of_pin = by_pin.setdefault(_pin_of(mechanism, name), {})
             for body, load in loads[name].items():
-                at[body] = at[body] + load if body in at else load
-    return found
+                of_pin[body] = of_pin[body] + load if body in of_pin else load
+    return by_pin
 
 
 def unique_pin_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, dict[str, bool]]:
-    """Tell, by pin and body, whether equilibrium alone determines the force at all times: see `unique_reactions`."""
-    found: dict[str, dict[str, bool]] = {}
-    unique, alive = unique_reactions(mechanism, solution), np.isfinite(np.asarray(solution.q)).all((1, 2))
+    """Return, by pin and body, whether equilibrium alone determines the force at all times: see `unique_reactions`."""
+    by_pin: dict[str, dict[str, bool]] = {}
+    unique, is_reached = unique_reactions(mechanism, solution), np.isfinite(np.asarray(solution.q)).all((1, 2))
     for name, joint in mechanism.joints.items():
         if has_point(joint):
-            at = found.setdefault(_pin_of(mechanism, name), {})
+            of_pin = by_pin.setdefault(_pin_of(mechanism, name), {})
             for body, is_unique in unique[name].items():
-                at[body] = at.get(body, True) and bool(np.asarray(is_unique)[alive, :2].all())
-    return found
+                of_pin[body] = of_pin.get(body, True) and bool(np.asarray(is_unique)[is_reached, :2].all())
+    return by_pin
 
 
 def cam_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, Float[np.ndarray, "T"]]:
     """Return the force (N) with which each cam presses on its follower, along the normal of the profile.
 
-    A `Cam` holds both ways. Where the force is below zero it pulls, and a real follower without a groove leaves the profile.
+    A `Cam` can also pull. Where the force is negative, the cam pulls, and a real follower without a groove would leave the
+    profile.
     """
-    found, q = {}, np.asarray(solution.q)
+    forces, q = {}, np.asarray(solution.q)
     cams = {name: joint for name, joint in mechanism.joints.items() if isinstance(joint, Cam)}
     loads = reactions(mechanism, solution) if cams else {}
 
     def place(body: str, point: Array) -> np.ndarray:
         x, y, angle = (0.0, 0.0, 0.0) if body == GROUND else q[:, mechanism.body_names.index(body)].T
-        along = np.exp(1j * angle) * complex(*point) + x + 1j * y
-        return np.broadcast_to(along, len(q))
+        position = np.exp(1j * angle) * complex(*point) + x + 1j * y
+        return np.broadcast_to(position, len(q))
 
     for name, cam in cams.items():
         centre, follower = (place(body, point) for body, point in zip(cam.bodies, np.asarray(cam.points), strict=True))
-        on, sign = (cam.bodies[1], 1.0) if cam.bodies[1] != GROUND else (cam.bodies[0], -1.0)
-        fx, fy = np.asarray(loads[name][on])[:, :2].T
+        body_on, sign = (cam.bodies[1], 1.0) if cam.bodies[1] != GROUND else (cam.bodies[0], -1.0)
+        fx, fy = np.asarray(loads[name][body_on])[:, :2].T
         outwards = ((fx + 1j * fy) * np.conj(follower - centre)).real
-        found[name] = sign * np.copysign(np.hypot(fx, fy), outwards)
-    return found
+        forces[name] = sign * np.copysign(np.hypot(fx, fy), outwards)
+    return forces
 
 
 def _pin_of(mechanism: Mechanism, joint: str) -> str:
     """Return the first joint at the pin of a revolute: its name without the number that drawings append."""
     base, _, number = joint.rpartition("-")
     pair = [mechanism.joints.get(name) for name in (base, joint)]
-    return base if number.isdigit() and all(isinstance(one, Revolute) for one in pair) else joint
+    return base if number.isdigit() and all(isinstance(joint_of_pair, Revolute) for joint_of_pair in pair) else joint
 
 
 @checked
 def envelope(cases: Peaks | Sequence[Peaks]) -> dict[str, dict[str, Envelope]]:
-    """Return the largest peaks over load cases, without cases that failed.
+    """Return the largest peaks over load cases, ignoring cases that failed.
 
     Args:
         cases: the peaks of each case as a sequence, or of a batch, as `jax.vmap(reaction_peaks)` returns them, with the cases as
@@ -181,18 +182,18 @@ def _largest(ts: Array, y: Float[Array, "T"]) -> tuple[Array, Array]:
     """Return the peak and its time, by the parabola through the largest sample and its neighbours; at an end, the sample."""
     top = jnp.argmax(y)
     middle = jnp.clip(top, 1, len(y) - 2)
-    before, at, after = y[middle - 1], y[middle], y[middle + 1]
+    before, centre, after = y[middle - 1], y[middle], y[middle + 1]
     left, right = ts[middle] - ts[middle - 1], ts[middle + 1] - ts[middle]
-    # y = at + slope s + bend s^2, s from the middle
-    bend = ((after - at) / right - (at - before) / left) / (left + right)
-    slope = (at - before) / left + bend * left
+    # y = centre + slope s + bend s^2, with s from the middle
+    bend = ((after - centre) / right - (centre - before) / left) / (left + right)
+    slope = (centre - before) / left + bend * left
     inside = (top == middle) & (bend < 0)
     shift = jnp.where(inside, -slope / (2 * jnp.where(inside, bend, -1.0)), 0.0)
-    return jnp.where(inside, at + slope * shift / 2, y[top]), jnp.where(inside, ts[middle] + shift, ts[top])
+    return jnp.where(inside, centre + slope * shift / 2, y[top]), jnp.where(inside, ts[middle] + shift, ts[top])
 
 
 def _root_mean_square(ts: Array, square: Float[Array, "T"]) -> Array:
-    """Return the root of the mean over time, by trapezoids."""
+    """Return the root of the mean over time, by the trapezoidal rule."""
     mean = jnp.sum((square[1:] + square[:-1]) * jnp.diff(ts)) / (2 * (ts[-1] - ts[0]))
     return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0 * mean)
 

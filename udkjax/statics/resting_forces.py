@@ -39,6 +39,6 @@ def force_lines(mechanism: Mechanism, held: RestingForces) -> str:
     for pin, on in held.forces.items():
         for body, (fx, fy, _) in on.items():
             components = ", ".join(format_number(x, scale=scale) for x in (fx, fy))
-            known = "" if held.unique[pin][body] else ", not unique: of least norm"
-            rows.append((f"at {pin} on {body}", f"{format_number(np.hypot(fx, fy), 'N', scale)}: ({components}) N{known}"))
+            note = "" if held.unique[pin][body] else ", not unique: of least norm"
+            rows.append((f"at {pin} on {body}", f"{format_number(np.hypot(fx, fy), 'N', scale)}: ({components}) N{note}"))
     return "\n".join(align_columns(rows)) if rows else "  no forces: nothing holds it"
