@@ -101,8 +101,8 @@ class _Line:
 
     def __init__(self, what: str, total: float | None, patience: float, interval: float | None):
         self.what, self.total, self.begun = what, total, time.time()
-        usual = TERMINAL_INTERVAL if sys.stderr.isatty() or "ipykernel" in sys.modules else FILE_INTERVAL
-        self.interval = usual if interval is None else interval
+        default = TERMINAL_INTERVAL if sys.stderr.isatty() or "ipykernel" in sys.modules else FILE_INTERVAL
+        self.interval = default if interval is None else interval
         self.bar: Any = None
         self.state: Progress | None = None
         self.lock = threading.Lock()

@@ -70,10 +70,10 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
     if isinstance(number, Tracer):
         return
     x = float(number)
-    bad = np.isnan(x) or (np.isinf(x) and not infinite)
-    if bad or (sign == "positive" and not x > 0) or (sign == "not negative" and not x >= 0):
-        meant = {"any": "a finite number", "positive": "positive", "not negative": "zero or positive"}[sign]
-        raise ArgumentError(f"{name} must be {meant}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
+    is_invalid = np.isnan(x) or (np.isinf(x) and not infinite)
+    if is_invalid or (sign == "positive" and not x > 0) or (sign == "not negative" and not x >= 0):
+        condition = {"any": "a finite number", "positive": "positive", "not negative": "zero or positive"}[sign]
+        raise ArgumentError(f"{name} must be {condition}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
 
 
 def require_count(name: str, value: Any, least: int = 1, given: GivenArguments = NOTHING) -> None:
@@ -107,8 +107,8 @@ def require_output_times(name: str, value: Any) -> None:
     """Require at least two finite, increasing times; of traced times, only the shape is checked."""
     times = array(name, value)
     if times.ndim != 1 or len(times) < 2:
-        what = "a vector of at least two output times, from the start on"
-        raise ArgumentError(f"{name} must be {what}; its shape is {times.shape}")
+        expected = "a vector of at least two output times, from the start on"
+        raise ArgumentError(f"{name} must be {expected}; its shape is {times.shape}")
     require_finite(name, times)
     if not isinstance(times, Tracer) and not np.all(steps := np.diff(times) > 0):
         k = int(np.argmin(steps))

@@ -36,10 +36,10 @@ def convert(
         state = udk.assemble(mechanism)
         fields = ("position", "angle", "velocity", "angular_velocity")
         values = (state.q[:, :2], state.q[:, 2], state.v[:, :2], state.v[:, 2])
-        moved = {
+        assembled = {
             f"body.{name}.{f}": x[k] for k, name in enumerate(mechanism.body_names) for f, x in zip(fields, values, strict=True)
         }
-        mechanism = mechanism.with_parameters(moved)
+        mechanism = mechanism.with_parameters(assembled)
     udk.save(mechanism, target)
     counts = {"bodies": len(mechanism.bodies), "joints": len(mechanism.joints), "forces": len(mechanism.forces)}
     text = ", ".join(f"{count} {name}" for name, count in counts.items())

@@ -48,11 +48,11 @@ def inverse(
         "peaks": {},
     }
     for name, x in efforts.items():
-        good = np.isfinite(x)
-        k = int(np.nanargmax(np.abs(x))) if good.any() else 0
-        rms = float(np.sqrt(np.mean(x[good] ** 2))) if good.any() else math.nan
+        finite = np.isfinite(x)
+        k = int(np.nanargmax(np.abs(x))) if finite.any() else 0
+        root_mean_square = float(np.sqrt(np.mean(x[finite] ** 2))) if finite.any() else math.nan
         energies = {"work": solution.works[name], "swing": solution.swings[name]}
-        results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": rms, **energies}
+        results["peaks"][name] = {"effort": x[k], "time": ts[k], "rms": root_mean_square, **energies}
     units = sorted({unit for _, unit in solution.effort_units}, reverse=True)
     variables = {
         "effort": (("time", "driver"), np.stack(list(efforts.values()), 1), " or ".join(units)),
@@ -69,7 +69,7 @@ def inverse(
     determined = np.asarray(solution.determined)
     if not determined.all():
         k = int(np.argmin(determined))
-        became = udk.Reached(int(solution.motion.status[k])) if solution.motion is not None else udk.Reached.closed
-        if became in (udk.Reached.closed, udk.Reached.singular, udk.Reached.not_determined):
+        cause = udk.Reached(int(solution.motion.status[k])) if solution.motion is not None else udk.Reached.closed
+        if cause in (udk.Reached.closed, udk.Reached.singular, udk.Reached.not_determined):
             fail(f"at {ts[k]:g} s the efforts are not determined: the position is singular")
-        fail(f"the prescribed motion ends at {ts[k]:g} s: {became.label}")
+        fail(f"the prescribed motion ends at {ts[k]:g} s: {cause.label}")

@@ -94,9 +94,9 @@ def _sweep(mech: "Mechanism", text: str, arguments: dict[str, Any], out: Path, j
     from udkjax.show.sweep_figures import save_sweep_pictures
     from udkjax.show.sweep_summary import sweep_results, sweep_summary
 
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     data = udk.sweep(mech, **arguments, out=out, **choices)
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - start_time
     data.attrs["scene"] = text
     unfinished = out / ".sweep.nc"
     data.to_netcdf(unfinished, engine="h5netcdf")

@@ -139,17 +139,17 @@ def _is_ours(x: type) -> bool:
 
 
 def _instance(classes: tuple[type, ...]) -> ArgumentCheck:
-    kinds = (*classes, np.bool_) if bool in classes else classes
-    meant = " or ".join(_meant(x) for x in classes).removesuffix(",")
+    accepted = (*classes, np.bool_) if bool in classes else classes
+    expected = " or ".join(_describe_class(x) for x in classes).removesuffix(",")
 
     def check(name: str, value: Any, given: GivenArguments):
-        if not isinstance(value, kinds):
-            raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}{_remedy(name, value, classes)}")
+        if not isinstance(value, accepted):
+            raise ArgumentTypeError(f"{name} must be {expected}, {describe(value)}{_remedy(name, value, classes)}")
 
     return check
 
 
-def _meant(cls: type) -> str:
+def _describe_class(cls: type) -> str:
     if cls is type(None):
         return "None"
     if cls in (bool, str):

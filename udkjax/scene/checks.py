@@ -207,11 +207,11 @@ def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMet
     """Iterate over the mistakes in a number: its type, its shape and, if concrete, its value."""
     traced = is_traced(value)
     array = jnp.asarray(value) if traced else _as_array(value)
-    fixed = all(dim.isdigit() for dim in dims)
+    is_fixed = all(dim.isdigit() for dim in dims)
     if array is not None and dims[-1:] == ["..."]:
         dims = [*dims[:-1], *map(str, array.shape[len(dims) - 1 :])]
-    if array is None or array.ndim != len(dims) or (fixed and array.shape != tuple(map(int, dims))):
-        expected = f"{' x '.join(dims)} numbers" if fixed else "numbers"
+    if array is None or array.ndim != len(dims) or (is_fixed and array.shape != tuple(map(int, dims))):
+        expected = f"{' x '.join(dims)} numbers" if is_fixed else "numbers"
         yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, is {abbreviate(value)}"
         return
     for dim, size in zip(dims, array.shape, strict=True):
@@ -277,5 +277,7 @@ def _check_bodies(where: str, cls: type, table: TomlTable) -> Iterator[str]:
     named = table.get("carrier", GROUND)
     carrier = [named] if isinstance(named, str) and named != GROUND else []
     attached = [name for name in (*bodies, *carrier) if isinstance(name, str)]
-    twice = {name: None for name in attached if attached.count(name) > 1}
-    yield from (f"{where}.{'carrier' if name in carrier else 'bodies'}: {quote(name)} is connected to itself" for name in twice)
+    repeated = {name: None for name in attached if attached.count(name) > 1}
+    yield from (
+        f"{where}.{'carrier' if name in carrier else 'bodies'}: {quote(name)} is connected to itself" for name in repeated
+    )

@@ -116,7 +116,7 @@ class Mechanism(PrintsTable):
     joint_names: tuple[str, ...] = eqx.field(static=True)
     driver_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
-    origin: Origin | None = eqx.field(static=True)  # from which a mechanism with traced numbers was made
+    origin: Origin | None = eqx.field(static=True)  # the mechanism from which one with traced numbers was made
     # JAX sorts the keys of a dict: tuples keep the user's order.
     _bodies: tuple[Body, ...]
     _joints: tuple[Joint, ...]

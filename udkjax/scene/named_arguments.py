@@ -71,9 +71,9 @@ def require_history(name: str, value: Any, given: GivenArguments) -> None:
             f"{name} is a batch of {len(q)} solutions: take one of them, {first_member}, or map over them, {all_of_them}"
         )
     if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != right or v.shape != q.shape:
-        meant = "ts (T,), q and v (T, bodies, 3)" if isinstance(mechanism, Mechanism) else "ts (T,), q and v (T, n)"
+        expected = "ts (T,), q and v (T, bodies, 3)" if isinstance(mechanism, Mechanism) else "ts (T,), q and v (T, n)"
         is_of = f" of {len(mechanism.body_names)} bodies" if isinstance(mechanism, Mechanism) else ""
-        raise ArgumentError(f"{name} must have {meant}{is_of}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
+        raise ArgumentError(f"{name} must have {expected}{is_of}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
 
 
 def _check_state(name: str, value: Any, given: GivenArguments) -> None:
@@ -105,18 +105,18 @@ def _of_diffrax(kind: str, example: str) -> ArgumentCheck:
     def check(name: str, value: Any, given: GivenArguments):
         diffrax = sys.modules.get("diffrax")  # no instance of its classes exists before it is imported
         if not (diffrax and isinstance(value, getattr(diffrax, kind))):
-            meant = f"an instance of diffrax's, such as {name}={example}, or None"
-            raise ArgumentTypeError(f"{name} must be {meant}, {describe(value)}")
+            expected = f"an instance of diffrax's, such as {name}={example}, or None"
+            raise ArgumentTypeError(f"{name} must be {expected}, {describe(value)}")
 
     return check
 
 
-def _of_kind(meant: str, suits: Callable[[Any], bool]) -> ArgumentCheck:
-    """Return a check that an argument satisfies `suits`; `meant` describes valid arguments in messages."""
+def _of_kind(condition: str, is_valid: Callable[[Any], bool]) -> ArgumentCheck:
+    """Return a check that an argument satisfies `is_valid`; `condition` describes valid arguments in messages."""
 
     def check(name: str, value: Any, given: GivenArguments):
-        if not suits(value):
-            raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
+        if not is_valid(value):
+            raise ArgumentTypeError(f"{name} must {condition}, {describe(value)}")
 
     return check
 
@@ -164,8 +164,8 @@ def _require_drivers(name: str, value: Any, given: GivenArguments) -> None:
         or not isinstance(value, Sequence)
         or not all(map(_is_coordinate, value))
     ):
-        meant = "map two drivers to their values" if "body" in given else "be a list of names"
-        raise ArgumentTypeError(f"{name} must {meant}, {describe(value)}")
+        condition = "map two drivers to their values" if "body" in given else "be a list of names"
+        raise ArgumentTypeError(f"{name} must {condition}, {describe(value)}")
 
 
 CHECKS: dict[str, ArgumentCheck] = {

@@ -208,9 +208,9 @@ def _read(text: str) -> _Unit:
     for slash, name, power in re.findall(r"(/?)\s*([^\W\d]+|1)\^?(-?\d+)?|\S", plain):
         name = _WORDS.get(name, name)
         if name not in _UNITS:
-            meant = [f"; did you mean {quote(unit)}?" for unit in _UNITS if unit.lower() == f"{name}".lower()]
-            meant += ["; cycles a second are rev/s"] if f"{name}".endswith("Hz") else []
-            cure = meant[0] if meant else f": they are made of {', '.join(_UNITS)}"
+            suggestions = [f"; did you mean {quote(unit)}?" for unit in _UNITS if unit.lower() == f"{name}".lower()]
+            suggestions += ["; cycles a second are rev/s"] if f"{name}".endswith("Hz") else []
+            cure = suggestions[0] if suggestions else f": they are made of {', '.join(_UNITS)}"
             raise ValueError(f"{quote(text)} is not a known unit{cure}")
         product = product.times(_UNITS[name], int(power or 1) * (-1 if slash else 1))
     return product

@@ -71,13 +71,13 @@ class _Draft:
         links = {name: self.link(name, body) for name, body in mechanism.bodies.items()}
         ground = [pin for pin, members in self.members.items() if GROUND in members]
         velocities = {pin: self.velocity(pin) for pin, members in self.members.items() if GROUND not in members}
-        fastest = max((float(np.abs(v).max()) for v in velocities.values()), default=0.0)
-        moving = {pin: v for pin, v in velocities.items() if np.abs(v).max() > SAME_PLACE * fastest}
+        largest = max((float(np.abs(v).max()) for v in velocities.values()), default=0.0)
+        nonzero_velocities = {pin: v for pin, v in velocities.items() if np.abs(v).max() > SAME_PLACE * largest}
         return Drawing(
             pins={name: position.tolist() for name, position in self.places.items()},
             links=links,
             ground=ground,
-            velocities=moving,
+            velocities=nonzero_velocities,
             gravity=mechanism.gravity,
             name=mechanism.name,
             **{f"{section}s": group for section, group in self.elements.items()},

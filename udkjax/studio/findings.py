@@ -126,16 +126,18 @@ def motor_travel(mechanism: Mechanism) -> JsonObject:
         if driver.coordinate == "y":
             continue
         try:
-            ends_of = travel(mechanism, name)
+            range_of_motor = travel(mechanism, name)
         except SceneError:
             continue  # this motor does not determine the positions
-        start = float(np.asarray(driver.motion(0.0)))
+        drawn_value = float(np.asarray(driver.motion(0.0)))
         ends = []
-        for limit, q in ((ends_of.lower, ends_of.lower_q), (ends_of.upper, ends_of.upper_q)):
+        for limit, q in ((range_of_motor.lower, range_of_motor.lower_q), (range_of_motor.upper, range_of_motor.upper_q)):
             if np.isfinite(float(limit)):
-                ends.append({"value": float(limit) - start, "in_line": pins_in_line(mechanism, np.asarray(q))})
-        lost = [side for side, code in zip(("lower", "upper"), np.asarray(ends_of.status), strict=True) if code == Reached.lost]
-        travels.append({"motor": name, "unit": ends_of.unit, "ends": ends, "lost": lost})
+                ends.append({"value": float(limit) - drawn_value, "in_line": pins_in_line(mechanism, np.asarray(q))})
+        lost = [
+            side for side, code in zip(("lower", "upper"), np.asarray(range_of_motor.status), strict=True) if code == Reached.lost
+        ]
+        travels.append({"motor": name, "unit": range_of_motor.unit, "ends": ends, "lost": lost})
     return {"travel": travels}
 
 

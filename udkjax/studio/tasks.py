@@ -92,10 +92,10 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
             raise SceneError(["format: the studio draws files of format 2"])
     except SceneError as error:
         return {"text": text, "document": _read(text), "problems": list(error.problems), "scene": None}
-    moving = engine_of(mechanism, tables) if engine == "wasm" else {}
+    engine_data = engine_of(mechanism, tables) if engine == "wasm" else {}
     if engine == "recorded":
-        moving = {"motion": recorded_motion(mechanism)}
-    return {"text": text, "document": tables, "problems": [], "scene": scene_of(mechanism), **moving}
+        engine_data = {"motion": recorded_motion(mechanism)}
+    return {"text": text, "document": tables, "problems": [], "scene": scene_of(mechanism), **engine_data}
 
 
 def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:

@@ -54,33 +54,35 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
     named = {s: {str(e.name): e.cls for e in entries if e.section == s} for s in (*DRAWN, *BY_HAND)}
     bodies = {GROUND: None, **named["link"], **named["body"]}
     known: dict[str, Any] = {"pin": named["pin"], "link": bodies, "body": bodies, "slide": named["slide"]}
-    fixed: Sequence[str] = ground if isinstance(ground, list | tuple) and all(isinstance(p, str) for p in ground) else ()
+    fixed_pins: Sequence[str] = ground if isinstance(ground, list | tuple) and all(isinstance(p, str) for p in ground) else ()
     if not named["link"] and not named["body"]:
         problems.append("link: a drawing needs at least one link")
-    if fixed != ground:
+    if fixed_pins != ground:
         problems.append(f"ground: must be a list of pins, is {abbreviate(ground)}")
     problems += [
-        f"ground[{k}]: no pin named {quote(p)}{suggestion(p, named['pin'])}" for k, p in enumerate(fixed) if p not in named["pin"]
+        f"ground[{k}]: no pin named {quote(p)}{suggestion(p, named['pin'])}"
+        for k, p in enumerate(fixed_pins)
+        if p not in named["pin"]
     ]
     groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWN, *BY_HAND)}
     for section in groups:
         if section == "body":  # the pins and links, which determine the joints, have been read
-            layout = PinLayout(groups["link"], fixed, groups["slide"])
+            layout = PinLayout(groups["link"], fixed_pins, groups["slide"])
             known["revolute"] = dict.fromkeys(joint_names(layout, list(groups["pin"])), Revolute)
             known["revolute"] |= named["joint"]
         for entry in entries:
             if entry.section == section:
                 _read_element(entry, known, units, groups[section], problems)
-    if any(len(groups[s]) < len(named[s]) for s in ("pin", "link")) or any(pin not in named["pin"] for pin in fixed):
+    if any(len(groups[s]) < len(named[s]) for s in ("pin", "link")) or any(pin not in named["pin"] for pin in fixed_pins):
         return DrawingElements(groups, gravity, problems)
-    layout = PinLayout(groups["link"], fixed, groups["slide"])
+    layout = PinLayout(groups["link"], fixed_pins, groups["slide"])
     all_read = all(len(groups[section]) == len(named[section]) for section in groups)
-    problems += layout_mistakes(layout, groups, fixed, all_read)
+    problems += layout_mistakes(layout, groups, fixed_pins, all_read)
     if not is_traced((groups["pin"], groups["link"])):
         drawn = concrete_elements(groups)
         problems += shape_mistakes({name: pin.position for name, pin in drawn["pin"].items()}, drawn["link"])
         if not problems:
-            problems += gap_mistakes(placement_of(drawn, fixed), drawn)
+            problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
     return DrawingElements(groups, gravity, problems)
 
 

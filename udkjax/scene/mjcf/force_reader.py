@@ -44,15 +44,16 @@ class ForceReader:
 
     def _add_passive(self, name: str, length: CoupledLength, read: AttributeReader) -> None:
         """Add the spring and the damper of a joint or a tendon, and refuse its unsupported attributes."""
-        off = self.settings.disabled
-        if "limit" not in off and self.settings.is_limited(read, "limited", "range"):
+        disabled = self.settings.disabled
+        if "limit" not in disabled and self.settings.is_limited(read, "limited", "range"):
             self._leave_or_refuse("limits", read, f"range is not taken over: {self._limit_cure(name, length, read)}")
-        if "frictionloss" not in off and read.number("frictionloss"):
+        if "frictionloss" not in disabled and read.number("frictionloss"):
             self._leave_or_refuse("frictionloss", read, "frictionloss is not taken over: give `udk.Friction`")
-        if "actuation" not in off and self.settings.is_limited(read, "actuatorfrclimited", "actuatorfrcrange"):
+        if "actuation" not in disabled and self.settings.is_limited(read, "actuatorfrclimited", "actuatorfrcrange"):
             self._leave_or_refuse("forceranges", read, "actuatorfrcrange is not taken over: forces are not cut off")
         stiffness, damping = (
-            0.0 if flag in off else self._linear_term(read, key) for key, flag in (("stiffness", "spring"), ("damping", "damper"))
+            0.0 if flag in disabled else self._linear_term(read, key)
+            for key, flag in (("stiffness", "spring"), ("damping", "damper"))
         )
         self._add_force(name, length, read, LinearForce(stiffness, damping, length.at_rest))
 
@@ -67,8 +68,8 @@ class ForceReader:
         if len(length.angles) == 2 and min(length.angles) >= 0 and read.element.tag == "joint":
             holder, body = sorted(length.angles)
             sign, radians = length.angles[body], self.settings.radians
-            ends = sorted(self.model.relative_angle(holder, body) + sign * (x * radians - length.length) for x in (low, high))
-            return f'give the event `udk.JointLimit("{name}", {ends[0]:.6g}, {ends[1]:.6g})`'
+            limits = sorted(self.model.relative_angle(holder, body) + sign * (x * radians - length.length) for x in (low, high))
+            return f'give the event `udk.JointLimit("{name}", {limits[0]:.6g}, {limits[1]:.6g})`'
         return "give an event, `udk.JointLimit` or `udk.Stop`"
 
     def _leave_or_refuse(self, kind: str, read: AttributeReader, text: str) -> None:

@@ -67,13 +67,13 @@ def mechanism_of_text(
     """Return the mechanism of the text of a model, as `read_mjcf`; warnings point to the caller `stacklevel` levels up."""
     root = parse_xml(text, source)
     problems = unknown_parts(root)
-    unknown = len(problems)
+    unknown_count = len(problems)
     settings = ModelSettings(root, problems)
     tree = BodyTree(root, settings)
     plane = plane_of(list(tree.joints.values()), settings.gravity)
     if not tree.joints:
         problems.append("<mujoco>: no body has a joint: nothing moves")
-    if len(problems) > unknown:
+    if len(problems) > unknown_count:
         raise SceneError(problems, source)
     model = PlaneModel(tree, plane)
     values, rates, controls = _initial_state(root, model, key)
@@ -84,8 +84,8 @@ def mechanism_of_text(
     loops = EqualityReader(root, lengths, motions, list(tree_joints)).joints
     bodies = {model.bodies[k].name: _body(model, k, motions[k]) for k, _ in tree.moving()}
     joints = tree_joints | loops
-    for name, body, of_body in model.named_joints():
-        for joint in of_body:
+    for name, body, joints_of_body in model.named_joints():
+        for joint in joints_of_body:
             _add_armature(model, joint, name, body, bodies, joints)
     if problems:
         raise SceneError(problems, source)
@@ -96,12 +96,12 @@ def mechanism_of_text(
         f"{loop} is open by {gap:.3g} (m, rad), which assembly closes" for loop, gap in _gaps(mechanism, list(loops), model.size)
     ]
     if "contact" not in settings.disabled and "contacts" not in leave_out and (pairs := contact_pairs(root, tree, plane)):
-        more = f" and {len(pairs) - 3} more pairs" * (len(pairs) > 3)
+        further = f" and {len(pairs) - 3} more pairs" * (len(pairs) > 3)
         messages.append(
-            f"contacts are not taken over, of {'; '.join(pairs[:3])}{more}: `udk.Contact` is an event for each point that hits"
+            f"contacts are not taken over, of {'; '.join(pairs[:3])}{further}: `udk.Contact` is an event for each point that hits"
         )
-    for text in messages:
-        warnings.warn(text, MjcfWarning, stacklevel=stacklevel)
+    for message in messages:
+        warnings.warn(message, MjcfWarning, stacklevel=stacklevel)
     return mechanism
 
 

@@ -110,11 +110,11 @@ class _Writer:
             else:
                 lines.append("  " * depth + "</body>")
         lines.append("  </worldbody>")
-        for section, parts in self.sections.items():
-            lines += [f"  <{section}>", *(f"    {part}" for part in parts), f"  </{section}>"] if parts else []
+        for section, items in self.sections.items():
+            lines += [f"  <{section}>", *(f"    {item}" for item in items), f"  </{section}>"] if items else []
         if any(rates) or any(self.controls):
-            given = {"qvel": _numbers(*rates)} | ({"ctrl": _numbers(*self.controls)} if self.controls else {})
-            lines += ["  <keyframe>", f"    <key{_attributes(name=INITIAL, **given)}/>", "  </keyframe>"]
+            values = {"qvel": _numbers(*rates)} | ({"ctrl": _numbers(*self.controls)} if self.controls else {})
+            lines += ["  <keyframe>", f"    <key{_attributes(name=INITIAL, **values)}/>", "  </keyframe>"]
         if self.problems:
             raise SceneError(self.problems, self.mechanism.name)
         return "\n".join([*lines, "</mujoco>", ""])

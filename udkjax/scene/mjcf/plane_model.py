@@ -69,16 +69,16 @@ def plane_of(joints: Sequence[TreeJoint], gravity: np.ndarray) -> MotionPlane:
     )
     normal = next((v for v in (*hinges, *across) if np.linalg.norm(v) > AXES_TOL), np.array([0.0, -1.0, 0.0]))
     normal = normal / np.linalg.norm(normal)
-    level = np.hypot(normal[0], normal[1]) < AXES_TOL
-    up = np.eye(3)[1 if level else 2]
+    is_horizontal = np.hypot(normal[0], normal[1]) < AXES_TOL
+    up = np.eye(3)[1 if is_horizontal else 2]
     up = up - (up @ normal) * normal
     up = up / np.linalg.norm(up)
     x = np.cross(up, normal)
     if x[0 if abs(x[0]) > AXES_TOL else 1] < 0:
         x, normal = -x, -normal
     for joint in joints:
-        off = np.linalg.norm(np.cross(joint.axis, normal)) if joint.kind == "hinge" else abs(joint.axis @ normal)
-        if off > AXES_TOL:
+        deviation = np.linalg.norm(np.cross(joint.axis, normal)) if joint.kind == "hinge" else abs(joint.axis @ normal)
+        if deviation > AXES_TOL:
             numbers = " ".join(f"{v:.4g}" for v in normal)
             joint.read.refuse(
                 f"leaves the plane in which the other joints move, whose normal is {numbers}: the model is not planar"
