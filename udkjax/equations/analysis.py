@@ -6,7 +6,8 @@ mechanism of a micrometre and one of a kilometre behave alike.
 The length L is the longest lever arm of a constraint at the initial guess, |dPsi/dangle| / |dPsi/d(x, y)|, or the largest radius
 of gyration sqrt(I/m) if that is longer. It does not depend on the origin. T is the shortest time in which anything changes at the
 guess: the time in which a velocity moves a body by L, the half period pi sqrt(L / a_F) of a pendulum of length L under a free
-acceleration a_F, and the same for the drivers. The scale of a row is its change by a displacement of L or a turn of one radian.
+acceleration a_F, and the corresponding times of the drivers. The scale of a row is its change by a displacement of L or a turn of
+one radian.
 """
 
 from collections import OrderedDict

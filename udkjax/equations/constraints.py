@@ -1,6 +1,6 @@
 """The constraints of a mechanism along a motion: Psi, Psi_q, Psi_dot and gamma (de Falco, Pennestri, Vita 2005, section 3).
 
-Each joint and driver defines only its residual; JAX takes all derivatives. The functions are written as in the paper, on dense
+Each joint and driver defines only its residual; JAX computes all derivatives. The functions are written as in the paper, on dense
 arrays; elements of the same structure are evaluated together (structure.py). The tests compare the faster forms with these.
 
 In all functions t is the time (s), and q and v are coordinates and velocities: x, y (m) and angle (rad) of each body in turn, as

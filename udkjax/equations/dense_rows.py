@@ -1,6 +1,6 @@
 """Psi and D of a small mechanism with concrete numbers, by NumPy on the scene's programs, without compilation.
 
-This module serves to close a mechanism and to find its redundant rows (redundancy.py).
+This module is used to close a mechanism and to find its redundant rows (redundancy.py).
 """
 
 from typing import Any, NamedTuple
@@ -74,7 +74,7 @@ class RowTerms:
 
 
 class DenseTerms(RowTerms):
-    """Psi of a mechanism with concrete numbers and its derivatives, as dense matrices."""
+    """Psi and its derivatives, of a mechanism with concrete numbers, as dense matrices."""
 
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
@@ -169,7 +169,7 @@ class KinematicRows(DenseRows):
         self.driver_time_step = driver_time_step(self.scales)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Psi, the lengths of the rows of D, and D with unit rows; scaling rows leaves consistent solutions unchanged."""
+        """Return Psi, the lengths of the rows of D, and D with unit rows, which does not change solutions of consistent rows."""
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rounding errors are not scaled up

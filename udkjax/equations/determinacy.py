@@ -1,11 +1,11 @@
-"""Uniqueness of multipliers by equilibrium alone (Wojtyra 2009), and the rank of the constraints in the scene's own units.
+"""Uniqueness of multipliers by equilibrium alone (Wojtyra 2009), and the rank of the constraints in the scene's units.
 
 If N spans the null space of Psi_q^T, lambda + N y satisfies M a + Psi_q^T lambda = F for every y as lambda does. So c^T lambda is
 unique if and only if c^T N = 0, and a single multiplier if its row of N is zero.
 
 Rank and null space are those of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...) (`Scales`), with lengths in units
 of the characteristic length, angles in radians, and each row divided by its scale; masses do not enter. All functions are pure
-and may be mapped over states (`jax.vmap`); without an `analysis` the scales are those of the mechanism.
+and may be mapped over states (`jax.vmap`); without an `analysis` the scales are computed from the mechanism.
 """
 
 from typing import NamedTuple

@@ -21,7 +21,7 @@ SETTLED = ("right2", "sum2", "y2", "x2")
 class DifferentiableProgram(NamedTuple):
     """A program, and loops with the same derivative, with respect to all arrays except `NOT_DIFFERENTIATED`.
 
-    No factorization is differentiated. With M^(-1) = C and J = Psi_q, accelerations, and corrections such as q - C J^T x, are
+    No factorization is differentiated. With M^(-1) = C and J = Psi_q, accelerations (and likewise corrections q - C J^T x) are
 
         a = a_F + z,        z = C J^T x,        J C J^T x = b,
 
@@ -33,7 +33,7 @@ class DifferentiableProgram(NamedTuple):
     and hence all terms with residuals as factors, vanish.
 
     Second derivatives are those of x after two corrections with the same factors, x + (J C J^T)^(-1) (b - J C J^T x): each
-    correction makes the derivatives of one more order exact.
+    correction makes derivatives of the next order exact.
     """
 
     program: LoopProgram
@@ -97,7 +97,7 @@ class DifferentiablePrograms:
         return self._solver.terms.add(f"{x}1", start=x, solution=solve, sign=-1, fixed=("constants",))
 
     def _corrected(self, right: str, **names: str) -> ProgramParts:
-        """Compute x0, whose value is given and whose derivatives are those of two corrections, and jt_x0."""
+        """Compute x0, with its current value and the derivatives of two corrections, and jt_x0."""
         terms, implicit = self._solver.terms, self._implicit_terms
         yield Reset("x0", 0, terms.layout.sizes["x0"])
         for solve in (1, 2):

@@ -1,4 +1,4 @@
-"""One element, a constraint or a force, as scalars of a graph: traced once for all elements of the same structure.
+"""One element, a constraint or a force, as scalars of a graph; the trace serves all elements of the same structure.
 
 For a constraint with residual Psi(t, q), forward differentiation of the residual along (1, v) gives
 

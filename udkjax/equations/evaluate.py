@@ -1,7 +1,7 @@
 """Quantities of the equations of motion at a state, each compiled as one program: the public functions of `udkjax.equations`.
 
-Without compilation, JAX would dispatch dozens of operations one by one. Inside the package the plain functions are called within
-larger programs.
+Without compilation, JAX would dispatch dozens of operations one by one. Inside the package, larger programs call the uncompiled
+functions.
 """
 
 from collections.abc import Callable

@@ -111,10 +111,10 @@ class NullSpaceSVD(PointwiseFormulation):
         a_p = V_1 S_1^(-1) U_1^T c,        N^T M N z = N^T (F - M a_p),        a = a_p + N z.
 
     Singular values up to `rank_tol` times the largest count as zero. Inconsistent redundant rows are satisfied in the sense of
-    least squares, so without stabilization their drift grows as it does with a truncated pseudoinverse: the paper's linkage is
-    lost after 18 s. In a singular configuration N gains a column, and with `Projection` the run crosses it. The difference from
-    the Udwadia-Kalaba equation by singular values is the metric in which rank and least squares are computed: A is not weighted
-    by the masses.
+    least squares, so without stabilization their drift grows as it does with a truncated pseudoinverse: a run of the paper's
+    linkage goes wrong after 18 s. In a singular configuration N gains a column, and with `Projection` the run crosses it. The
+    difference from the Udwadia-Kalaba equation by singular values is the metric in which rank and least squares are computed: A
+    is not weighted by the masses.
 
     Args:
         rank_tol: threshold of dependence, relative to the longest row or the largest singular value.

@@ -42,8 +42,8 @@ class MotionModel(NamedTuple):
 class MotionMeasures:
     """The measures of a model in a graph: their `values`, and their derivatives with respect to s and x, `slopes()`.
 
-    Everything is first written in a separate graph, with x, s, q, u, w, y and the multipliers as inputs, so that it can be
-    differentiated by each; then the expressions of these inputs are substituted.
+    Everything is first written in a separate graph, with x, s, q, u, w, y and the multipliers as inputs, and differentiated with
+    respect to each; then the expressions of these inputs are substituted.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ def _read(graph: Graph, function: Callable[..., jax.Array], *arguments: Scalar |
 
 
 def _along(row: SparseRow, variables: Scalars, tangents: Scalars, zero: Scalar) -> Scalar:
-    """Return the product of a row of derivatives with the tangents of some variables."""
+    """Return the product of a row of derivatives with the tangents of `variables`."""
     return sum((row[v.index] * t for v, t in zip(variables, tangents, strict=True) if v.index in row), zero)
 
 

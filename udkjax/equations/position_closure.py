@@ -29,7 +29,7 @@ LONGEST_STEP = 0.3  # largest change of a coordinate in one step, in rad or char
 CLOSURE_ITERATIONS = 40  # maximum number of Gauss-Newton steps; five or six are usual: convergence is quadratic
 PACE_STEPS = 4  # steps over which the rate of convergence is measured: see `try_to_close`
 VELOCITIES = 2  # corrections of v: the second removes the rounding errors of the first
-STEP_HALVINGS = 12  # maximum for one step: if 2^-12 of it does not lower the residual, the position cannot be closed
+STEP_HALVINGS = 12  # maximum for one step: if 2^-12 of a step does not lower the residual, the position cannot be closed
 
 Assembly = tuple[AnyArray, AnyArray, AnyArray, AnyArray, ArrayLike]  # q, v, Psi, Psi_dot and the rank of D
 

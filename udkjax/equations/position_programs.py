@@ -1,6 +1,6 @@
 """The positions of a driven mechanism as programs of its free numbers, for batches of mechanisms in machine code.
 
-A model gives Psi(x, s, q), with free numbers x and the driver's value s, and measures g(x, s, q, d) of a position, with data d.
+A model defines Psi(x, s, q), with free numbers x and the driver's value s, and measures g(x, s, q, d) of a position, with data d.
 At Psi = 0, by one elimination of Psi_q (expressions/elimination.py),
 
     q <- q - Psi_q^+ Psi,      dq/ds = -Psi_q^+ Psi_s,      dq/dx = -Psi_q^+ Psi_x,
@@ -30,7 +30,7 @@ class Sizes(NamedTuple):
 
     parameters: int  # x
     coordinates: int  # q
-    data: int  # d, of one position
+    data: int  # d, for one position
     measures: int  # g
 
 
@@ -56,7 +56,7 @@ class PositionPrograms:
             transmission angle; it vanishes, and changes its sign, where branches meet.
         positions: Whether the first n measures are q itself.
         derivatives: Whether measures have derivatives.
-        rows: The scales of the m rows of Psi, relative to which residuals of redundant rows are measured; by default one.
+        rows: The scales of the m rows of Psi, which divide the residuals of redundant rows; by default one.
         chosen: Selected measures of the model; by default all.
         motion: Measures of the motion, appended to those of the position.
 

@@ -150,7 +150,7 @@ def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:
-    """Return the names of the constraints in the left null space of D at a closed position, whose rows are dependent."""
+    """Return the names of the constraints whose rows are dependent at a closed position, by the left null space of D."""
     rows = kinematic_rows(mechanism)
     position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
     if position is None:

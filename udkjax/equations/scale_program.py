@@ -32,7 +32,7 @@ PAIR, PAIR_ROW, PAIR_MASS, PAIR_INERTIA = range(4)  # columns of the table of pa
 
 
 class ScaleProgram(NamedTuple):
-    """The program, and the sizes of its own arrays."""
+    """The program, and the sizes of the arrays that only it uses."""
 
     program: LoopProgram
     sizes: dict[str, int]

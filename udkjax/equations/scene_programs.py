@@ -34,10 +34,10 @@ RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces roo
 class ScenePrograms:
     """Programs over arrays of numbers: they compute `RESULTS` from constants, t, q, v, dq and dv.
 
-    Intermediate results are kept in arrays of the sizes `scratch`; no number is overwritten after it has been read. `safe` is one
-    if all pivots exceed `safe_tol`; `distance`, the root of the smallest pivot relative to its diagonal entry, is the distance
-    from dependence. The docstring of each program names its results. The `policy` for small pivots concerns the accelerations;
-    corrections leave out the rows whose pivots do not exceed `drop_tol`.
+    Intermediate results are stored in arrays of the sizes `scratch`; no number is overwritten after it has been read. `safe` is
+    one if all pivots exceed `safe_tol`; `distance`, the root of the smallest pivot relative to its diagonal entry, is the
+    distance from dependence. The docstring of each program names its results. The `policy` for small pivots concerns the
+    accelerations; corrections leave out the rows whose pivots do not exceed `drop_tol`.
     """
 
     def __init__(
@@ -327,7 +327,7 @@ def scene_programs(
         redundant_rows: Rows of Psi that are left out (`Analysis.redundant_rows`); None: chosen by marks among the numbers.
         baumgarte: Whether Baumgarte stabilization is included.
         policy: Policy for small pivots.
-        in_pieces: Whether sampled numbers are given by `Mechanism.at` for each time, or as all samples and knots.
+        in_pieces: Whether `Mechanism.at` passes sampled numbers for each time; otherwise all samples and knots are passed.
 
     Returns:
         The programs; the same object for the same structure and settings.

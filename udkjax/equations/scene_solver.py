@@ -7,7 +7,7 @@ from udkjax.equations.scene_terms import ProgramParts, SceneTerms
 from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
 
-# Corrections of a solution by its residual: each removes the rounding errors of the factors, as long as eps times the square of
+# Number of corrections of a solution by its residual. Each removes the rounding errors of the factors if eps times the square of
 # the condition number of the rows is below one.
 REFINEMENTS = 2
 
@@ -48,7 +48,7 @@ class SceneSolver:
         return [self.terms.sincos(), *self.terms.free_accelerations("v"), *self.terms.element_terms(("psi_q", "b"))]
 
     def newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
-        """Compute x - M^(-1) Psi_q^T y for x = q or v, so that a residual vanishes."""
+        """Compute x - M^(-1) Psi_q^T y for x = q or v, with y such that the linearized residual vanishes."""
         factorize = self.factorize_dropping if dropping else self.factorize
         step = [*self.solve(), self.terms.add(f"{x}1", start=x, solution=0, sign=-1)]
         return [*self.position_terms("psi_q", residual), *factorize, *step]

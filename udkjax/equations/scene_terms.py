@@ -131,7 +131,7 @@ class SceneTerms:
     ) -> ProgramParts:
         """Compute Psi_q, if among `outputs`, and the other outputs as right-hand sides of the systems `solve`, `solve` + 1, ...
 
-        `groups` are by default those with eliminated rows.
+        The default of `groups` is all groups with eliminated rows.
         """
         rights = [name for name in outputs if name != "psi_q"]
         for group in self.layout.eliminated if groups is None else groups:
@@ -221,7 +221,7 @@ class SceneTerms:
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
     def remainder(self, solve: int, target: int) -> ProgramParts:
-        """Compute the residual right - Psi_q M^(-1) Psi_q^T x of a linear system as the right-hand side of another one."""
+        """Compute right - Psi_q M^(-1) Psi_q^T x of the system `solve`, as the right-hand side of the system `target`."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):

@@ -120,7 +120,7 @@ class SparseRows(RowTerms):
         return minimum_degree(rows)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, SparseMatrix]:
-        """Return Psi, the lengths of the rows of D, and D with unit rows; scaling rows leaves consistent solutions unchanged."""
+        """Return Psi, the lengths of the rows of D, and D with unit rows, which does not change solutions of consistent rows."""
         psi, _, values = self.geometry(t, q, q)
         D, length = self._normalize_rows(values)
         return psi, length, D
@@ -201,14 +201,14 @@ def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
 
 
 class RowSubset(NamedTuple):
-    """Some rows at one position, with an orthonormal basis of their left null space."""
+    """A set of rows at one position, with an orthonormal basis of its left null space."""
 
     smallest: Time  # smallest nonzero singular value, relative to the largest
     null_space: np.ndarray
 
 
 def split_dependent_rows(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[RowSubset]]]:
-    """Split the rows into sets that depend on each other, and find the null space of each set."""
+    """Split the rows into sets that depend on each other, and compute the null space of each set."""
     null_vectors = _stack_columns([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
     rows, columns = null_vectors.shape
     links = coo_array(

@@ -105,7 +105,7 @@ class ElementKind(NamedTuple):
 def element_kinds(
     mechanism: Mechanism, elements: Sequence[Element], labels: Sequence[Hashable] | None = None
 ) -> list[ElementKind]:
-    """Sort elements by their structure and, if given, by their `labels`."""
+    """Sort elements by structure and, if there are `labels`, by label."""
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
     kinds: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):

@@ -43,7 +43,7 @@ class TextbookEquations(MechanismSystem):
         return _project(self, t, q, v)
 
     def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Take a Newton step in position and one in velocity; on the manifold it has the derivatives of a projection."""
+        """Take a Newton step in position and one in velocity; on the manifold the result has the derivatives of a projection."""
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:

@@ -12,11 +12,11 @@ compare every faster form with it; `method` is any pseudoinverse.
 
 Rows of Psi in metres and in radians have singular values of different units. Weights w (m,) of the rows make them comparable, so
 that one rank tolerance suffices (`Scales.weights`: 1 for metres, a length for radians): D and b stand for diag(w) D and
-diag(w) b, which has the same solutions if the rows are consistent, and lambda = -w (D^+)^T D^+ b, in N and N m. A weight of zero
-leaves its row out.
+diag(w) b, which has the same solutions if the rows are consistent, and lambda = -w (D^+)^T D^+ b, in N and N m. A row with weight
+zero is left out.
 
-Arguments and shapes are those of constraints.py: t (s), q and v of n coordinates, m rows. `baumgarte` holds the gains alpha and
-beta; None: no stabilization. `w` are the weights (m,); None: all one.
+Arguments and shapes are those of constraints.py: t (s), q and v of n coordinates, m rows. `baumgarte` contains the gains alpha
+and beta; None: no stabilization. `w` are the weights (m,); None: all weights are one.
 """
 
 import equinox as eqx

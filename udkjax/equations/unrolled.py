@@ -86,11 +86,11 @@ class Unrolled:
         self._inputs |= {s: (x, k) for x, scalars in state.items() for k, s in scalars.items()}
 
     def program(self, name: str) -> UnrolledProgram:
-        """Return one of the programs."""
+        """Return a program by its name."""
         return self._program(self._results[name], {})
 
     def derivative(self, name: str) -> UnrolledDerivative:
-        """Return one of the differentiable programs with its derivative."""
+        """Return a differentiable program with its derivative."""
         results, outputs = self._derivatives[name]
         before_seeds = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
         stored = [s for s in before_seeds if s not in self._inputs]

@@ -201,7 +201,7 @@ def _values(array: np.ndarray) -> np.ndarray:
 
 
 def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
-    """Put elements of one array into another at constant indices, by letting JAX put their positions, as the same dtype."""
+    """Put elements of one array into another at constant indices, by letting JAX put their positions, with the same dtype."""
     updates, indices = _REPLACING[equation.primitive.name](inputs)
     elements = np.concatenate([inputs[0].ravel(), updates.ravel()])
     places = np.arange(elements.size, dtype=equation.outvars[0].aval.dtype)

@@ -1,7 +1,8 @@
 """Loop programs: loops over elements of one kind, each running a small straight-line program.
 
-A `Kernel` is this program with the addresses of its inputs and outputs relative to base addresses; a `KernelLoop` runs it for
-each row of a table of bases, in order. The code grows with the number of kinds, the tables with the number of elements.
+A `Kernel` is such a program with the addresses of its inputs and outputs relative to base addresses; a `KernelLoop` runs the
+kernel for each row of a table of bases, in order. The code grows with the number of kinds, the tables with the number of
+elements.
 """
 
 import math
@@ -18,7 +19,7 @@ from jaxtyping import Array
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.scalar_program import ScalarProgram
 
-# Ways to update a number with an output: replace it, add to it, take the maximum, or the conjunction.
+# Ways to update a number with an output: replacement, addition, maximum, conjunction.
 SET, ADD, MAXIMUM, ALL = "set", "add", "maximum", "all"
 _BY_ARRAYS = {ADD: np.add, MAXIMUM: np.maximum, ALL: np.minimum}
 _BY_FLOATS = {  # NaN propagates
@@ -212,7 +213,7 @@ def _run_on_floats(part: LaidOutPart, arrays: dict[str, list[float]]) -> None:
 
 
 def _run_by_jax(part: LaidOutPart, arrays: dict[str, Array]) -> None:
-    """Run a part, with one operation for all reads from an array and one for all writes: XLA takes milliseconds for each."""
+    """Run a part, with one operation for all reads from an array and one for all writes: XLA compiles each for milliseconds."""
     if not isinstance(part.run, ScalarProgram):
         for name, places, _ in part.outputs:
             x = arrays[name]

@@ -228,7 +228,7 @@ def _evaluate(node: Node, values: list[Operand]) -> Operand:
 
 
 def _function_of_floats(node: Node) -> Callable:
-    """Return the function that computes a node on Python floats; chosen once, as many programs run thousands of times."""
+    """Return the function that computes a node on Python floats; chosen once, because many programs run thousands of times."""
     return _plain_function(node, math, _NUMBER_FUNCTIONS) or (lambda *values: _evaluate(node, list(values)))
 
 

@@ -39,7 +39,7 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
         arrays: Its inputs by array.
         graph: The graph of all scalars.
         linear: A group of inputs in which the program is linear, such as tangents: the coefficients of each input are added up
-            first, so that a sum has only one product for each input.
+            first, so that a sum has only one product for each number on which it depends.
     """
     results: dict[str, dict[int, Scalar]] = {name: dict(x) for name, x in arrays.items()}
     joined: dict[ArrayPlace, _Joined] = {}

@@ -69,7 +69,7 @@ def _cholesky(
 ) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
     """Return L with L L^T = gram, by the largest remaining pivot; which pivots exceed their thresholds; and the order of rows.
 
-    L[order] is lower triangular. A dropped pivot leaves a zero column.
+    L[order] is lower triangular. The column of a dropped pivot is zero.
     """
     m = len(gram)
 

@@ -38,7 +38,7 @@ class Fronts(NamedTuple):
     size: int  # number of rows of each block
     later_sizes: tuple[int, ...]  # numbers of rows of the later blocks that each block meets
     blocks: list[int]
-    later: list[list[int]]  # the later blocks that each block meets, in the order of elimination
+    later: list[list[int]]  # for each block the later blocks that it meets, in the order of elimination
 
 
 def order_blocks(sizes: Sequence[int], entries_of_blocks: Sequence[Set[int]]) -> list[Fronts]:

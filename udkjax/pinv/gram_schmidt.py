@@ -12,7 +12,7 @@ from udkjax.pinv.rule import dot, exceeds
 class GramSchmidt(Orthogonal):
     """D = Q R with column pivoting, then R^T = Z U: D^+ = Z U^(-T) Q^T, both by modified Gram-Schmidt.
 
-    With `twice` each column is reorthogonalized when its turn comes: the error is then of the order of eps cond(D), as with
+    With `twice` each column is orthogonalized again before it is used: the error is then of the order of eps cond(D), as with
     Householder. Without it Q is orthogonal only to eps cond(D), and the error can be of the order of eps cond(D)^2. The threshold
     applies to the diagonal of R, relative to the largest column norm.
 
@@ -29,7 +29,7 @@ class GramSchmidt(Orthogonal):
 
 
 def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: bool) -> PivotedQR:
-    """Modified Gram-Schmidt; each step takes the column with the largest remainder and stops once that is at most `threshold`."""
+    """Modified Gram-Schmidt; each step uses the column with the largest remainder, until that is at most `threshold`."""
     rows, columns = D.shape
     steps = min(rows, columns)
     column = jnp.arange(columns)

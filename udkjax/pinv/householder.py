@@ -32,7 +32,7 @@ class Householder(Orthogonal):
 
 
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Householder's QR; each step takes the column with the largest remaining norm and stops once that is at most `threshold`."""
+    """Householder's QR; each step uses the column with the largest remaining norm, until that is at most `threshold`."""
     q, r, order, rank = complete_qr(D, threshold)
     significant = jnp.arange(len(order)) < rank
     return PivotedQR(

@@ -41,11 +41,11 @@ def _number(value: NumberLike) -> Float[Array, ""]:
 class OneOf(Dense):
     """One of several methods, chosen by an index that may be traced and batched: one compiled program serves all of them.
 
-    All share one threshold. In machine code each lane has its own method, and a method that no lane has chosen is not executed.
-    In a program without machine code, `vmap` over the index executes all methods.
+    All share one threshold. In machine code the members of a batch may use different methods, and a method that no member has
+    chosen is not executed. In a program without machine code, `vmap` over the index executes all methods.
 
     Args:
-        methods: the methods, without thresholds of their own; by default the five of the paper.
+        methods: the methods, each with `rank_tol=None`; by default the five methods of the paper.
         number: index of the method, from zero; a traced index out of range is clipped to the first or the last.
     """
 

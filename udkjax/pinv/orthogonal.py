@@ -27,7 +27,7 @@ class OrthogonalFactors(NamedTuple):
 
 
 class Orthogonal(Dense):
-    """A method whose factors are Z and Q, one of them with the triangle divided out."""
+    """A method whose factors are Z and Q; one of them is already divided by the triangle."""
 
     def apply(self, factors: OrthogonalFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         return dot(factors.z, dot(factors.q.T, b))

@@ -169,7 +169,7 @@ def _by_jax(primitive: Primitive, parameters: dict[str, Any], xs: Sequence[Any])
 
 
 class _Expanded:
-    """An operation expanded into others, traced at its first evaluation; evaluated by JAX if it cannot be expanded."""
+    """An operation that is expanded into others, traced at the first evaluation; JAX evaluates it if that is impossible."""
 
     def __init__(self, equation: Any):
         self._primitive, self._parameters = equation.primitive, equation.params

@@ -34,7 +34,7 @@ def varies(x: Any) -> bool:
 
 
 def zero_of(x: Array) -> Array | float:
-    """Return a zero that is batched and varies over devices like x, also by outer `vmap`s; XLA removes it."""
+    """Return a zero that varies over devices and is batched, also by outer `vmap`s, like x; XLA removes the computation."""
     if jnp.size(x) == 0:
         return 0.0
     first = jnp.ravel(x)[0]

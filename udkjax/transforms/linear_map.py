@@ -9,7 +9,7 @@ Their derivatives need the second derivative D^2 f along two directions, and g a
     dg = D^2 f [v, dx] + J dv,        dh_i = w^T D^2 f [dx, e_i] + (J^T dw)_i        for each unit vector e_i.
 
 In reverse mode, since w^T J(x) v is a scalar, the cotangents of x are w^T D^2 f [v, e_i], and those of v and w are h and g.
-Second derivatives along pairs of directions are thus sufficient; JAX's forward mode gives higher orders.
+Second derivatives along pairs of directions are thus sufficient; JAX's forward mode computes higher orders.
 """
 
 import math
