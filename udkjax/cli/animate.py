@@ -94,7 +94,7 @@ def animate(
                 measures=_measures(measures, runs) if kind == ".html" else (),
                 reactions=reactions,
                 traces=traces or None,
-                live=list(live or ()) or live is not None,
+                live=list(live or ()) or live is not None,  # names, True for all numbers, or False
             )
         animation.save(out, t, **options)
     except (ValueError, OSError) as problem:

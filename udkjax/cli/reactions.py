@@ -61,12 +61,12 @@ def reactions(
 
         reactions_figure(ts, forces, mech.name).savefig(plot, dpi=150)
     remarks, cams = [], {}
-    for cam, pressed in cam_forces(mech, sol).items():
-        lowest = int(np.nanargmin(pressed)) if np.isfinite(pressed).any() else 0
-        cams[cam] = {"least": pressed[lowest], "time": ts[lowest]}
-        lifts = "; where it is negative, the follower lifts off" if pressed[lowest] < 0 else ""
+    for cam, contact_force in cam_forces(mech, sol).items():
+        lowest = int(np.nanargmin(contact_force)) if np.isfinite(contact_force).any() else 0
+        cams[cam] = {"least": contact_force[lowest], "time": ts[lowest]}
+        lift_off = "; where it is negative, the follower lifts off" if contact_force[lowest] < 0 else ""
         remarks.append(
-            f"  smallest contact force of cam {cam}: {format_number(pressed[lowest], 'N')}, at {ts[lowest]:g} s{lifts}"
+            f"  smallest contact force of cam {cam}: {format_number(contact_force[lowest], 'N')}, at {ts[lowest]:g} s{lift_off}"
         )
     heads = "pin", "on body", "largest force (N)", "fx (N)", "fy (N)", "at (s)", ""
     show(

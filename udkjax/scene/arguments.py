@@ -161,7 +161,7 @@ def _describe_class(cls: type) -> str:
 def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
     """Return the advice to give an instance, if the value is a class or its name; else an empty string."""
     wanted = value if isinstance(value, str) else value.__name__ if isclass(value) else ""
-    class_name = {x.__name__.lower(): x.__name__ for x in _family(classes)}.get(wanted.strip("() ").lower())
+    class_name = {x.__name__.lower(): x.__name__ for x in _with_subclasses(classes)}.get(wanted.strip("() ").lower())
     return (
         f"; give an instance: {name}=udk.{class_name}()"
         if class_name and class_name not in ("Mechanism", "State", "Analysis")
@@ -169,11 +169,11 @@ def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
     )
 
 
-def _family(classes: Sequence[type]) -> Iterator[type]:
+def _with_subclasses(classes: Sequence[type]) -> Iterator[type]:
     for cls in classes:
         yield cls
         if cls not in (bool, str, type(None)):
-            yield from _family(cls.__subclasses__())
+            yield from _with_subclasses(cls.__subclasses__())
 
 
 def _choice(known: tuple[Any, ...]) -> ArgumentCheck:

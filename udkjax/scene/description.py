@@ -62,11 +62,11 @@ def _format_element(element: eqx.Module) -> str:
     for path, value, _ in numbers_in(element):
         if value is None or (path[-1] in LEFT_OUT and has_numbers(value) and not np.any(np.asarray(value))):
             continue
-        owner = element
+        holder = element
         for field in path[:-1]:
-            owner = getattr(owner, field)
-        is_held = isinstance(owner, Held)
-        unit = field_unit(type(element if is_held else owner).__name__, path[-2] if is_held else path[-1], driven)
+            holder = getattr(holder, field)
+        is_held = isinstance(holder, Held)
+        unit = field_unit(type(element if is_held else holder).__name__, path[-2] if is_held else path[-1], driven)
         shown.append(f"{' '.join(path)} {format_numbers(value, unit)}".replace("_", " "))
     return ", ".join(shown)
 

@@ -52,7 +52,7 @@ class _Draft:
         mechanism = self.mechanism
         for name, joint in mechanism.joints.items():
             if isinstance(joint, Revolute):
-                self.pin(name, joint.bodies, self.place(joint.bodies[0], joint.points[0]))
+                self.pin(name, joint.bodies, self.world_point(joint.bodies[0], joint.points[0]))
         for name, joint in mechanism.joints.items():
             self.joint(name, joint)
         for name, driver in mechanism.drivers.items():
@@ -83,7 +83,7 @@ class _Draft:
             **{f"{section}s": group for section, group in self.elements.items()},
         )
 
-    def place(self, body: str, point: Any) -> np.ndarray:
+    def world_point(self, body: str, point: Any) -> np.ndarray:
         x, y, angle = self.frames[body]
         px, py = np.asarray(point, float)
         c, s = np.cos(angle), np.sin(angle)
@@ -115,12 +115,14 @@ class _Draft:
                 return
             case Slot():
                 body1, body2 = joint.bodies
-                pin = self.pin(name, [body2], self.place(body2, joint.points[1]))
-                self.add("slot", name, {"pin": pin, "direction": self.world(body1, joint.axis), "on": body1, "link": body2})
+                pin = self.pin(name, [body2], self.world_point(body2, joint.points[1]))
+                self.add(
+                    "slot", name, {"pin": pin, "direction": self.world_direction(body1, joint.axis), "on": body1, "link": body2}
+                )
             case Prismatic():
                 body1, body2 = joint.bodies
-                self.pin(f"{body2}'", [body2], self.place(body2, joint.points[1]))
-                self.add("slide", name, {"link": body2, "direction": self.world(body1, joint.axis), "on": body1})
+                self.pin(f"{body2}'", [body2], self.world_point(body2, joint.points[1]))
+                self.add("slide", name, {"link": body2, "direction": self.world_direction(body1, joint.axis), "on": body1})
             case Gear() if all(self.has_centre(body, joint.carrier) for body in joint.bodies):
                 gear = {"links": list(joint.bodies), "radii": np.asarray(joint.radii), "internal": joint.internal}
                 self.add("gear", name, gear | {"carrier": joint.carrier})
@@ -131,7 +133,7 @@ class _Draft:
         """Return True if a wheel turns on its carrier about a single pin."""
         return sum(wheel in members and carrier in members for members in self.members.values()) == 1
 
-    def world(self, body: str, axis: Any) -> list[float]:
+    def world_direction(self, body: str, axis: Any) -> list[float]:
         angle = float(axis) + float(self.frames[body][2])
         return [float(np.cos(angle)), float(np.sin(angle))]
 
@@ -158,7 +160,7 @@ class _Draft:
 
     def ends(self, name: str, bodies: Sequence[str], points: Any) -> list[str]:
         return [
-            self.pin(f"{name}{k + 1}", [body], self.place(body, point))
+            self.pin(f"{name}{k + 1}", [body], self.world_point(body, point))
             for k, (body, point) in enumerate(zip(bodies, np.asarray(points), strict=True))
         ]
 
@@ -184,14 +186,14 @@ class _Draft:
             raise SceneError([f"{section} {name!r}: the studio cannot draw elements of class {type(element).__name__}; {cure}"])
         for k, (body, point) in enumerate(zip(element.bodies, np.asarray(element.points), strict=True)):
             if body != GROUND:
-                self.pin(f"{name}{k + 1}", [body], self.place(body, point))
+                self.pin(f"{name}{k + 1}", [body], self.world_point(body, point))
         self.format_1.append((section, name, element))
 
     def in_links(self, element: Any) -> Any:
         """Return an element with its points in link frames: origin at the centre of mass, x from the first pin to the second."""
         moved = []
         for body, point in zip(element.bodies, np.asarray(element.points), strict=True):
-            position = self.place(body, point)
+            position = self.world_point(body, point)
             if body != GROUND:
                 pins = [self.places[pin] for pin in self.pins_of(body)]
                 axis = pins[1] - pins[0] if len(pins) > 1 else np.array([1.0, 0.0])

@@ -50,8 +50,8 @@ class Folder:
         if not isinstance(name, str) or not 0 < len(name) <= MOST_CHARACTERS_OF_A_PATH:
             raise RefusedError(400, "path: must be the path of a file in the studio's folder")
         parts = PurePosixPath(name).parts
-        wrong = any(not c.isprintable() or c in '\\:*?"<>|' for c in name)
-        if wrong or name.startswith("/") or any(part.startswith(".") for part in parts):
+        is_invalid = any(not character.isprintable() or character in '\\:*?"<>|' for character in name)
+        if is_invalid or name.startswith("/") or any(part.startswith(".") for part in parts):
             raise RefusedError(400, f"path: {name!r} is not a plain path in the studio's folder")
         if not name.lower().endswith(suffixes):
             raise RefusedError(400, f"path: {name!r} must end in {' or '.join(suffixes)}")

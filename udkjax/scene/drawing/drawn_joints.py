@@ -61,7 +61,7 @@ class PinInSlot(DrawnElement):
         return Parts(joint=Slot(pair, points, placement.direction(self.on, self.along, self.direction)))
 
     def _guided_link(self, layout: PinLayout) -> str:
-        return self.link or next((m for m in layout.members(self.pin) if m != self.on), "")
+        return self.link or next((member for member in layout.members(self.pin) if member != self.on), "")
 
     @property
     def anchors(self):
@@ -135,5 +135,5 @@ class CamPair(DrawnElement):
 
     def _pair(self, layout: PinLayout) -> tuple[str, ...]:
         """Return the links, by default the only moving link of each pin."""
-        moving = [[m for m in layout.members(pin) if m != GROUND] for pin in self.pins]
+        moving = [[member for member in layout.members(pin) if member != GROUND] for pin in self.pins]
         return self.links or tuple(members[0] for members in moving if len(members) == 1)

@@ -138,7 +138,7 @@ class Link(PrintsLine):
     def body(self, places: Places, velocities: Places) -> "DrawnBody":
         """Return the link's mass properties, position and velocity, given the positions (m) and velocities (m/s) of the pins."""
         if self.inertia is not None and self.centre is not None and self.mass is not None:
-            shape = Shape(0.0, self.centre, 0.0)
+            shape = Shape(0.0, self.centre, 0.0)  # area and radius are not used
         else:
             shape = self.shape(places)
         if self.mass is not None:

@@ -44,7 +44,7 @@ def compound_pendulum(
     mass: ArrayLike = 2.0,
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return a uniform rod pinned at one end; `angle` is measured from hanging straight down."""
+    """Return a uniform rod pinned at one end; `angle` is measured from the downward vertical."""
 
     def pose(s):
         return [hanging_rod_pose(np.zeros(2), length, s)]
@@ -65,7 +65,7 @@ def double_pendulum(
     masses: Sequence[ArrayLike] = (1.0, 1.0),
     gravity: ArrayLike = 9.81,
 ) -> Mechanism:
-    """Return a double pendulum of two uniform rods, which is chaotic; `angles` are measured from hanging straight down."""
+    """Return a double pendulum of two uniform rods, which is chaotic; `angles` are measured from the downward vertical."""
     a, b = (0.5 * length for length in lengths)
 
     def pose(s):
@@ -118,7 +118,7 @@ def chain(
 ) -> Mechanism:
     """Return n uniform rods in a chain of `length` and `mass`, suspended at one end: an n-fold pendulum.
 
-    Bodies link0, ... from the top, all at the same `angle` from straight down; joints pin0 (on the ground), pin1, ...
+    Bodies link0, ... from the top, all at the same `angle` from the downward vertical; joints pin0 (on the ground), pin1, ...
     """
     half = 0.5 * length / n
 

@@ -39,22 +39,24 @@ class EqualityReader:
         self._put_joint(read, ends, Revolute(*self.model.attached(ends)))
 
     def _add_weld(self, read: AttributeReader) -> None:
-        ends, turned = self._attachment(read, "body2")
+        ends, rotation = self._attachment(read, "body2")
         if not read.number("torquescale", 1.0):
             read.refuse("with a torquescale of 0 it is a connect: write one")
         normal = self.model.plane.normal
-        if np.linalg.norm(turned @ normal - normal) > AXES_TOL:
+        if np.linalg.norm(rotation @ normal - normal) > AXES_TOL:
             read.refuse("turns its bodies out of the plane of the motion")
-        angle = self.model.relative_angle(*ends.bodies) + float(np.angle(self.model.plane.flat(turned @ self.model.plane.across)))
+        angle = self.model.relative_angle(*ends.bodies) + float(
+            np.angle(self.model.plane.flat(rotation @ self.model.plane.across))
+        )
         self._put_joint(read, ends, Weld(*self.model.attached(ends), angle))
 
     def _attachment(self, read: AttributeReader, anchored: str) -> tuple[Ends, np.ndarray]:
         """Return the points that an equality joins, and the rotation (3, 3) of body 2 from its position in the file."""
-        tree, turned = self.model.tree, np.eye(3)
+        tree, rotation = self.model.tree, np.eye(3)
         if "site1" in read or "site2" in read:
             located = [tree.find(read, f"site{k}", tree.sites, "site") or (0, tree.bodies[0].frame) for k in (1, 2)]
             (body1, frame1), (body2, frame2) = located
-            points, turned = (frame1.origin, frame2.origin), frame1.axes @ frame2.axes.T
+            points, rotation = (frame1.origin, frame2.origin), frame1.axes @ frame2.axes.T
         else:
             body1, body2 = tree.index_of(read, "body1", ""), tree.index_of(read, "body2")
             frames = {"body1": tree.bodies[body1].frame, "body2": tree.bodies[body2].frame}
@@ -64,13 +66,13 @@ class EqualityReader:
             if pose[3:].any():
                 values = {"pos": " ".join(map(repr, pose[:3].tolist())), "quat": " ".join(map(repr, pose[3:].tolist()))}
                 wanted = frames["body1"].within(self.model.tree.settings.frame(AttributeReader(read.element, values, [])))
-                points, turned = (wanted.origin, anchor), wanted.axes @ frames["body2"].axes.T
+                points, rotation = (wanted.origin, anchor), wanted.axes @ frames["body2"].axes.T
         if abs((points[1] - points[0]) @ self.model.plane.normal) > AXES_TOL * self.model.size:
             read.refuse("its two points are not at one height above the plane of the motion")
         if tree.hosts[body1] == tree.hosts[body2]:
             read.refuse("connects a body to itself")
         flat = self.model.plane.flat(points[0]), self.model.plane.flat(points[1])
-        return Ends((tree.hosts[body1], tree.hosts[body2]), flat), turned
+        return Ends((tree.hosts[body1], tree.hosts[body2]), flat), rotation
 
     def _add_joint(self, read: AttributeReader) -> None:
         offset, slope = self._line(read)
@@ -104,8 +106,8 @@ class EqualityReader:
             angle = self.model.relative_angle(body1, body2) + offset / factor
             self.joints[self._joint_name(read)] = Angle(self.model.names((body1, body2)), angle)
         elif len(angles) == 3:
-            turned = sum(factor * self._motions[body].angle for body, factor in angles.items())
-            if offset or abs(turned) > MESHED * max(map(abs, angles.values())):
+            mismatch = sum(factor * self._motions[body].angle for body, factor in angles.items())
+            if offset or abs(mismatch) > MESHED * max(map(abs, angles.values())):
                 read.refuse(
                     "is not satisfied in the initial state, and gears start in mesh: change the ref or the key of a joint"
                 )

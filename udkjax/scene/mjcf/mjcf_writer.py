@@ -290,8 +290,8 @@ class _Writer:
         """Add a site for each of two points, the first turned by an angle (rad); return their names."""
         titles = [self._unique(f"{name}.{body}") for body in bodies]
         for title, body, point, turn in zip(titles, bodies, points, (angle, 0.0), strict=True):
-            turned = {"axisangle": f"{NORMAL} {_numbers(turn)}"} if turn else {}
-            self.sites[body].append({"name": title, "pos": _in_space(Point(*point.tolist())), **turned})
+            orientation = {"axisangle": f"{NORMAL} {_numbers(turn)}"} if turn else {}
+            self.sites[body].append({"name": title, "pos": _in_space(Point(*point.tolist())), **orientation})
         return titles
 
     def _unique(self, name: str) -> str:

@@ -45,9 +45,9 @@ class PlaneMotion(NamedTuple):
 
     def turn(self, anchor: complex, angle: float, rate: float) -> "PlaneMotion":
         """Return the motion after a turn about a point of the body (rad, rad/s)."""
-        position, turned = self.point(anchor), self.angle + angle
-        shift = position - np.exp(1j * turned) * anchor
-        return PlaneMotion(turned, shift, self.omega + rate, self.rate - 1j * rate * position)
+        position, new_angle = self.point(anchor), self.angle + angle
+        shift = position - np.exp(1j * new_angle) * anchor
+        return PlaneMotion(new_angle, shift, self.omega + rate, self.rate - 1j * rate * position)
 
     def slide(self, direction: complex, distance: float, rate: float) -> "PlaneMotion":
         """Return the motion after a slide along a direction of the body (m, m/s)."""
@@ -217,13 +217,13 @@ def contact_pairs(root: XmlElement, tree: BodyTree, plane: MotionPlane) -> list[
     pairs = [f"{p.attributes.get('geom1')} and {p.attributes.get('geom2')}" for p in elements if p.tag == "pair"]
     for geom1, geom2 in combinations(tree.geoms, 2):
         a, b = tree.hosts[geom1.body], tree.hosts[geom2.body]
-        hangs = b and a == tree.hosts[tree.bodies[b].parent], a and b == tree.hosts[tree.bodies[a].parent]
+        is_held = b and a == tree.hosts[tree.bodies[b].parent], a and b == tree.hosts[tree.bodies[a].parent]
         is_apart = abs((geom1.centre - geom2.centre) @ plane.normal) > geom1.reach + geom2.reach
         names = {tree.bodies[geom1.body].name, tree.bodies[geom2.body].name}
-        if a != b and not (a and b and any(hangs)) and _match(geom1, geom2) and not is_apart and names not in excluded:
+        if a != b and not (a and b and any(is_held)) and _may_collide(geom1, geom2) and not is_apart and names not in excluded:
             pairs.append(f"{geom1.name} and {geom2.name}")
     return pairs
 
 
-def _match(geom1: TreeGeom, geom2: TreeGeom) -> bool:
+def _may_collide(geom1: TreeGeom, geom2: TreeGeom) -> bool:
     return bool(geom1.types[0] & geom2.types[1] or geom2.types[0] & geom1.types[1])

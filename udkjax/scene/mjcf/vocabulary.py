@@ -23,13 +23,13 @@ _SOFT = "solref solimp"  # softness of constraints, which are ideal here
 class _Attributes(NamedTuple):
     used: str
     idle: str = ""  # attributes without effect on the motion
-    nothing: Mapping[str, str] = {}  # attributes refused unless they have this value, which has no effect
+    inactive: Mapping[str, str] = {}  # attributes with the only value that is accepted, which has no effect
 
 
-def _actuator(used: str = "", **nothing: str) -> _Attributes:
+def _actuator(used: str = "", **inactive: str) -> _Attributes:
     shared = "name class joint tendon gear ctrlrange ctrllimited forcerange forcelimited"
     idle = "group user lengthrange input actlimited actrange"
-    return _Attributes(f"{shared} {used}", idle, {"damping": "0", "armature": "0", "delay": "0", "nsample": "0", **nothing})
+    return _Attributes(f"{shared} {used}", idle, {"damping": "0", "armature": "0", "delay": "0", "nsample": "0", **inactive})
 
 
 _EQUALITY = _Attributes("name class active", _SOFT)
@@ -125,7 +125,7 @@ def unknown_parts(root: XmlElement) -> list[str]:
         known = _KNOWN[key]
         words = {*known.used.split(), *known.idle.split()}
         for name, value in element.attributes.items():
-            if name not in words and not _is_without_effect(value, known.nothing.get(name)):
+            if name not in words and not _is_without_effect(value, known.inactive.get(name)):
                 problems.append(f"{element.where}: {name}={quote(value)} is not taken over{_cure(name)}")
     return problems
 
@@ -134,11 +134,11 @@ def _cure(name: str) -> str:
     return f": {_CURES[name]}" if name in _CURES else ""
 
 
-def _is_without_effect(value: str, nothing: str | None) -> bool:
-    if nothing is None or value == nothing:
-        return nothing is not None
+def _is_without_effect(value: str, inactive: str | None) -> bool:
+    if inactive is None or value == inactive:
+        return inactive is not None
     try:
-        given, empty = ([float(word) for word in text.split()] for text in (value, nothing))
+        given, empty = ([float(word) for word in text.split()] for text in (value, inactive))
     except ValueError:
         return False
     return all(x == (empty[k] if k < len(empty) else 0.0) for k, x in enumerate(given)) or (
