@@ -51,10 +51,10 @@ class BlockElimination:
         bodies = [set(group.bodies[:, i].tolist()) for group, i in self._elements]
         self.order: list[Fronts] = order_blocks(self._sizes, bodies)
         self._diagonals = [layout.reserve("gram", p + p * (p + 1) // 2) for p in self._sizes]
-        self._position = {k: j for j, k in enumerate(k for e in self.order for k in e.blocks)}
+        self._position = {k: j for j, k in enumerate(k for fronts in self.order for k in fronts.blocks)}
         self._off_diagonal_start, self._off_diagonal = layout.sizes["gram"], {}
-        for e in self.order:
-            for k, later in zip(e.blocks, e.later, strict=True):
+        for fronts in self.order:
+            for k, later in zip(fronts.blocks, fronts.later, strict=True):
                 for a in later:
                     self._off_diagonal[a, k] = layout.reserve("gram", self._sizes[a] * self._sizes[k])
         self._off_diagonal_size = layout.sizes["gram"] - self._off_diagonal_start
@@ -75,13 +75,13 @@ class BlockElimination:
         yield Reset("trusted", 0, 1, 1.0)
         layout = self.terms.layout
         first_mark = layout.first_mark if layout.leaves_out_marked else None
-        for e in self.order:
+        for fronts in self.order:
 
-            def write(w: KernelWriter, e: Fronts = e):
-                _eliminate(w, e.size, e.later_sizes, dropping, first_mark)
+            def write(w: KernelWriter, fronts: Fronts = fronts):
+                _eliminate(w, fronts.size, fronts.later_sizes, dropping, first_mark)
 
-            key = ("eliminate", e.size, e.later_sizes, dropping, first_mark)
-            yield KernelLoop(self.terms.kernel(key, write), self._front_table(e))
+            key = ("eliminate", fronts.size, fronts.later_sizes, dropping, first_mark)
+            yield KernelLoop(self.terms.kernel(key, write), self._front_table(fronts))
 
     def solve(self, solve: int = 0) -> ProgramParts:
         """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right, and jt_x = Psi_q^T x."""
@@ -92,18 +92,20 @@ class BlockElimination:
         """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right."""
         names = arrays_of_solve(solve)
         yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
-        for e in self.order:
+        for fronts in self.order:
 
-            def forward(w: KernelWriter, e: Fronts = e):
-                _substitute_forward(w, e.size, e.later_sizes)
+            def forward(w: KernelWriter, fronts: Fronts = fronts):
+                _substitute_forward(w, fronts.size, fronts.later_sizes)
 
-            yield KernelLoop(self.terms.kernel(("forward", e.size, e.later_sizes), forward), self._front_table(e), names)
-        for e in reversed(self.order):
+            kernel = self.terms.kernel(("forward", fronts.size, fronts.later_sizes), forward)
+            yield KernelLoop(kernel, self._front_table(fronts), names)
+        for fronts in reversed(self.order):
 
-            def backward(w: KernelWriter, e: Fronts = e):
-                _substitute_backward(w, e.size, e.later_sizes)
+            def backward(w: KernelWriter, fronts: Fronts = fronts):
+                _substitute_backward(w, fronts.size, fronts.later_sizes)
 
-            yield KernelLoop(self.terms.kernel(("backward", e.size, e.later_sizes), backward), self._front_table(e)[::-1], names)
+            kernel = self.terms.kernel(("backward", fronts.size, fronts.later_sizes), backward)
+            yield KernelLoop(kernel, self._front_table(fronts)[::-1], names)
 
     def safe(self) -> KernelLoop:
         """Write `safe`: one if all pivots exceed `safe_tol`, else zero."""
@@ -185,27 +187,29 @@ class BlockElimination:
         tables: dict[tuple[ConstraintGroup, int, ConstraintGroup, int], list[list[int]]] = {}
         for body, blocks in holders.items():
             blocks.sort(key=lambda x: self._position[x[0]])
-            for j, (early, s) in enumerate(blocks):
-                for late, r in blocks[j + 1 :]:
+            for j, (early, early_slot) in enumerate(blocks):
+                for late, late_slot in blocks[j + 1 :]:
                     if early != late:
                         entries = self._place(late, ENTRIES), self._place(early, ENTRIES)
-                        key = self._elements[late][0], r, self._elements[early][0], s
+                        key = self._elements[late][0], late_slot, self._elements[early][0], early_slot
                         row = [*entries, self._off_diagonal[late, early], self.terms.layout.of_body(body)]
                         tables.setdefault(key, []).append(row)
         return [KernelLoop(self._product(*key), np.array(table)) for key, table in tables.items()]
 
-    def _product(self, g: ConstraintGroup, r: int, h: ConstraintGroup, s: int):
+    def _product(self, late: ConstraintGroup, late_slot: int, early: ConstraintGroup, early_slot: int):
         def write(w: KernelWriter):
-            late_entries = [[g.entry(w, row, 3 * r + k, 0) for k in range(3)] for row in g.rows]
-            early_entries = [_scaled(w, [h.entry(w, row, 3 * s + k, 1) for k in range(3)], lambda _: 3) for row in h.rows]
+            late_entries = [[late.entry(w, row, 3 * late_slot + k, 0) for k in range(3)] for row in late.rows]
+            early_entries = [
+                _scaled(w, [early.entry(w, row, 3 * early_slot + k, 1) for k in range(3)], lambda _: 3) for row in early.rows
+            ]
             for i, x in enumerate(late_entries):
                 for j, y in enumerate(early_entries):
                     w.write(dot(w.graph, x, y), "gram", 2, i * len(early_entries) + j, ADD)
 
-        key: Hashable = ("product", g, r, h, s)
+        key: Hashable = ("product", late, late_slot, early, early_slot)
         return self.terms.kernel(key, write)
 
-    def _front_table(self, e: Fronts) -> np.ndarray:
+    def _front_table(self, fronts: Fronts) -> np.ndarray:
         """Return the table of fronts of the same sizes.
 
         The columns are start indices: first of the block's factors and of its right-hand side; then, for each later block, of the
@@ -213,7 +217,7 @@ class BlockElimination:
         later blocks with each other, as a lower triangle, row by row.
         """
         table = []
-        for k, later in zip(e.blocks, e.later, strict=True):
+        for k, later in zip(fronts.blocks, fronts.later, strict=True):
             row = [self._diagonals[k], self._place(k, RIGHT)]
             for a in later:
                 row += [self._off_diagonal[a, k], self._place(a, RIGHT)]

@@ -54,7 +54,7 @@ def differentiate_constraint(
     one, zero = graph.constant(1.0), graph.constant(0.0)
 
     def derivative(program: TraceFunction, dt: Scalar, dq: list[Scalar]) -> list[list[Scalar]]:
-        return [list(o) for o in program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)])]
+        return [list(array) for array in program(graph, leaves, [np.asarray(s, object) for s in (t, *q, dt, *dq)])]
 
     value, rate = derivative(first_derivative, one, v)
     (acceleration,) = derivative(second_derivative, one, v)

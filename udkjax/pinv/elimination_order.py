@@ -46,7 +46,7 @@ def order_blocks(sizes: Sequence[int], entries_of_blocks: Sequence[Set[int]]) ->
 
     A block waits only for the earlier blocks that it meets. The next run is the largest group of equal blocks that are ready.
     """
-    position = {k: i for i, k in enumerate(minimum_degree([set(h) for h in entries_of_blocks]))}
+    position = {k: i for i, k in enumerate(minimum_degree([set(entries) for entries in entries_of_blocks]))}
     order = sorted(position, key=lambda k: position[k])
     blocks_of_entry: dict[int, list[int]] = {}
     for k, entries in enumerate(entries_of_blocks):
@@ -55,7 +55,7 @@ def order_blocks(sizes: Sequence[int], entries_of_blocks: Sequence[Set[int]]) ->
     neighbours = [{j for x in entries for j in blocks_of_entry[x]} - {k} for k, entries in enumerate(entries_of_blocks)]
     later: list[list[int]] = [[] for _ in sizes]
     waits, parent = [0] * len(sizes), [-1] * len(sizes)
-    filled: list[set[int]] = [{j for j in n if position[j] > position[k]} for k, n in enumerate(neighbours)]
+    filled: list[set[int]] = [{j for j in others if position[j] > position[k]} for k, others in enumerate(neighbours)]
     for k in order:
         later[k] = sorted(filled[k], key=lambda j: position[j])
         if later[k]:

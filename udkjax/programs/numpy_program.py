@@ -145,7 +145,7 @@ def _step_of(equation: Any) -> Callable[..., Any]:
 def _by_rule(equation: Any, rule: Callable[..., Any]) -> Callable[..., Any]:
     primitive, parameters = equation.primitive, equation.params
     dtypes = [v.aval.dtype for v in equation.outvars]
-    exact = all(d in PLAIN for d in dtypes)
+    exact = all(dtype in PLAIN for dtype in dtypes)
 
     def step(_: Meter, *xs: Any) -> Any:
         try:
@@ -157,7 +157,7 @@ def _by_rule(equation: Any, rule: Callable[..., Any]) -> Callable[..., Any]:
         if exact:
             return result
         if primitive.multiple_results:
-            return [np.asarray(x, d) for x, d in zip(result, dtypes, strict=True)]
+            return [np.asarray(x, dtype) for x, dtype in zip(result, dtypes, strict=True)]
         return np.asarray(result, dtypes[0])
 
     return step
