@@ -38,7 +38,7 @@ class Operation(ABC):
     input_names: ClassVar[tuple[str, ...]] = INPUTS  # names of the first inputs
     settings: ClassVar[tuple[str, ...]] = SETTINGS  # names of the settings of this kind of operation
     in_lanes: ClassVar[bool] = True  # whether members run in lanes
-    results: ClassVar[int] = len(OUTPUTS)  # number of outputs without directions: the first ones
+    results: ClassVar[int] = len(OUTPUTS)  # number of outputs without directions, which come first
     share: ClassVar[int] = SHARE  # minimum number of members of a thread
     is_reverse: ClassVar[bool] = False  # whether two passes, integration and backpropagation, write a part of the outputs each
 
@@ -49,7 +49,7 @@ class Operation(ABC):
 
     @property
     def tangents(self) -> int:
-        """The number of inputs that have directions: the last ones."""
+        """The number of inputs with directions, which come last."""
         return 0
 
     @abstractmethod

@@ -103,9 +103,9 @@ class SampleRows:
     def changes(self, mechanism: Mechanism) -> Array:
         """Return the tangents of the rows from those of a mechanism."""
         leaves, form = jax.tree.flatten(list(self.samples.values()))
-        given = leaves_and_none(list(mechanism.samples.values()))
-        along = [jax.numpy.zeros(np.shape(x)) if dx is None else dx for x, dx in zip(leaves, given, strict=True)]
-        return jax.jvp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), (leaves,), (along,))[1]
+        given_tangents = leaves_and_none(list(mechanism.samples.values()))
+        tangents = [jax.numpy.zeros(np.shape(x)) if dx is None else dx for x, dx in zip(leaves, given_tangents, strict=True)]
+        return jax.jvp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), (leaves,), (tangents,))[1]
 
     def with_cotangents(self, mechanism: Mechanism, active: Mechanism, bars: Array) -> Mechanism:
         """Return a mechanism of cotangents that includes the samples, from the cotangents of the rows."""

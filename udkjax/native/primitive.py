@@ -128,21 +128,21 @@ class LoadedCode:
         """Return a call that can be repeated with other numbers in `inputs`, which are the given arrays if these are float64."""
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
         # Each pass of reverse mode writes only a part of the outputs. The rest is zero, as jax.debug_nans would report NaN.
-        found = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
+        outputs = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
         members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
-        arrays, following = (*inputs, *found), (ctypes.c_int64 * 2)()
+        arrays, following = (*inputs, *outputs), (ctypes.c_int64 * 2)()
         record = (  # the fields in the order of `Memory.call_fields`
             *(members, times, knots, inputs[-1].shape[self._module.directions_in]),
             *(x.__array_interface__["data"][0] for x in inputs),
             *(x.size // len(x) if len(x) > 1 else 0 for x in inputs),
-            *(x.__array_interface__["data"][0] for x in found),
+            *(x.__array_interface__["data"][0] for x in outputs),
             *(arrays[k].shape[1] for k in self._lengths),
             ctypes.addressof(following),
         )
         assert len(record) == self._field_count
         call = (ctypes.c_int64 * len(record))(*record)
         threads = max(1, min(members // self._share, thread_count()))
-        return PreparedCall(code.run, call, following, threads, inputs, found)
+        return PreparedCall(code.run, call, following, threads, inputs, outputs)
 
 
 class PreparedCall(NamedTuple):
@@ -236,11 +236,11 @@ def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[
 
 def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in operation.shapes(inputs, times)]
-    found = jax.ffi.ffi_call(_select_code(inputs, operation).name, results)(*inputs)
+    outputs = jax.ffi.ffi_call(_select_code(inputs, operation).name, results)(*inputs)
     if not operation.is_reverse:
-        return found
+        return outputs
     # The outputs that a pass does not write (`LoadedCode`) are uninitialized memory.
-    results, (*bars, record) = found[: len(OUTPUTS)], found[len(OUTPUTS) :]
+    results, (*bars, record) = outputs[: len(OUTPUTS)], outputs[len(OUTPUTS) :]
     if inputs[-1].shape[0]:
         return [*map(jnp.zeros_like, results), *bars, record]
     return [*results, *map(jnp.zeros_like, bars), jnp.where(jnp.isfinite(record), record, 0.0)]
@@ -265,10 +265,10 @@ def _batch(
             x = xp.moveaxis(x, 0, 1)
             return x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:])
 
-        given = [directions(x, axis) for x, axis in zip(first[shared:], axes[shared:], strict=True)]
-        found = native_p.bind(*first[:shared], *given, operation=operation, times=times)
-        changes = [x.reshape(x.shape[0], size, x.shape[1] // size, *x.shape[2:]) for x in found[results:]]
-        return [*found[:results], *changes], [*[None] * results, *[1] * len(changes)]
+        changed = [directions(x, axis) for x, axis in zip(first[shared:], axes[shared:], strict=True)]
+        outputs = native_p.bind(*first[:shared], *changed, operation=operation, times=times)
+        changes = [x.reshape(x.shape[0], size, x.shape[1] // size, *x.shape[2:]) for x in outputs[results:]]
+        return [*outputs[:results], *changes], [*[None] * results, *[1] * len(changes)]
     members = max(x.shape[0 if axis is None else 1] for x, axis in zip(first, axes, strict=True))
 
     def as_members(x: Any, axis: int | None) -> Any:
@@ -277,8 +277,8 @@ def _batch(
         x = x[None] if axis is None else x
         return jnp.broadcast_to(x, (size, members, *x.shape[2:])).reshape(size * members, *x.shape[2:])
 
-    found = native_p.bind(*(as_members(x, axis) for x, axis in zip(first, axes, strict=True)), operation=operation, times=times)
-    return [x.reshape(size, members, *x.shape[1:]) for x in found], [0] * len(found)
+    outputs = native_p.bind(*(as_members(x, axis) for x, axis in zip(first, axes, strict=True)), operation=operation, times=times)
+    return [x.reshape(size, members, *x.shape[1:]) for x in outputs], [0] * len(outputs)
 
 
 native_p = Primitive("native_trajectory")
@@ -301,16 +301,16 @@ def _scale_inputs(numbers: Any) -> list[Any]:
 def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:
     if numbers.dtype != np.float64 or unsupported(programs):
         return scales_by_jax(numbers, programs)
-    (found,) = native_p.bind(*_scale_inputs(numbers), operation=FindScales(programs), times=1)
-    return found.reshape(*numbers.shape[:-1], -1)
+    (scales,) = native_p.bind(*_scale_inputs(numbers), operation=FindScales(programs), times=1)
+    return scales.reshape(*numbers.shape[:-1], -1)
 
 
 def _scales_of_batch(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
     """Evaluate the primitive of scales outside compiled programs; for a few vectors by NumPy, without compilation."""
     if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or jax.default_backend() != "cpu" or unsupported(programs):
         return evaluate_scales(numbers, programs)
-    (found,) = call_members(*_scale_inputs(np.asarray(numbers, float)), operation=FindScales(programs), times=1)
-    return found.reshape(*numbers.shape[:-1], -1)
+    (scales,) = call_members(*_scale_inputs(np.asarray(numbers, float)), operation=FindScales(programs), times=1)
+    return scales.reshape(*numbers.shape[:-1], -1)
 
 
 mlir.register_lowering(scales_p, mlir.lower_fun(_find_scales, multiple_results=False), platform="cpu")

@@ -107,7 +107,7 @@ def _format_rate(omega2: float) -> str:
 def equilibrium(
     mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0, stable: bool = False, analysis: Analysis | None = None
 ) -> Equilibrium:
-    """Return a position of rest near a given one: N^T F = 0 on Psi = 0, where N spans the directions that constraints leave free.
+    """Return a position of rest near a given position: N^T F = 0 on Psi = 0, where N spans the free directions.
 
     Newton's method with K = -F_q + (lambda^T Psi)_qq; steps are limited in length, and halved until the unbalanced loads
     decrease. Pure, jittable and batched by `vmap` (`balanced` tells which members are at rest); differentiable by every number
@@ -139,7 +139,8 @@ def equilibria(
 ) -> list[Equilibrium]:
     """Return the different equilibria found from several positions: the given position and random positions.
 
-    Random positions turn every body by a random angle and are closed again, so that all branches are tried. Not exhaustive.
+    Random positions turn every body by a random angle, and are then closed: any branch may be reached. The search is not
+    exhaustive.
 
     Args:
         mechanism: a mechanism of concrete numbers; its drivers hold the values of time t.
@@ -153,8 +154,8 @@ def equilibria(
     """
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)
-    found = jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, analysis=analysis))(guesses)
-    different = [jax.tree.map(lambda x, k=k: x[k], found) for k in distinct_positions(found.q, found.balanced, analysis.scales)]
+    batch = jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, analysis=analysis))(guesses)
+    different = [jax.tree.map(lambda x, k=k: x[k], batch) for k in distinct_positions(batch.q, batch.balanced, analysis.scales)]
     return sorted(different, key=lambda e: -float(jnp.min(e.omega2, initial=jnp.inf)))
 
 
@@ -252,16 +253,16 @@ def _settle(
     return by.while_loop(is_unsettled, body, start)[0]
 
 
-def _towards_rest(here: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:
+def _towards_rest(linearization: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:
     """Return the step eta of the linearization; only downhill if the equilibrium is to be stable."""
     xp, rounding = curve.by.xp, SMALLEST_STIFFNESS * scale.stiffness
     if not stable:
-        resists = xp.max(xp.abs(here.stiffness)) > rounding
-        return curve.plus(xp.where(resists, here.stiffness, 0.0), NEUTRAL_STIFFNESS) @ here.force
-    values, vectors = xp.linalg.eigh(0.5 * (here.stiffness + here.stiffness.T))
+        resists = xp.max(xp.abs(linearization.stiffness)) > rounding
+        return curve.plus(xp.where(resists, linearization.stiffness, 0.0), NEUTRAL_STIFFNESS) @ linearization.force
+    values, vectors = xp.linalg.eigh(0.5 * (linearization.stiffness + linearization.stiffness.T))
     values = xp.abs(values)
     values = xp.maximum(values, xp.maximum(NEUTRAL_STIFFNESS * xp.max(values), rounding))
-    return vectors @ (vectors.T @ here.force / xp.where(values > 0, values, 1.0))
+    return vectors @ (vectors.T @ linearization.force / xp.where(values > 0, values, 1.0))
 
 
 @eqx.filter_custom_jvp

@@ -41,7 +41,7 @@ class Linearization(NamedTuple):
 def linearize(mechanism: Mechanism, analysis: Analysis, free: int, t: ArrayLike, q: Float[Array, "n"]) -> Linearization:
     """Return the linearization at rest, in a closed position q at time t (s), with `free` degrees of freedom.
 
-    N = M^(-1/2) (I - D^+ D) V with V a basis of the null space of D at q: N spans the null space of D nearby, too, so that
+    N = M^(-1/2) (I - D^+ D) V with V a basis of the null space of D at q: N also spans the null space of D nearby, so that
     derivatives of results independent of the basis are exact.
     """
     w, root, still = analysis.scales.weights, uk.inverse_sqrt_mass(mechanism), jnp.zeros_like(q)

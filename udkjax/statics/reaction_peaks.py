@@ -85,13 +85,13 @@ def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any)
     ts = jnp.asarray(solution.ts)
     if len(ts) < 3:
         raise ValueError(f"a peak needs at least 3 output times, not {len(ts)}")
-    found = reactions(mechanism, solution, **{"about": "joint", **choices})
-    return {name: {body: _peak(ts, load) for body, load in loads.items()} for name, loads in found.items()}
+    loads_of_joint = reactions(mechanism, solution, **{"about": "joint", **choices})
+    return {name: {body: _peak(ts, load) for body, load in loads.items()} for name, loads in loads_of_joint.items()}
 
 
 @checked
 def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> dict[str, dict[str, Float[Array, "T 3"]]]:
-    """Return the load at each pin on each body that meets there, in ground axes: `pin_reactions(mech, sol)["B"]["coupler"]`.
+    """Return the load at each pin on each of its bodies, in ground axes: `pin_reactions(mech, sol)["B"]["coupler"]`.
 
     Where k bodies share a pin, k - 1 joints, such as B, B-2, connect them: their loads on one body are added up.
 

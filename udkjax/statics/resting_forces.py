@@ -26,9 +26,9 @@ def resting_forces(mechanism: Mechanism, q: ArrayLike, t: NumberLike) -> Resting
     still, q = with_halted_drivers(mechanism, t), np.asarray(q)
     rest = RestingPositions(np.array([t]), q[None], np.zeros((1, *q.shape)))
     at_pins = pin_reactions(still, rest)
-    forces = {pin: {body: np.asarray(load)[0].tolist() for body, load in on.items()} for pin, on in at_pins.items()}
-    held = {name: float(effort[0]) for name, effort in efforts(still, rest).items()}
-    return RestingForces(held, forces, unique_pin_forces(still, rest))
+    forces = {pin: {body: np.asarray(load)[0].tolist() for body, load in loads.items()} for pin, loads in at_pins.items()}
+    effort_of = {name: float(effort[0]) for name, effort in efforts(still, rest).items()}
+    return RestingForces(effort_of, forces, unique_pin_forces(still, rest))
 
 
 def force_lines(mechanism: Mechanism, held: RestingForces) -> str:

@@ -5,4 +5,7 @@ each holds one member. A *register* holds `vector` float64 numbers: several coor
 members. A *slot* addresses a number in a loop's array, by a base column of the table and an offset. The *call record* is the list
 of counts and addresses that is passed to `run`. A *tangent* is the memory of the derivatives along one direction. A *row* of
 samples holds the values of the sampled numbers between two breakpoints.
+
+In the code, `f` is the function that is written, `s` has the numbers of its lanes, `r` is the index of a register, and `k` the
+index of a lane or of an entry.
 """

@@ -20,7 +20,7 @@ _MAGIC = b"udkjax object 1\n"
 
 
 def cache_folder() -> Path | None:
-    """Return the folder of stored code, `UDKJAX_CACHE` or the user's cache folder; None if it is 0, or without a home."""
+    """Return the folder of stored code, `UDKJAX_CACHE` or the user's cache folder; None without a home, or for "0"."""
     choice = os.environ.get("UDKJAX_CACHE", "").strip()
     if choice == "0":
         return None

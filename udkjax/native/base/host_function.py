@@ -98,9 +98,9 @@ class _TracedFunction:
         return [(members, *aval.shape) for aval in self._program.out_avals]
 
     def _of_member(self, inputs: Sequence[Any]) -> list[Any]:
-        given = [np.asarray(x, aval.dtype) for x, aval in zip(inputs, self._program.in_avals, strict=True)]
+        arguments = [np.asarray(x, aval.dtype) for x, aval in zip(inputs, self._program.in_avals, strict=True)]
         with np.errstate(all="ignore"):
-            return [np.asarray(x, float) for x in numpy_program(self._program)(Meter(math.inf), given)]
+            return [np.asarray(x, float) for x in numpy_program(self._program)(Meter(math.inf), arguments)]
 
 
 def _members(inputs: Sequence[Any]) -> int:

@@ -128,7 +128,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
 
 
 class Lane:
-    """The `LANE_NUMBERS` as attributes: reading one loads it from all lanes; assigning, or `where` for some lanes, stores it."""
+    """The `LANE_NUMBERS` as attributes: reading loads and assigning stores a number of all lanes; `where` stores in some."""
 
     def __init__(self, f: Function, layout: Layout):
         self.__dict__.update(_f=f, _layout=layout)

@@ -1,6 +1,6 @@
 """Machine code for this processor from LLVM's text, compiled in parallel and stored on disk.
 
-A module is compiled in parts, with each large function as a part of its own, so that modules share the code of equal functions.
+A module is compiled in parts; each large function is a separate part, so that modules can share the code of equal functions.
 """
 
 import ctypes

@@ -45,7 +45,7 @@ GAP = ENDS_BEFORE + BEGINS_BEHIND
 
 # Pieces of the state.
 EDGE = 1e-7  # length of the step across the end of a piece, as a fraction of a step; its error is of the order of its square
-# Fraction of a step. The end of a piece nearer than this to an end of the step is located to rounding from the state there.
+# Fraction of a step. An end of a piece nearer than this to an end of the step is located to rounding, from the state at that end.
 NEAR_END = 0.01
 # A repeated step ends slightly beyond the end of a piece; once the end has been located, a step ends just before it, and the next
 # leads across.

@@ -26,7 +26,7 @@ class Method:
     def of(
         cls, c: np.ndarray, stages: Sequence[Any], b: np.ndarray, error: np.ndarray, order: float, ends: bool = False
     ) -> "Method":
-        """Return the method of nodes c, rows of A below the first, weights b, those of the error, and its order."""
+        """Return the method with nodes c, rows of A after the first, weights b, weights of the error estimate, and an order."""
         A = np.zeros((len(c), len(c)))
         for i, coefficients in enumerate(stages):
             A[i + 1, : i + 1] = coefficients

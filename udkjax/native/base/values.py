@@ -60,10 +60,10 @@ class Value:
         return self.f.arithmetic("div", other, self)
 
     def __neg__(self):
-        found = self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
+        negative = self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
         if self.product:
-            found.product = self.product._replace(is_negative=not self.product.is_negative)
-        return found
+            negative.product = self.product._replace(is_negative=not self.product.is_negative)
+        return negative
 
     def __lt__(self, other):
         return self.f.compare("lt", self, other)

@@ -39,7 +39,7 @@ class RowEntries:
                 module.loops.globals.append(line)
 
     def entries(self, f: Function) -> Iterator[tuple[Value, Value, Value, Value]]:
-        """Run the block for each entry with its row among the chosen ones, its column, its index in `psi_q`, and its factor."""
+        """Run the block for each entry with its row among the chosen rows, its column, its index in `psi_q`, and its factor."""
         with f.each(self._count) as e:
             row, column, place = (f.load(Value(f, _ENTRIES, POINTER), e * 3 + j, base=INT) for j in range(3))
             yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)

@@ -150,7 +150,7 @@ class Closing(Module):
     # --- hooks for derivatives (closing_derivatives.py)
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
-        """Hook: called at the state before each correction with its `scale`, and `limited`, one if the scale is a limit."""
+        """Hook: called at the state before each correction with its `scale`; `limited` is one if it limits the length."""
 
     def _finish_closing(self, f: Function, member: Value):
         """Hook: called when a member has been closed."""

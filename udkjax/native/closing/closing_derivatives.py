@@ -36,7 +36,7 @@ class ClosingDerivative(Closing):
 
 
 class ClosingForward(ClosingDerivative):
-    """Closing with tangents along directions, each in its own memory."""
+    """Closing with tangents along directions, which have separate memory."""
 
     mode = FORWARD
     ways = ("d",)  # prefixes of the inputs of each tangent
@@ -129,11 +129,11 @@ class ClosingForward(ClosingDerivative):
 
     def allocate_memory(self, f: Function, block: Value) -> list[Value]:
         size = self.field(f, "directions") * (len(self.ways) * self.tangents.size)
-        own, start = self.allocate(f, size, [block])
+        tangent_block, start = self.allocate(f, size, [block])
         with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.places["tangents"], base=POINTER)
-        return [own]
+        return [tangent_block]
 
 
 class ClosingTwice(ClosingForward):
@@ -203,13 +203,13 @@ class ClosingReverse(ClosingDerivative):
         self._evaluate(f, x)
         self.corrections[x].prepare_derivative(f)
         longest, which = self._longest(f, x)
-        along = f.variable(0.0)
+        product = f.variable(0.0)
         with f.each(self.n) as i:
             bar = f.given["scale"] * self.entry(f, f"bar iterate {x}", i)
-            along.value = f.fma(bar, self.change(f, x, i), along.value)
+            product.value = f.fma(bar, self.change(f, x, i), product.value)
             self.put_entry(f, f"bar result {x}", i, bar)
         with f.if_((f.given["limited"] > 0.5) & (longest > 0.0)):
-            self._increase(f, f"bar result {x}", which, -(along.value / self.change(f, x, which)))
+            self._increase(f, f"bar result {x}", which, -(product.value / self.change(f, x, which)))
         with f.each(self.n) as i:
             self._increase(f, f"bar iterate {x}", i, -self.entry(f, f"bar result {x}", i))
         f.call(f"reverse_newton_{x}", f.given["work"], self.address(f, "correction"), f.given["work"])

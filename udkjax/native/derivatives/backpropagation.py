@@ -141,7 +141,7 @@ class Reverse(Recorded):
         """Write the backpropagation of all members that are `ready` to the cotangents of their initial states and numbers."""
         f, s = self.function("walk", [(POINTER, "work"), (POINTER, "call")])
         call, yes = f.given["call"], f.const(1.0, DOUBLE, f.width)
-        self._begin_walk(f, s)
+        self._begin_backpropagation(f, s)
 
         def due() -> Value:
             s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
@@ -179,7 +179,7 @@ class Reverse(Recorded):
         start = self.member_address(f, "ysbar", self.lane_entry(f, "member", k))
         self._add_state(f, k, f.at(start, number * (2 * self.n)), to)
 
-    def _begin_walk(self, f: Function, s: Lane):
+    def _begin_backpropagation(self, f: Function, s: Lane):
         """Clear all cotangents, and load the last points of the members that are `ready`, with the cotangents of their ends."""
         n, times = self.n, self.field(f, "times")
         s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)

@@ -33,11 +33,11 @@ class Recorded(Differentiated):
             self.places.add(name)
         self.row = HEAD + 3 * self.n
 
-    def walks_back(self, f: Function) -> Value:
+    def backpropagates(self, f: Function) -> Value:
         """Return whether there are cotangents."""
         return self.field(f, "directions") > 0
 
-    def _leaves_record(self, f: Function) -> Value:
+    def _returns_record(self, f: Function) -> Value:
         return self.field(f, "record length") > 0
 
     def begin_member(self, f: Function, lane: Value, member: Value):
@@ -50,20 +50,20 @@ class Recorded(Differentiated):
                 self.put_lane_entry(f, "record", lane, f.at(given, TITLE), base=POINTER)
                 for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
                     self.put_lane_entry(f, name, lane, x)
-        with f.if_((self.lane_entry(f, "given", lane) < 0.5) & (self.walks_back(f) | self._leaves_record(f))):
+        with f.if_((self.lane_entry(f, "given", lane) < 0.5) & (self.backpropagates(f) | self._returns_record(f))):
             self._new_record(f, lane)
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        with f.if_(self.walks_back(f) | self._leaves_record(f)), self.each_lane(f, accept) as k:
+        with f.if_(self.backpropagates(f) | self._returns_record(f)), self.each_lane(f, accept) as k:
             self._store_point(f, s, k)
 
     def end_members(self, f: Function, s: Lane):
-        with f.if_(self.walks_back(f)):
+        with f.if_(self.backpropagates(f)):
             s.where(s.due > 0.5, ready=1.0)
-        with f.if_(self._leaves_record(f)), self.each_lane(f, s.due) as k:
-            self._leave_record(f, k)
+        with f.if_(self._returns_record(f)), self.each_lane(f, s.due) as k:
+            self._return_record(f, k)
 
-    def _leave_record(self, f: Function, k: Value):
+    def _return_record(self, f: Function, k: Value):
         """Write the record of lane k to the output; without points if it is too long."""
         length = self.field(f, "record length")
         to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
@@ -87,14 +87,14 @@ class Recorded(Differentiated):
         return f.any_of(s.active > 0.5) | f.any_of(s.ready > 0.5)
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
-        with f.if_(~self.walks_back(f)):
+        with f.if_(~self.backpropagates(f)):
             fill()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Backpropagate the members of all lanes together when all are complete, and load the next ones."""
         with f.if_(f.any_of(s.active > 0.5)):
             super().step_all(f, s, fill)
-        with f.if_(self.walks_back(f) & ~f.any_of(s.active > 0.5)):
+        with f.if_(self.backpropagates(f) & ~f.any_of(s.active > 0.5)):
             f.call("walk", f.given["work"], f.given["call"])
             fill()
 

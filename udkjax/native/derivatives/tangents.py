@@ -5,8 +5,8 @@ the tangents of the stages are the sums
 
     dq_i = dq + h c_i dv + h^2 sum_j (A A)_ij da_j,        dv_i = dv + h sum_j A_ij da_j,
 
-and those of the accelerations, the end of a step and the projected outputs come from the programs of derivatives
-(expressions/differential.py), with intermediate results from the evaluation. Interpolation is linear.
+and the tangents of the accelerations, the end of a step and the projected outputs come from the programs of derivatives
+(expressions/differential.py), which need intermediate results of the evaluation. Interpolation is linear.
 """
 
 from collections.abc import Iterator, Sequence
@@ -39,8 +39,10 @@ class Forward(Differentiated):
 
     def __init__(self, plan: Plan, active: tuple[bool, ...], lanes: int):
         super().__init__(plan, active)
-        given = [way for way in self.ways if way in GIVEN]
-        names = [f"{way}samples" for way in given if plan.sampled] + [f"{way}{x}" for way in given for x in ("numbers", "q", "v")]
+        input_ways = [way for way in self.ways if way in GIVEN]
+        names = [f"{way}samples" for way in input_ways if plan.sampled] + [
+            f"{way}{x}" for way in input_ways for x in ("numbers", "q", "v")
+        ]
         self.inputs = (*self.inputs, *names)
         self.tangents = w = Layout(lanes, plan.vector)
         self.group = lanes // plan.width  # directions of a tangent
@@ -93,14 +95,14 @@ class Forward(Differentiated):
     def _groups(self, f: Function) -> Value:
         return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
 
-    def _along(self, f: Function, name: str, stored: str, out: Value | None = None):
+    def _call_derivative(self, f: Function, name: str, stored: str, out: Value | None = None):
         tangent = f.given["tangent"]
         f.call(name, f.given["work"], self.address(f, stored), tangent, out or tangent)
 
     def _project_tangent(self, f: Function):
         """Compute `result` of a tangent, the projection of its `state`, at a state on the manifold."""
         if self.of_projection:
-            self._along(f, f"{self.mode}_projection", "projection linearization")
+            self._call_derivative(f, f"{self.mode}_projection", "projection linearization")
         else:
             group = f.given["tangent"]
             for way in self.ways:
@@ -116,7 +118,7 @@ class Forward(Differentiated):
         with self._each_tangent(f):
             self._change_stage(f, i, h, "point3")
         with self._each_group(f):
-            self._along(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
+            self._call_derivative(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         with f.if_(f.any_of(accept)):
@@ -144,7 +146,7 @@ class Forward(Differentiated):
                     self.put(f, f"state {x}", r, new, "tangent")
         self._project_end(f, begin)
         with self._each_group(f):
-            self._along(f, self.mode, f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
+            self._call_derivative(f, self.mode, f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
                 old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
@@ -213,13 +215,13 @@ class Forward(Differentiated):
     def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
         """Return the address of the tangents of a member's numbers along a direction, with those of the row of samples."""
         count = self.code.number_count
-        given = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
+        numbers = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
         places = self.active_samples
         if not places:
-            return given
+            return numbers
         copy = Value(f, f.reserve(DOUBLE, count), POINTER)
         with f.each(count) as i:
-            f.store(f.load(given, i), copy, i)
+            f.store(f.load(numbers, i), copy, i)
         rows, row = self.field(f, "knots") + 1, self.lane_entry(f, "row", f.given["lane"])
         samples = f.at(row_address(self, f, f"{way}samples", member, row), direction * rows * len(self.plan.sampled))
         for k, place in places.items():
@@ -247,7 +249,7 @@ class Forward(Differentiated):
                     f.store(change, tangent, place + self.place(f"{array} {x}", i, "tangent"))
 
     def end_members(self, f: Function, s: Lane):
-        """Write the tangents of the first state, as given, and of the last."""
+        """Write the tangents of the initial state, as given, and of the last state."""
         way, times = self.ways[-1], self.field(f, "times")
         with self._each_group(f) as p, self.each_lane(f, s.due) as k:
             f.given["tangent"], member = self._way(f, way), self.to_int(f, f.lane(s.member, k))
@@ -262,18 +264,18 @@ class Forward(Differentiated):
     def allocate_memory(self, f: Function, block: Value) -> list[Value]:
         """Allocate memory for all directions; return the blocks to free."""
         size = self._groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
-        own, start = self.allocate(f, size, [block])
+        tangent_block, start = self.allocate(f, size, [block])
         with f.each(size) as i:
             f.store(0.0, start, i)
         f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
-        return [own]
+        return [tangent_block]
 
 
 class ForwardTwice(Forward):
     """A trajectory with its second derivatives along pairs of directions.
 
-    They are the same sums over stages, ends of steps and outputs; the programs of accelerations and projections compute them
-    together with the tangents along either direction.
+    Second derivatives are the same sums over stages, ends of steps and outputs; the programs of accelerations and projections
+    compute them together with the tangents along either direction.
     """
 
     mode = TWICE

@@ -117,6 +117,6 @@ class GramSchmidtCode(DenseMethod):
         y.clear()
         with f.each(d.steps) as k:
             right = d.dot(d.row("q", k), b)
-            found = (right - d.dot(d.row("l", k), y)) * d.row("inverse").entry(k)
-            y.put(k, found)
-            d.axpy(found, d.row("r", k), x)
+            entry = (right - d.dot(d.row("l", k), y)) * d.row("inverse").entry(k)
+            y.put(k, entry)
+            d.axpy(entry, d.row("r", k), x)

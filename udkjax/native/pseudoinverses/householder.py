@@ -82,8 +82,8 @@ class HouseholderCode(DenseMethod):
 
     def _count(self, d: DenseMatrices) -> Value:
         """Return the maximum over lanes of the number of free columns."""
-        found = d.row("free").entry(0)
-        return d.whole(found if d.f.width == 1 else d.f.reduce("fmax", found))
+        free = d.row("free").entry(0)
+        return d.whole(free if d.f.width == 1 else d.f.reduce("fmax", free))
 
     def solve(self, d: DenseMatrices):
         f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")

@@ -61,10 +61,10 @@ class LUCode(DenseMethod):
 
     def sign(self, d: DenseMatrices) -> Value:
         """Return the sign of det D: the product of the signs of the pivots, and -1 for each inversion of rows."""
-        f, order, found = d.f, d.row("order"), d.f.variable(1.0)
+        f, order, sign = d.f, d.row("order"), d.f.variable(1.0)
         with f.each(d.m) as k:
             place = order.entry(k)
-            found.value = f.select(d.row("inverse").entry(k) < 0.0, -found.value, found.value)
+            sign.value = f.select(d.row("inverse").entry(k) < 0.0, -sign.value, sign.value)
             with f.each(k) as i:
-                found.value = f.select(order.entry(i) > place, -found.value, found.value)
-        return found.value
+                sign.value = f.select(order.entry(i) > place, -sign.value, sign.value)
+        return sign.value

@@ -33,10 +33,10 @@ class OneOfCode(DenseMethod):
         for method, part, chosen in self._chosen(d):
             d.copy(d.row("b"), part.row("b"))
             method.solve(part)
-            share, found = d.spread(d.f.select(chosen, d.wide(1.0), 0.0)) > 0.5, part.row("x")
+            share, solution = d.spread(d.f.select(chosen, d.wide(1.0), 0.0)) > 0.5, part.row("x")
 
-            def take(r: Operand, share=share, found=found):
-                x[r] = d.f.select(share, found[r], x[r])
+            def take(r: Operand, share=share, solution=solution):
+                x[r] = d.f.select(share, solution[r], x[r])
 
             d.over_registers(x.registers, take)
 

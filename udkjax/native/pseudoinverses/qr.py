@@ -39,7 +39,7 @@ def start_pivoting(d: DenseMatrices) -> Value:
 
 
 def choose_pivot(d: DenseMatrices) -> tuple[Value, Value]:
-    """Return the squared length of the longest unused column, and its index; the first of equal ones."""
+    """Return the squared length of the longest unused column, and its index; of equal columns, the first."""
     f, squares = d.f, d.row("squares")
     best, pivot = f.variable(-1.0), f.variable(0.0)
     with f.each(d.n) as j:

@@ -52,7 +52,7 @@ def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
 
 
 def next_breakpoint(module: Module, f: Function, s: Lane, now: Value):
-    """Set `t1` just before the next breakpoint, and `behind` just after all breakpoints at the time `here`."""
+    """Set `t1` just before the next breakpoint, and `behind` just after all breakpoints at the time `now`."""
     work, call = f.given["work"], f.given["call"]
     f.call("next_breakpoint", work, call)
     with f.while_(lambda: f.any_of(s.due <= now + s.smallest)):

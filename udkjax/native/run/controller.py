@@ -6,7 +6,7 @@ Numbers of a lane `s` (layout.py has them all):
     h, behind               step length chosen by the controller (s); scratch
     error, rate             error of the attempt, relative to the tolerance; error of the previous step divided by length^order
     begin, last, lands      one if the attempt begins a run, ends it, ends at a breakpoint
-    fallback, fallback_due  one if the attempt is made by the fallback, if the next one must be
+    fallback, fallback_due  one if the fallback makes this attempt, if it must make the next
     retries, distance       number of successive attempts shortened because of a pivot; distance from singular configurations
     distance0 to 2          distances of the accepted states before, the latest last
 """
@@ -107,7 +107,7 @@ def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value) -> 
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value) -> tuple[Value, Value]:
     """Return the ratio of the next step to this one, and the error divided by (length of the step)^order."""
     where, order, error = f.select, module.method.order, s.error
-    # Errors are bounded below by the one at which a step grows by GROW, as smaller ones may be rounding.
+    # Errors are bounded below by the error at which a step grows by `grow`, as smaller errors may be rounding.
     size = where(f.is_finite(error), f.max(error, FACTORS.grow ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
     foreseen = size * (rate / s.rate)  # the error of an equal step if errors continue to grow (Gustafsson 1994)
@@ -152,7 +152,7 @@ def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value
 
 
 def first_step(module: Module, f: Function, s: Lane) -> Value:
-    """Return the given first step, or one over which the state changes by a hundredth of itself or of its unit.
+    """Return the given first step, or the step over which the state changes by a hundredth of itself or of its unit.
 
     The rule is that of `first_step` in integrate/diffrax_engine.py.
     """

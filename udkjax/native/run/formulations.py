@@ -4,7 +4,7 @@ With the unconstrained accelerations a_F, their change x by the constraints, and
 
     M x + A^T lambda = 0,        A x = b,        a = a_F + x,
 
-all in the scene's own units, in which coordinates, rows and masses are of order one. Projection is that of the pseudoinverse.
+all in the scene's own units, in which coordinates, rows and masses are of order one. States are projected by the pseudoinverse.
 """
 
 from abc import ABC, abstractmethod
@@ -259,12 +259,12 @@ class MethodCode(NamedTuple):
         Raises:
             UnsupportedError: machine code does not support one of them.
         """
-        found = cls(dense_method(method), None if formulation is None else formulation_code(formulation))
-        if formulation is not None and found.formulation is None:
+        code = cls(dense_method(method), None if formulation is None else formulation_code(formulation))
+        if formulation is not None and code.formulation is None:
             raise UnsupportedError(f"the formulation {formulation}")
-        if found.pseudoinverse is None and not isinstance(method, Auto | Elimination):
+        if code.pseudoinverse is None and not isinstance(method, Auto | Elimination):
             raise UnsupportedError(f"the pseudoinverse {type(method).__name__}")
-        return found
+        return code
 
     @staticmethod
     def formulation_settings(formulation: Any, mass: Any) -> dict[str, Any]:

@@ -26,8 +26,8 @@ def write_begin(module: Module):
     for name in LANE_NUMBERS:
         if name not in SETTINGS and name not in ("stepping", "call", "tangents"):
             put(name, 0.0)
-    given = module.member_address(f, "settings", member)
-    settings = dict.fromkeys(SETTINGS, f.const(1.0)) | {name: f.load(given, j) for j, name in enumerate(module.settings)}
+    given_settings = module.member_address(f, "settings", member)
+    settings = dict.fromkeys(SETTINGS, f.const(1.0)) | {name: f.load(given_settings, j) for j, name in enumerate(module.settings)}
     for name, value in settings.items():
         put(name, value)
     q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)

@@ -26,11 +26,11 @@ def write_leave(module: Module):
         module.invoke(f, "pieces")
 
     def moved() -> Value:
-        found = f.variable(f.const(False, BOOL, f.width), BOOL)
+        differs = f.variable(f.const(False, BOOL, f.width), BOOL)
         with f.each(module.pieces) as k:
-            current, has_left = (module.entry(f, x, k) for x in ("pieces", "pieces before"))
-            found.value = found.value | current.is_not(has_left)
-        return found.value
+            current, previous = (module.entry(f, x, k) for x in ("pieces", "pieces before"))
+            differs.value = differs.value | current.is_not(previous)
+        return differs.value
 
     with f.each(module.rowcount) as r:
         module.put(f, "corrected q", r, module.vector(f, "state q", r))

@@ -68,11 +68,11 @@ class Reader:
 
 def leb128(value: int) -> bytes:
     """Return a nonnegative integer in LEB128."""
-    found = bytearray()
+    digits = bytearray()
     while value > 127:
-        found.append(value & 127 | 128)
+        digits.append(value & 127 | 128)
         value >>= 7
-    return bytes([*found, value])
+    return bytes([*digits, value])
 
 
 def link(code: bytes, exports: Sequence[str]) -> LinkedModule:

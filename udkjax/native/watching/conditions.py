@@ -71,10 +71,10 @@ class Resolution(NamedTuple):
 
         def changes_once(x: Any) -> Any:
             signs = [second > 0.0, x > 0.0, fourth > 0.0, b > 0.0]  # the coefficient before them counts as positive
-            found = ~signs[-1]
+            result = ~signs[-1]
             for now, later in pairwise(signs):
-                found = found & (now | ~later)
-            return found
+                result = result & (now | ~later)
+            return result
 
         return changes_once(middle - e) & changes_once(middle + e) & is_resolved, is_away
 
@@ -89,7 +89,7 @@ MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
 MOST_STUCK = 4  # maximum number of successive refinements; before a jump, some finer intervals are resolved
 FIRST, SECOND, THIRD = range(3)  # the next node of two intervals
 LAST_CHANGE = 1e-7  # largest final correction of the event time, in T; as a Taylor step it has an error of its square
-MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; one is usual
+MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; usually one
 LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long
 WANTED, UNDER_WAY = 1, 2  # states of a landing: a step from the point before the crossing is requested, or has been planned
 SHORTEST_SPAN = 100  # shortest span, in smallest steps, that is refined

@@ -13,11 +13,11 @@ def write_locate(module: WatchMemory):
 
     def crossed() -> Value:
         """Return the first condition beyond zero, or -1."""
-        found = f.variable(-1.0)
+        event_index = f.variable(-1.0)
         with f.each(module.conditions.count) as c:
-            beyond = (module.condition(f, "hit", c) * module.condition(f, "g", c) > 0.0) & (found.value < 0.0)
-            found.value = f.select(beyond, f.like(c, DOUBLE, f.width), found.value)
-        return found.value
+            beyond = (module.condition(f, "hit", c) * module.condition(f, "g", c) > 0.0) & (event_index.value < 0.0)
+            event_index.value = f.select(beyond, f.like(c, DOUBLE, f.width), event_index.value)
+        return event_index.value
 
     def wide() -> Value:
         middle = (s.low + s.high) * 0.5
