@@ -15,12 +15,12 @@ from udkjax.integrate.solvers.multistep import Multistep
 class Constrained(Wrapper):
     """A diffrax solver for the motion of a mechanism: `args` are its equations, y is (q, v) in one vector.
 
-    With `projected` each step ends on the constraint manifold. A derivative at its end that the solver would store for the next
-    step (FSAL) belongs to the state before projection: with `made_jump`, the solver computes a new derivative. (A multistep
-    method would then forget its whole history. Its `made_jump` stays as it is, because the method detects that its newest point
-    moved.) The part of an error that projection removes hardly counts. Where only some coordinates are integrated, only their
+    With `projected` each step ends on the constraint manifold. The derivative at the end of a step, which a solver stores for the
+    next step (FSAL), belongs to the state before projection. `made_jump` therefore makes the solver compute a new derivative.
+    (A multistep method would discard its whole history: its `made_jump` is unchanged, since it detects that its newest point
+    moved.) The part of an error that projection removes has a small weight. If only some coordinates are integrated, only their
     errors count.
-    Error estimates, with their counts, and interpolation are the wrapped solver's.
+    Error estimates, with their counts, and interpolation are those of the wrapped solver.
     """
 
     solver: diffrax.AbstractSolver
@@ -30,16 +30,16 @@ class Constrained(Wrapper):
         if self.projected and not isinstance(self.solver, Multistep):
             made_jump = jnp.array(True)
         equations, solver = args.fix_partition(t0, *jnp.split(y0, 2)), self.solver
-        judged = None if equations.independent is None else jnp.tile(equations.independent, 2)
-        if judged is not None:
-            solver = _with_partial_norm(solver, judged)
+        controlled = None if equations.independent is None else jnp.tile(equations.independent, 2)
+        if controlled is not None:
+            solver = _with_partial_norm(solver, controlled)
         y1, error, dense, state, result = solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
         if self.projected:
             y1 = project(equations, t1, y1)
             if error is not None and not isinstance(self.solver, Multistep):
                 error = jnp.concatenate(error_after_projection(equations, t1, *jnp.split(y1, 2), *jnp.split(error, 2))[:2])
-        if judged is not None:
-            error = jnp.where(judged, jnp.asarray(error), jnp.where(jnp.isfinite(y1), 0.0, jnp.nan))
+        if controlled is not None:
+            error = jnp.where(controlled, jnp.asarray(error), jnp.where(jnp.isfinite(y1), 0.0, jnp.nan))
         return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result
 
 
@@ -54,7 +54,7 @@ class _PartialNorm(eqx.Module):
 
 
 def _with_partial_norm(solver: diffrax.AbstractSolver, components: Bool[Array, "2n"]) -> diffrax.AbstractSolver:
-    """Return a multistep method, which judges its errors itself, with a norm of some components alone."""
+    """Return a solver; the norm of a multistep method, which controls its own errors, is limited to `components`."""
     if not isinstance(solver, Multistep):
         return solver
     return eqx.tree_at(lambda s: s.root_finder.norm, solver, _PartialNorm(solver.root_finder.norm, components))

@@ -135,15 +135,15 @@ class DifferentiableRun(DifferentiableFunction):
         self, inputs: list[Array], active: Mask, tangents: list[Array], others: Mask, other_tangents: list[Array]
     ) -> list[Array]:
         either, problem = tuple(map(operator.or_, active, others)), self.problem(inputs)
-        which = self.problem.marks(either)
-        moves_samples = any(x is True for x in jax.tree.leaves(which.textbook.mechanism.samples))
+        mask = self.problem.marks(either)
+        moves_samples = any(x is True for x in jax.tree.leaves(mask.textbook.mechanism.samples))
         if moves_samples or not self._is_native(inputs, either):  # splines are not linear in their knots
             return super().twice(inputs, active, tangents, others, other_tangents)
         changes = (
-            (self.problem.marks(which), self.problem.changes(which, dxs))
-            for which, dxs in ((active, tangents), (others, other_tangents))
+            (self.problem.marks(mask), self.problem.changes(mask, dxs))
+            for mask, dxs in ((active, tangents), (others, other_tangents))
         )
-        return list(native_engine.second_derivative(problem, which, *changes))
+        return list(native_engine.second_derivative(problem, mask, *changes))
 
     def run_and_jvp(self, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
         """Return the run and the change of its states along tangents of the active inputs, by machine code if possible."""

@@ -24,11 +24,11 @@ from udkjax.transforms.gradients import stop_gradients
 def integrate_by_diffrax(
     problem: Problem, adjoint: diffrax.AbstractAdjoint | None = None, meter: diffrax.AbstractProgressMeter | None = None
 ) -> IntegratorOutput:
-    """Integrate one problem with any solver of diffrax (default Dopri8), and by default with checkpoints for reverse mode."""
+    """Integrate one problem with any solver (default Dopri8) and adjoint (default: checkpoints for reverse mode) of diffrax."""
     ts = _leave_breakpoints(problem)
-    y0 = given = jnp.concatenate([problem.q, problem.v])
+    y0 = initial = jnp.concatenate([problem.q, problem.v])
     equations = equations_for_diffrax(problem)
-    if problem.compiled.plan.projected:  # machine code does so, and its derivatives are combined with those of this engine
+    if problem.compiled.plan.projected:  # as machine code does, whose derivatives are combined with those of this engine
         y0 = project(equations, ts[0], y0)
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
@@ -41,7 +41,7 @@ def integrate_by_diffrax(
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
         stepsize_controller=CountingController(_controller(problem)),
         adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
-        max_steps=int(np.asarray(problem.max_steps)),  # diffrax makes its loops of a known number
+        max_steps=int(np.asarray(problem.max_steps)),  # the loops of diffrax need a concrete number
         progress_meter=meter or diffrax.NoProgressMeter(),
         throw=False,
     )
@@ -49,16 +49,16 @@ def integrate_by_diffrax(
     (ys, end), (_, t_end) = saved
     reached = ts <= t_end[0]
     later = reached & (jnp.arange(len(ts)) > 0)
-    ys = jnp.where(later[:, None], ys, y0)  # a run without any accepted step has saved nothing
-    others = project_all(equations, ts[1:], ys[1:]) if problem.compiled.plan.projected else ys[1:]
-    ys = jnp.concatenate([given[None], others])
+    ys = jnp.where(later[:, None], ys, y0)  # a run without an accepted step has no saved states
+    projected = project_all(equations, ts[1:], ys[1:]) if problem.compiled.plan.projected else ys[1:]
+    ys = jnp.concatenate([initial[None], projected])
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
     lost = jnp.min(jnp.where(reached & ~(violated <= problem.drift_tol), np.arange(float(len(ts))), np.inf))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, Status.STEP_LIMIT, Status.STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, Status.DONE, status)
     status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
-    found = evaluations(run.controller_state)
-    right_hand_sides = jnp.where(found == NOT_COUNTED, NOT_COUNTED, found + (problem.h is None))  # one chooses the first step
+    count = evaluations(run.controller_state)
+    right_hand_sides = jnp.where(count == NOT_COUNTED, NOT_COUNTED, count + (problem.h is None))  # one chooses the step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
     output = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides)
@@ -67,9 +67,9 @@ def integrate_by_diffrax(
 
 
 def _leave_breakpoints(problem: Problem) -> Float[Array, "T"]:
-    """Return the times of a run moved to just after a breakpoint at the first time, and just before one at the last.
+    """Return the times of a run; a first or last time at a breakpoint is moved just inside the run.
 
-    A breakpoint closer than the smallest step counts as equal: no step leads from the one time to the other.
+    A breakpoint closer than the smallest step counts as equal, since no step is that short.
     """
     ts, breakpoints = problem.ts, problem.compiled.breakpoints
     if breakpoints is None:
@@ -95,8 +95,8 @@ def _first_step(problem: Problem, equations: AbstractSystem, y0: Array) -> Array
 def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, unit: Array) -> Array:
     """Return a step over which the state y (n,), with this slope, changes by a hundredth of itself or, if more, of its unit.
 
-    As in Hairer, Norsett, Wanner, II.4, without its second evaluation: the controller corrects what is off. The unit is that of
-    `atol`: a state that is zero, or zero but for rounding, changes by none of itself.
+    As in Hairer, Norsett, Wanner, II.4, without the second evaluation: the controller corrects the step. The unit, that of
+    `atol`, is needed for states that are zero, exactly or to rounding.
     """
     y, slope, span, rtol, atol, unit = stop_gradients((y, slope, span, rtol, atol, unit))
     scale = atol * unit + rtol * jnp.abs(y)
@@ -107,7 +107,7 @@ def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, un
 
 
 def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
-    # Every coordinate and velocity meets its tolerance: the mean over a large mechanism would hide one that does not.
+    # Every coordinate and velocity must meet its tolerance; a mean over a large mechanism would hide large errors of a few.
     settings: dict[str, Any] = {"norm": optx.max_norm, "dtmin": problem.smallest, "force_dtmin": False}
     if is_explicit(problem.compiled.plan.solver):  # the same steps as by machine code
         settings |= {"safety": FACTORS.safety, "factormin": FACTORS.shrink, "factormax": FACTORS.grow}
@@ -120,8 +120,8 @@ def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
 class _FrozenSteps(diffrax.PIDController):
     """A step controller whose steps have no derivatives.
 
-    A step of the controller depends on the previous one: after a breakpoint has cut one short, the following ones, each up to ten
-    times as long, would have derivatives along it that grow as fast.
+    Each step depends on the previous one. After a step that a breakpoint has shortened, the following steps grow by factors of up
+    to ten, and their derivatives by the shortened step would grow equally fast.
     """
 
     def adapt_step_size(self, *args: Any, **kwargs: Any) -> Any:

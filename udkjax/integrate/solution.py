@@ -44,7 +44,7 @@ class Result(PrintsWords):
 
     @property
     def is_success(self) -> bool:
-        """True if the run went as far as it should: to its last time, or to an event that ends it."""
+        """True if the run reached its last time, or an event that ends it."""
         return self in SUCCESSES
 
     def __str__(self) -> str:
@@ -53,7 +53,7 @@ class Result(PrintsWords):
 
 SUCCESSES = (Result.successful, Result.event_stop, Result.at_rest)
 
-# Causes that every run with the result shares. `Solution.cause` says more of a single run, where more is found.
+# The cause of each result, common to all runs. `Solution.cause` is more specific for a single run, if possible.
 CAUSES = {
     Result.successful: "the end time was reached",
     Result.step_limit: "the limit on steps was reached; raise `max_steps`, loosen the tolerances, or look for what is stiff",
@@ -79,7 +79,7 @@ CAUSES = {
 }
 
 
-_ORDER = "steps rejected right_hand_sides projections events"  # of counts in texts: jit sorts the names
+_ORDER = "steps rejected right_hand_sides projections events"  # order of counts in texts, since jit sorts the names
 
 
 class SimulationError(RuntimeError):
@@ -96,10 +96,10 @@ class SimulationError(RuntimeError):
 
 
 class Solution(PrintsTable):
-    """States of a mechanism at the output times, how the run ended, and what it took.
+    """The states of a mechanism at the output times, the way in which the run ended, and its cost.
 
-    `q` and `v` are (T, bodies, 3): x, y (m) and angle (rad) and their rates; not a number after the time of a failure. `code` is
-    a `Result`, `time` the time (s) that was reached, or at which the drift was first seen.
+    `q` and `v` are (T, bodies, 3): x, y (m) and angle (rad) and their rates; NaN after a failure. `code` is a
+    `Result`, `time` the time (s) that was reached, or of the first output with too much drift.
 
     Attributes:
         ts: output times (s).
@@ -122,12 +122,12 @@ class Solution(PrintsTable):
     atol: Float[Array, ""]
     bodies: tuple[str, ...] = eqx.field(static=True)
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
-    events: "Events | None" = None  # `Events`, where there were any to look for
+    events: "Events | None" = None  # `Events` of a run with events
     found_cause: Any = eqx.field(static=True, default=None, repr=False)  # `FoundCause` of a single run that failed
 
     @property
     def settings(self) -> dict[str, str]:
-        """The choices that were made, by name: the method, the solver, the engine and why it was taken, ..."""
+        """The choices of the run, by name: the method, the solver, the engine and the reason for it, ..."""
         return dict(self.choices)
 
     @property
@@ -139,7 +139,7 @@ class Solution(PrintsTable):
 
     @property
     def cause(self) -> str:
-        """The end of the run, in words; the cause of a failure is looked for when this is first read, for up to a second."""
+        """The end of the run, in words. The first access searches for the cause of a failure, for up to a second."""
         found = self.found_cause and self.found_cause.text(int(self.code), float(self.time))
         if self.events is not None and (names := self.events.undefined_names):
             found = f"the condition of {names} is not a number; look at what it divides by, or takes the root of"
@@ -171,14 +171,14 @@ class Solution(PrintsTable):
         return frame_over_time(self.bodies, self.q, self.v, body)
 
     def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
-        """Return the path (m) of a point given in the body's own frame (m). `udkjax.path` knows pins, too, and velocities."""
+        """Return the path (m) of a point given in the body's own frame (m). `udkjax.path` also supports pins and velocities."""
         return jnp.stack(self.frame(body).point(number(point)), -1)
 
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
-        """Return an xarray Dataset: q and v over time, body, coordinate, with units, versions, settings, result and statistics.
+        """Return an xarray Dataset: q and v over time, body and coordinate, units, versions, settings, result and statistics.
 
-        With the mechanism, its numbers (the attribute `parameters`, as JSON) and its text (`scene`, as TOML) are inside too, and
-        what its drivers exert (`effort` over time, driver): torques (N m) and forces (N), as `udkjax.efforts` returns them.
+        If `mechanism` is given, the dataset also has its numbers (the attribute `parameters`, as JSON), its text (`scene`, as
+        TOML) and the efforts of its drivers (`effort` over time and driver): torques (N m) and forces (N), by `udkjax.efforts`.
         """
         with OptionalImport():
             import xarray
@@ -221,13 +221,13 @@ def format_work(stats: Mapping[str, ArrayLike]) -> str:
 
 
 def scene_text(mechanism: Mechanism) -> str:
-    """Return a mechanism as the text of a scene file, or why it has none."""
+    """Return a mechanism as the text of a scene file, or the reason why this is impossible."""
     from udkjax.scene.checks import SceneError
     from udkjax.scene.files import dumps
 
     try:
         return dumps(mechanism)
-    except SceneError as error:  # classes of the user's own have no text
+    except SceneError as error:  # user-defined classes cannot be written
         return f"# {error}"
 
 

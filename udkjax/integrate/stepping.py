@@ -26,8 +26,8 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
-STORED_POINTS = 6  # accepted steps of one interval that reverse mode has stored; of more than that it runs again
-MOST_STEPS_OF_INTERVAL = 1_000  # within one interval
+STORED_POINTS = 6  # accepted steps of an interval stored for reverse mode; with more the interval is integrated again
+MOST_STEPS_OF_INTERVAL = 1_000  # default
 
 
 @checked
@@ -45,16 +45,16 @@ def step(
 ) -> State:
     """Return the state one control interval later, with inputs held constant.
 
-    For `jax.lax.scan`, jit, vmap and grad: all numbers may be traced. The integrator chooses its own steps within the interval,
-    the first of which is the whole interval. Nothing is assembled: projection keeps states on the constraints, so begin with one
-    of `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster.
+    For `jax.lax.scan`, jit, vmap and grad: all numbers may be traced. The integrator chooses its steps within the interval;
+    the first step tried is the whole interval. The state is not assembled: projection keeps states on the constraints, so begin
+    with a state from `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster.
 
     Args:
         mechanism: the mechanism.
         state: the state at the beginning.
-        inputs: values of parameters by name, as in `with_parameters`, such as {"force.motor.value": 1.5}; None: there are none.
+        inputs: values of parameters by name, as in `with_parameters`, such as {"force.motor.value": 1.5}; None: no inputs.
         dt: the length of the interval (s), greater than zero.
-        t: the time at its beginning (s), for drivers and whatever else depends on time.
+        t: the time at its beginning (s), for drivers and everything else that depends on time.
         rtol: relative tolerance, as in `simulate`.
         atol: absolute tolerance, as in `simulate`.
         max_steps: the largest number of steps tried.
@@ -76,9 +76,9 @@ def step(
             return _advance(mechanism, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
         values, numbers = ({name: number(x) for name, x in given.items()} for given in (values, numbers))
         return _advance_at_once(mechanism.without_origin, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
-    parts = _parts(mechanism, analysis)
-    run = _program(parts.form, max_steps, engine)
-    q, v = run(parts.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
+    split = _parts(mechanism, analysis)
+    run = _program(split.form, max_steps, engine)
+    q, v = run(split.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
     if not np.isfinite(np.asarray(q)).all():
         ts = np.asarray(t, float) + np.array([0.0, 1.0]) * np.asarray(dt, float)
         tolerances: Any = {"rtol": rtol, "atol": atol, "dt0": dt, "max_steps": max_steps}
@@ -99,14 +99,14 @@ def _advance(
 ) -> State:
     dt, t, rtol, atol = (number(numbers[name]) for name in ("dt", "t", "rtol", "atol"))
     moved = mechanism.with_parameters(values).without_origin if values else mechanism.without_origin
-    is_concrete = not isinstance(t, Tracer) and not isinstance(dt, Tracer)  # and stays so while something else is traced
+    is_concrete = not isinstance(t, Tracer) and not isinstance(dt, Tracer)  # concrete even while something else is traced
     ts = number(np.array([float(t), float(t) + float(dt)])) if is_concrete else jnp.stack([t, t + dt])
     choices = Choices(rtol, atol, DRIFT_PROJECTED, dt, AUTO, Projection(), max_steps=max_steps, engine=engine)
     compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, None, choices)
     raw = differentiable(replace(run.problem, points=STORED_POINTS), has_concrete_times)
     good = stop_gradients(run.is_usable & raw.reached[-1] & jnp.isinf(raw.lost))
-    failed = jnp.where(good, 0.0, jnp.nan)  # added: a choice would be one more thing to store for reverse mode
+    failed = jnp.where(good, 0.0, jnp.nan)  # added, since `where` would store one more array for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
 
 
@@ -114,22 +114,22 @@ _advance_at_once = deferred(_advance)
 
 
 class MechanismParts(NamedTuple):
-    """A mechanism and its analysis, taken apart."""
+    """A mechanism and its analysis, split into structure and numbers."""
 
-    form: Hashable  # all but the numbers
+    form: Hashable  # the tree structure
     leaves: list[Array]
 
 
 @cached_by_identity
 def _parts(mechanism: Mechanism, analysis: Analysis | None) -> MechanismParts:
-    """Return a mechanism taken apart: once, however many steps it takes."""
+    """Return the parts of a mechanism, cached for all of its steps."""
     leaves, form = jax.tree.flatten((mechanism.without_origin, analysis or analyse(mechanism)))
     return MechanismParts(form, leaves)
 
 
 @lru_cache(maxsize=64)
 def _program(form: Any, max_steps: int, engine: str) -> Callable[..., tuple[Array, Array]]:
-    """Return the step as one program for all mechanisms of a structure."""
+    """Return the step as a program for all mechanisms with one structure."""
 
     def run(leaves: list[Array], q: Array, v: Array, values: dict[str, Array], numbers: dict[str, Array]) -> tuple[Array, Array]:
         mechanism, analysis = jax.tree.unflatten(form, leaves)

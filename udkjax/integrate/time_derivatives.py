@@ -4,7 +4,7 @@ With the flow Phi of y' = f(t, y), the state at t_k of a run that begins at t_0 
 
     d/dt_k = f(t_k, y_k),        d/dt_0 = -(dy_k/dy_0) f(t_0, y_0).
 
-So a run of fixed times serves: its first state and its outputs are moved along f for a time s that is zero, but has derivatives.
+The run itself has fixed times: its first state and its outputs are moved along f for a time s that is zero, but has derivatives.
 """
 
 from abc import abstractmethod
@@ -26,7 +26,7 @@ from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_
 
 
 def run_of_times(run: Callable[[Problem], IntegratorOutput], problem: Problem) -> IntegratorOutput:
-    """Return `run(problem)`, of a function that has no derivatives along `problem.ts`, with these derivatives of q and v."""
+    """Return `run(problem)` with derivatives of q and v along `problem.ts`, which the function `run` does not have."""
     ts = stop_gradients(problem.ts)
     move = partial(_move, replace(problem, ts=ts))
     q, v = move(problem.ts[0], problem.q, problem.v, ts[0] - problem.ts[0])
@@ -39,14 +39,14 @@ def _move(
     problem: Problem, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"], s: Float[Array, ""]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     problem_of, numbers = split_numbers(problem)
-    # A state is batched wherever its changes are: JAX takes for granted that rules of derivatives return values as they were.
+    # A state is batched wherever its changes are, since JAX requires that derivative rules return values with unchanged batching.
     zero = sum(map(zero_of, (s, t, *numbers)))
     q, v = _state_after(StateAfter(RatesOfState(problem_of)), [s, t, q + zero, v + zero, *numbers])
     return q, v
 
 
 class Rates(eqx.Module):
-    """The rates x' of some numbers x."""
+    """The rates x' of numbers x."""
 
     @abstractmethod
     def __call__(self, x: list[Array]) -> list[Array]:
@@ -54,7 +54,7 @@ class Rates(eqx.Module):
 
 
 class RatesOfState(Rates):
-    """The rates of time, q and v, and those of the numbers of a problem, which stay as they are."""
+    """The rates of time, q and v, and of the numbers of a problem, which are constant."""
 
     problem: TreeOfNumbers
 
@@ -76,7 +76,7 @@ class RatesOfChange(Rates):
 
 
 class StateAfter(DifferentiableFunction):
-    """q and v after a time s = 0, of s, t, q, v and the numbers of a problem."""
+    """q and v after a time s = 0, as a function of s, t, q, v and the numbers of a problem."""
 
     rates: RatesOfState
 
@@ -125,7 +125,7 @@ def _(primals, tangents):
 
 @eqx.filter_custom_jvp
 def _after(rates: Rates, x: list[Array], s: Float[Array, ""]) -> list[Array]:
-    """Return x(s) of x' = rates(x), for s = 0: it is x, and has the derivatives of x(s), of any order, by forward mode."""
+    """Return x(s) of x' = rates(x) at s = 0: the value x, with forward-mode derivatives of x(s) of any order."""
     del rates, s
     return x
 

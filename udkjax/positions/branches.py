@@ -60,7 +60,7 @@ def branches(
 def _close(
     mechanism: Mechanism, analysis: Analysis, s: Float[Array, ""], guesses: Float[Array, "count bodies 3"]
 ) -> tuple[Array, Array]:
-    def one(q: Float[Array, "bodies 3"]) -> tuple[Array, Array]:
+    def close_one(q: Float[Array, "bodies 3"]) -> tuple[Array, Array]:
         found = close(mechanism, s, State(q, jnp.zeros_like(q)), analysis=analysis)
         return found.state.q, jnp.asarray(found.is_closed)
 

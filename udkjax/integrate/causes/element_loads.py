@@ -22,8 +22,8 @@ class ElementLoads(NamedTuple):
     """Loads of the force elements at states, and the fastest rates (1/s) of their damping and stiffness."""
 
     names: tuple[str, ...]
-    size: np.ndarray  # (states, elements): largest acceleration of its bodies, in L / s^2 and rad / s^2
-    jump: np.ndarray  # (states, elements): its largest change from the first state, in the same units
+    size: np.ndarray  # (states, elements): largest acceleration of the element's bodies, in L / s^2 and rad / s^2
+    jump: np.ndarray  # (states, elements): largest change of these accelerations from the first state, in the same units
     damping: np.ndarray  # (states, elements), 1/s
     stiffness: np.ndarray  # (states, elements), 1/s
 
@@ -42,10 +42,10 @@ def element_loads(mechanism: Mechanism, length: float, states: Sequence[TimedSta
         a = loads / moving / unit
         size[:, kind.members] = np.abs(a).max(-1, initial=0.0)
         jump[:, kind.members] = np.abs(a - a[:1]).max(-1, initial=0.0)
-        root = np.sqrt(moving)
-        for found, matrix, power in ((stiffness, by_q, 0.5), (damping, by_v, 1.0)):
-            scaled = np.nan_to_num(matrix / root[:, :, None] / root[:, None, :], posinf=0.0, neginf=0.0)
-            found[:, kind.members] = np.linalg.norm(scaled, 2, axis=(-2, -1)) ** power if moving.shape[1] else 0.0
+        sqrt_mass = np.sqrt(moving)
+        for rates, matrix, power in ((stiffness, by_q, 0.5), (damping, by_v, 1.0)):
+            scaled = np.nan_to_num(matrix / sqrt_mass[:, :, None] / sqrt_mass[:, None, :], posinf=0.0, neginf=0.0)
+            rates[:, kind.members] = np.linalg.norm(scaled, 2, axis=(-2, -1)) ** power if moving.shape[1] else 0.0
     return ElementLoads(tuple(names), size, jump, damping, stiffness)
 
 
@@ -67,10 +67,10 @@ def _load(element: ForceElement, t: Array, frames: Sequence[Frame]) -> tuple[Arr
     moving = [k for k, frame in enumerate(frames) if isinstance(frame.x, Array)]
 
     def placed(q: Array, v: Array) -> list[Frame]:
-        found = list(frames)
+        moved_frames = list(frames)
         for k, (x, y, angle), (vx, vy, omega) in zip(moving, q.reshape(-1, 3), v.reshape(-1, 3), strict=True):
-            found[k] = Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
-        return found
+            moved_frames[k] = Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
+        return moved_frames
 
     def load(q: Array, v: Array) -> Array:
         total = jnp.zeros(len(q))

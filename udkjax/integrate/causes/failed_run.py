@@ -20,7 +20,7 @@ class FailedRun:
     mechanism: Mechanism
     analysis: Analysis
     result: Result
-    time: float  # s
+    time: float  # (s)
     ts: np.ndarray  # (T,)
     q: np.ndarray  # (T, n); NaN at times that were not reached
     v: np.ndarray
@@ -31,7 +31,7 @@ class FailedRun:
     drift_tol: float
     is_projected: bool
     is_explicit: bool  # whether the solver is explicit
-    drops_rows: bool  # whether the method leaves out the rows that the analysis found redundant
+    drops_rows: bool  # whether the method leaves out rows that are redundant by the analysis
     formulation: str
 
     @cached_property
@@ -68,5 +68,5 @@ class FailedRun:
         return np.linalg.svd(D, full_matrices=False)[:2] if np.all(np.isfinite(D)) else (D, np.full(len(D), np.nan))
 
     def open_rows(self, t: float, q: np.ndarray) -> str:
-        """Name the open constraints at a position, the widest first, each with its residual (m, rad)."""
+        """Name the open constraints at a position, the largest residual first, each with its residual (m, rad)."""
         return name_open_rows([name for name, _ in self.rows.names], self.psi(t, q), self.row_scales, self.drift_tol)

@@ -1,8 +1,8 @@
 """The reach of drivers: the value beyond which constraints cannot be closed, and the cause.
 
 The position is followed in small steps of time from the last good state until one cannot be closed; that step is then bisected.
-Rows with impossible demands are in the left null space of D. At a dead point they are dependent only there; rows of drivers that
-contradict each other, or the joints, are dependent in every position.
+Rows with impossible demands are in the left null space of D. At a dead point, rows are dependent in that position only; rows of
+drivers that contradict each other, or the joints, are dependent in every position.
 """
 
 from typing import NamedTuple
@@ -16,19 +16,19 @@ from udkjax.scene.drivers import Driver
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
-REACH_STEPS = 32  # from the last good state to the time of the failure
-REACH_HALVINGS = 34  # of the failing step: to 2e-12 of the time to the failure
+REACH_STEPS = 32  # number of steps from the last good state to the time of the failure
+REACH_HALVINGS = 34  # bisections of the failing step: to 2e-12 of the time to the failure
 DEAD_POINT_TOL = 1e-2  # relative to the largest singular value of D: smaller ones belong to the dead point, found to 1e-5 or so
 INVOLVED_SHARE = 1e-3  # relative to the largest row of a combination: smaller rows are not involved
-IN_LINE = 1e-3  # rad
+IN_LINE = 1e-3  # (rad)
 STATES_TRIED = 4  # states to start from
-SAME_BRANCH = 1.0  # rad, characteristic lengths: larger changes lead to another branch
+SAME_BRANCH = 1.0  # in rad and characteristic lengths: larger changes lead to another branch
 
 
 class Reach(NamedTuple):
     """The last position that closes, and the constraints with impossible demands."""
 
-    t: float  # s
+    t: float  # (s)
     q: np.ndarray  # (n,)
     owners: frozenset[str]  # constraints whose rows contradict each other
 
@@ -38,10 +38,10 @@ def explain_reach(run: FailedRun, until: float) -> str:
     mechanism = run.mechanism
     if not mechanism.drivers:
         return ""
-    found = _find_reach(run, until)
-    if found is None:
+    reach = _find_reach(run, until)
+    if reach is None:
         return ""
-    names = [name for name in mechanism.driver_names if name in found.owners]
+    names = [name for name in mechanism.driver_names if name in reach.owners]
     if not names:
         return ""
     opposed = _opposed(mechanism, names)
@@ -49,12 +49,12 @@ def explain_reach(run: FailedRun, until: float) -> str:
     where = f"at {until:.6g} s"
     if opposed and len(names) > 1:
         listed = " and ".join(f'"{name}"' for name in names)
-        return f"drivers {listed} contradict each other: {demands} {where}; take one out, or change its motion"
+        return f"drivers {listed} contradict each other: {demands} {where}; remove one, or change its motion"
     if opposed:
-        return f"{demands} {where}, where the joints leave its coordinate no motion; take it out, or free the coordinate"
-    reached = " and ".join(_value(mechanism.drivers[name], found.t) for name in names)
-    point = dead_point(mechanism, found, names)
-    return f"{demands} {where}; the linkage reaches {reached}, at {found.t:.6g} s ({point})"
+        return f"{demands} {where}, where the joints leave its coordinate no motion; remove the driver, or free the coordinate"
+    reached = " and ".join(_value(mechanism.drivers[name], reach.t) for name in names)
+    point = dead_point(mechanism, reach, names)
+    return f"{demands} {where}; the linkage reaches {reached}, at {reach.t:.6g} s ({point})"
 
 
 def _find_reach(run: FailedRun, until: float) -> Reach | None:
@@ -94,7 +94,7 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
 
 
 def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozenset[str]:
-    """Return the constraints with impossible demands after a time: with demands outside of the range of D."""
+    """Return the constraints whose demands after a time are impossible: outside the range of D."""
     rows = run.rows
     psi, length, D = rows.at(t, q)
     u, sigma, _ = np.linalg.svd(dense(D))
@@ -103,7 +103,7 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
     N = u[:, null]
     demand = N @ (N.T @ ((rows.at(until, q)[0] - psi) / length))
     involved = np.abs(demand) > INVOLVED_SHARE * np.abs(demand).max(initial=0.0)
-    return frozenset(name for (name, _), part in zip(rows.names, involved, strict=True) if part)
+    return frozenset(name for (name, _), is_involved in zip(rows.names, involved, strict=True) if is_involved)
 
 
 def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
@@ -118,7 +118,7 @@ def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
     frames = found.q.reshape(-1, 3)
     driven = {GROUND, *(body for name in drivers for body in mechanism.drivers[name].bodies)}
 
-    def place(name: str) -> np.ndarray:
+    def position_of(name: str) -> np.ndarray:
         joint = mechanism.joints[name]
         body, point = next((b, np.asarray(p, float)) for b, p in zip(joint.bodies, joint.points, strict=True) if b in index)
         x, y, angle = frames[index[body]]
@@ -129,16 +129,16 @@ def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
     links = {body: [p for p in mechanism.joints if p in pins and body in mechanism.joints[p].bodies] for body in index}
     links = {body: ends for body, ends in links.items() if len(ends) == 2 and body not in driven}
     lines: list[list[str]] = []
-    for one, (a, b) in links.items():
+    for link, (a, b) in links.items():
         for other, ends in links.items():
             shared = {a, b} & set(ends)
-            if one >= other or len(shared) != 1:
+            if link >= other or len(shared) != 1:
                 continue
             (middle,) = shared
             chain = [*({a, b} - shared), middle, *(set(ends) - shared)]
-            u, w = place(chain[1]) - place(chain[0]), place(chain[2]) - place(chain[1])
+            u, w = position_of(chain[1]) - position_of(chain[0]), position_of(chain[2]) - position_of(chain[1])
             if abs(u[0] * w[1] - u[1] * w[0]) <= IN_LINE * np.linalg.norm(u) * np.linalg.norm(w):
-                lines.append(chain if index[one] < index[other] else chain[::-1])
+                lines.append(chain if index[link] < index[other] else chain[::-1])
     if lines:
         return "dead point: " + " and ".join(f"pins {', '.join(line)} in line" for line in lines)
     joints = [name for name in mechanism.joints if name in found.owners]

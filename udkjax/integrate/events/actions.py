@@ -1,7 +1,7 @@
 """Actions: what an event does.
 
-A new action is a class here, its name in the stubs, and, if nothing below says what it does, a jump of its own in `jumps`. The
-plan of a run, its phases and pages read the attributes and methods of `Action`; no other module asks for the type of an action.
+To add an action, write a class here, and add its name to the stubs. If the attributes of `Action` cannot describe the effect, add
+a jump in `jumps`. The plan of a run, its phases and pages use attributes and methods of `Action`, never the type of an action.
 """
 
 from typing import Any, ClassVar, Literal
@@ -25,11 +25,11 @@ class Action(PrintsLine):
     """The base of all actions, which changes nothing about constraints or velocities.
 
     Attributes:
-        is_impact: reverses the rate of its condition, which then falls to zero and depends on positions alone.
-        stops: ends the run.
-        changes: changes the motion; an event that does not leaves contacts as they are.
-        adds: adds a joint, its `addition`.
-        on_page: the engine of live pages knows it.
+        is_impact: whether it reverses the rate of its condition, which must fall to zero and depend on positions alone.
+        stops: whether it ends the run.
+        changes: whether it changes the motion; if not, contacts stay as they are.
+        adds: whether it adds a joint, its `addition`.
+        on_page: whether the engine of live pages supports it.
     """
 
     is_impact: ClassVar[bool] = False
@@ -40,7 +40,7 @@ class Action(PrintsLine):
 
     @property
     def rebound(self) -> Any:
-        """The part of the approaching speed that comes back."""
+        """The ratio of the rebound speed to the approach speed."""
         return 0.0
 
     @property
@@ -50,18 +50,18 @@ class Action(PrintsLine):
 
     @property
     def removed(self) -> frozenset[str]:
-        """The names of the constraints that it takes away."""
+        """The names of the constraints that the action removes."""
         return frozenset()
 
     def addition(self, mechanism: Mechanism, where: str) -> tuple[str, Joint] | None:
-        """Return the name of the joint that it adds, and the joint, without the numbers that the state at the event decides."""
+        """Return the name of the joint that it adds, and the joint without the numbers that depend on the state at the event."""
         return None
 
     def check(self, mechanism: Mechanism, where: str):
         """Raise an error, whose message begins with `where`, if its arguments do not fit a mechanism."""
 
     def has_usable_numbers(self) -> Bool[Array, ""]:
-        """Tell whether its numbers, which may be traced, are within their limits."""
+        """Return whether its numbers, which may be traced, are within their limits."""
         return jnp.array(True)
 
 
@@ -81,12 +81,12 @@ class Log(Action):
 
 
 class Impact(Action):
-    """Reverse the rate of the condition, g >= 0 being what is allowed: g_dot+ = -restitution g_dot-.
+    """Reverse the rate of the condition, to keep g >= 0: g_dot+ = -restitution g_dot-.
 
-    All contacts that are closed at the instant are hit together: no impulse pulls, none is penetrated, energy never grows
-    (`impacts`). The jump of the velocities is the smallest in the metric of M that keeps all constraints: no friction. Rebounds
-    that have become too small to follow end in rest: with `at_rest="hold"` the condition is held at zero, as a constraint, until
-    the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
+    All contacts that are closed at that instant are hit together: no impulse pulls, no contact is penetrated, and energy never
+    grows (`impacts`). The jump of the velocities is the smallest in the metric of M that keeps all constraints: no friction. A
+    contact whose rebounds are too small to follow comes to rest: with `at_rest="hold"` the condition is held at zero, as a
+    constraint, until the contact would have to pull; with "stop" the run ends there (`Result.at_rest`).
 
     Args:
         restitution: ratio of the rebound speed to the approach speed, 0 to 1.
@@ -117,7 +117,7 @@ class Impact(Action):
 
 
 class Release(Action):
-    """Remove a joint or driver from then on, by its name: one of the scene's, or one that `Attach` or `Lock` has added.
+    """Remove a joint or driver for the rest of the run: one of the scene, or a joint that `Attach` or `Lock` has added.
 
     Args:
         name: name of the joint or driver.
@@ -134,13 +134,13 @@ class Release(Action):
 
 
 class Attach(Action):
-    """Add a joint, under a `name`, from then on. Numbers that it leaves to the guess are those of the state at the event.
+    """Add a joint for the rest of the run. Numbers that default to the initial guess are taken from the state at the event.
 
     Velocities jump as in an inelastic impact: the smallest change in the metric of M that the new constraints allow.
 
     Args:
         joint: such as `Revolute(...)`.
-        name: under which it is added.
+        name: the name of the added joint.
     """
 
     joint: Joint
@@ -161,7 +161,7 @@ class Attach(Action):
 
 
 class Lock(Action):
-    """Stop all motion in a revolute or prismatic joint or a slot's sliding, where it is, as `Attach` does.
+    """Lock a revolute or prismatic joint, or the sliding of a slot, in its position at the event, as if by `Attach`.
 
     Its constraint is named after the joint, with ".lock" appended: `Release("elbow.lock")` removes it again.
 
@@ -185,14 +185,14 @@ class Lock(Action):
 
 
 class Displacement(Joint):
-    """Point 2 stays where it is along `axis` of body 1. 1 row (m): its distance from point 1 along it, less `position`."""
+    """Point 2 keeps its place along `axis` of body 1. 1 row (m): its distance from point 1 along the axis, less `position`."""
 
     points: Float[Array, "2 2"] = eqx.field(converter=number)
     axis: Float[Array, ""] = eqx.field(converter=number)
     position: Float[Array, ""] | None = eqx.field(converter=optional_number, default=None)
 
     def residual(self, t, *frames):
-        assert self.position is not None  # `complete` fills it in
+        assert self.position is not None  # set by `complete`
         return [self._along(*frames) - self.position]
 
     def complete(self, *frames):

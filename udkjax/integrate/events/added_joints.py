@@ -1,4 +1,4 @@
-"""Joints that events add, for machine code: their numbers as programs of the state at the event, and the places these go to."""
+"""Joints that events add, for machine code: programs that compute their numbers from the state at the event, and their places."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,23 +19,23 @@ class AddedJoint(NamedTuple):
     """A joint that an event adds."""
 
     event: int
-    program: ScalarProgram  # all numbers of the joint, of q and the numbers that do not depend on it
+    program: ScalarProgram  # computes all numbers of the joint from q and its constant numbers
 
 
 class NumberOf(NamedTuple):
-    """The number of values of a leaf of a joint, in its place."""
+    """A placeholder for a leaf of a joint: its number of values."""
 
     size: int
 
 
 def joint_numbers(phases: Phases) -> list[Array]:
-    """Return the numbers of all joints that events add, except those that the state decides."""
+    """Return the numbers of all joints that events add, except those that depend on the state."""
     return jax.tree.leaves(eqx.filter(phases.added, eqx.is_inexact_array))
 
 
 def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
     """Return the joints that events add."""
-    names, found = phases.mechanisms[0].body_names, []
+    names, joints = phases.mechanisms[0].body_names, []
     for (event, _), joint in zip(phases.added_by, phases.added, strict=True):
         arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten(arrays)
@@ -48,12 +48,12 @@ def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
         closed = jax.make_jaxpr(numbers)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
         inputs = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
         outputs = [x for array in read_jaxpr(graph, closed, inputs) for x in array.flat]
-        found.append(AddedJoint(event, ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs)))
-    return tuple(found)
+        joints.append(AddedJoint(event, ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs)))
+    return tuple(joints)
 
 
 def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Return the places of the numbers of joints among all numbers of a mechanism; none of a joint that it does not have."""
+    """Return the places of the numbers of joints among all numbers of a mechanism; empty for joints that the mechanism lacks."""
     found = []
     for name in names:
         if name not in mechanism.joint_names:
@@ -71,5 +71,5 @@ def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[
 
 
 def evaluate_joint(joint: AddedJoint, q: Float[np.ndarray, "b n"], numbers: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b m"]:
-    """Return all numbers of a joint that is added at some states."""
+    """Return all numbers of a joint that is added in the given states."""
     return np.array([joint.program([*map(float, row), *map(float, own)]) for row, own in zip(q, numbers, strict=True)], float)

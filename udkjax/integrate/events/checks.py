@@ -12,7 +12,7 @@ from udkjax.scene.joints import Joint
 
 
 def number_if_any(value: Any) -> Any:
-    """Convert a number to an array leaf; return anything else unchanged, for the checks to name it."""
+    """Convert a number to an array leaf; return anything else unchanged, so that checks can report it."""
     try:
         return None if value is None else number(value)
     except (TypeError, ValueError):

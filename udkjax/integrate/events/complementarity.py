@@ -1,8 +1,9 @@
 """Linear complementarity problems of contacts: 0 <= x, y = W x + b >= 0, x y = 0, for a symmetric W >= 0 of a few rows.
 
 These are the conditions of the minimum of x W x / 2 + b x over x >= 0. Lawson and Hanson's active-set method (Solving Least
-Squares Problems, 1974, chapter 23) finds the positive x, the passive set, in few steps, and keeps its rows independent; x then
-solves linear equations, whose derivatives are taken. Arrays are those of JAX or NumPy, with any leading dimensions.
+Squares Problems, 1974, chapter 23) determines the positive x, the passive set, in few steps, and keeps the rows of this set
+independent. x is then the solution of linear equations, and has its derivatives. Arrays are those of JAX or NumPy, with any
+leading dimensions.
 """
 
 from types import ModuleType
@@ -17,7 +18,7 @@ from udkjax.transforms.gradients import stop_gradients
 
 # Tolerance on y >= 0, relative to max |b|, for rows of unit size. Rounding errors are some 1e-15, more for nearly dependent rows.
 TIGHT = 1e-12
-STEPS_PER_ROW = 6  # Lawson and Hanson found half a step per row; the limit stops cycles by rounding
+STEPS_PER_ROW = 6  # Lawson and Hanson observed half a step per row; the limit stops cycles caused by rounding
 
 
 class Complementary(NamedTuple):
@@ -47,7 +48,7 @@ def solve_complementarity(
     Args:
         W: symmetric, and positive semidefinite.
         b: y for x = 0.
-        allowed: mask of the x that may be positive; the others are zero for any y.
+        allowed: mask of the x that may be positive; all others are zero, whatever y is.
         floor: tolerance on y >= 0.
         xp: jax.numpy, or NumPy.
 
@@ -74,38 +75,38 @@ def times(W: Any, x: Any) -> Any:
 
 def _solve_passive(W: Any, b: Any, passive: Any, xp: ModuleType) -> Any:
     """Return x with (W x + b) = 0 in the passive set, and x = 0 elsewhere."""
-    both = passive[..., None, :] & passive[..., :, None]
-    matrix = xp.where(both, W, xp.eye(W.shape[-1]))
+    passive_pairs = passive[..., None, :] & passive[..., :, None]
+    matrix = xp.where(passive_pairs, W, xp.eye(W.shape[-1]))
     return xp.linalg.solve(matrix, xp.where(passive, -b, 0.0)[..., None])[..., 0]
 
 
 def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, xp: ModuleType) -> Any:
-    most = xp.max(xp.where(allowed, xp.abs(b), 0.0), axis=-1, keepdims=True)
-    floor = xp.maximum(floor, TIGHT * most)
+    largest_b = xp.max(xp.where(allowed, xp.abs(b), 0.0), axis=-1, keepdims=True)
+    floor = xp.maximum(floor, TIGHT * largest_b)
     if xp is np and allowed.sum(-1).max(initial=0) <= 1:
         return allowed & (b + floor < 0)
 
-    def step(at: _ActiveSet) -> _ActiveSet:  # no change once done
-        z = _solve_passive(W, b, at.passive, xp)
-        leaves = at.passive & (z <= 0)
-        # Go towards z as far as all x stay positive; entries that are zero there leave the passive set.
-        way = at.x - z
-        part = xp.where(leaves, xp.where(way > 0, at.x / xp.where(way > 0, way, 1.0), 0.0), xp.inf)
-        least = xp.min(part, axis=-1, keepdims=True)
-        partial = at.x + xp.where(xp.isfinite(least), least, 0.0) * (z - at.x)
-        y = xp.where(allowed & ~at.passive, times(W, z) + b + floor, xp.inf)
+    def step(state: _ActiveSet) -> _ActiveSet:  # changes nothing once done
+        z = _solve_passive(W, b, state.passive, xp)
+        leaves = state.passive & (z <= 0)
+        # Go towards z until the first x becomes zero; these entries leave the passive set.
+        decrease = state.x - z
+        fraction = xp.where(leaves, xp.where(decrease > 0, state.x / xp.where(decrease > 0, decrease, 1.0), 0.0), xp.inf)
+        smallest = xp.min(fraction, axis=-1, keepdims=True)
+        partial = state.x + xp.where(xp.isfinite(smallest), smallest, 0.0) * (z - state.x)
+        y = xp.where(allowed & ~state.passive, times(W, z) + b + floor, xp.inf)
         enters = np.arange(b.shape[-1]) == xp.argmin(y, axis=-1)[..., None]
         any_leaves, any_enters = xp.any(leaves, -1, keepdims=True), xp.min(y, axis=-1, keepdims=True) < 0
-        passive = xp.where(any_leaves, at.passive & ~(leaves & (part <= least)), at.passive | (enters & any_enters))
+        passive = xp.where(any_leaves, state.passive & ~(leaves & (fraction <= smallest)), state.passive | (enters & any_enters))
         x = xp.where(passive, xp.where(any_leaves, partial, z), 0.0)
-        return _ActiveSet(x, passive, at.steps + 1, ~xp.any(any_leaves | any_enters))
+        return _ActiveSet(x, passive, state.steps + 1, ~xp.any(any_leaves | any_enters))
 
-    def goes_on(at: _ActiveSet) -> Any:
-        return ~at.done & (at.steps < STEPS_PER_ROW * b.shape[-1] + 2)
+    def goes_on(state: _ActiveSet) -> Any:
+        return ~state.done & (state.steps < STEPS_PER_ROW * b.shape[-1] + 2)
 
-    at = _ActiveSet(xp.zeros_like(b), xp.zeros_like(allowed), xp.asarray(0), xp.asarray(False))
+    state = _ActiveSet(xp.zeros_like(b), xp.zeros_like(allowed), xp.asarray(0), xp.asarray(False))
     if xp is not np:
-        return jax.lax.while_loop(goes_on, step, at).passive
-    while goes_on(at):
-        at = step(at)
-    return at.passive
+        return jax.lax.while_loop(goes_on, step, state).passive
+    while goes_on(state):
+        state = step(state)
+    return state.passive

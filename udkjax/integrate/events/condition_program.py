@@ -21,12 +21,12 @@ from udkjax.scene.mechanism import Mechanism
 
 
 def condition_numbers(events: Sequence[Event]) -> list[Array]:
-    """Return the numbers of all events, in the order in which programs take them."""
+    """Return the numbers of all events, in the order of the inputs of programs."""
     return jax.tree.leaves(eqx.filter(tuple(events), eqx.is_inexact_array))
 
 
 def watched_conditions(events: Sequence[Event], mechanism: Mechanism) -> Conditions | None:
-    """Return the conditions of the events of a mechanism as programs; None where machine code has no instruction for one."""
+    """Return the conditions of the events of a mechanism as programs; None if machine code lacks an instruction for one."""
     is_concrete = not any(isinstance(x, Tracer) for x in condition_numbers(events))
     return _concrete_conditions(mechanism, *events) if is_concrete and mechanism.is_concrete else _conditions(mechanism, *events)
 
@@ -68,9 +68,9 @@ _concrete_conditions = cached_by_identity(_conditions)
 
 
 class _Functions:
-    """The conditions of events that are plain functions, and None for others; equal where what they compute is and stays equal.
+    """The conditions of events that are plain functions, None for others; equal if they compute the same, now and later.
 
-    So their programs are the same, their code, and what it refers to: equal numbers and texts, or the very same objects.
+    Equal conditions have equal programs and code, and refer to equal numbers and strings, or to identical objects.
     """
 
     def __init__(self, events: Sequence[Event], programs: Conditions):
@@ -86,9 +86,13 @@ class _Functions:
 
 def _reference(function: FunctionType) -> Hashable:
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    given = (*cells, *(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values())
-    is_plain = [isinstance(x, int | float | str) for x in given]
-    return function.__code__, id(function.__globals__), *(x if plain else id(x) for x, plain in zip(given, is_plain, strict=True))
+    values = (*cells, *(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values())
+    is_plain = [isinstance(x, int | float | str) for x in values]
+    return (
+        function.__code__,
+        id(function.__globals__),
+        *(x if plain else id(x) for x, plain in zip(values, is_plain, strict=True)),
+    )
 
 
 @lru_cache(maxsize=64)
@@ -97,19 +101,19 @@ def _first_of_equals(functions: _Functions) -> _Functions:
 
 
 def with_cached_functions(events: Sequence[Event], programs: Conditions) -> tuple[Event, ...]:
-    """Return events with functions of earlier ones that have the same programs, so that code compiled for those is used again.
+    """Return events with equal functions of earlier events instead of their own, so that code compiled for these is reused.
 
-    A function that is written within another is a new one in each call.
+    A function defined within another is a new object in each call.
     """
     first = _first_of_equals(_Functions(events, programs)).functions
     return tuple(e if f is None else eqx.tree_at(lambda e: e.condition, e, f) for e, f in zip(events, first, strict=True))
 
 
 def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array of inputs of a graph, the k-th of all."""
+    """Return the k-th array of inputs of a graph."""
     array = np.empty(shape, object)
-    for place in np.ndindex(*shape):
-        array[place] = graph.input((k, place), "condition")
+    for index in np.ndindex(*shape):
+        array[index] = graph.input((k, index), "condition")
     return array
 
 

@@ -85,10 +85,10 @@ def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoord
 
 
 def sees_velocity(condition: Callable[[Number, Frames], Any], mechanism: Mechanism) -> bool:
-    """Tell whether a condition depends on velocities: it then fails with frames that have none."""
+    """Return whether a condition depends on velocities: it then fails with frames without velocities."""
     try:
         return condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel())) is None
-    except (TypeError, AttributeError, ValueError):  # as arithmetic with None raises, of Python, JAX or NumPy
+    except (TypeError, AttributeError, ValueError):  # errors of arithmetic with None, in Python, JAX or NumPy
         return True
 
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-# Conditions smaller than ZERO are zero, and so are smaller first and second rates, per T and T^2; all are relative to the
-# condition's scale, its change by a displacement of L or a turn of one radian. Rounding errors of a state are some 1e-15.
+# Bounds below which a condition, its first rate (per T) and its second rate (per T^2) are zero, relative to the condition's
+# scale: its change by a displacement of L or a turn of one radian. Rounding errors of a state are about 1e-15.
 ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
-PARTS, DIVISIONS = 32, 6  # parts of the bracket of a cubic's root, and number of subdivisions: down to 1e-9 of it
+PARTS, DIVISIONS = 32, 6  # the bracket of a cubic's root is divided into 32 parts 6 times: to 1e-9 of its length
 NO_EVENT = -1
 
 Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slope at 1
@@ -24,7 +24,7 @@ class ConditionValues(NamedTuple):
     rate: Float[Any, "*m E"]
     rate_2: Float[Any, "*m E"]  # 0 for conditions that depend on velocities
     a: Float[Any, "*m n"]
-    scale: Float[Any, "*m E"]  # the change of a condition by a displacement of L, a turn of one radian, or in T
+    scale: Float[Any, "*m E"]  # the change of a condition by a displacement of L, by a turn of one radian, or within T
 
 
 def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType = jnp) -> Int[Any, "*m C"]:

@@ -1,9 +1,10 @@
 """Zero crossings within a window: certain ones, and intervals that are too coarse to decide.
 
 The conditions are evaluated at the nodes of a window, and their rates if they depend on positions alone. Between two nodes a
-condition is a Hermite cubic up to E x^2 (1 - x)^2. E is measured: the error of the cubic over two intervals in the value and rate
-at the node in between, of which one interval has a sixteenth or less. There is exactly one crossing if the Bernstein coefficients
-of the cubic plus and minus this error change sign once (Descartes' rule), and none if they do not. Other intervals are refined.
+condition is a Hermite cubic up to E x^2 (1 - x)^2. E is estimated from the error of the cubic over two intervals, in value and
+rate at the node between them; the error in one interval is at most a sixteenth of that. There is exactly one crossing if the
+Bernstein coefficients of the cubic plus and minus this error change sign once (Descartes' rule), and no crossing if they do not
+change sign. Other intervals are refined.
 """
 
 from typing import NamedTuple
@@ -23,12 +24,12 @@ from udkjax.integrate.events.crossings import (
 )
 from udkjax.native.watching.conditions import RESOLUTION
 
-INTERVALS = 32  # of a window
+INTERVALS = 32  # number of intervals of a window
 # The nodes, relative to a window's length: slightly irregular, so that no oscillation is zero at all of them.
 _shift = 0.2 * np.sin(np.arange(INTERVALS + 1) * 2.4)
 _shift[[0, -1]] = 0.0
 NODES = (np.arange(INTERVALS + 1) + _shift) / INTERVALS
-INTERVALS_OF_JUMP = 6  # intervals too coarse to resolve a jump or a kink, at every scale
+INTERVALS_OF_JUMP = 6  # a jump or a kink makes at most this many intervals coarse, at every scale
 
 REDONE = 4  # intervals before a coarse one that are repeated
 
@@ -51,17 +52,17 @@ class Nodes(NamedTuple):
 class Detection(NamedTuple):
     """The first crossing of conditions in a window."""
 
-    sides: Int[Array, "G C"]  # of zero, at the nodes
+    sides: Int[Array, "G C"]  # sides of zero at the nodes
     place: Int[Array, ""]  # the last node before the first crossing at which its condition is not zero
-    behind: Int[Array, ""]  # the first node after it
+    behind: Int[Array, ""]  # the first node after the crossing
     is_found: Bool[Array, ""]
     event: Int[Array, ""]
-    root: Float[Array, ""]  # between the two, from 0 to 1
-    is_exact: Bool[Array, ""]  # to rounding
+    root: Float[Array, ""]  # place of the crossing between these nodes, from 0 to 1
+    is_exact: Bool[Array, ""]  # whether the root is exact to rounding
     is_coarse: Bool[Array, ""]  # whether this or an earlier interval is too coarse
     last_sure: Int[Array, ""]  # the last node before a coarse interval that is certain
-    coarse: Bool[Array, "C"]  # conditions for which it is too coarse
-    undefined: Bool[Array, "C"]  # conditions that are NaN at its end
+    coarse: Bool[Array, "C"]  # conditions for which that interval is too coarse
+    undefined: Bool[Array, "C"]  # conditions that are NaN at the end of that interval
 
 
 def detect(
@@ -79,20 +80,20 @@ def detect(
 
     Args:
         nodes: the conditions at the nodes of the window.
-        has_rates: conditions with given rates; the rates of others are taken by differences.
+        has_rates: conditions with given rates; the rates of others are estimated by differences.
         direction: direction of the crossings of each condition, 0 for either.
         sides: the sides of zero at the first node.
         scale: scale of each condition.
         located: the condition that certainly crosses zero in this window; -1: none.
         watched: mask of the watched conditions.
-        is_short: whether the window is short enough to take coarse intervals for a jump.
+        is_short: whether the window is so short that coarse intervals must be due to a jump.
         unresolved: mask of the conditions that are not refined.
     """
     t, g, g_dot, good = nodes
     finite = jnp.isfinite(g)
     g = jnp.where(finite, g, 0.0)
-    least = jnp.where(np.arange(len(scale)) == located, 0.0, ZERO * scale)
-    signs = jnp.where((jnp.abs(g) <= least) | ~good[:, None] | ~finite, 0, jnp.sign(g)).astype(int)
+    zero_tol = jnp.where(np.arange(len(scale)) == located, 0.0, ZERO * scale)
+    signs = jnp.where((jnp.abs(g) <= zero_tol) | ~good[:, None] | ~finite, 0, jnp.sign(g)).astype(int)
     sides = carry_signs(sides, signs.at[0].set(0))
     before, after = sides[:-1], sides[1:]
     step = jnp.diff(t)[:, None]
@@ -110,12 +111,12 @@ def detect(
     jumps = is_short & (jnp.sum(coarse, 0) <= INTERVALS_OF_JUMP) & jnp.all(finite, 0)
     coarse = coarse & ~jumps
 
-    found = hits & crosses(direction, before, after) & usable
-    place, coarse_place = (jnp.argmax(jnp.any(x, axis=1)) for x in (found, coarse))
+    is_crossing = hits & crosses(direction, before, after) & usable
+    place, coarse_place = (jnp.argmax(jnp.any(x, axis=1)) for x in (is_crossing, coarse))
     last_sure = jnp.maximum(coarse_place - REDONE, 0)  # earlier intervals may only look fine enough
     at_place: Cubic = (cubic[0][place], cubic[1][place], cubic[2][place], cubic[3][place])
-    root = jnp.where(found[place], cubic_root(at_place, before[place]), jnp.inf)
-    event, is_found = jnp.argmin(root), jnp.any(found)
+    root = jnp.where(is_crossing[place], cubic_root(at_place, before[place]), jnp.inf)
+    event, is_found = jnp.argmin(root), jnp.any(is_crossing)
     is_before = (signs.at[0].set(1)[:, event] != 0) & (np.arange(len(t)) <= place)
     last_before = jnp.where(event == located, place, jnp.max(jnp.where(is_before, np.arange(len(t)), 0)))
     is_coarse = jnp.any(coarse) & ~(is_found & (place < last_sure))
@@ -137,7 +138,7 @@ def detect(
 def _slopes(
     t: Float[Array, "G"], g: Float[Array, "G C"], g_dot: Float[Array, "G C"], has_rates: Bool[np.ndarray, "C"]
 ) -> Float[Array, "G C"]:
-    """Return the rates at the nodes; by differences of second order where they are not given or not finite."""
+    """Return the rates at the nodes, from differences of second order if they are not given or not finite."""
     step = jnp.diff(t)[:, None]
     secant = jnp.diff(g, axis=0) / jnp.where(step > 0, step, 1.0)
     total = step[1:] + step[:-1]
@@ -156,8 +157,8 @@ def _errors(
     x = (middle - start) / jnp.where(length > 0, length, 1.0)
     cubic: Cubic = (g[:-2:2], length * slope[:-2:2], g[2::2], length * slope[2::2])
     miss = jnp.abs(g[1:-1:2] - cubic_value(cubic, x))
-    # The rate tells a kink from a smooth condition, for which its error is smaller.
+    # The error of the rate distinguishes a kink from a smooth condition, whose error is smaller.
     of_rate = jnp.abs(length * slope[1:-1:2] - cubic_slope(cubic, x)) * RESOLUTION.miss
     miss = jnp.where(has_rates, jnp.maximum(RESOLUTION.miss * miss, of_rate), miss)
-    beside = jnp.pad(miss, ((1, 1), (0, 0)))
-    return jnp.repeat(jnp.maximum(jnp.maximum(beside[:-2], beside[2:]), miss), 2, axis=0)
+    neighbours = jnp.pad(miss, ((1, 1), (0, 0)))
+    return jnp.repeat(jnp.maximum(jnp.maximum(neighbours[:-2], neighbours[2:]), miss), 2, axis=0)

@@ -1,7 +1,7 @@
 """Events: actions on a mechanism where a scalar condition along its motion crosses zero.
 
-An event is a `condition`, the `direction` in which its zero counts, and an `action`. Conditions see the frames of all bodies by
-name, as joints and force elements see theirs:
+An event is a `condition`, the `direction` in which its zero counts, and an `action`. Conditions receive the frames of all bodies
+by name:
 
     udk.Event(lambda t, at: at["link"].angle, udk.Log(), name="vertical")
 
@@ -43,9 +43,9 @@ class Event(PrintsLine):
     """An `action` that happens when `condition(t, frames)`, a scalar, crosses zero.
 
     `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
-    `direction` is 1 for rising, -1 for falling, 0 for either; of an `Impact`, before whose zero the condition is positive, 0 or
-    -1, which mean the same. Only crossings count: a run that starts at a zero, or that touches one and turns back, does not cross
-    it. But an `Impact` whose condition is zero at the start, and falling, happens at once.
+    `direction` is 1 for rising, -1 for falling, 0 for either; for an `Impact`, whose condition is positive before
+    the zero, 0 and -1 mean the same. Only crossings count: a run that starts at a zero, or touches zero and turns back, does not
+    cross it. But an `Impact` whose condition is zero at the start, and falling, happens at once.
 
     Args:
         condition: (t, frames) -> a number.
@@ -60,7 +60,7 @@ class Event(PrintsLine):
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Mechanism) -> list["Event"]:
-        """Return this event as a list: ready-made ones stand for several."""
+        """Return this event as a list; ready-made events may expand to several."""
         return [self]
 
 
@@ -74,7 +74,7 @@ class JointLimit(PrintsLine):
         joint: the name of a revolute or prismatic joint, or of a slot.
         lower: lower end of travel (rad, m), or None.
         upper: upper end of travel (rad, m), or None.
-        restitution: the part of the approaching speed that comes back, 0 to 1.
+        restitution: ratio of the rebound speed to the approach speed, 0 to 1.
         at_rest: "hold": rest in contact; "stop": end the run.
         name: name in lists; by default that of the joint.
     """
@@ -102,9 +102,9 @@ class JointLimit(PrintsLine):
 
 
 class Contact(PrintsLine):
-    """A point of a body hits a line, fixed to the ground or to another body, that it cannot pass: an `Impact`, without friction.
+    """A point of a body hits a line fixed to the ground or to another body, and cannot pass it: an `Impact` without friction.
 
-    The line goes through the point `through` of the body `on`; the `normal`, of any length, is on the side that is allowed. Both
+    The line goes through the point `through` of the body `on`; the `normal`, of any length, points to the allowed side. Both
     are in that body's own frame (m).
 
     Args:
@@ -112,8 +112,8 @@ class Contact(PrintsLine):
         point: point of that body, in its own frame (m).
         through: a point of the line, in the frame of `on` (m).
         normal: normal of the line, towards the allowed side, in the frame of `on`.
-        restitution: the part of the approaching speed that comes back, 0 to 1.
-        on: the body that has the line, or "ground".
+        restitution: ratio of the rebound speed to the approach speed, 0 to 1.
+        on: the body with the line, or "ground".
         at_rest: "hold": rest in contact; "stop": end the run.
         name: name in lists.
     """
@@ -145,28 +145,28 @@ class Contact(PrintsLine):
 
 
 class Events(PrintsTable):
-    """The events of a run in their order: times (s), states before and after, and which each was.
+    """The events of a run in order: times (s), states before and after, and the index of each in `names`.
 
-    Where numbers are traced, or in a batch, there are `max_events` of each, padded with infinity, and -1 for `index`.
+    With traced numbers, or in a batch, arrays have `max_events` entries, padded with infinity, and -1 for `index`.
 
     Attributes:
-        time: of each event (s).
+        time: time of each event (s).
         q_before: positions right before it.
         v_before: velocities right before it.
         q_after: positions right after it.
         v_after: velocities right after it.
         count: number of events.
-        names: of the conditions.
+        names: the names of the conditions.
     """
 
     time: Float[Array, "events"]
-    index: Int[Array, "events"]  # of `names`
+    index: Int[Array, "events"]  # index of each event in `names`
     q_before: Float[Array, "events bodies 3"]
     v_before: Float[Array, "events bodies 3"]
     q_after: Float[Array, "events bodies 3"]
     v_after: Float[Array, "events bodies 3"]
     count: Int[Array, ""]
-    unresolved: Float[Array, "conditions"]  # time (s) from which crossings may be missed, as it varies too quickly; else inf
+    unresolved: Float[Array, "conditions"]  # time (s) from which a condition varies too quickly to be resolved; else inf
     undefined: Bool[Array, "conditions"]  # whether a condition was NaN and ended the run
     names: tuple[str, ...] = eqx.field(static=True)
 
@@ -181,13 +181,13 @@ class Events(PrintsTable):
         return PrintedTable(f"events: {int(self.count)}", [(f"{t:.9g} s", self.names[k]) for t, k in listed])
 
     def of(self, name: str) -> Float[Array, "k"]:
-        """Return the times (s) of the events of one name, of a single run."""
+        """Return the times (s) of the events with a name, in a single run."""
         require_name(name, self.names, "events", "event")
         return self.time[np.asarray(self.index) == self.names.index(name)]
 
     @property
     def undefined_names(self) -> str:
-        """The names of the events that ended a single run by conditions that are not numbers, as text."""
+        """The names of the events whose NaN conditions ended a single run, as a string."""
         return ", ".join(f"event {quote(self.names[k])}" for k in np.flatnonzero(self.undefined))
 
     @property
@@ -197,7 +197,7 @@ class Events(PrintsTable):
 
 
 class ExpandsToEvents(Protocol):
-    """An `Event`, or an object that expands to several."""
+    """An `Event`, or an object that expands to several events."""
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """Return the events, for a mechanism."""
@@ -234,23 +234,23 @@ def _expand(event: ExpandsToEvents, k: int, mechanism: Mechanism, found: list[Ev
 def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
     """Tell whether the numbers of events are valid: restitutions from 0 to 1, limits in order, contacts finite.
 
-    Concrete numbers were checked before; this checks those that were traced.
+    Concrete numbers were checked before; this checks traced ones.
     """
-    found, limits = jnp.array(True), {}
+    are_usable, limits = jnp.array(True), {}
     for e in events:
         if isinstance(e.condition, WithinLimit):
             limits[e.name] = e.condition.limit
-        found &= e.action.has_usable_numbers()
+        are_usable &= e.action.has_usable_numbers()
         if isinstance(e.condition, WithinLimit | Gap):
-            found &= jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(e.condition)]))
+            are_usable &= jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(e.condition)]))
         if isinstance(e.condition, Gap):
-            found &= jnp.any(e.condition.normal != 0)
-    both = (name[: -len(".lower")] for name in limits if name.endswith(".lower"))
-    return reduce(jnp.logical_and, (limits[f"{n}.lower"] <= limits.get(f"{n}.upper", jnp.inf) for n in both), found)
+            are_usable &= jnp.any(e.condition.normal != 0)
+    joints = (name[: -len(".lower")] for name in limits if name.endswith(".lower"))
+    return reduce(jnp.logical_and, (limits[f"{n}.lower"] <= limits.get(f"{n}.upper", jnp.inf) for n in joints), are_usable)
 
 
 def _with_name(event: Event, name: str) -> Event:
-    falls = event.action.is_impact and event.direction in (0, -1)  # from above zero, which it does not pass
+    falls = event.action.is_impact and event.direction in (0, -1)  # impacts come from above zero, and do not pass it
     return Event(event.condition, event.action, -1 if falls else event.direction, name)
 
 
@@ -270,8 +270,8 @@ def _check(event: Event, mechanism: Mechanism) -> None:
     if not is_traced(event):
         probe = np.linspace(0.1, 0.9, mechanism.q0.size)
         with jax.ensure_compile_time_eval():
-            found = event.condition(0.0, frames_of(mechanism.body_names, probe, probe))
-        if isinstance(found, Tracer):  # its derivatives by them would be lost
+            result = event.condition(0.0, frames_of(mechanism.body_names, probe, probe))
+        if isinstance(result, Tracer):  # derivatives by the traced numbers would be lost
             cure = "make it an equinox module that holds them and has a `__call__`"
             raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
     if value.shape:

@@ -34,7 +34,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import units_of
 
-STEPS_OF_A_PAGE = 20_000  # of a run in it: beyond, it would not answer for seconds
+STEPS_OF_A_PAGE = 20_000  # largest number of steps of a run in a page: with more the page would not respond for seconds
 
 
 class PortableEngine(NamedTuple):
@@ -42,7 +42,7 @@ class PortableEngine(NamedTuple):
 
     Attributes:
         data: the engine as JSON: see the package.
-        numbers: the numbers of the equations as a function of the parameters, as Python evaluates it.
+        numbers: the numbers of the equations as a function of the parameters, for evaluation in Python.
         mechanism: the mechanism that is simulated.
     """
 
@@ -65,14 +65,14 @@ def portable_engine(
     """Compile the engine of a mechanism for pages.
 
     Args:
-        mechanism: the scene, with known numbers.
+        mechanism: the scene, with concrete numbers.
         parameters: names of the numbers that may change, whole (`pin.A`) or one entry (`pin.A[0]`).
         rtol: relative tolerance of runs.
         atol: tolerance of runs, relative to the mechanism's scales, as in `simulate`.
-        pull: whether a hand may pull bodies: each gets a spring, without stiffness until it does.
-        runs: whether it integrates motions; without them it closes positions and evaluates energies, and is compiled faster.
-        events: of its runs, as `simulate` takes them.
-        drawn: whether it evaluates `drawn_points` as well.
+        pull: whether a hand may pull bodies: each body gets a spring, without stiffness until it is pulled.
+        runs: whether the engine integrates motions; if not, it closes positions and evaluates energies, and compiles faster.
+        events: the events of its runs, as for `simulate`.
+        drawn: whether the engine evaluates `drawn_points` as well.
 
     Returns:
         The `PortableEngine`.
@@ -80,8 +80,8 @@ def portable_engine(
     Raises:
         SceneError: a parameter is unknown.
         ArgumentError: an event changes the constraints.
-        UnsupportedError: a scene, the condition of an event, or how numbers follow from a parameter, takes what machine code has
-            no instruction for.
+        UnsupportedError: the scene, the condition of an event, or the dependence of numbers on a parameter has an operation
+            without a machine instruction.
     """
     values = scalar_parameters(mechanism, parameters)
     watched = PortableEvents(events, mechanism)
@@ -105,17 +105,17 @@ def _engine(
     drawn: bool,
     held: int | None = None,
 ) -> PortableEngine:
-    """Compile the engine of a mechanism; with the contact of an event at rest, where `held` names one."""
+    """Compile the engine of a mechanism, with the contact of event `held` at rest unless None."""
 
-    def rest(given: Mechanism) -> Mechanism:
+    def with_contact(given: Mechanism) -> Mechanism:
         return given if held is None else watched.with_contact(given, held)
 
     def dress(given: Mechanism) -> Mechanism:
-        return with_pulls(rest(given)) if pull else rest(given).without_origin
+        return with_pulls(with_contact(given)) if pull else with_contact(given).without_origin
 
-    dressed, analysis = dress(mechanism), analyse(rest(mechanism))
-    if _may_move_by_redundancy(rest(mechanism), analysis):
-        analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page finds them
+    dressed, analysis = dress(mechanism), analyse(with_contact(mechanism))
+    if _may_move_by_redundancy(with_contact(mechanism), analysis):
+        analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page determines them
     numbers = NumberProgram(
         mechanism, values, dress, lambda given: [*watched.numbers(given), *(x for _, x in drawn_points(given) if drawn)]
     )
@@ -197,7 +197,7 @@ def _places(mechanism: Mechanism, pull: bool) -> JsonObject:
 
 
 def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float) -> Problem:
-    """Return a run that stands for all: its times and its state are replaced in the page."""
+    """Return a run as a template: the page replaces its times and its state."""
     choices = Choices(rtol=rtol, atol=atol, drift_tol=DRIFT_PROJECTED, dt0=None, method=AUTO, stabilization=Projection())
     choices = choices._replace(max_steps=STEPS_OF_A_PAGE)
     compiled = compile_concrete(mechanism, analysis, *choices.of_mechanism)
@@ -209,11 +209,11 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
 def _run(problem: Problem, data: JsonObject, events: PortableEvents, rows: tuple[int, ...]) -> JsonObject:
     """Return the module of runs; its inputs go into the data."""
     operation, inputs = problem.compiled.plan.operation, packed(problem)
-    assert operation is not None  # such a page runs machine code
-    given = dict(zip(Operation.input_names, inputs, strict=False))
+    assert operation is not None  # checked by the caller
+    inputs_by_name = dict(zip(Operation.input_names, inputs, strict=False))
     data |= {
-        "thresholds": given["numbers"][0, -2:].tolist(),
-        "settings": dict(zip(operation.settings, given["settings"][0].tolist(), strict=True)),
+        "thresholds": inputs_by_name["numbers"][0, -2:].tolist(),
+        "settings": dict(zip(operation.settings, inputs_by_name["settings"][0].tolist(), strict=True)),
         "smallest": SMALLEST_STEP,
         "info": list(RunStates.info_names),
         "drift_tol": DRIFT_PROJECTED,
@@ -237,7 +237,7 @@ def _closing(analysis: Analysis) -> JsonObject:
 
 
 def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: JsonObject) -> JsonObject:
-    """Return the module of evaluations; which efforts it finds goes into the data."""
+    """Return the module of evaluations; the list of its efforts goes into the data."""
     code = scene_programs(mechanism, analysis.redundant_rows)
     evaluation = Evaluation(code, [numbers.function()])
     data["efforts"] = [
@@ -257,31 +257,31 @@ def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[JsonObject
 
 
 def joint_forces(mechanism: Mechanism, code: ScenePrograms) -> list[JsonObject]:
-    """Return for each constraint at a point how the force on its second body is found (its first one, where that is the ground).
+    """Return, for each constraint at a point, terms of the force on its second body (the first if the second is the ground).
 
     The load of a constraint on a body is -Psi_q^T lambda = Psi_q^T x, with x the solution of the linear system for its rows. It
-    is unique where no row is redundant; where rows are left out, a share of them would be a choice.
+    is unique if no row is redundant; otherwise the share of the rows left out is arbitrary.
 
     Args:
-        mechanism: The scene.
-        code: Its programs, of all rows.
+        mechanism: the scene.
+        code: the programs of all its rows.
 
     Returns:
         A list of {constraint, x, y}; the force (N) along each axis of the ground is the sum of x0[i] psi_q[j] f over the entries
-        (i, j, f), without psi_q where j is null.
+        (i, j, f), without the factor psi_q if j is null.
     """
     row, column, place, factor = code.psi_q_entries
-    found, owners = [], [name for name, _ in code.row_names]
+    forces, owners = [], [name for name, _ in code.row_names]
     for name, constraint in mechanism.constraints.items():
         if getattr(constraint, "points", None) is None or getattr(constraint, "coordinate", "") == "angle":
             continue
         body = constraint.bodies[0 if constraint.bodies[1] == GROUND else 1]
         start = 3 * mechanism.body_names.index(body)
-        own = np.flatnonzero([owner == name for owner in owners])
-        parts: dict[str, list] = {"x": [], "y": []}
-        for axis, entries in enumerate(parts.values()):
-            for k in np.flatnonzero(np.isin(row, own) & (column == start + axis)):
+        own_rows = np.flatnonzero([owner == name for owner in owners])
+        terms: dict[str, list] = {"x": [], "y": []}
+        for axis, entries in enumerate(terms.values()):
+            for k in np.flatnonzero(np.isin(row, own_rows) & (column == start + axis)):
                 where = None if place[k] == code.constant_entry else int(place[k])
                 entries.append([code.eliminated_rows[int(row[k])], where, float(factor[k])])
-        found.append({"constraint": name, **parts})
-    return found
+        forces.append({"constraint": name, **terms})
+    return forces

@@ -20,25 +20,25 @@ def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) 
     """Return parameters one number at a time: `joint.A.points[0][1]` for an entry of an array.
 
     Args:
-        mechanism: The scene.
-        names: Of parameters or of entries; by default all parameters of the scene, of one that is drawn without those numbers
-            that follow from its drawing: they would keep their values when the drawing changes.
+        mechanism: the scene.
+        names: names of parameters or of entries; by default all parameters of the scene except numbers that follow from its
+            drawing: these would not follow changes of the drawing.
 
     Returns:
-        The values by their names, in order.
+        The values by name, in order.
 
     Raises:
-        SceneError: A name is unknown.
+        SceneError: a name is unknown.
     """
-    known, found = mechanism.parameters(), {}
+    known, scalars = mechanism.parameters(), {}
     for name in independent_parameters(mechanism) if names is None else names:
-        owner, place = split_index(name, known)
-        if owner not in known or (place and place not in np.ndindex(*np.shape(known[owner])[: len(place)])):
+        owner, index = split_index(name, known)
+        if owner not in known or (index and index not in np.ndindex(*np.shape(known[owner])[: len(index)])):
             mechanism.with_parameters({name: 0.0})  # raises an error that names the parameter
         value = np.asarray(known[owner])
-        for rest in np.ndindex(*value.shape[len(place) :]):
-            found[owner + "".join(f"[{k}]" for k in (*place, *rest))] = float(value[(*place, *rest)])
-    return found
+        for inner in np.ndindex(*value.shape[len(index) :]):
+            scalars[owner + "".join(f"[{k}]" for k in (*index, *inner))] = float(value[(*index, *inner)])
+    return scalars
 
 
 def independent_parameters(mechanism: Mechanism) -> list[str]:
@@ -46,15 +46,15 @@ def independent_parameters(mechanism: Mechanism) -> list[str]:
     known = mechanism.parameters()
     if mechanism.drawing is None:
         return list(known)
-    own = {"gravity", *parameters_in(mechanism.drawing.groups), *mechanism.changed_names}
-    return [name for name in known if name in own]
+    independent = {"gravity", *parameters_in(mechanism.drawing.groups), *mechanism.changed_names}
+    return [name for name in known if name in independent]
 
 
 class NumberProgram:
     """The numbers of a mechanism's equations as a function of some parameters, followed by its breakpoints and further numbers.
 
     Attributes:
-        base: all of them as they are.
+        base: the present values of all numbers.
         changing: the outputs that depend on the parameters.
         count: count of the numbers before the breakpoints.
         knots: number of breakpoints.
@@ -67,13 +67,13 @@ class NumberProgram:
         dress: Callable[[Mechanism], Mechanism],
         further: Callable[[Mechanism], Sequence[Array | np.ndarray]] = lambda mechanism: (),
     ):
-        """Trace it.
+        """Trace the program.
 
         Args:
             mechanism: the scene.
-            values: the parameters, as they are.
-            dress: makes, of the mechanism with parameters in, the one that is simulated.
-            further: additional numbers that follow from the mechanism with these parameters.
+            values: the parameters with their present values.
+            dress: returns the mechanism to simulate, from the mechanism with changed parameters.
+            further: additional numbers, as a function of the mechanism with changed parameters.
         """
 
         def parts(given: Mechanism) -> list[Array | np.ndarray]:
@@ -97,18 +97,18 @@ class NumberProgram:
         self._program = ScalarProgram(graph, inputs, [outputs[k] for k in self.changing])
 
     def function(self) -> Function:
-        """Return `numbers(parameters, numbers)`, which writes those that depend on parameters."""
+        """Return `numbers(parameters, numbers)`, which writes the numbers that depend on parameters."""
         return vector_function(self._program, "numbers", "parameters", "numbers", self.changing)
 
     def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
         """Return all numbers, by NumPy."""
-        found = self.base.copy()
-        found[self.changing] = [float(x) for x in self._program([float(x) for x in values])]
-        return found
+        numbers = self.base.copy()
+        numbers[self.changing] = [float(x) for x in self._program([float(x) for x in values])]
+        return numbers
 
 
 def _numbers(mechanism: Mechanism) -> list[Array | np.ndarray]:
-    """Return all numbers, zeros in place of samples, and the breakpoints."""
+    """Return all numbers, with zeros instead of samples, and the breakpoints."""
     breakpoints = mechanism.breakpoints
     stand_in = SampleRows(mechanism, breakpoints).stand_in(mechanism)
     return [numbers_as_vector(stand_in.numbers), np.zeros(0) if breakpoints is None else breakpoints]

@@ -22,7 +22,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
 CONTACT = "{}.contact"  # name of the joint that holds the contact of an event
-MOST_EVENTS = 1000  # of a run in a page: beyond, nobody would look at them
+MOST_EVENTS = 1000  # largest number in a run of a page; nobody would look at more
 TOLERANCES = {
     "zero": ZERO,
     "zero_rate": ZERO_RATE,
@@ -56,11 +56,11 @@ class PortableEvents:
 
     @property
     def holding(self) -> list[int]:
-        """The events whose contacts are held when they come to rest."""
+        """The indices of events whose contacts are held at rest."""
         return [k for k, e in enumerate(self._events) if e.action.rest == "hold"]
 
     def with_contact(self, mechanism: Mechanism, event: int) -> Mechanism:
-        """Return the mechanism with the contact of an event as a joint: it is at rest."""
+        """Return the mechanism with the contact of an event at rest, as a joint."""
         held = expand_events(self._given, mechanism)[event]
         joints = {**mechanism.joints, CONTACT.format(held.name): HeldContact.of(held, mechanism)}
         return Mechanism(mechanism.bodies, joints, mechanism.drivers, mechanism.forces, mechanism.gravity, mechanism.name)
@@ -88,15 +88,15 @@ class PortableEvents:
         }
 
     def numbers(self, mechanism: Mechanism) -> Sequence[Array | np.ndarray]:
-        """Return the numbers of the conditions, some of which follow from those of the mechanism."""
+        """Return the numbers of the conditions, which may depend on the numbers of the mechanism."""
         return condition_numbers(expand_events(self._given, mechanism)) if self._given else ()
 
     def watched_by(self, operation: RunStates, rows: tuple[int, ...] = ()) -> RunStates:
-        """Return the run that ends where a condition crosses zero, or the force of a contact in a row of Psi."""
+        """Return the run that ends where a condition, or the force of a contact in one of the rows of Psi, crosses zero."""
         return operation if self._conditions is None else operation.watching(replace(self._conditions, rows=rows))
 
     def states_of(self, run: RunStates) -> EvaluateEvents:
-        """Return the operation that finds conditions, their rates and slopes, and directions of impulses at states."""
+        """Return the operation that evaluates conditions, their rates and slopes, and directions of impulses at states."""
         assert self._conditions is not None  # since there are events
         impacts = tuple(k for k, event in enumerate(self._events) if event.action.is_impact)
         return run.accelerations.of_events(self._conditions, impacts)

@@ -9,7 +9,7 @@ from udkjax.scene.fields import NOT_NEGATIVE, given_number
 from udkjax.scene.forces import ForceElement, Wrench
 from udkjax.scene.mechanism import Mechanism
 
-PREFIX = "pull of "  # in the names of the elements
+PREFIX = "pull of "  # prefix of the names of the elements
 
 
 class Pull(ForceElement):
