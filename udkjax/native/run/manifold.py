@@ -44,7 +44,7 @@ def take_newton_step(module: Module, f: Function, active: Value) -> Value:
 
 
 def with_threshold(f: Function, place: int | None, threshold: Value, do: Callable[[], None]):
-    """Run `do` with another threshold of pivots at the offset `place`; if that is None, just run `do`."""
+    """Run `do` with another threshold of pivots at the offset `place`. Without an offset (None), only run `do`."""
     if place is None:
         do()
         return

@@ -207,7 +207,7 @@ def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.nda
 
 
 def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the factor s of each group of residuals; NaN for groups that determine as many unknowns as they have residuals."""
+    """Return the factor s of each group of residuals; NaN for a group with no more residuals than unknowns that it determines."""
     groups = [np.flatnonzero(group == g) for g in range(group.max(initial=-1) + 1)]
     sums, counts = np.array([r[g] @ r[g] for g in groups]), np.array([len(g) for g in groups], float)
     # The factor R of QR replaces the rows of a group, since only J^T J is needed.
