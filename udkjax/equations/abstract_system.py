@@ -152,8 +152,8 @@ class MechanismSystem(AbstractSystem):
 
     @abstractmethod
     def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
-        """Return D^+ by the method and Psi, their rows weighted, and M^(-1/2)."""
+        """Return D^+ by the method, Psi, both with weighted rows, and M^(-1/2)."""
 
     @abstractmethod
     def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
-        """Return D^+ by the method and Psi_dot, their rows weighted, and M^(-1/2)."""
+        """Return D^+ by the method, Psi_dot, both with weighted rows, and M^(-1/2)."""

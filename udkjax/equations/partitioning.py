@@ -76,8 +76,8 @@ class PartitionedSystem(WrappedSystem):
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
         # A solution farther from the predicted state might be another assembly mode; NaN makes the integrator shorten the step.
-        near = self.equations.size(closed - q) <= LONGEST_STEP
-        return jnp.where(near, v, jnp.nan), _accelerations(fixed, t, closed, v)
+        is_near = self.equations.size(closed - q) <= LONGEST_STEP
+        return jnp.where(is_near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Solve the constraints for the dependent coordinates and velocities."""

@@ -183,7 +183,7 @@ class SceneLayout:
         return self.first_body + PER_BODY * body
 
     def reserve(self, name: str, count: int) -> int:
-        """Reserve room for `count` more numbers in an array; return where they begin."""
+        """Reserve room for `count` more numbers in an array; return the index of the first one."""
         self.sizes[name] += count
         return self.sizes[name] - count
 

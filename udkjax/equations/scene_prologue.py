@@ -23,7 +23,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) -> LoopProgram:
-    """Write the program from the array `numbers` to `constants`.
+    """Write the program that computes the array `constants` from the array `numbers`.
 
     Args:
         layout: Layout of the constants.

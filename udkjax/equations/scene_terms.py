@@ -54,7 +54,7 @@ class SceneTerms:
         return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int))
 
     def over_bodies(self, key: Hashable, write: Write, fixed: Collection[str] = (), **names: str) -> KernelLoop:
-        """Return a loop over all bodies; `names` map arrays of the kernel to arrays of the program, if they differ."""
+        """Return a loop over all bodies; `names` map arrays of the kernel to arrays of the program whose names differ."""
         return KernelLoop(self.kernel(key, write), self.layout.body_table, names, fixed)
 
     def over_group(

@@ -74,13 +74,13 @@ def _cholesky(
     m = len(gram)
 
     def column(k, carry):
-        left, L, independent, order, waiting = carry
-        j = jnp.argmax(jnp.where(waiting, jnp.diagonal(left), -jnp.inf))
-        is_independent = exceeds(left[j, j], threshold[j])
-        root = jnp.sqrt(jnp.where(is_independent, left[j, j], 1.0))
-        entry = jnp.where(is_independent & waiting, left[:, j] / root, 0.0)
-        left = left - entry[:, None] * entry
-        return left, L.at[:, k].set(entry), independent.at[k].set(is_independent), order.at[k].set(j), waiting.at[j].set(False)
+        remainder, L, independent, order, waiting = carry
+        j = jnp.argmax(jnp.where(waiting, jnp.diagonal(remainder), -jnp.inf))
+        is_independent = exceeds(remainder[j, j], threshold[j])
+        root = jnp.sqrt(jnp.where(is_independent, remainder[j, j], 1.0))
+        entry = jnp.where(is_independent & waiting, remainder[:, j] / root, 0.0)
+        remainder = remainder - entry[:, None] * entry
+        return remainder, L.at[:, k].set(entry), independent.at[k].set(is_independent), order.at[k].set(j), waiting.at[j].set(False)
 
     start = (gram, jnp.zeros_like(gram), jnp.zeros(m, bool), jnp.zeros(m, int), jnp.ones(m, bool))
     return jax.lax.fori_loop(0, m, column, start)[1:4]
