@@ -88,8 +88,8 @@ class PositionPrograms:
         self._psi, self._q0, self._s0 = list(psi.flat), list(q0.flat), s0.item()
         self._scales = np.ones(len(self._psi)) if rows is None else np.asarray(rows, float)
         self._differential = Differential(graph, self._psi, [*self._x, self._s, *self._q])
-        index_of_coordinate = {v.index: k for k, v in enumerate(self._q)}
-        entries = [{index_of_coordinate[k]: a for k, a in self._differential.row(r).items() if k in index_of_coordinate} for r in self._psi]
+        column = {v.index: k for k, v in enumerate(self._q)}
+        entries = [{column[k]: a for k, a in self._differential.row(r).items() if k in column} for r in self._psi]
         self._factors = SymbolicFactors(graph, entries, coordinates)
         self._measures = [*(self._q if positions else []), *measures.ravel()[chosen or slice(None)]]
         self._motion = MotionMeasures(graph, motion, self._factors, self._x, self._s, self._q, self._d) if motion else None

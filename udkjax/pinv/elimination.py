@@ -74,13 +74,13 @@ def _cholesky(
     m = len(gram)
 
     def column(k, carry):
-        remainder, L, independent, order, waiting = carry
-        j = jnp.argmax(jnp.where(waiting, jnp.diagonal(remainder), -jnp.inf))
-        is_independent = exceeds(remainder[j, j], threshold[j])
-        root = jnp.sqrt(jnp.where(is_independent, remainder[j, j], 1.0))
-        entry = jnp.where(is_independent & waiting, remainder[:, j] / root, 0.0)
-        remainder = remainder - entry[:, None] * entry
-        return remainder, L.at[:, k].set(entry), independent.at[k].set(is_independent), order.at[k].set(j), waiting.at[j].set(False)
+        rest, L, independent, order, waiting = carry
+        j = jnp.argmax(jnp.where(waiting, jnp.diagonal(rest), -jnp.inf))
+        is_independent = exceeds(rest[j, j], threshold[j])
+        root = jnp.sqrt(jnp.where(is_independent, rest[j, j], 1.0))
+        entry = jnp.where(is_independent & waiting, rest[:, j] / root, 0.0)
+        rest = rest - entry[:, None] * entry
+        return rest, L.at[:, k].set(entry), independent.at[k].set(is_independent), order.at[k].set(j), waiting.at[j].set(False)
 
     start = (gram, jnp.zeros_like(gram), jnp.zeros(m, bool), jnp.zeros(m, int), jnp.ones(m, bool))
     return jax.lax.fori_loop(0, m, column, start)[1:4]
