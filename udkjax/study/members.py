@@ -1,7 +1,7 @@
 """Compiled functions of the members of a study, with forward derivatives.
 
-A member has inputs of its own, and inputs shared by all. A program computes a fixed number of members at a time (a piece), the
-last piece padded with copies, so that results do not depend on the number of members or on the size of chunks.
+Some inputs of a member differ between members, others are shared by all. A program computes a fixed number of members at a time
+(a piece); the last piece is padded with copies. Results therefore do not depend on the number of members or the size of chunks.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from jaxtyping import Array, PyTree
 
 from udkjax.threads import cores, thread_count
 
-MOST_PROGRAMS = 64  # programs of identifications, and of sweeps, kept in memory: each holds the scene that it was made for
+MOST_PROGRAMS = 64  # number of programs of identifications, and of sweeps, in memory; each holds the scene that it was made for
 
 T = TypeVar("T")
 Outputs: TypeAlias = dict[str, Array]
@@ -30,7 +30,7 @@ Results: TypeAlias = tuple[dict[str, np.ndarray], dict[str, np.ndarray]]  # valu
 
 
 class MemberFunction(Protocol):
-    """A function of one member: arrays by name, from shared inputs, its own, and a shift (K,) of the varied numbers."""
+    """A function of a member: arrays by name, from shared inputs, the member's inputs, and a shift (K,) of varied numbers."""
 
     def __call__(self, shared: Any, own: Any, shift: Array, /) -> Outputs: ...
 
@@ -45,7 +45,7 @@ class Program:
         self._compiled: jax.stages.Compiled | None = None
 
     def __call__(self, shared: PyTree, own: PyTree, on_threads: bool = False) -> Results:
-        """Compute members, the first axis of `own`, in their order; pieces run one after another, or concurrently on threads."""
+        """Compute the members along the first axis of `own`, in order; pieces run one after another, or concurrently on threads."""
         count = len(jax.tree.leaves(own)[0])
         program = self.compile(shared, own)
 
@@ -56,7 +56,7 @@ class Program:
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *each(compute, range(0, count, self.size)))
 
     def place(self, shared: T, own: PyTree) -> T:
-        """Compile for members like these, and return the shared inputs on the devices: repeated calls need not transfer them."""
+        """Compile for members like these, and return the shared inputs on the devices, where repeated calls can use them."""
         return jax.device_put(shared, self.compile(shared, own).input_shardings[0][0])
 
     def compile(self, shared: PyTree, own: PyTree) -> jax.stages.Compiled:
@@ -68,26 +68,26 @@ class Program:
 
     def shapes(self, shared: PyTree, own: PyTree) -> tuple[dict[str, jax.ShapeDtypeStruct], dict[str, jax.ShapeDtypeStruct]]:
         """Return shapes and types of the values and slopes of one member."""
-        found = jax.eval_shape(self._compute, shared, _rows(own, 0, 1))
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found)
+        outputs = jax.eval_shape(self._compute, shared, _rows(own, 0, 1))
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), outputs)
 
     def _compute(self, shared: PyTree, own: PyTree) -> tuple[Outputs, Outputs]:
-        """Compute values of members, and slopes of the floating-point ones."""
+        """Compute values of members, and slopes of the floating-point values."""
         alone = len(jax.tree.leaves(own)[0]) == 1
 
         def values(shift: Array) -> tuple[Outputs, Outputs]:
-            if alone:  # `vmap` of one member would execute all branches
-                found = self.function(shared, jax.tree.map(lambda x: x[0], own), shift)
-                found = {name: jnp.asarray(x)[None] for name, x in found.items()}
+            if alone:  # `vmap` of a single member would execute all branches
+                outputs = self.function(shared, jax.tree.map(lambda x: x[0], own), shift)
+                outputs = {name: jnp.asarray(x)[None] for name, x in outputs.items()}
             else:
-                found = jax.vmap(lambda own: self.function(shared, own, shift))(own)
-            return {name: x for name, x in found.items() if jnp.issubdtype(x.dtype, jnp.floating)}, found
+                outputs = jax.vmap(lambda own: self.function(shared, own, shift))(own)
+            return {name: x for name, x in outputs.items() if jnp.issubdtype(x.dtype, jnp.floating)}, outputs
 
         no_shift = jnp.zeros(self.slopes)
         if not self.slopes:
             return values(no_shift)[1], {}
-        slopes, found = jax.jacfwd(values, has_aux=True)(no_shift)
-        return found, slopes
+        slopes, outputs = jax.jacfwd(values, has_aux=True)(no_shift)
+        return outputs, slopes
 
     def _on_devices(self) -> Callable[[PyTree, PyTree], tuple[Outputs, Outputs]]:
         """Return the function that computes one piece on each device."""
@@ -100,25 +100,25 @@ class Program:
         return jax.shard_map(self._compute, mesh=mesh, in_specs=(same, spread), out_specs=spread, check_vma=False)
 
 
-_EXECUTABLES: OrderedDict[Hashable, jax.stages.Compiled] = OrderedDict()  # the `MOST_PROGRAMS` used most recently
+_EXECUTABLES: OrderedDict[Hashable, jax.stages.Compiled] = OrderedDict()  # the `MOST_PROGRAMS` most recently used
 
 
 def _compile(lowered: jax.stages.Lowered, devices: tuple[Any, ...]) -> jax.stages.Compiled:
-    """Return the executable of a program: studies that differ only in the values of its arguments share one.
+    """Return the executable of a program; studies that differ only in the values of its arguments share an executable.
 
-    Programs are identified by their text. Those that call Python functions, or whose constants JAX keeps outside the text, are
-    always compiled.
+    Programs are identified by their text. Programs that call Python functions, or whose constants JAX stores
+    outside the text, are always compiled.
     """
     text = lowered.as_text()
     if "callback" in text or getattr(jax.config, "jax_use_simplified_jaxpr_constants", False):
         return lowered.compile()
     key = hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, devices
-    found = _EXECUTABLES.get(key) or lowered.compile()
-    _EXECUTABLES[key] = found
+    executable = _EXECUTABLES.get(key) or lowered.compile()
+    _EXECUTABLES[key] = executable
     _EXECUTABLES.move_to_end(key)
     while len(_EXECUTABLES) > MOST_PROGRAMS:
         _EXECUTABLES.popitem(last=False)
-    return found
+    return executable
 
 
 def _rows(own: T, first: int, count: int) -> T:
@@ -128,18 +128,18 @@ def _rows(own: T, first: int, count: int) -> T:
 
 @lru_cache(maxsize=1)
 def _threads(process: int, count: int) -> ThreadPoolExecutor:
-    """Return the thread pool of this process: starting threads anew would take as long as a short run."""
+    """Return the thread pool of this process; starting new threads would take as long as a short run."""
     return ThreadPoolExecutor(count, thread_name_prefix="members")
 
 
-CHUNKED_PLATFORMS = ("cpu",)  # platforms that compute a batch in pieces; others compute it whole
-PIECE_MEMBERS = 64  # members of a piece on these platforms
+CHUNKED_PLATFORMS = ("cpu",)  # platforms that compute a batch in pieces; others compute the whole batch at once
+PIECE_MEMBERS = 64  # number of members of a piece on these platforms
 
 
 def concurrent_chunks() -> int:
     """Return the number of chunks that are computed concurrently.
 
-    One CPU device runs one program per thread; several devices share each chunk.
+    A single CPU device runs a program per thread; several devices share each chunk.
     """
     devices = jax.local_devices()
     return thread_count() if len(devices) == 1 and devices[0].platform in CHUNKED_PLATFORMS else 1

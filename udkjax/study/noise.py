@@ -1,4 +1,4 @@
-"""Noise of a series of measurements: its standard deviation before a fit, outliers, and a test of residuals for whiteness."""
+"""Noise of a series of measurements: standard deviation before a fit, outliers, and a test of residuals for whiteness."""
 
 from typing import NamedTuple
 
@@ -6,19 +6,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import chdtrc, ndtri
 
-GAUSSIAN_RATIO = 1.4826  # standard deviation over median absolute value of Gaussian noise
-MOST_TOGETHER = 5  # consecutive outliers; longer runs are not slips of a sensor
-SIGNIFICANCE = 1e-3  # p-value below which noise is reported as not white
-MAX_LAGS = 5  # an incomplete model leaves slow waves in the residuals, which show at the first lags
-PAIRS_PER_LAG = 4  # fewer pairs are too few for the test
-NO_GAP = 1.5  # times the usual duration of k samples: pairs farther apart have a gap between them
+GAUSSIAN_RATIO = 1.4826  # ratio of standard deviation to median absolute value of Gaussian noise
+MOST_TOGETHER = 5  # largest number of consecutive outliers; longer series are not errors of a sensor
+SIGNIFICANCE = 1e-3  # p-value below which residuals are reported as not white
+MAX_LAGS = 5  # residuals of an incomplete model have slow waves, which the first lags detect
+PAIRS_PER_LAG = 4  # least number of pairs for the test, per lag
+NO_GAP = 1.5  # pairs farther apart than this, relative to the usual duration of k samples, have a gap between them
 
 
 def noise_of_differences(times: Float[np.ndarray, "N"], values: Float[np.ndarray, "N"]) -> float:
-    """Estimate the standard deviation of the noise from the distance of each value from the line through its neighbours.
+    """Estimate the standard deviation of the noise from the distances between values and the lines through their neighbours.
 
     The median of these distances, scaled to unit noise, is insensitive to outliers. The signal should be nearly straight between
-    samples: its curvature counts as noise. NaN for fewer than three values.
+    samples, since its curvature counts as noise. NaN for fewer than three values.
 
     Source: T. Gasser, L. Sroka & C. Jennen-Steinmetz, Residual variance and residual pattern in nonlinear regression, 1986.
     """
@@ -26,36 +26,36 @@ def noise_of_differences(times: Float[np.ndarray, "N"], values: Float[np.ndarray
     t, y = np.asarray(times, float)[present], np.asarray(values, float)[present]
     if len(t) < 3:
         return np.nan
-    part = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
-    distance = (1.0 - part) * y[:-2] + part * y[2:] - y[1:-1]
-    return robust_deviation(distance / np.sqrt(part**2 + (1.0 - part) ** 2 + 1.0))
+    fraction = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+    distance = (1.0 - fraction) * y[:-2] + fraction * y[2:] - y[1:-1]
+    return robust_deviation(distance / np.sqrt(fraction**2 + (1.0 - fraction) ** 2 + 1.0))
 
 
 def robust_deviation(values: Float[np.ndarray, "N"]) -> float:
-    """Return the standard deviation of Gaussian noise with the median absolute value of these: insensitive to outliers."""
+    """Return the standard deviation of Gaussian noise with the same median absolute value, which is insensitive to outliers."""
     return float(GAUSSIAN_RATIO * np.median(np.abs(values)))
 
 
 def outlier_rows(values: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
-    """Return a mask of numbers too large to be noise like the others: one in a thousand series of Gaussian noise has any.
+    """Return a mask of numbers that are too large to be noise; a thousandth of the series of Gaussian noise has such numbers.
 
-    Runs of more than `MOST_TOGETHER` are not outliers: the signal itself is different there.
+    Series of more than `MOST_TOGETHER` are not outliers; they are part of the signal.
     """
     limit = ndtri(1.0 - 0.5 * SIGNIFICANCE / max(len(values), 1)) * robust_deviation(values) if len(values) else np.inf
-    found = np.abs(values) > limit if limit > 0.0 else np.zeros(len(values), bool)
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], found, [False]])))
+    mask = np.abs(values) > limit if limit > 0.0 else np.zeros(len(values), bool)
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     for first, end in ends.reshape(-1, 2).tolist():
-        found[first:end] &= end - first <= MOST_TOGETHER
-    return found
+        mask[first:end] &= end - first <= MOST_TOGETHER
+    return mask
 
 
 class Whiteness(NamedTuple):
     """Test of a channel's residuals for white noise."""
 
-    lag1: float  # correlation of neighbours
+    lag1: float  # correlation of neighbouring residuals
     statistic: float  # Q
     lags: int
-    p: float  # probability that white noise has a Q as large; NaN if there are too few residuals
+    p: float  # probability of an equal or larger Q for white noise; NaN if there are too few residuals
     samples: int
 
     @property
@@ -64,7 +64,7 @@ class Whiteness(NamedTuple):
         return not self.p < SIGNIFICANCE
 
     def text(self, channel: str) -> str:
-        """Return a sentence about residuals that are not white; else an empty string."""
+        """Return a sentence about residuals that are not white; empty if they are."""
         if self.white:
             return ""
         return (
@@ -83,12 +83,12 @@ def whiteness_of(
         z_k = sum (e_i e_(i+k) + s^2 H_(i, i+k)) / (sum e_i^2 e_(i+k)^2)^(1/2),        Q = sum z_k^2,
 
     For white noise of any variances and spacing, Q is chi^2-distributed with one degree of freedom per lag. H = U U^T is the hat
-    matrix of the fit: -s^2 H is the covariance that fitting leaves in the residuals of white noise.
+    matrix of the fit; off the diagonal, -s^2 H is the covariance of the residuals that a fit to white noise causes.
 
     Args:
         times: increasing, s; samples may be irregular and have gaps.
         residuals: residuals; NaN where nothing was measured.
-        projection: the rows of U for these residuals; by default nothing was fitted.
+        projection: the rows of U for these residuals; by default there was no fit.
 
     Source: Lobato, Nankervis & Savin, International Economic Review 42 (2001) 187.
     """

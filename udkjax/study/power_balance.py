@@ -33,7 +33,7 @@ from udkjax.scene.mechanism import Mechanism
 
 @prints_table
 class PowerBalance(NamedTuple):
-    """Powers (W) at each output time; their imbalance is `residual`.
+    """Powers (W) at each output time; `residual` is their imbalance.
 
     Attributes:
         drivers: power of each driver over time (W).
@@ -41,10 +41,10 @@ class PowerBalance(NamedTuple):
 
     drivers: dict[str, Float[Array, "T"]]
     forces: dict[str, Float[Array, "T"]]  # power of dampers, loads, and potentials that depend on time
-    joints: dict[str, Float[Array, "T"]]  # on both bodies together: zero up to rounding and the violation of the velocities
+    joints: dict[str, Float[Array, "T"]]  # power on both bodies together: zero up to rounding and the velocity violation
     kinetic: Float[Array, "T"]  # dT/dt
     potential: Float[Array, "T"]  # dV/dt
-    scale: Float[Array, ""]  # of powers: m L^2 / T^3 of the mechanism
+    scale: Float[Array, ""]  # the mechanism's scale of powers, m L^2 / T^3
 
     _units = units(drivers="W", forces="W", joints="W", kinetic="W", potential="W", scale="W")
 
@@ -74,7 +74,7 @@ class PowerBalance(NamedTuple):
 
     @property
     def relative(self) -> Float[Array, ""]:
-        """The largest residual over the largest of its terms, or over the mechanism's own scale of power if that is larger."""
+        """The largest residual, relative to its largest term or, if this is larger, the mechanism's scale of powers."""
         parts = [self.kinetic, self.potential, *self.drivers.values(), *self.forces.values(), self.scale]
         size = jnp.max(jnp.stack([jnp.max(jnp.abs(part)) for part in parts]))
         return jnp.max(jnp.abs(self.residual)) / jnp.where(size > 0, size, 1.0)
@@ -130,7 +130,7 @@ def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
 
 
 def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Array, "forces"]:
-    """Return the power of each force element: of its loads, and of the explicit time dependence of its potential."""
+    """Return the power of each force element: the power of its loads, and of the explicit time dependence of its potential."""
 
     def power(element: ForceElement, *frames: Frame) -> Array:
         stated = element.loads(t, *frames)
@@ -142,7 +142,7 @@ def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[A
         return total + jax.grad(lambda t: jnp.asarray(element.potential(t, *frames), t.dtype))(t)
 
     elements = [*mechanism.forces.values()]
-    found = jnp.zeros(len(elements))
+    by_element = jnp.zeros(len(elements))
     for kind, powers in evaluate_by_kind(power, mechanism, elements, bodies(q), bodies(v)):
-        found = found.at[kind.members].set(powers)
-    return found
+        by_element = by_element.at[kind.members].set(powers)
+    return by_element

@@ -1,4 +1,4 @@
-"""Quantities of a mechanism that are not single parameters: functions of a mechanism and a value, which texts can name."""
+"""Quantities of a mechanism that are not single parameters: functions of a mechanism and a value, with names in files."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Scaled:
 
 
 def parameter_value(mechanism: Mechanism, name: str) -> Array:
-    """Return the value of an existing parameter, or one entry of it (`joint.A.points[1][0]`)."""
+    """Return the value of an existing parameter, or of an entry (`joint.A.points[1][0]`)."""
     known = parameters_of(mechanism)
     owner, index = split_index(name, known)
     return jnp.asarray(known[owner].value)[index]

@@ -9,7 +9,7 @@ import numpy as np
 
 from udkjax.scene.mechanism import Mechanism
 
-MOST_DIGITS = 12  # most digits of a number in a table
+MOST_DIGITS = 12  # largest number of digits in a table
 _ROWS = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
 
 
@@ -19,7 +19,7 @@ def ratio(values: Sequence[float] | np.ndarray) -> str:
 
 
 def format_value(value: float, error: float) -> str:
-    """Return a value with the digits that its standard error allows, and one more."""
+    """Return a value with the digits that are significant according to its standard error, and one more."""
     if not (math.isfinite(error) and error > 0 and value):
         return f"{value:.6g}"
     digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(error)) + 2
@@ -38,9 +38,9 @@ def plain(value: object) -> Any:
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, Enum | Mechanism):
         return value.name
-    if (fields := getattr(value, "_asdict", None)) is not None:  # a NamedTuple
+    if (fields := getattr(value, "_asdict", None)) is not None:  # `value` is a NamedTuple
         return plain(fields())
-    if (tolist := getattr(value, "tolist", None)) is not None:  # an array or number of NumPy or JAX
+    if (tolist := getattr(value, "tolist", None)) is not None:  # `value` is an array or number of NumPy or JAX
         return plain(tolist())
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(item) for item in value]

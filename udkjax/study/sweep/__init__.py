@@ -1,9 +1,9 @@
-"""Sweeps: many runs that differ in parameters, settings and methods, as one dataset.
+"""Sweeps: many runs that differ in parameters, settings and methods, collected in a dataset.
 
-axes, dimensions, grid      the varied quantities: as given by users, as dimensions, as a TOML file
+axes, dimensions, grid      the varied quantities: in Python, as dimensions, and in a TOML file
 measures                    the variables stored for each member
 plan, groups                members (the single runs) and groups of members with a common compiled program
-chunks, executors           chunks of members of a few seconds, computed on devices or on a cluster
+chunks, executors           chunks of members that take a few seconds, computed on devices or on a cluster
 store, fingerprint          finished chunks on disk; all inputs that determine the results
 dataset                     all results, labelled
 sweep                       the public function and its progress

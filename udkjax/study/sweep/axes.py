@@ -1,9 +1,9 @@
 """Axes: the quantities that a sweep varies, by name; and designs, which sample members from their ranges.
 
 An axis of numbers (parameters, tolerances, gains) is batched in one compiled program. An axis of choices (methods, solvers,
-mechanisms, initial states) divides the members into groups by the structure of their choices, with one program each, so that no
-member executes a branch that it did not choose. Choices that differ only in numbers share a program, and so do dense
-pseudoinverses, of which machine code selects one by its number.
+mechanisms, initial states) divides the members into groups by the structure of their choices. Each group has a program, and no
+member executes the branches of other choices. Choices that differ only in numbers share a program; so do dense pseudoinverses,
+among which machine code selects by number.
 """
 
 import abc
@@ -26,7 +26,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.study.choices import Choice
 from udkjax.study.quantities import Setter
 
-# The settings of a run that are choices, each with the label of None.
+# Settings of a run that are choices, with the label of None for each.
 CHOICES = {
     "mechanism": "",
     "state": "assembled",
@@ -45,12 +45,12 @@ class Distribution(Protocol):
 
 
 AxisChoice: TypeAlias = "Mechanism | State | int | Choice"
-# Numbers (n, ...) or choices; with a design, a range or a distribution.
+# Numbers (n, ...) or choices; a range or a distribution if there is a design.
 Values: TypeAlias = "Distribution | State | Numbers | Sequence[AxisChoice]"
 
 
 class Axis:
-    """The values of one axis, and the quantity that they set.
+    """The values of an axis, and the quantity that they set.
 
     Functions and parameters are applied in the order of the axes.
 
@@ -58,7 +58,7 @@ class Axis:
         values: numbers (n, ...), one entry per value, or instances such as `[SVD(), Varga()]`; with a design, a range (low, high)
             or a frozen distribution of scipy.stats.
         of: the name of a parameter or a setting, several tied names that take the same value, or a pure function (mechanism,
-            value) -> mechanism; by default the axis's own name.
+            value) -> mechanism; by default the axis's name.
         units: units of the values, if `of` does not determine them.
     """
 
@@ -95,7 +95,7 @@ class AxisColumn:
 
     @property
     def is_choice(self) -> bool:
-        """True if its values are choices, not numbers."""
+        """True if the values are choices, not numbers."""
         return bool(self.labels)
 
     @property
@@ -112,7 +112,7 @@ class AxisColumn:
 
     @cached_property
     def computed(self) -> tuple[AxisChoice, ...]:
-        """The choices as inputs of programs: dense methods are replaced by a `OneOf`, selected by its number."""
+        """The choices as inputs of programs: dense methods are replaced by a `OneOf`, which selects the method by number."""
         return one_of_several(self.choices) if self.setting == "method" else self.choices
 
     @property
@@ -141,7 +141,7 @@ class Dimension:
 
 
 def labels_of(setting: str, choices: Sequence[AxisChoice]) -> tuple[str, ...]:
-    """Return readable, unique names of choices: their types, with their numbers if the types are equal."""
+    """Return readable, unique names of choices: the types, with numbers if types are equal."""
     plain = [_short_label(setting, choice) for choice in choices]
     names = [
         name if plain.count(name) == 1 else _label_with_numbers(name, choice) for name, choice in zip(plain, choices, strict=True)
@@ -162,14 +162,14 @@ def _label_with_numbers(name: str, choice: AxisChoice) -> str:
 
 
 def structure_of(choice: PyTree) -> Hashable:
-    """Return the structure of a choice, without the values of its numbers: choices of the same structure share a program."""
-    arrays, rest = eqx.partition(choice, eqx.is_array)
-    leaves, tree = jax.tree.flatten(rest)
+    """Return the structure of a choice without the values of its numbers; choices with the same structure share a program."""
+    arrays, static = eqx.partition(choice, eqx.is_array)
+    leaves, tree = jax.tree.flatten(static)
     return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), tree, tuple(leaves)
 
 
 def one_of_several(methods: Sequence[AxisChoice]) -> tuple[AxisChoice, ...]:
-    """Return methods with the compilable dense ones replaced by a `OneOf` of all their kinds, so that they share a structure."""
+    """Return the methods; compilable dense ones are replaced by a `OneOf` of all their kinds, to give them the same structure."""
     dense: dict[int, Dense] = {}
     for k, method in enumerate(methods):
         if isinstance(method, Dense) and not isinstance(method, Auto | Elimination | OneOf) and not reason_for_plain(method):
@@ -178,11 +178,11 @@ def one_of_several(methods: Sequence[AxisChoice]) -> tuple[AxisChoice, ...]:
     distinct = {structure_of(kind): kind for kind in kinds.values()}
     if len(distinct) < 2:
         return tuple(methods)
-    found, structures = list(methods), list(distinct)
+    replaced, structures = list(methods), list(distinct)
     for k, method in dense.items():
         number = structures.index(structure_of(kinds[k]))
-        found[k] = OneOf(method.rank_tol, method.relative, tuple(distinct.values()), np.asarray(number))
-    return tuple(found)
+        replaced[k] = OneOf(method.rank_tol, method.relative, tuple(distinct.values()), np.asarray(number))
+    return tuple(replaced)
 
 
 # --- designs: members sampled from ranges, instead of all combinations of values
@@ -237,7 +237,7 @@ class Random(SweepDesign):
 
 
 def scale_to_range(values: Values, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
-    """Map points of the unit interval to a range (low, high) or a frozen distribution of scipy.stats; None if it is neither."""
+    """Map points of the unit interval to a range (low, high) or a frozen distribution of scipy.stats; None for other values."""
     if hasattr(values, "ppf"):
         return np.asarray(cast(Distribution, values).ppf(unit), float)
     ends = np.asarray(cast(Numbers, values), float)

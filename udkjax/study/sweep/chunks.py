@@ -1,6 +1,6 @@
-"""Chunks of a sweep: members of one group that take a few seconds together, as estimated from a first chunk of the group.
+"""Chunks of a sweep: members of a group that together take a few seconds, as estimated from a first chunk of the group.
 
-Members are sorted by their expected number of steps, the longest first, so that devices wait only briefly for the last chunk.
+Members are sorted by their expected number of steps, the largest first; devices then wait only briefly for the last chunk.
 """
 
 import sys
@@ -18,12 +18,12 @@ from udkjax.study.sweep.groups import group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 
 MEMORY = 2**30  # default limit of the memory of members in computation (bytes)
-CHUNK_COPIES = 4  # copies of a chunk's stored variables in memory while it is computed: on the device, joined, of other chunks
-CHUNK_SECONDS = 2.0  # approximate work in a chunk (s): bounds the loss by an interruption, and the time between progress reports
-CHUNKS_FOR_EACH = 4  # chunks per device or core, so that all are busy to the end
-SHORTEST_CHUNK = 0.05  # s of work in a chunk: calling a program and storing its results takes a few hundredths of it
-MOST_TRIED_GROUPS = 3  # groups timed to estimate a cost; the others are assumed to be as fast on average
-# The number of steps grows approximately as this power of the reciprocal of rtol, and of atol, for methods of 8th order.
+CHUNK_COPIES = 4  # number of copies of a chunk's stored variables in memory during its computation
+CHUNK_SECONDS = 2.0  # approximate work in a chunk (s); limits the loss by interruptions, and the time between reports
+CHUNKS_FOR_EACH = 4  # number of chunks per device or core, to keep all of them busy to the end
+SHORTEST_CHUNK = 0.05  # least work in a chunk (s); the overhead is a few hundredths of it
+MOST_TRIED_GROUPS = 3  # number of groups timed to estimate a cost; the others are assumed to be as fast on average
+# The number of steps grows approximately as this power of 1 / rtol, and of 1 / atol, for methods of 8th order.
 TOLERANCE_POWER = 1 / 16
 
 
@@ -34,9 +34,9 @@ def compute_members(
     memory: int = MEMORY,
     expect: Callable[[Sequence[Chunk]], None] = lambda chunks: None,
 ) -> Iterator[Done]:
-    """Compute the members that are not done: a few pieces of each group, then chunks sized by the time that these took.
+    """Compute the members that are not done: first some pieces of each group, then chunks sized by the duration of these.
 
-    `expect` is called with the chunks after the first ones, with their `work` in seconds.
+    `expect` is called with the chunks that follow the first ones, with `work` in seconds.
     """
     orders = members_to_compute(plan, done)
     measured = []
@@ -44,31 +44,33 @@ def compute_members(
         measured.append((chunk, seconds))
         yield chunk, data, seconds
     computed = np.concatenate([np.zeros(0, int), *(chunk.members for chunk in firsts)])
-    rest = {index: members[~np.isin(members, computed)] for index, members in orders.items()}
-    if chunks := cut_chunks(plan, rest, measured, memory):
+    remaining = {index: members[~np.isin(members, computed)] for index, members in orders.items()}
+    if chunks := cut_chunks(plan, remaining, measured, memory):
         expect(chunks)
         yield from engine(plan, chunks)
 
 
 def members_to_compute(plan: SweepPlan, done: Int[np.ndarray, "n"] | Sequence[int] = ()) -> dict[int, np.ndarray]:
-    """Return the members of each group that are not done, the longest runs first; finished groups are omitted."""
-    found = {}
+    """Return the unfinished members of each group, the longest runs first; finished groups are omitted."""
+    by_group = {}
     for group in plan.groups:
         members = group.members[~np.isin(group.members, done)]
         if len(members):
-            found[group.index] = members[np.argsort(-expected_steps(plan, members), kind="stable")]
-    return found
+            by_group[group.index] = members[np.argsort(-expected_steps(plan, members), kind="stable")]
+    return by_group
 
 
 def first_chunks(plan: SweepPlan, orders: Mapping[int, np.ndarray]) -> list[Chunk]:
-    """Return chunks of one piece to measure the speed of each group, as many as are computed concurrently."""
-    found: list[Chunk] = []
+    """Return chunks of one piece each, as many as can be computed concurrently, to measure the speed of each group."""
+    chunks: list[Chunk] = []
     for index, members in orders.items():
         piece = group_run(plan, index).program.size
         size = min(len(members), piece * -(-concurrent_chunks() // len(orders)))
-        some = members[np.linspace(0, len(members) - 1, size).round().astype(int)]
-        found += [_chunk(plan, len(found) + k, index, some[at : at + piece]) for k, at in enumerate(range(0, size, piece))]
-    return found
+        chosen = members[np.linspace(0, len(members) - 1, size).round().astype(int)]
+        chunks += [
+            _chunk(plan, len(chunks) + k, index, chosen[start : start + piece]) for k, start in enumerate(range(0, size, piece))
+        ]
+    return chunks
 
 
 def cut_chunks(
@@ -76,31 +78,32 @@ def cut_chunks(
 ) -> list[Chunk]:
     """Cut the members of each group, in order, into chunks of a few seconds of work and at most `memory` bytes.
 
-    `measured` are finished chunks with the time they took (s); groups without one are assumed to be as fast as the others.
+    `measured` are finished chunks with their duration (s); groups without a finished chunk are assumed to be as fast as the
+    others.
     """
-    most = max(1, memory // (CHUNK_COPIES * max(1, bytes_per_member(plan))))
+    largest = max(1, memory // (CHUNK_COPIES * max(1, bytes_per_member(plan))))
     pace = {index: [seconds / chunk.work for chunk, seconds in measured if chunk.group == index] for index in orders}
     usual = float(np.mean([seconds / chunk.work for chunk, seconds in measured])) if measured else 0.0
     seconds = {k: expected_steps(plan, members) * (np.mean(pace[k]) if pace[k] else usual) for k, members in orders.items()}
-    share = sum(float(each.sum()) for each in seconds.values()) / (CHUNKS_FOR_EACH * concurrent_chunks())
-    found: list[Chunk] = []
+    share = sum(float(times.sum()) for times in seconds.values()) / (CHUNKS_FOR_EACH * concurrent_chunks())
+    chunks: list[Chunk] = []
     for index, members in orders.items():
-        for part in _cut(
-            seconds[index], group_run(plan, index).program.size, most, min(CHUNK_SECONDS, max(SHORTEST_CHUNK, share))
+        for selection in _cut(
+            seconds[index], group_run(plan, index).program.size, largest, min(CHUNK_SECONDS, max(SHORTEST_CHUNK, share))
         ):
-            found.append(Chunk(len(measured) + len(found), index, members[part], float(seconds[index][part].sum())))
-    return found
+            chunks.append(Chunk(len(measured) + len(chunks), index, members[selection], float(seconds[index][selection].sum())))
+    return chunks
 
 
 def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = CHUNK_SECONDS) -> list[slice]:
-    """Cut members into consecutive parts of whole pieces, each of at most `limit` seconds and `most` members."""
+    """Cut members into consecutive parts of whole pieces, of at most `limit` seconds and `most` members each."""
     most = max(piece, most // piece * piece)
     parts, start = [], 0
     total = np.concatenate([[0.0], np.cumsum(seconds)])
     while start < len(seconds):
         enough = int(np.searchsorted(total, total[start] + limit, side="right")) - 1 - start
-        rest = len(seconds) - start
-        size = rest if rest <= min(most, enough) else min(most, max(piece, enough // piece * piece), rest)
+        left = len(seconds) - start
+        size = left if left <= min(most, enough) else min(most, max(piece, enough // piece * piece), left)
         parts.append(slice(start, start + size))
         start += size
     return parts
@@ -131,13 +134,13 @@ class SweepCost:
     """The cost of a sweep in this process, on its devices."""
 
     members: int
-    groups: int  # programs, each compiled once
-    tried: int  # groups of which a first chunk was run
+    groups: int  # number of programs, each compiled once
+    tried: int  # number of groups of which a first chunk was run
     chunks: int
     stored: int  # bytes of the dataset, and approximately of the files
     memory: int  # peak memory of this process (bytes)
-    compiling: float  # s; less if programs are in the cache
-    computing: float  # s
+    compiling: float  # time of compiling (s); less if programs are in the cache
+    computing: float  # time of computing (s)
 
 
 def estimate_cost(plan: SweepPlan, memory: int = MEMORY) -> SweepCost:
@@ -162,7 +165,7 @@ def _resident() -> int:
     """Return the peak memory of this process so far (bytes); 0 if it is unknown."""
     try:
         import resource
-    except ImportError:  # Windows
+    except ImportError:  # not available on Windows
         return 0
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else most * 1024

@@ -1,4 +1,4 @@
-"""A sweep as one dataset: labelled, with units, and with a result for each member."""
+"""A sweep as a dataset: labelled, with units, and with a result for each member."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,18 +33,22 @@ NOT_COMPUTED = -1  # the result of an unfinished member
 
 def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
     """Return the variables that are stored for each member of a group."""
-    bodies, found = len(plan.mechanism_of(group).body_names), {}
+    bodies, variables = len(plan.mechanism_of(group).body_names), {}
     labels = {name: label for measure in plan.measures for name, label in measure.labels.items()} | LABELS
     outputs = group_run(plan, group.index).outputs
-    slopes = {f"d_{of}_d_{by}": (of, by) for of in outputs for by in plan.derivatives}
+    slopes = {f"d_{variable}_d_{by}": (variable, by) for variable in outputs for by in plan.derivatives}
     for name, info in outputs.items():
         if name in slopes:
-            of, by = slopes[name]
-            label = Label(found[of].dims, _derivative_unit(found[of].units, by, plan), f"derivative of {of} by {by}")
+            variable, by = slopes[name]
+            label = Label(
+                variables[variable].dims,
+                _derivative_unit(variables[variable].units, by, plan),
+                f"derivative of {variable} by {by}",
+            )
         else:
             label = labels.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
-        found[name] = StoredVariable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
-    return found
+        variables[name] = StoredVariable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
+    return variables
 
 
 def _derivative_unit(units: str, by: str, plan: SweepPlan) -> str:
@@ -56,7 +60,7 @@ def _derivative_unit(units: str, by: str, plan: SweepPlan) -> str:
 
 @lru_cache(maxsize=8)
 def variables_of(plan: SweepPlan) -> Mapping[str, StoredVariable]:
-    """Return the variables that are stored for each member, always including `result`, `end_time` and `steps`.
+    """Return the variables that are stored for each member, including `result`, `end_time` and `steps`.
 
     If mechanisms have different bodies, the dimension "body" has all of them, and any other dimension has the largest size.
     """
@@ -78,9 +82,9 @@ def bytes_per_member(plan: SweepPlan) -> int:
 
 
 def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
-    """Return the xarray Dataset of a plan from (members, their stored variables) in any order.
+    """Return the xarray Dataset of a plan from pairs of members and their stored variables, in any order.
 
-    Unfinished members are NaN, with result -1.
+    Unfinished members have NaN and the result -1.
     """
     import xarray
 
@@ -115,39 +119,39 @@ def _fill_value(name: str, variable: StoredVariable) -> float | int | bool:
 def _write_members(
     into: np.ndarray, variable: StoredVariable, members: np.ndarray, values: np.ndarray, places: Sequence[int] | None
 ) -> None:
-    """Write the values of members; values of bodies go to their places among all bodies."""
+    """Write the values of members; `places` are the indices of a group's bodies among all bodies."""
     if "body" in variable.dims and places is not None:
         axis = variable.dims.index("body")
-        for k, place in enumerate(places):
-            into[(members, *[slice(None)] * axis, place)] = np.take(values, k, axis=axis + 1)
+        for k, index in enumerate(places):
+            into[(members, *[slice(None)] * axis, index)] = np.take(values, k, axis=axis + 1)
     else:
         into[(members, *(slice(n) for n in values.shape[1:]))] = values
 
 
 def _body_places(plan: SweepPlan) -> dict[int, list[int]]:
-    """Return the places of a group's bodies among all bodies, for groups that do not have all of them."""
+    """Return the indices of each group's bodies among all bodies, for groups that do not have all bodies."""
     everyone = list(plan.bodies)
-    own = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
-    return {index: [everyone.index(name) for name in names] for index, names in own.items() if names != everyone}
+    names_by_group = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
+    return {index: [everyone.index(name) for name in names] for index, names in names_by_group.items() if names != everyone}
 
 
 def _coordinates(plan: SweepPlan) -> dict[str, Labelled]:
-    """Return the values of axes along their dimensions; and times, bodies and coordinates if a variable has that dimension."""
-    found: dict[str, Labelled] = {}
+    """Return the values of axes along their dimensions; and times, bodies and coordinates if variables have these dimensions."""
+    coordinates: dict[str, Labelled] = {}
     for dimension in plan.dimensions:
         for column in dimension.columns:
-            found |= _coordinate(dimension, column)
-    along = {dim for variable in variables_of(plan).values() for dim in variable.dims}
-    if "time" in along:
+            coordinates |= _coordinate(dimension, column)
+    used = {dim for variable in variables_of(plan).values() for dim in variable.dims}
+    if "time" in used:
         scaled = any(not callable(column.of) and "t1" in column.of for column in plan.columns)
         fractions = (plan.ts - plan.ts[0]) / (plan.ts[-1] - plan.ts[0])
-        part = "time", fractions, {"units": "1", "long_name": "fraction of the span from the start to t1"}
-        found["time"] = part if scaled else ("time", plan.ts, {"units": "s"})
-    if "body" in along:
-        found["body"] = list(plan.bodies)
-    if "coordinate" in along:
-        found["coordinate"] = list(COORDINATES)
-    return found
+        normalized = "time", fractions, {"units": "1", "long_name": "fraction of the span from the start to t1"}
+        coordinates["time"] = normalized if scaled else ("time", plan.ts, {"units": "s"})
+    if "body" in used:
+        coordinates["body"] = list(plan.bodies)
+    if "coordinate" in used:
+        coordinates["coordinate"] = list(COORDINATES)
+    return coordinates
 
 
 def _coordinate(dimension: Dimension, column: AxisColumn) -> dict[str, Labelled]:

@@ -1,4 +1,4 @@
-"""From axes as given by users to the dimensions of a sweep; all mistakes are reported together."""
+"""Checks axes and converts them to the dimensions of a sweep; all mistakes are reported together."""
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
@@ -32,7 +32,7 @@ from udkjax.study.sweep.axes import (
 )
 from udkjax.wording import abbreviate, quote, suggestion
 
-Settings: TypeAlias = Mapping[str, Any]  # arguments of `simulate`
+Settings: TypeAlias = Mapping[str, Any]  # further arguments of `simulate`
 MEMBER = "member"  # the dimension of a design
 # Dimensions and variables of the dataset, whose names a dimension of the sweep cannot have.
 TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
@@ -60,10 +60,10 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepD
     unit = dict(zip(ranges, design.unit(len(ranges)).T, strict=True)) if design is not None and ranges else {}
     if design is not None and not ranges:
         problems.append("design: no axis is a range (low, high) or a distribution for it to fill")
-    found: list[Dimension] = []
+    dimensions: list[Dimension] = []
     if unit and design is not None:
         columns = [_column(mechanism, name, axes[name], unit[name], problems) for name in ranges]
-        found.append(Dimension(MEMBER, design.n, tuple(column for column in columns if column is not None)))
+        dimensions.append(Dimension(MEMBER, design.n, tuple(column for column in columns if column is not None)))
     for name, given in axes.items():
         if name in unit:
             continue
@@ -78,17 +78,17 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepD
                 f"axis {quote(name)}: the dataset has a dimension or variable of this name; choose another, with of=..."
             )
         if columns:
-            found.append(Dimension(name, len(columns[0].values), columns))
-    problems += _clashes(found)
+            dimensions.append(Dimension(name, len(columns[0].values), columns))
+    problems += _clashes(dimensions)
     if not axes:
         problems.append("axes: a sweep needs at least one")
     if problems:
         raise SweepError(problems)
-    return tuple(found)
+    return tuple(dimensions)
 
 
 def _is_range(given: "Axis | Values") -> bool:
-    """Return True if a design samples this axis, that is, unless it is one of choices."""
+    """Return True if a design can sample this axis: if its values are numbers or a distribution, not choices."""
     values = given.values if isinstance(given, Axis) else given
     return hasattr(values, "ppf") or _numbers(values) is not None
 
@@ -96,7 +96,7 @@ def _is_range(given: "Axis | Values") -> bool:
 def _column(
     mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]
 ) -> AxisColumn | None:
-    """Return the values of one axis; None if they are invalid, with the mistake added to `problems`."""
+    """Return the values of an axis; if they are invalid, add the mistake to `problems` and return None."""
     assert not isinstance(given, Zipped), "zipped axes are passed one by one"
     axis = given if isinstance(given, Axis) else Axis(given)
     of = (name,) if axis.of is None else axis.of
@@ -160,7 +160,7 @@ def _unknown_targets(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iter
 
 
 def _suggest_ending(target: str, parameters: Iterable[str]) -> str:
-    """Suggest a parameter whose last part is similar: `body.a.mass` for `mass`."""
+    """Suggest a parameter whose last part is similar, such as `body.a.mass` for `mass`."""
     last = {full.rpartition(".")[2]: full for full in parameters}
     close = difflib.get_close_matches(target, last, n=1)
     return f"; did you mean {quote(last[close[0]])}?" if close else ""
@@ -198,7 +198,7 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
 
 
 def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
-    """Return the mistakes of axes of settings: invalid values, settings given twice, gains that the choices do not have."""
+    """Return the mistakes in axes of settings: invalid values, settings given twice, and gains that the choices do not have."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]

@@ -21,46 +21,47 @@ from udkjax.threads import thread_count
 if TYPE_CHECKING:
     import distributed
 
-Done: TypeAlias = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, its stored variables, and the time it took (s)
+Done: TypeAlias = tuple[Chunk, dict[str, np.ndarray], float]  # a chunk, its stored variables, and its duration (s)
 Executor: TypeAlias = Callable[[SweepPlan, Sequence[Chunk]], Generator[Done, None, None]]  # yields chunks as they finish
 
-CHUNK_RETRIES = 2  # retries of a chunk that raised: another worker may have enough memory, or space on the disk
-TASKS_AHEAD = 2  # tasks per thread of the cluster, so that every thread is busy; more would only fill the workers' memory
-LEAST_TASKS = 16  # tasks, so that an adaptive cluster sees demand
+CHUNK_RETRIES = 2  # number of retries after an error: another worker may have enough memory, or space on the disk
+TASKS_AHEAD = 2  # number of tasks per thread of the cluster, to keep all threads busy; more would only fill the workers' memory
+LEAST_TASKS = 16  # least number of tasks, for an adaptive cluster to start workers
 
 
 def run(plan: SweepPlan, chunk: Chunk) -> Done:
-    """Compute the stored variables (members, ...) of a chunk. A failed member has its code in "result", and NaN elsewhere.
+    """Compute the stored variables (members, ...) of a chunk. Failed members have their code in "result", and NaN elsewhere.
 
-    A member whose numbers make other rows redundant than those of the group's mechanism is run again with its own.
+    If other rows are redundant for the numbers of a member than for the group's mechanism, the member is run again with these
+    rows.
     """
     group = group_run(plan, chunk.group)
-    group.compile()  # compiling is not counted
+    group.compile()  # the duration does not include compiling
     begun = time.perf_counter()
-    found = group.compute(chunk.members)
+    stored = group.compute(chunk.members)
     if group.redundant and group.varied:
-        for rows, which in other_redundant_rows(group, chunk.members, found[RESULT]).items():
+        for rows, which in other_redundant_rows(group, chunk.members, stored[RESULT]).items():
             for name, values in group_run(plan, chunk.group, rows).compute(chunk.members[which]).items():
-                found[name][which] = values
-    return chunk, found, time.perf_counter() - begun
+                stored[name][which] = values
+    return chunk, stored, time.perf_counter() - begun
 
 
 def other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Return members that drifted despite projection because other rows are redundant in them, by these rows."""
-    found: dict[tuple[int, ...], list[int]] = {}
+    """Return members that drifted despite projection because other rows are redundant, by these rows."""
+    by_rows: dict[tuple[int, ...], list[int]] = {}
     for k in np.flatnonzero(result == Result.drift).tolist():
         own = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))
         rows = analyse(group.mechanism(group.shared, own, {})).redundant_rows
         if rows is not None and rows != group.redundant:
-            found.setdefault(rows, []).append(k)
-    return {rows: np.array(which) for rows, which in found.items()}
+            by_rows.setdefault(rows, []).append(k)
+    return {rows: np.array(which) for rows, which in by_rows.items()}
 
 
-# --- where chunks are computed
+# --- executors
 
 
 def compute_on_devices(plan: SweepPlan, chunks: Sequence[Chunk]) -> Generator[Done, None, None]:
-    """Compute chunks, and yield each when it is finished."""
+    """Compute chunks, and yield each one when it is finished."""
     waiting, width = deque(chunks), concurrent_chunks()
     with ThreadPoolExecutor(width, thread_name_prefix="sweep") as pool:
         running = set()
@@ -81,14 +82,14 @@ class ClusterError(RuntimeError):
 
 
 def dask_engine(client: "distributed.Client | None" = None) -> Executor:
-    """Return the engine on the workers of a `distributed.Client`, by default the one created last.
+    """Return the executor on the workers of a `distributed.Client`, by default the most recent client.
 
-    Workers may come and go: unfinished chunks of a lost worker are computed by another. Each result is yielded when it arrives,
-    and is not kept on the cluster.
+    Workers may come and go; unfinished chunks of a lost worker are computed by another. Each result is yielded when it arrives,
+    and removed from the cluster.
 
     Raises:
-        ClusterError: there is no client, a worker has other versions of the packages that determine the results, or a chunk
-            killed several workers.
+        ClusterError: there is no client, a worker has other versions of packages that affect results, or a chunk killed several
+            workers.
     """
     with OptionalImport():
         import distributed
@@ -138,7 +139,7 @@ def dask_engine(client: "distributed.Client | None" = None) -> Executor:
 
 @contextmanager
 def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]:
-    """Start a client of the scheduler at an address, or of one worker process per thread, which end with the client."""
+    """Start a client of the scheduler at an address, or of new worker processes, one per thread, which end with the client."""
     with OptionalImport():
         import distributed
     cluster = {"n_workers": thread_count(), "threads_per_worker": 1, "dashboard_address": ":0"}

@@ -1,4 +1,4 @@
-"""The fingerprint of a sweep: all inputs that determine its results, as JSON; and the differences of two, in words."""
+"""The fingerprint of a sweep: all inputs that determine its results, as JSON; and the differences of two, as text."""
 
 import difflib
 import hashlib
@@ -20,13 +20,13 @@ from udkjax.study.sweep.plan import SweepPlan
 from udkjax.wording import abbreviate
 
 JsonValue: TypeAlias = "str | int | float | bool | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
-MOST_LINES = 24  # lines on differences; further ones are counted
-MOST_NUMBERS = 64  # largest array written in full; larger ones by their shape, first and last number, and a digest
+MOST_LINES = 24  # largest number of printed differences; further ones are counted
+MOST_NUMBERS = 64  # largest array written in full; larger arrays by shape, first and last number, and a digest
 STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
 
 
 def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
-    """Return all inputs that determine the results: plans with equal ones have the same results."""
+    """Return all inputs that determine the results; plans with equal fingerprints have the same results."""
     return {
         **_mechanism(plan.mechanism),
         "axes": {dimension.name: {c.name: _axis(plan, c) for c in dimension.columns} for dimension in plan.dimensions},
@@ -106,7 +106,7 @@ def _value(value: PyTree) -> JsonValue:
 
 
 def digest(content: bytes) -> str:
-    """Return the first 64 bits of the SHA-256, as text."""
+    """Return the first 64 bits of the SHA-256, as a string."""
     return hashlib.sha256(content).hexdigest()[:16]
 
 
@@ -116,32 +116,32 @@ def digest(content: bytes) -> str:
 def differences(before: JsonValue, now: JsonValue) -> list[str]:
     """Return a line for each difference between two JSON values: the path, the old value, and the new one.
 
-    Texts of several lines, such as scenes, are compared line by line.
+    Strings of several lines, such as scenes, are compared line by line.
     """
-    old, new, found = dict(_leaves(before)), dict(_leaves(now)), []
+    old, new, lines = dict(_leaves(before)), dict(_leaves(now)), []
     for path in {**old, **new}:
         a, b = old.get(path), new.get(path)
         if path not in new:
-            found.append(f"{path}: was {abbreviate(a)}, is now missing")
+            lines.append(f"{path}: was {abbreviate(a)}, is now missing")
         elif path not in old:
-            found.append(f"{path}: was missing, is now {abbreviate(b)}")
+            lines.append(f"{path}: was missing, is now {abbreviate(b)}")
         elif isinstance(a, str) and isinstance(b, str) and "\n" in a + b:
             compared = list(difflib.unified_diff(a.splitlines(), b.splitlines(), lineterm="", n=0))[
                 2:
             ]  # without the two lines of file names
-            found += [f"{path}: {'was' if line[0] == '-' else 'is'} {line[1:]}" for line in compared if line[0] != "@"]
+            lines += [f"{path}: {'was' if line[0] == '-' else 'is'} {line[1:]}" for line in compared if line[0] != "@"]
         elif json.dumps(a) != json.dumps(b):  # as text, nan equals nan, and true differs from 1
-            found.append(f"{path}: was {abbreviate(a)}, is {abbreviate(b)}")
-    return found if len(found) <= MOST_LINES else [*found[:MOST_LINES], f"and {len(found) - MOST_LINES} more"]
+            lines.append(f"{path}: was {abbreviate(a)}, is {abbreviate(b)}")
+    return lines if len(lines) <= MOST_LINES else [*lines[:MOST_LINES], f"and {len(lines) - MOST_LINES} more"]
 
 
 def _leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Iterate over the paths and values of a JSON value's scalars, and of its empty lists and mappings."""
+    """Iterate over the paths and values of scalars, empty lists and empty mappings in a JSON value."""
     if isinstance(value, dict) and value:
-        for key, part in value.items():
-            yield from _leaves(part, f"{path}.{key}" if path else key)
+        for key, item in value.items():
+            yield from _leaves(item, f"{path}.{key}" if path else key)
     elif isinstance(value, list) and value:
-        for k, part in enumerate(value):
-            yield from _leaves(part, f"{path}[{k}]")
+        for k, item in enumerate(value):
+            yield from _leaves(item, f"{path}[{k}]")
     else:
         yield path, value

@@ -55,9 +55,9 @@ def loads_grid(text: str, source: str = "") -> dict[str, Any]:
 
 
 class _GridReader:
-    """Reads a grid file. Mistakes are collected in `problems`; invalid values become None or empty.
+    """Reads a grid file. Mistakes are added to `problems`; invalid values are replaced by None or an empty value.
 
-    If `drawn`, members are drawn by a design from ranges and distributions, not from lists of values. Paths of other files are
+    If `drawn`, a design draws the members from ranges and distributions, instead of lists of values. Paths of other files are
     relative to `folder`.
     """
 
@@ -121,7 +121,7 @@ class _GridReader:
             return None
         if not 0 < dt <= t1 - t0:
             return self.wrong("dt", f"must be positive and at most t1 - t0 = {t1 - t0:g}, is {dt:g}")
-        return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # including t1 if it is a multiple of dt up to rounding
+        return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # includes t1 if it is t0 + k dt up to rounding
 
     def axis(self, place: str, name: str, given: Toml) -> Axis | Zipped:
         """Read one axis: a list of values, or a table."""
@@ -152,7 +152,7 @@ class _GridReader:
         return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
 
     def range(self, place: str, given: TomlTable) -> Values:
-        """Read a range: its two ends for a design, otherwise `num` numbers between them."""
+        """Read a range: the two ends for a design, otherwise `num` numbers from one end to the other."""
         needed = ("from", "to") if self.drawn else ("from", "to", "num")
         self.check_keys(place, given, (*needed, "scale"))
         for key in needed:
@@ -204,16 +204,16 @@ class _GridReader:
 
     def settings(self, given: TomlTable) -> dict[str, Any]:
         self.check_keys("settings", given, SETTINGS)
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for name, value in given.items():
             place = f"settings.{name}"
             if name in CHOICES:
-                found[name] = self.choice(place, name, value)
+                values[name] = self.choice(place, name, value)
             elif name == "max_steps":
-                found[name] = self.whole(place, value, 1)
+                values[name] = self.whole(place, value, 1)
             elif name in SETTINGS:
-                found[name] = self.number(place, value)
-        return found
+                values[name] = self.number(place, value)
+        return values
 
     def design(self, given: TomlTable) -> SweepDesign | None:
         self.check_keys("design", given, ("type", "members", "seed"))

@@ -1,6 +1,6 @@
 """The computation of the members of a group: from their indices in the sweep to their stored variables.
 
-Members of a group differ only in numbers, which are arguments of its program: those shared by all members, and those of each.
+Members of a group differ only in numbers, which are arguments of its program: numbers shared by all members, and numbers of each.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ from udkjax.study.quantities import parameter_value
 from udkjax.study.sweep.plan import SweepPlan, stack_choices
 
 RESULT, END, STEPS = "result", "end_time", "steps"  # variables stored for every member
-LANE_WIDTH = 8  # members in the widest vector unit; the size of a piece is a multiple
-DEVICE_PIECE = 4096  # members of a piece on devices that compute a batch whole
-LARGEST_PIECE = 8  # times `PIECE_MEMBERS`: larger pieces save little, since calling a program takes as long as ten members
-LEAST_PIECES = 16  # pieces of a group before they become larger, so that all devices are busy
-STRAIGHT_METHODS = (type(None), Auto, Elimination)  # methods without branches, which suit vector lanes also without machine code
+LANE_WIDTH = 8  # number of members in the widest vector unit; the size of a piece is a multiple of it
+DEVICE_PIECE = 4096  # number of members of a piece on devices that compute a batch at once
+LARGEST_PIECE = 8  # largest piece relative to `PIECE_MEMBERS`; since a call takes as long as ten members, larger ones save little
+LEAST_PIECES = 16  # number of pieces of a group before pieces become larger, to keep all devices busy
+STRAIGHT_METHODS = (type(None), Auto, Elimination)  # without branches: fast in vector lanes even without machine code
 
 
 class Shared(NamedTuple):
@@ -43,7 +43,7 @@ class Shared(NamedTuple):
 
 
 class Own(NamedTuple):
-    """The numbers of single members: of their choices by setting, of axes by name, and their indices."""
+    """The numbers of single members: numbers of choices by setting, numbers of axes by name, and indices of members."""
 
     choices: Mapping[str, PyTree]
     axes: Mapping[str, np.ndarray | Array]
@@ -51,7 +51,7 @@ class Own(NamedTuple):
 
 
 class GroupChoices(NamedTuple):
-    """The choices of an axis that occur in a group: their stacked numbers, their common static part, and their indices."""
+    """The choices of an axis in a group: axis, stacked numbers, common static part, and indices of the choices."""
 
     axis: str
     numbers: PyTree
@@ -80,12 +80,12 @@ class GroupRun:
         analysis = analyse(fixed["mechanism"])
         self.redundant = analysis.redundant_rows if redundant is None else redundant
         fixed["analysis"] = dataclasses.replace(analysis, redundant_rows=self.redundant)
-        if "mechanism" in self._own:  # each has its own scales
-            own = self._own["mechanism"]
-            column = next(column for column in plan.columns if column.name == own.axis)
-            analyses = [analyse(cast(Mechanism, column.choices[k])) for k in own.places]
-            found = [dataclasses.replace(one, redundant_rows=self.redundant) for one in analyses]
-            self._own["analysis"] = GroupChoices(own.axis, *stack_choices(found), own.places)
+        if "mechanism" in self._own:  # each mechanism has different scales
+            batched = self._own["mechanism"]
+            column = next(column for column in plan.columns if column.name == batched.axis)
+            analyses = [analyse(cast(Mechanism, column.choices[k])) for k in batched.places]
+            with_rows = [dataclasses.replace(analysed, redundant_rows=self.redundant) for analysed in analyses]
+            self._own["analysis"] = GroupChoices(batched.axis, *stack_choices(with_rows), batched.places)
         given = {setting for setting in fixed if setting not in self._own}
         arrays, self._static = eqx.partition({setting: fixed[setting] for setting in given}, eqx.is_array)
         targets = [target for column in self.numbers for target in (("",) if callable(column.of) else column.of)]
@@ -114,9 +114,9 @@ class GroupRun:
         """Return the numbers of members, each (n, ...)."""
         places = self.plan.places(members)
         choices = {}
-        for setting, given in self._own.items():
-            rows = np.searchsorted(given.places, places[given.axis])
-            choices[setting] = jax.tree.map(lambda x, rows=rows: x[rows], given.numbers)
+        for setting, choice in self._own.items():
+            rows = np.searchsorted(choice.places, places[choice.axis])
+            choices[setting] = jax.tree.map(lambda x, rows=rows: x[rows], choice.numbers)
         return Own(choices, {column.name: column.numbers[places[column.name]] for column in self.numbers}, members)
 
     def mechanism(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> Mechanism:
@@ -140,7 +140,7 @@ class GroupRun:
     def settings(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> dict[str, PyTree]:
         """Return the settings of one member, including output times."""
         names = {*self._static, *self._own} - {"mechanism"}
-        found = {name: self._setting(name, shared, own) for name in names}
+        values = {name: self._setting(name, shared, own) for name in names}
         numbers = {
             target: own.axes[column.name] + shift.get(column.name, 0.0)
             for column in self.numbers
@@ -153,11 +153,11 @@ class GroupRun:
             ts = ts[0] + (numbers.pop("t1") - ts[0]) * fractions
         for gain in ("alpha", "beta"):
             if gain in numbers:
-                found["stabilization"] = _with(found["stabilization"], gain, numbers.pop(gain))
+                values["stabilization"] = _with(values["stabilization"], gain, numbers.pop(gain))
         for tol in ("rank_tol", "branch_tol"):
             if tol in numbers:
-                found["method"] = _with(found.get("method") or Auto(), tol, numbers.pop(tol))
-        return found | numbers | {"ts": ts}
+                values["method"] = _with(values.get("method") or Auto(), tol, numbers.pop(tol))
+        return values | numbers | {"ts": ts}
 
     def __call__(self, shared: Shared, own: Own, shifts: Array) -> Outputs:
         """Return the stored variables of one member, with `shifts` (names,) added to the numbers to differentiate by."""
@@ -173,7 +173,7 @@ class GroupRun:
         return stored
 
     def compile(self) -> None:
-        """Compile the program, and put the shared numbers on the devices, once."""
+        """Compile the program and transfer the shared numbers to the devices; done once."""
         if self._placed is None:
             self._placed = self.program.place(self.shared, self.own(self.members[:1]))
 
@@ -185,12 +185,12 @@ class GroupRun:
 
     @property
     def outputs(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shapes and types of the stored variables of one member."""
+        """Shapes and types of the stored variables of a member."""
         stored, slopes = self.program.shapes(self.shared, self.own(self.members[:1]))
         return stored | {name: stored[of] for name, (of, _) in self._names_of_slopes(slopes).items()}
 
     def _names_of_slopes(self, slopes: Mapping[str, object]) -> dict[str, tuple[str, int]]:
-        """Return the variable and the index of the differentiation name of each derivative."""
+        """Return, for each derivative, its variable and the index of the name to differentiate by."""
         return {f"d_{of}_d_{by}": (of, k) for of in slopes if of != END for k, by in enumerate(self.names)}
 
     def _closure(self, shared: Shared, own: Own, mechanism: Mechanism) -> Closure | None:
@@ -223,4 +223,4 @@ def group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None = N
 
 @lru_cache(maxsize=MOST_PROGRAMS)
 def _group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None) -> GroupRun:
-    return GroupRun(plan, group, redundant)  # positional arguments, so that equal calls share one entry of the cache
+    return GroupRun(plan, group, redundant)  # positional arguments, since the cache distinguishes keyword arguments

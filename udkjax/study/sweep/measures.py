@@ -1,4 +1,4 @@
-"""Measures: the variables stored for each member. Nothing else is computed."""
+"""Measures: the variables stored for each member; nothing else is computed."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ MeasureChoice = TypeAliasType("MeasureChoice", OneMeasure | Sequence[OneMeasure]
 # Coordinates (T, bodies, 3) to compare runs with, or a function of (mechanism, ts) that returns them.
 Reference = TypeAliasType("Reference", Solution | Numbers | Callable[[Mechanism, Array], Numbers] | None)
 
-RANK_NOT_REACHED = -1  # the rank at output times that a run did not reach
+RANK_NOT_REACHED = -1  # rank at output times that a run did not reach
 
 
 class MeasuredRun(NamedTuple):
@@ -53,9 +53,9 @@ class Label(NamedTuple):
 
 @dataclass(frozen=True)
 class Measure:
-    """The part of a run to be stored: `compute(run)` returns arrays, stored under the names of `labels`, in this order.
+    """The part of a run to be stored: `compute(run)` returns arrays, which are stored by the names of `labels`, in this order.
 
-    Without labels it is a user-defined `function`, which names its arrays itself.
+    Without labels, a user-defined `function` names its arrays.
     """
 
     name: str
@@ -66,12 +66,12 @@ class Measure:
     function: UserMeasure | None = None
 
     def of(self, mechanism: Mechanism, solution: Solution, method: Pseudoinverse | None) -> dict[str, Array]:
-        """Return the stored arrays by their names in the dataset."""
-        found = self.compute(MeasuredRun(mechanism, solution, method, self.reference))
-        return {name: jnp.asarray(x) for name, x in zip(self.labels or found, found.values(), strict=True)}
+        """Return the stored arrays by name in the dataset."""
+        outputs = self.compute(MeasuredRun(mechanism, solution, method, self.reference))
+        return {name: jnp.asarray(x) for name, x in zip(self.labels or outputs, outputs.values(), strict=True)}
 
     def renamed(self, key: str) -> "Measure":
-        """Return the measure with its single variable renamed to `key`, or with `key` as a prefix of several names."""
+        """Return the measure with its variable renamed to `key`, or with `key` as a prefix of several names."""
         if key in ("", self.name):
             return self
         alone = len(self.labels) == 1
@@ -92,7 +92,7 @@ def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) ->
 
 
 def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mechanism: Mechanism) -> tuple[Measure, ...]:
-    """Read `measure`: a name, a function of (mechanism, solution), or a sequence or dict of these.
+    """Return the measures for an argument: a name, a function of (mechanism, solution), or a sequence or dict of these.
 
     Names are those of `MEASURES`, or of channels of the mechanism, such as `pin.C.x` and `driver.motor.load`.
 
@@ -104,13 +104,13 @@ def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mech
     else:
         several = given if isinstance(given, list | tuple) else [cast(OneMeasure, given)]
         items = [("", value) for value in several]
-    found = tuple(_measure(key, value, mechanism).renamed(key) for key, value in items)
-    if not any(measure.name == "error" for measure in found):
+    measures = tuple(_measure(key, value, mechanism).renamed(key) for key, value in items)
+    if not any(measure.name == "error" for measure in measures):
         if reference is not None:
             raise ValueError('reference: is used by the measure "error" only, which is not among the measures')
-        return found
+        return measures
     reference = _reference(reference, ts)
-    return tuple(replace(measure, reference=reference) if measure.name == "error" else measure for measure in found)
+    return tuple(replace(measure, reference=reference) if measure.name == "error" else measure for measure in measures)
 
 
 def _measure(key: str, given: OneMeasure, mechanism: Mechanism) -> Measure:
@@ -137,16 +137,16 @@ def _evaluate_channel(channel: Channel, run: MeasuredRun) -> dict[str, Array]:
 
 
 def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array]:
-    """Call a user-defined function: a single array gets the measure's name, several get it as a prefix, if there is a name."""
+    """Call a user-defined function; the measure's name, if any, is the name of a single array, or a prefix of several names."""
     try:
-        found = function(run.mechanism, run.solution)
+        outputs = function(run.mechanism, run.solution)
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
         cure = "write it in jax.numpy, without numpy, float() or `if` on computed values: members are computed in a batch"
         raise SweepError([f"measure {quote(name)}: {cure}"]) from None
-    if isinstance(found, Mapping):
+    if isinstance(outputs, Mapping):
         front = "" if name == NAMELESS else f"{name}_"
-        return {f"{front}{key}": jnp.asarray(value) for key, value in found.items()}
-    return {name: jnp.asarray(found)}
+        return {f"{front}{key}": jnp.asarray(value) for key, value in outputs.items()}
+    return {name: jnp.asarray(outputs)}
 
 
 def _reference(given: Reference, ts: np.ndarray) -> Reference:
@@ -163,7 +163,7 @@ def _reference(given: Reference, ts: np.ndarray) -> Reference:
 
 
 def _largest(x: Array) -> Array:
-    """Return the largest absolute value, ignoring the NaN after the end of a run."""
+    """Return the largest absolute value; the NaN after the end of a run is ignored."""
     return jnp.max(jnp.where(jnp.isnan(x), 0.0, jnp.abs(x)), initial=0.0)
 
 
@@ -174,7 +174,7 @@ _STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
 
 
 def _named(name: str, along: bool = True, **labels: Label) -> Callable[[Compute], Compute]:
-    """Decorate a function that computes a measure with its name, the need for all output times, and its variables."""
+    """Decorate a function as a measure with a name, the need for all output times, and the labels of its variables."""
 
     def add(compute: Compute) -> Compute:
         MEASURES[name] = Measure(name, compute, labels, along)
@@ -240,7 +240,7 @@ def _counts(run: MeasuredRun) -> dict[str, Array]:
 
 @_named("rank", rank=Label(("time",), "1", "rank of D by the method's own rule; -1: not reached"))
 def _rank(run: MeasuredRun) -> dict[str, Array]:
-    """Compute ranks by the method's own rule; `Auto` has that of its rank-revealing fallback."""
+    """Compute ranks by the method's rule; for `Auto`, by that of its rank-revealing fallback."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))

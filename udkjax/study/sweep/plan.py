@@ -22,14 +22,14 @@ from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimensio
 from udkjax.study.sweep.dimensions import Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
-OUTSIDE = ("throw", "progress", "adjoint")  # arguments of simulate that a sweep sets itself
+OUTSIDE = ("throw", "progress", "adjoint")  # arguments of `simulate` that only a sweep sets
 
 
 @dataclass(frozen=True, eq=False)
 class StoredVariable:
     """A variable that is stored for each member."""
 
-    dims: tuple[str, ...]  # in addition to those of the sweep
+    dims: tuple[str, ...]  # dimensions in addition to those of the sweep
     shape: tuple[int, ...]
     dtype: np.dtype
     units: str
@@ -38,11 +38,11 @@ class StoredVariable:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Members whose choices have the same structure, and one compiled program, which groups of other methods may share."""
+    """Members whose choices have the same structure; they have a compiled program, which other groups may share."""
 
     index: int
-    choices: Mapping[str, tuple[int, ...]]  # for each axis of choices, the indices of those that occur
-    labels: Mapping[str, str]  # the same, readable
+    choices: Mapping[str, tuple[int, ...]]  # for each axis of choices, the indices of the choices in this group
+    labels: Mapping[str, str]  # labels of the choices
     members: Int[np.ndarray, "n"]  # indices in the flattened grid, row-major over the dimensions
 
 
@@ -50,7 +50,7 @@ class Group:
 class Chunk:
     """Members of one group that are computed together: the unit of progress, of storage and of a task."""
 
-    index: int  # its number among all chunks
+    index: int  # number among all chunks
     group: int  # `Group.index`
     members: Int[np.ndarray, "n"]  # indices in the flattened grid, in the order of computation
     work: float  # expected work, relative to other chunks of its group
@@ -63,11 +63,11 @@ class SweepPlan:
     mechanism: Mechanism
     dimensions: tuple[Dimension, ...]
     ts: np.ndarray  # (T,) s
-    settings: Settings  # arguments of simulate that are not axes
+    settings: Settings  # arguments of `simulate` that are not axes
     measures: tuple[Measure, ...]
     derivatives: tuple[str, ...] = ()
     design: SweepDesign | None = None
-    token: str = field(default_factory=lambda: uuid.uuid4().hex)  # the same in every copy, so that copies share compiled code
+    token: str = field(default_factory=lambda: uuid.uuid4().hex)  # equal in all copies, which therefore share compiled code
 
     def __hash__(self) -> int:
         return hash(self.token)
@@ -87,17 +87,17 @@ class SweepPlan:
 
     @property
     def columns(self) -> tuple[AxisColumn, ...]:
-        """All axes, in their order."""
+        """All axes, in order."""
         return tuple(column for dimension in self.dimensions for column in dimension.columns)
 
     def places(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
         """Return the index of each member's value on each axis."""
-        along = np.unravel_index(members, self.shape)
-        return {column.name: k for d, k in zip(self.dimensions, along, strict=True) for column in d.columns}
+        indices = np.unravel_index(members, self.shape)
+        return {column.name: k for d, k in zip(self.dimensions, indices, strict=True) for column in d.columns}
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """One group for each combination of structures that occurs among the choices."""
+        """The groups of members, one for each combination of structures of choices."""
         chosen = [column for column in self.columns if column.is_choice]
         places = self.places(np.arange(self.size))
         kinds = np.stack(
@@ -105,23 +105,23 @@ class SweepPlan:
         )
         _, number = np.unique(kinds, axis=0, return_inverse=True)
         number = number.ravel()
-        found = []
+        groups = []
         for members in sorted((np.flatnonzero(number == k) for k in range(number.max() + 1)), key=lambda m: m[0]):
-            at = {column.name: tuple(np.unique(places[column.name][members]).tolist()) for column in chosen}
-            labels = {column.name: " | ".join(column.labels[k] for k in at[column.name]) for column in chosen}
-            found.append(Group(len(found), at, labels, members))
-        return tuple(found)
+            choices = {column.name: tuple(np.unique(places[column.name][members]).tolist()) for column in chosen}
+            labels = {column.name: " | ".join(column.labels[k] for k in choices[column.name]) for column in chosen}
+            groups.append(Group(len(groups), choices, labels, members))
+        return tuple(groups)
 
     @cached_property
     def first_alike(self) -> tuple[int, ...]:
-        """For each group, the first with the same compiled program: their methods differ only in the number of a `OneOf`."""
+        """For each group, the first group with the same program; their methods differ only in the number of a `OneOf`."""
         numbers = {column.name: _number_structures(column.computed) for column in self.columns if column.is_choice}
 
         def key(group: Group) -> tuple:
             return tuple((numbers[name][places[0]], len(places) > 1) for name, places in group.choices.items())
 
         keys = [key(group) for group in self.groups]
-        return tuple(keys.index(one) for one in keys)
+        return tuple(keys.index(key_of_group) for key_of_group in keys)
 
     @cached_property
     def _numbers(self) -> np.ndarray:
@@ -135,17 +135,17 @@ class SweepPlan:
         return int(self._numbers[member])
 
     def choice(self, group: Group, setting: str) -> AxisChoice:
-        """Return a group's value of a setting: the first of its choices, if they differ in numbers."""
+        """Return a group's value of a setting; the first one if values differ in numbers."""
         for column in self.columns:
             if column.of == (setting,) and column.is_choice:
                 return column.choices[group.choices[column.name][0]]
         return self.mechanism if setting == "mechanism" else self.settings.get(setting)
 
     def mechanism_of(self, group: Group) -> Mechanism:
-        """Return the mechanism of a group: the first, if they differ in numbers."""
-        found = self.choice(group, "mechanism")
-        assert isinstance(found, Mechanism)
-        return found
+        """Return the mechanism of a group; the first one if mechanisms differ in numbers."""
+        mechanism = self.choice(group, "mechanism")
+        assert isinstance(mechanism, Mechanism)
+        return mechanism
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -187,7 +187,7 @@ def make_plan(
         problems += error.problems
     targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
     if targets & {"alpha", "beta"} and "stabilization" not in targets:
-        settings.setdefault("stabilization", Baumgarte())  # needed by an axis of gains
+        settings.setdefault("stabilization", Baumgarte())  # an axis of gains needs a stabilization
     problems += check_settings(mechanism, dimensions, settings)
     problems += check_tangents(mechanism, dimensions, derivatives)
     measures: tuple[Measure, ...] = ()
@@ -211,5 +211,7 @@ def _number_structures(values: Sequence[AxisChoice]) -> np.ndarray:
 
 def stack_choices(choices: Sequence[PyTree]) -> tuple[PyTree, PyTree]:
     """Return the stacked numbers of choices with the same structure, and their common static part."""
-    parts = [eqx.partition(choice, eqx.is_array) for choice in choices]
-    return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(arrays for arrays, _ in parts)), parts[0][1]
+    partitions = [eqx.partition(choice, eqx.is_array) for choice in choices]
+    return jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *(arrays for arrays, _ in partitions)), partitions[
+        0
+    ][1]

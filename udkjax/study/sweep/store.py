@@ -1,7 +1,7 @@
 """The finished chunks of a sweep on disk, which survive a crash and are not computed again.
 
 A folder contains `sweep.json`, the fingerprint of the sweep, and `chunks/`, with one file per chunk. A file gets its name only
-after all of it is on the disk; the name ends with digests of the sweep and of the file, so that chunks can be identified even if
+when it is completely on the disk. The name ends with digests of the sweep and of the file; they identify chunks even if
 `sweep.json` is damaged. There is no separate list of finished chunks.
 """
 
@@ -20,10 +20,10 @@ from udkjax.study.sweep.fingerprint import JsonValue, differences, digest
 from udkjax.study.sweep.plan import Chunk
 from udkjax.wording import abbreviate
 
-FORMAT = 2  # of the folder; a folder of another format counts as another sweep
-UNFINISHED_SUFFIX = ".unfinished"  # suffix of a file while it is written
+FORMAT = 2  # format of the folder; a folder with another format counts as another sweep
+UNFINISHED_SUFFIX = ".unfinished"  # suffix of files that are not complete
 MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
-MEMBERS, STORED_PREFIX = "members", "stored/"  # in a file: the name of the members' indices, and the prefix of stored variables
+MEMBERS, STORED_PREFIX = "members", "stored/"  # names in a file: that of the members' indices, and the prefix of stored variables
 ADVICE = "choose another folder, or remove this one to start over"
 
 Variables = Mapping[str, np.ndarray]
@@ -55,9 +55,10 @@ class MemoryStore:
 
 
 class FolderStore:
-    """The finished chunks of a sweep in a folder, which only one process may write to at a time.
+    """The finished chunks of a sweep in a folder. Only one process at a time may write to it.
 
-    `fingerprint` has all inputs that determine the results. A folder with another sweep is refused, and the differences listed.
+    `fingerprint` contains all inputs that determine the results. A folder with another sweep is refused, with a list of the
+    differences.
 
     Raises:
         StoreError: the folder cannot be used.
@@ -69,7 +70,7 @@ class FolderStore:
             (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
             self._lock = FileLock(self.folder / LOCK, timeout=0)
             self._lock.acquire()
-        except Timeout:  # an OSError, too
+        except Timeout:  # Timeout is an OSError
             text = f"{self._writer()} is writing to {self.folder}: wait for it, end it, or choose another folder"
             raise StoreError(text) from None
         except OSError as error:
@@ -99,7 +100,7 @@ class FolderStore:
         self._write(f"{CHUNKS}/{chunk.index:06d}-{self._sweep}-{digest(content)}.npz", content)
 
     def read_chunks(self) -> Iterator[tuple[np.ndarray, Variables]]:
-        """Iterate over finished chunks: members, and their data. Damaged files are removed."""
+        """Iterate over finished chunks, as members and their data. Damaged files are removed."""
         for file in self._files():
             try:
                 content = file.read_bytes()
@@ -116,7 +117,7 @@ class FolderStore:
     def _begin(self, sweep: dict[str, JsonValue]) -> None:
         """Write the fingerprint of the sweep, or compare it with an existing one."""
         for file in (*self.folder.glob(f"*{UNFINISHED_SUFFIX}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED_SUFFIX}")):
-            file.unlink(missing_ok=True)  # left by a process that was killed while writing
+            file.unlink(missing_ok=True)  # file of a process that was killed while writing
         manifest = self.folder / MANIFEST
         try:
             begun = json.loads(manifest.read_text(encoding="utf-8"))
@@ -160,8 +161,8 @@ def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, Jso
 
 def read_variable(store: MemoryStore | FolderStore, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the finished members, and their values of one stored variable."""
-    parts = [(members, data[name]) for members, data in store.read_chunks()] or [(np.empty(0, int), np.empty(0, int))]
-    members, values = zip(*parts, strict=True)
+    chunks = [(members, data[name]) for members, data in store.read_chunks()] or [(np.empty(0, int), np.empty(0, int))]
+    members, values = zip(*chunks, strict=True)
     return np.concatenate(members), np.concatenate(values)
 
 
@@ -170,7 +171,7 @@ def _cannot_use(folder: Path, error: OSError) -> str:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file atomically: if the process or the machine stops, either the old or the whole new file is on the disk."""
+    """Write a file atomically: if the process or the machine stops, either the old or the complete new file is on the disk."""
     unfinished = path.with_name(f"{path.name}.{os.getpid()}{UNFINISHED_SUFFIX}")
     try:
         with open(unfinished, "wb") as file:
@@ -181,7 +182,7 @@ def write_whole(path: Path, content: bytes) -> None:
     except BaseException:
         unfinished.unlink(missing_ok=True)
         raise
-    if hasattr(os, "O_DIRECTORY"):  # the folder's entry has to reach the disk, too
+    if hasattr(os, "O_DIRECTORY"):  # the folder's entry must also reach the disk
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(folder)

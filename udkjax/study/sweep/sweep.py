@@ -49,38 +49,38 @@ def sweep(
     progress: ProgressOption = None,
     **settings: Any,
 ) -> "xarray.Dataset":
-    """Simulate a mechanism for all combinations of the values of some axes.
+    """Simulate a mechanism for all combinations of the values of axes.
 
     Members (the single runs) are computed concurrently, in chunks of a few seconds, on all devices or cores of the machine.
 
     Args:
         mechanism: the scene.
         axes: values by name. A name is that of a parameter (`body.link1.mass`), of a setting of `simulate` (`rtol`, `atol`,
-            `drift_tol`, `dt0`, `method`, `solver`, `stabilization`, `formulation`, `max_steps`, `state`), of one of its parts
-            (`alpha` and `beta` of Baumgarte's stabilization, `rank_tol` and `branch_tol` of the method), `t1`, to which the
-            output times are stretched, or `mechanism`, to compare mechanisms. `Axis(values, of=...)` gives an axis a name of
-            its own and may tie several quantities; `Zipped({...})` varies axes together.
+            `drift_tol`, `dt0`, `method`, `solver`, `stabilization`, `formulation`, `max_steps`, `state`), of an attribute of
+            settings (`alpha` and `beta` of Baumgarte's stabilization, `rank_tol` and `branch_tol` of the method), `t1`, to which
+            the output times are stretched, or `mechanism`, to compare mechanisms. `Axis(values, of=...)` allows another name of
+            an axis and may tie several quantities; `Zipped({...})` varies axes together.
         ts: output times (T,), s.
-        measure: measures to store for each member; nothing else is stored. By name: "final" (q and v at the end), "states" (at
-            all `ts`), "violation" (the largest, m or rad), "energy_drift" (J), "error" (the largest error of a position and of an
-            angle, against `reference`), "counts", "rank" (of D at all `ts`), or a channel, such as "pin.C.x" (at all `ts`). Or a
-            function of (mechanism, solution), in jax.numpy, that returns an array or a dict of arrays; or several measures, in a
-            list, or a dict by name.
+        measure: measures to store for each member; nothing else is stored. A measure is a name: "final" (q and v at the end),
+            "states" (at all `ts`), "violation" (the largest, m or rad), "energy_drift" (J), "error" (the largest error of a
+            position and of an angle, against `reference`), "counts", "rank" (of D at all `ts`), or a channel, such as "pin.C.x"
+            (at all `ts`). It may also be a function of (mechanism, solution), in jax.numpy, that returns an array or a dict of
+            arrays. Several measures are given in a list, or a dict by name.
         design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are then ranges (low, high) or frozen
             distributions of scipy.stats, and all of them lie along the dimension "member".
         reference: for the measure "error": a Solution, coordinates (T, bodies, 3), or a function of (mechanism, ts).
         derivatives: names of parameters and axes: the dataset also has the derivatives of all stored variables by each of them,
             as `d_<variable>_d_<name>`, in forward mode.
         engine: "dask": on the workers of a `client`; "devices": in this process; "auto": on a client if one is given.
-        client: a client of dask.distributed; by default the one created last.
-        out: a folder for finished chunks: the same sweep, run again, continues from them.
-        memory: limit of the memory of members in computation (bytes).
+        client: a client of dask.distributed; by default the most recent one.
+        out: a folder for finished chunks; if the same sweep is run again, it continues from these.
+        memory: limit of the memory for members that are being computed (bytes).
         progress: None shows a line after two seconds, True at once, False never; a function gets a `SweepProgress` after each
             chunk.
         settings: further arguments of `simulate`, for all members.
 
     Returns:
-        A dataset along the axes. `result` is the result of each member, a number whose meanings are in its attributes. The
+        A dataset along the axes. `result` is the result of each member, a number that its attributes explain. The
         variables of failed members are NaN; no exception is raised for them.
 
     Raises:
@@ -102,24 +102,24 @@ def sweep(
 
 
 def _engine(engine: str, client: "distributed.Client | None") -> Executor:
-    """Return the engine that computes chunks; "auto" uses a client if one is given."""
+    """Return the executor of chunks; "auto" uses a client if one is given."""
     return dask_engine(client) if engine == "dask" or (engine == "auto" and client is not None) else compute_on_devices
 
 
 T = TypeVar("T", int, float)
-STEPS = "steps"  # the variable by which members are compared
+STEPS = "steps"  # variable by which members are compared
 
 
 @dataclass(frozen=True)
 class SweepProgress(Progress):
-    """The progress of a sweep: `done` of `total` members, including those of an earlier run that it continues.
+    """The progress of a sweep: `done` of `total` members, including members of an earlier run.
 
     Attributes:
-        rate: members per second, in this run; None until something is done.
+        rate: members per second in this run; None before the first chunk.
         remaining: estimated remaining time (s); None until it can be estimated.
         failures: number of members for each `Result` other than success.
-        slowest: the member with the most steps, and their number; None if steps are not stored.
-        slowest_chunk: the chunk that took longest, and its time (s).
+        slowest: the member with the most steps, and its number of steps; None if steps are not stored.
+        slowest_chunk: the chunk with the longest duration, and the duration (s).
     """
 
     rate: float | None = None
@@ -133,14 +133,14 @@ class SweepProgress(Progress):
         return self.remaining
 
     def __str__(self) -> str:
-        part = 100 * self.done / self.total if self.total else 100.0
+        percent = 100 * self.done / self.total if self.total else 100.0
         time_left = duration(self.seconds) if self.left is None or self.done == self.total else f"{duration(self.left)} left"
         rate = [] if self.rate is None else [f"{self.rate:.3g} per second"]
-        return "; ".join([f"{self.done:g} of {self.total:g} members ({part:.0f} %)", *rate, time_left, self.message])
+        return "; ".join([f"{self.done:g} of {self.total:g} members ({percent:.0f} %)", *rate, time_left, self.message])
 
 
 class Watch:
-    """The progress of a sweep of `members`, of which an earlier run has `done` some, with the results `codes`.
+    """The progress of a sweep of `members`; an earlier run has completed `done` of them, with the results `codes`.
 
     `show` is called with the `SweepProgress` at the start and after each chunk.
     """
@@ -148,17 +148,17 @@ class Watch:
     def __init__(self, members: int, done: int, show: Callable[[SweepProgress], object], codes: ArrayLike = ()):
         self.show, self.new = show, 0
         self.begun = time.monotonic()
-        self.since, self.work, self.work_done = self.begun, 0.0, 0.0  # of chunks with a known amount of work
+        self.since, self.work, self.work_done = self.begun, 0.0, 0.0  # start, amount and completed part of the known work
         failures = _count_failures({}, codes)
         self.state = SweepProgress("sweep", done, members, 0.0, _message(failures), failures=failures)
         self.show(self.state)
 
     def expect(self, chunks: Sequence[Chunk]) -> None:
-        """Set the remaining work to that of `chunks`, which are all remaining ones."""
+        """Set the remaining work to that of `chunks`, all of those that remain."""
         self.since, self.work = time.monotonic(), sum(chunk.work for chunk in chunks)
 
     def __call__(self, chunk: Chunk, data: Mapping[str, np.ndarray], seconds: float | None = None) -> None:
-        """Update the progress with a finished chunk, its stored variables, and the time it took (s), if known."""
+        """Update the progress with a finished chunk, its stored variables, and its duration (s), if known."""
         before, now = self.state, time.monotonic()
         self.new += len(chunk.members)
         self.work_done += chunk.work if self.work else 0.0
@@ -183,28 +183,32 @@ def _message(
     failures: Mapping[str, int], slowest: tuple[int, int] | None = None, slowest_chunk: tuple[int, float] | None = None
 ) -> str:
     failed = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in failures.items())
-    parts = [f"failed: {failed}" if failed else "no failures"]
-    parts += [] if slowest_chunk is None else ["slowest chunk {}: {:.1f} s".format(*slowest_chunk)]
-    parts += [] if slowest is None else ["slowest member {}: {} steps".format(*slowest)]
-    return "; ".join(parts)
+    remarks = [f"failed: {failed}" if failed else "no failures"]
+    remarks += [] if slowest_chunk is None else ["slowest chunk {}: {:.1f} s".format(*slowest_chunk)]
+    remarks += [] if slowest is None else ["slowest member {}: {} steps".format(*slowest)]
+    return "; ".join(remarks)
 
 
-def _count_failures(before: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
+def _count_failures(previous: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
     """Add members to the counts of each `Result` other than success."""
-    found = Counter(before)
+    counts = Counter(previous)
     for code, count in zip(*np.unique(np.asarray(codes, int), return_counts=True), strict=True):
         if code != Result.successful:
-            found[Result(code).name] += int(count)
-    return dict(found)
+            counts[Result(code).name] += int(count)
+    return dict(counts)
 
 
-def _find_slowest(before: tuple[int, T] | None, indices: ArrayLike, values: ArrayLike | None) -> tuple[int, T] | None:
-    """Return the index and value of the largest of the values, unless the one before was as large."""
+def _find_slowest(previous: tuple[int, T] | None, indices: ArrayLike, values: ArrayLike | None) -> tuple[int, T] | None:
+    """Return the index and value of the largest value, or the previous maximum if that is at least as large."""
     if values is None:
-        return before
+        return previous
     values = np.atleast_1d(values)
-    most = int(np.argmax(values))
-    return before if before is not None and before[1] >= values[most] else (int(np.asarray(indices)[most]), values[most].item())
+    largest = int(np.argmax(values))
+    return (
+        previous
+        if previous is not None and previous[1] >= values[largest]
+        else (int(np.asarray(indices)[largest]), values[largest].item())
+    )
 
 
 def duration(seconds: float) -> str:
