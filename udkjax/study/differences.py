@@ -80,11 +80,11 @@ def _truncation(R: np.ndarray, noise: np.ndarray, series: Sequence[np.ndarray]) 
     return np.where(error > TOO_LARGE * np.fmax(size[:-1], size[1:]), np.nan, error)
 
 
-def leave_out_far_steps(differences: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
+def leave_out_far_steps(computed: Differences, size: Float[np.ndarray, "S"], series: Sequence[np.ndarray]) -> Differences:
     """Exclude differences whose steps lead to an entirely different motion; `size` is the derivative's size in each series."""
-    h = differences.steps[:, None]
-    far = (h * size > differences.largest) & (h * sizes(differences.values, series) > LEAST_CHANGE * differences.largest)
-    return differences._replace(truncation=np.where(far, np.nan, differences.truncation))
+    h = computed.steps[:, None]
+    far = (h * size > computed.largest) & (h * sizes(computed.values, series) > LEAST_CHANGE * computed.largest)
+    return computed._replace(truncation=np.where(far, np.nan, computed.truncation))
 
 
 def best_steps(errors: Float[np.ndarray, "... H"]) -> Int[np.ndarray, "..."]:

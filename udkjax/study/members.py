@@ -45,7 +45,7 @@ class Program:
         self._compiled: jax.stages.Compiled | None = None
 
     def __call__(self, shared: PyTree, own: PyTree, on_threads: bool = False) -> Results:
-        """Compute the members along the first axis of `own`, in order; pieces run one after another, or concurrently on threads."""
+        """Compute the members along the first axis of `own`, in order; pieces run in turn, or concurrently on threads."""
         count = len(jax.tree.leaves(own)[0])
         program = self.compile(shared, own)
 

@@ -241,11 +241,11 @@ def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePai
 
 
 def _places(
-    problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, differences: Differences
+    problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, computed: Differences
 ) -> tuple[DisagreementPlace, ...]:
     places = []
-    for rows, best in zip(series, best_steps((differences.noise + differences.truncation).T), strict=True):
-        difference = differences.values[best][rows]
+    for rows, best in zip(series, best_steps((computed.noise + computed.truncation).T), strict=True):
+        difference = computed.values[best][rows]
         worst = int(np.argmax(np.abs(difference - slope[rows])))
         record, time, channel = problem.index[rows[worst]]
         name, t = problem.channel_names[channel], float(problem.ts[record, time])

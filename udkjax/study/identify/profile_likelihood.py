@@ -166,7 +166,7 @@ def trace_profile(
         index: index of the unknown.
         step: standard error of the unknown, approximately.
         noise: ratio of the estimated to the assumed noise.
-        degrees_of_freedom: those of the estimated noise, for the quantile of F; None if the noise is known.
+        degrees_of_freedom: degrees of freedom of the estimated noise, for the quantile of F; None if the noise is known.
         value: x as a function of z_k, increasing between the `bounds` of z_k.
         steps: maximum number of fits on each side.
     """
