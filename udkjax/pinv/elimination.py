@@ -74,13 +74,13 @@ def _cholesky(
     m = len(gram)
 
     def column(k, carry):
-        rest, L, independent, order, waiting = carry
-        j = jnp.argmax(jnp.where(waiting, jnp.diagonal(rest), -jnp.inf))
-        is_independent = exceeds(rest[j, j], threshold[j])
-        root = jnp.sqrt(jnp.where(is_independent, rest[j, j], 1.0))
-        entry = jnp.where(is_independent & waiting, rest[:, j] / root, 0.0)
-        rest = rest - entry[:, None] * entry
-        return rest, L.at[:, k].set(entry), independent.at[k].set(is_independent), order.at[k].set(j), waiting.at[j].set(False)
+        schur, L, independent, order, waiting = carry
+        j = jnp.argmax(jnp.where(waiting, jnp.diagonal(schur), -jnp.inf))
+        is_independent = exceeds(schur[j, j], threshold[j])
+        root = jnp.sqrt(jnp.where(is_independent, schur[j, j], 1.0))
+        entry = jnp.where(is_independent & waiting, schur[:, j] / root, 0.0)
+        schur = schur - entry[:, None] * entry
+        return schur, L.at[:, k].set(entry), independent.at[k].set(is_independent), order.at[k].set(j), waiting.at[j].set(False)
 
     start = (gram, jnp.zeros_like(gram), jnp.zeros(m, bool), jnp.zeros(m, int), jnp.ones(m, bool))
     return jax.lax.fori_loop(0, m, column, start)[1:4]
