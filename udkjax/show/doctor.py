@@ -58,28 +58,28 @@ def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
     return engine, reason or "by default; models that cannot be compiled are run by diffrax, see `Solution.settings`"
 
 
-def summary(found: dict[str, Any]) -> str:
+def summary(facts_by_name: dict[str, Any]) -> str:
     """Describe the findings of `facts`."""
-    cached = f"{found['cached_programs']} in {found['cache']}, {found['cached_bytes'] / 2**20:.1f} MiB"
-    if found["cache"] is None:
+    cached = f"{facts_by_name['cached_programs']} in {facts_by_name['cache']}, {facts_by_name['cached_bytes'] / 2**20:.1f} MiB"
+    if facts_by_name["cache"] is None:
         cached = "nothing, because " + (
             "UDKJAX_CACHE=0 is set" if os.environ.get("UDKJAX_CACHE") == "0" else "there is no home folder"
         )
     lines = {
-        **found["versions"],
-        "missing extras": ", ".join(found["missing_extras"]) or "none",
-        "system": found["system"],
-        "processor": found["processor"],
-        "cores": f"{found['cores']} of {found['cores_of_machine']}",
-        "threads": f"{found['threads']} (a limit can be set by UDKJAX_THREADS)",
-        "devices": ", ".join(found["devices"]),
-        "precision": found["precision"],
-        "engine": f"{found['engine']}: {found['engine_reason']}",
-        "machine code": f"{found['lanes']} lanes; cached: {cached}",
-        "environment": ", ".join(f"{key}={value}" for key, value in found["environment"].items()) or "-",
+        **facts_by_name["versions"],
+        "missing extras": ", ".join(facts_by_name["missing_extras"]) or "none",
+        "system": facts_by_name["system"],
+        "processor": facts_by_name["processor"],
+        "cores": f"{facts_by_name['cores']} of {facts_by_name['cores_of_machine']}",
+        "threads": f"{facts_by_name['threads']} (a limit can be set by UDKJAX_THREADS)",
+        "devices": ", ".join(facts_by_name["devices"]),
+        "precision": facts_by_name["precision"],
+        "engine": f"{facts_by_name['engine']}: {facts_by_name['engine_reason']}",
+        "machine code": f"{facts_by_name['lanes']} lanes; cached: {cached}",
+        "environment": ", ".join(f"{key}={value}" for key, value in facts_by_name["environment"].items()) or "-",
     }
     width = max(map(len, lines))
-    advice = [f"! {line}" for line in found["advice"]] or ["no problems found"]
+    advice = [f"! {line}" for line in facts_by_name["advice"]] or ["no problems found"]
     return "\n".join([f"{key:<{width}}  {value}" for key, value in lines.items()] + advice)
 
 

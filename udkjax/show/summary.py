@@ -16,11 +16,11 @@ from udkjax.study.report import row_label
 from udkjax.wording import plural
 
 
-def check_summary(mech: Mechanism, found: Check) -> str:
+def check_summary(mech: Mechanism, check: Check) -> str:
     """Describe the findings of `udkjax.positions.assembly.check` about a mechanism."""
-    lines = check_lines(found)
+    lines = check_lines(check)
     lines["constraint equations"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
-    lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in found.redundant) or "none"
+    lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in check.redundant) or "none"
     return table(mech.name or "mechanism", lines)
 
 

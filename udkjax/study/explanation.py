@@ -82,8 +82,8 @@ class Explanation(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and strings, for JSON."""
-        found = plain(self) | {"bodies": list(self.mechanism.body_names), "rows": self.row_labels()}
-        return found | {"lambda": found.pop("multipliers")}
+        results = plain(self) | {"bodies": list(self.mechanism.body_names), "rows": self.row_labels()}
+        return results | {"lambda": results.pop("multipliers")}
 
     def row_labels(self) -> list[str]:
         """Return the names of the rows as they are printed."""
@@ -196,13 +196,13 @@ def _multipliers(e: Explanation, rows: list[str]) -> list[str]:
 
 def _directions(e: Explanation) -> list[tuple[str, float]]:
     """Return the pins and welds whose force is unique in one direction only, with this direction (rad)."""
-    found, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
+    directions, null_rows = [], e.null_rows / np.abs(e.null_rows).max(initial=np.finfo(float).tiny)
     for name, joint in e.mechanism.joints.items():
-        own = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
+        indices = [k for k, (owner, _) in enumerate(e.row_names) if owner == name]
         holds_point = isinstance(joint, Revolute | Weld)
-        angle = determinacy.unique_direction(null_rows[own[:2]]) if holds_point else None  # a weld's third row is its torque
-        found += [] if angle is None else [(name, angle)]
-    return found
+        angle = determinacy.unique_direction(null_rows[indices[:2]]) if holds_point else None  # a weld's third row is its torque
+        directions += [] if angle is None else [(name, angle)]
+    return directions
 
 
 def _gauss(e: Explanation) -> list[str]:

@@ -139,8 +139,8 @@ class DesignProblem:
             np.array([graph.input((n, k), n) for k in range(c)], object)
             for n, c in (("x", self.unknowns), ("q", self.coordinates))
         )
-        found = trace(points, jnp.zeros(self.unknowns), jnp.zeros(self.coordinates))(graph, x, q)[0]
-        return ScalarProgram(graph, [*x, *q], list(found.flat))
+        traced = trace(points, jnp.zeros(self.unknowns), jnp.zeros(self.coordinates))(graph, x, q)[0]
+        return ScalarProgram(graph, [*x, *q], list(traced.flat))
 
     # --- single mechanisms
 

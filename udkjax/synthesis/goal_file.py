@@ -195,7 +195,7 @@ def _read_bounds(mechanism: Mechanism, table: Any, units: Units, problems: list[
 
 
 def _read_lengths(tables: Any, units: Units, problems: list[str]) -> dict[tuple[str, str], tuple[float, float]]:
-    found = {}
+    ranges = {}
     for k, table in enumerate(tables):
         where = f"length[{k}]"
         problems += [f"{where}.{key}: {unknown_key(key, LENGTH)}" for key in table if key not in LENGTH]
@@ -205,5 +205,5 @@ def _read_lengths(tables: Any, units: Units, problems: list[str]) -> dict[tuple[
             continue
         least = units.convert(f"{where}.least", table.get("least", 0.0), "m", problems)
         most = units.convert(f"{where}.most", table.get("most", float("inf")), "m", problems)
-        found[tuple(pins)] = (least, most)
-    return found
+        ranges[tuple(pins)] = (least, most)
+    return ranges

@@ -90,25 +90,27 @@ class LengthLimits:
     def __init__(self, free: FreeNumbers, lengths: Mapping[tuple[str, str], Range], areas: Mapping[str, object] | None = None):
         mechanism = free.mechanism
         ranges = [_read_range(mechanism, pins, ends) for pins, ends in lengths.items()]
-        problems = [p for found in ranges for p in found[3]]
-        found = {pin: read_area(mechanism, pin, area, problems) for pin, area in (areas or {}).items()}
+        problems = [p for areas_by_pin in ranges for p in areas_by_pin[3]]
+        areas_by_pin = {pin: read_area(mechanism, pin, area, problems) for pin, area in (areas or {}).items()}
         if problems:
             raise SceneError(problems, mechanism.name)
-        rows = [(pins, way, end) for pins, low, high, _ in ranges for way, end in ((-1.0, low), (1.0, high)) if 0 < end < np.inf]
-        rows += [((None, pin), 1.0, area[2]) for pin, area in found.items() if area.ndim == 1]
-        centres = np.array([area[:2] for area in found.values() if area.ndim == 1]).reshape(-1, 2)
+        rows = [
+            (pins, sign, end) for pins, low, high, _ in ranges for sign, end in ((-1.0, low), (1.0, high)) if 0 < end < np.inf
+        ]
+        rows += [((None, pin), 1.0, area[2]) for pin, area in areas_by_pin.items() if area.ndim == 1]
+        centres = np.array([area[:2] for area in areas_by_pin.values() if area.ndim == 1]).reshape(-1, 2)
         # Outward normals of the sides, and distances of the sides from the origin.
-        polygons = {pin: ConvexHull(area).equations for pin, area in found.items() if area.ndim == 2}
+        polygons = {pin: ConvexHull(area).equations for pin, area in areas_by_pin.items() if area.ndim == 2}
         sides = [(pin, side[:2], -side[2]) for pin, equations in polygons.items() for side in equations]
         self.count, self._free = len(rows) + len(sides), free.count
         ends = [f"the area of {pin}" if a is None else f"the length {a}-{pin}" for (a, pin), *_ in rows]
         self.names = [*ends, *(f"the area of {pin}" for pin, *_ in sides)]
-        self._way, self._end = np.array([way for _, way, _ in rows]), np.array([end for *_, end in rows])
+        self._way, self._end = np.array([sign for _, sign, _ in rows]), np.array([end for *_, end in rows])
 
         def between(x: Array) -> Array:  # affine: pins are free numbers or constant
             pins = free.moved(x).drawing.pins  # pyright: ignore
-            ways = [pins[b] if a is None else pins[b] - pins[a] for (a, b), *_ in rows]
-            return jnp.stack([*ways, *(pins[pin] for pin, *_ in sides)])
+            directions = [pins[b] if a is None else pins[b] - pins[a] for (a, b), *_ in rows]
+            return jnp.stack([*directions, *(pins[pin] for pin, *_ in sides)])
 
         x = jnp.asarray(free.vector)
         slopes = np.asarray(jax.jacobian(between)(x)) if self.count else np.zeros((0, 2, free.count))

@@ -92,12 +92,12 @@ def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np
     return a, centre - a * middle, np.sum(np.abs(a[:, None] * dz - dt) ** 2, 1)
 
 
-def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fitted:
-    """Return the best assignment in order, with the same direction and first value as before."""
+def _in_order(curve: np.ndarray, target: np.ndarray, previous: np.ndarray) -> _Fitted:
+    """Return the best assignment in order, with the same direction and first value as `previous`."""
     M, K = curve.shape
     J, rows = len(target), np.arange(M)
-    direction = np.where(before[:, -1] >= before[:, 0], 1, -1)
-    indices = (before[:, :1] + direction[:, None] * np.arange(-(K // 8), K + K // 8 + 1)) % K
+    direction = np.where(previous[:, -1] >= previous[:, 0], 1, -1)
+    indices = (previous[:, :1] + direction[:, None] * np.arange(-(K // 8), K + K // 8 + 1)) % K
     cost = np.abs(np.take_along_axis(curve, indices, 1)[..., None] - target) ** 2  # (M, L, J)
     L = cost.shape[1]
     total, back = cost[..., 0].copy(), np.zeros((M, J, L), int)
@@ -112,7 +112,7 @@ def _in_order(curve: np.ndarray, target: np.ndarray, before: np.ndarray) -> _Fit
     places[:, -1] = total.argmin(1)
     for j in range(J - 1, 0, -1):
         places[:, j - 1] = back[rows, j, places[:, j]]
-    return _Fitted(before[:, :1] + direction[:, None] * (places - K // 8), total.min(1))
+    return _Fitted(previous[:, :1] + direction[:, None] * (places - K // 8), total.min(1))
 
 
 # --- given values

@@ -167,10 +167,10 @@ class _Drawing:
             case _ if (points := getattr(joint, "points", None)) is not None and len(joint.bodies) == 2:
                 self._pin(name, self._held(joint.bodies, points))
 
-    def _pin(self, name: str, place: Mark) -> None:
-        self.pins.append({"kind": MarkKind.PIN, "name": name, **place})
-        if place["body"] < 0:
-            self.rails.append({"kind": MarkKind.SUPPORT, **place})
+    def _pin(self, name: str, mark: Mark) -> None:
+        self.pins.append({"kind": MarkKind.PIN, "name": name, **mark})
+        if mark["body"] < 0:
+            self.rails.append({"kind": MarkKind.SUPPORT, **mark})
 
     def _driver(self, driver: Driver) -> None:
         if driver.coordinate == "angle":
@@ -220,8 +220,8 @@ class _Drawing:
         nx, ny = np.asarray(gap.normal, float)
         axis = float(np.arctan2(-nx, ny))
         gap_vector, turned = self._path(body, gap.point) - self._path(on, gap.through), axis + self._frames(on)[:, 2]
-        along, gaps = (gap_vector[:, 0] * np.cos(a) + gap_vector[:, 1] * np.sin(a) for a in (turned, turned + np.pi / 2))
-        near = along[gaps <= gaps.min() + margin]
+        positions, gaps = (gap_vector[:, 0] * np.cos(a) + gap_vector[:, 1] * np.sin(a) for a in (turned, turned + np.pi / 2))
+        near = positions[gaps <= gaps.min() + margin]
         span = [float(near.min()) - margin, float(near.max()) + margin]
         self.rails.append({"kind": MarkKind.FLOOR, **self._at(on, gap.through), "axis": axis, "span": span})
 
@@ -251,8 +251,8 @@ class _Drawing:
         """Return the range (m) of a point of body `two` along an axis of body `one`, measured from the point `at` of `one`."""
         gap = self._path(two, point) - self._path(one, at)
         direction = axis + self._frames(one)[:, 2]
-        along = gap[:, 0] * np.cos(direction) + gap[:, 1] * np.sin(direction)
-        return float(along.min()), float(along.max())
+        displacements = gap[:, 0] * np.cos(direction) + gap[:, 1] * np.sin(direction)
+        return float(displacements.min()), float(displacements.max())
 
     def _frames(self, body: str) -> Float[np.ndarray, "T 3"]:
         return np.zeros((len(self.poses), 3)) if body == GROUND else self.poses[:, self.number[body]]
@@ -317,6 +317,6 @@ def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Floa
 
 def _size(drawing: _Drawing) -> float:
     """Return the extent of a mechanism's points (m)."""
-    every = [to_ground(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
-    every += [frame[:2] for frame in drawing.poses[0]]
-    return float(np.ptp(np.array(every), axis=0).max()) or 1.0
+    all_points = [to_ground(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
+    all_points += [frame[:2] for frame in drawing.poses[0]]
+    return float(np.ptp(np.array(all_points), axis=0).max()) or 1.0

@@ -96,15 +96,15 @@ class Diagnosis(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and strings, for JSON; angles in rad."""
-        found, names, line = plain(self), self.mechanism.body_names, self.timeline
-        for branch in found["branches"]:
+        results, names, line = plain(self), self.mechanism.body_names, self.timeline
+        for branch in results["branches"]:
             branch["tangent"] = dict(zip(names, branch["tangent"], strict=True))
         if line is not None:
             closest = dict(zip(("time", "smallest"), line.closest, strict=True))
-            found["timeline"] |= plain({"smallest": line.smallest, "closest": closest})
+            results["timeline"] |= plain({"smallest": line.smallest, "closest": closest})
         further = ("gruebler", "degrees_of_freedom", "mobility", "joint_mobility", "conditioning")
         return (
-            found
+            results
             | {name: plain(getattr(self, name)) for name in further}
             | {"q": dict(zip(names, self.q.tolist(), strict=True)), "singular": self.is_singular}
         )
@@ -126,35 +126,35 @@ class Diagnosis(NamedTuple):
 # --- as text
 
 
-def _sections(found: Diagnosis) -> list[tuple[str, list[str]]]:
+def _sections(result: Diagnosis) -> list[tuple[str, list[str]]]:
     """Return the title and the lines of each section that is not empty."""
     parts = [
-        ("mobility", _mobility(found)),
-        ("redundancy", [line for r in found.redundancies for line in _redundancy(r)]),
-        ("cure", _cure(found)),
-        ("singular", _singular(found)),
-        ("branches", _branches(found)),
-        ("forces", _forces(found)),
-        ("conditioning", _conditioning(found)),
-        ("timeline", [] if found.timeline is None else _timeline(found.timeline)),
+        ("mobility", _mobility(result)),
+        ("redundancy", [line for r in result.redundancies for line in _redundancy(r)]),
+        ("cure", _cure(result)),
+        ("singular", _singular(result)),
+        ("branches", _branches(result)),
+        ("forces", _forces(result)),
+        ("conditioning", _conditioning(result)),
+        ("timeline", [] if result.timeline is None else _timeline(result.timeline)),
     ]
     return [(title, lines) for title, lines in parts if lines]
 
 
-def _mobility(found: Diagnosis) -> list[str]:
-    bodies = f"{found.coordinates // 3} {'body' if found.coordinates == 3 else 'bodies'}"
-    actual, free = found.coordinates - found.ordinary_rank, plural(found.degrees_of_freedom, "degree") + " of freedom"
+def _mobility(result: Diagnosis) -> list[str]:
+    bodies = f"{result.coordinates // 3} {'body' if result.coordinates == 3 else 'bodies'}"
+    actual, free = result.coordinates - result.ordinary_rank, plural(result.degrees_of_freedom, "degree") + " of freedom"
     lines = [
-        f"Gruebler's count: 3 x {bodies} - {plural(found.rows, 'row')} (constraint equations) = {found.gruebler}",
-        f"by the rank: {found.coordinates} coordinates - rank {found.ordinary_rank} = {actual}"
-        + (f" ({free})" if found.degrees_of_freedom == actual else f"; it moves with {free}"),
+        f"Gruebler's count: 3 x {bodies} - {plural(result.rows, 'row')} (constraint equations) = {result.gruebler}",
+        f"by the rank: {result.coordinates} coordinates - rank {result.ordinary_rank} = {actual}"
+        + (f" ({free})" if result.degrees_of_freedom == actual else f"; it moves with {free}"),
     ]
-    if found.gruebler != actual:
-        extra = plural(found.rows - found.ordinary_rank, "row")
+    if result.gruebler != actual:
+        extra = plural(result.rows - result.ordinary_rank, "row")
         lines.append(f"Gruebler's count treats every row as independent, but {extra} can be left out without any effect")
-    if found.rows > found.joint_rows:
-        driven = found.joint_mobility - found.mobility
-        lines.append(f"without drivers: {plural(found.joint_mobility, 'degree')} of freedom, of which drivers control {driven}")
+    if result.rows > result.joint_rows:
+        driven = result.joint_mobility - result.mobility
+        lines.append(f"without drivers: {plural(result.joint_mobility, 'degree')} of freedom, of which drivers control {driven}")
     return lines
 
 
@@ -172,33 +172,34 @@ def _redundancy(r: Redundancy) -> list[str]:
     return lines
 
 
-def _cure(found: Diagnosis) -> list[str]:
-    if len(found.cure) < 2:
+def _cure(result: Diagnosis) -> list[str]:
+    if len(result.cure) < 2:
         return []
-    return ["these changes together remove all redundancy:", *(f"  {fix.constraint}: {fix.change}" for fix in found.cure)]
+    return ["these changes together remove all redundancy:", *(f"  {fix.constraint}: {fix.change}" for fix in result.cure)]
 
 
-def _singular(found: Diagnosis) -> list[str]:
-    if found.rank < found.ordinary_rank:
+def _singular(result: Diagnosis) -> list[str]:
+    if result.rank < result.ordinary_rank:
         return [
-            f"the rank is {found.rank} here, and {found.ordinary_rank} nearby; the first-order mobility is {found.mobility} here"
+            f"the rank is {result.rank} here, and {result.ordinary_rank} nearby; "
+            f"the first-order mobility is {result.mobility} here"
         ]
-    if found.is_singular:
+    if result.is_singular:
         return [
-            f"the first-order mobility is {found.mobility}, but no displacement satisfies the constraints to second order: "
+            f"the first-order mobility is {result.mobility}, but no displacement satisfies the constraints to second order: "
             "the mechanism cannot move"
         ]
     return []
 
 
-def _branches(found: Diagnosis) -> list[str]:
-    if not found.is_singular:
+def _branches(result: Diagnosis) -> list[str]:
+    if not result.is_singular:
         return []
-    lines = [f"{len(found.branches)} branches meet here" if len(found.branches) != 1 else "one branch passes through"]
-    for k, branch in enumerate(found.branches):
+    lines = [f"{len(result.branches)} branches meet here" if len(result.branches) != 1 else "one branch passes through"]
+    for k, branch in enumerate(result.branches):
         moving = [
             f"{name} ({', '.join(f'{x:.3g}' if abs(x) > SMALLEST_POSE_NUMBER else '0' for x in row)})"
-            for name, row in zip(found.mechanism.body_names, branch.tangent, strict=True)
+            for name, row in zip(result.mechanism.body_names, branch.tangent, strict=True)
             if np.abs(row).max() > SMALLEST_POSE_NUMBER
         ]
         state = f"rank {branch.rank}" if branch.followed else "not followed: it may end here"
@@ -206,40 +207,40 @@ def _branches(found: Diagnosis) -> list[str]:
     return lines
 
 
-def _forces(found: Diagnosis) -> list[str]:
+def _forces(result: Diagnosis) -> list[str]:
     """Name the multipliers that are not unique; constraints with the same direction share a line."""
     groups: dict[str, list[str]] = {}
-    for name, forces in found.forces.items():
+    for name, forces in result.forces.items():
         if all(forces.unique):
             continue
-        loose = [row_label(found.mechanism, name, k) for k, unique in enumerate(forces.unique) if not unique]
+        loose = [row_label(result.mechanism, name, k) for k, unique in enumerate(forces.unique) if not unique]
         angle = None if forces.direction is None else np.rad2deg(forces.direction)
-        along = "" if angle is None else f"; only the component along {angle:.4g} degrees is unique"
-        groups.setdefault(along, []).extend(loose)
-    lines = [f"not unique: {', '.join(loose)}{along}" for along, loose in groups.items()]
-    return lines or (["all unique"] if found.rows else [])
+        remark = "" if angle is None else f"; only the component along {angle:.4g} degrees is unique"
+        groups.setdefault(remark, []).extend(loose)
+    lines = [f"not unique: {', '.join(loose)}{remark}" for remark, loose in groups.items()]
+    return lines or (["all unique"] if result.rows else [])
 
 
-def _conditioning(found: Diagnosis) -> list[str]:
-    c = found.clearance
-    lines = [f"{found.conditioning:.4g}: the largest over the smallest nonzero singular value of the scaled Jacobian"]
-    if found.rank == found.ordinary_rank and np.isfinite(c.estimate):
+def _conditioning(result: Diagnosis) -> list[str]:
+    c = result.clearance
+    lines = [f"{result.conditioning:.4g}: the largest over the smallest nonzero singular value of the scaled Jacobian"]
+    if result.rank == result.ordinary_rank and np.isfinite(c.estimate):
         lines.append(
             f"next rank change, estimated from the slope of the smallest singular value: {c.estimate:.3g} away "
             "(rad, and lengths over the characteristic length)"
         )
     if c.nearest is not None:
         lines.append(
-            f"next rank change on the path: {c.nearest.distance:.6g} away, rank {c.nearest.rank}, at {_pose(found, c.nearest)}"
+            f"next rank change on the path: {c.nearest.distance:.6g} away, rank {c.nearest.rank}, at {_pose(result, c.nearest)}"
         )
     elif c.searched:
         lines.append(f"no rank change on the path within {c.searched:.3g}")
     return lines
 
 
-def _pose(found: Diagnosis, change: RankChange) -> str:
+def _pose(result: Diagnosis, change: RankChange) -> str:
     angles = np.rad2deg(np.where(np.abs(change.q[:, 2]) > SMALLEST_POSE_NUMBER, change.q[:, 2], 0.0))
-    return ", ".join(f"{name} {angle:.4g}" for name, angle in zip(found.mechanism.body_names, angles, strict=True)) + " degrees"
+    return ", ".join(f"{name} {angle:.4g}" for name, angle in zip(result.mechanism.body_names, angles, strict=True)) + " degrees"
 
 
 def _timeline(line: Timeline) -> list[str]:

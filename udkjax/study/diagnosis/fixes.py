@@ -44,8 +44,8 @@ class JointChange(NamedTuple):
     def _direction(self, q: np.ndarray, places: list[int | None]) -> np.ndarray:
         """Return the direction of the slot in ground axes."""
         body, axis = self.slides or (0, 0.0)
-        place = places[body]
-        angle = axis + (0.0 if place is None else q[3 * place + 2])
+        index = places[body]
+        angle = axis + (0.0 if index is None else q[3 * index + 2])
         return np.array([np.cos(angle), np.sin(angle)])
 
 
@@ -182,17 +182,17 @@ def _half_turn(angle: float) -> float:
 
 
 def _effect(
-    own: list[int], places: list[int | None], change: JointChange, at: list[Configuration], rank_tol: float
+    indices: list[int], places: list[int | None], change: JointChange, at: list[Configuration], rank_tol: float
 ) -> tuple[int, float]:
     """Return the number of redundant rows that a change removes, and the conditioning after it.
 
-    The number is -1 if the mobility changes or the number differs between positions. `own` are the rows of the constraint,
+    The number is -1 if the mobility changes or the number differs between positions. `indices` are the rows of the constraint,
     `places` the indices of its bodies.
     """
     falls, conditioning = -1, np.inf
     for k, position in enumerate(at):
-        other_rows = np.delete(position.J, own, axis=0)
-        remaining = np.concatenate([other_rows, change.remaining_rows(position.J[own], position.q, places)])
+        other_rows = np.delete(position.J, indices, axis=0)
+        remaining = np.concatenate([other_rows, change.remaining_rows(position.J[indices], position.q, places)])
         sigma = singular_values(remaining)
         rank = count_rank(sigma, rank_tol)
         fall = position.redundancy - (len(remaining) - rank)

@@ -76,15 +76,17 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
         return [Zeros(np.eye(d), d)]
     A, random = A / size, np.random.default_rng(0)
     x = _solve(A, np.concatenate([np.eye(d), random.standard_normal((N_DIRECTIONS, d))]))
-    found: list[Zeros] = []
+    all_zeros: list[Zeros] = []
     for direction in x:
-        if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME_DIRECTION for z in found):
+        if any(np.linalg.norm(direction - z.space @ (z.space.T @ direction)) < SAME_DIRECTION for z in all_zeros):
             continue
         zeros = _zeros_around(A, direction)
-        if zeros.is_cone and any(z.is_cone and z.dimension == zeros.dimension for z in found):  # one line of each cone is enough
+        if zeros.is_cone and any(
+            z.is_cone and z.dimension == zeros.dimension for z in all_zeros
+        ):  # one line of each cone is enough
             continue
-        found = [z for z in found if not _inside(z.space, zeros.space)] + [zeros]
-    return found
+        all_zeros = [z for z in all_zeros if not _inside(z.space, zeros.space)] + [zeros]
+    return all_zeros
 
 
 def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -111,8 +113,8 @@ def _zeros_around(A: np.ndarray, x: np.ndarray) -> Zeros:
     return Zeros(x[:, None], 1)
 
 
-def _inside(one: np.ndarray, two: np.ndarray) -> bool:
-    return one.shape[1] < two.shape[1] and bool(np.linalg.norm(one - two @ (two.T @ one)) < SAME_DIRECTION)
+def _inside(line: np.ndarray, space: np.ndarray) -> bool:
+    return line.shape[1] < space.shape[1] and bool(np.linalg.norm(line - space @ (space.T @ line)) < SAME_DIRECTION)
 
 
 def _follow(positions: RankedPositions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
@@ -128,5 +130,7 @@ def _follow(positions: RankedPositions, at: Configuration, tangents: np.ndarray,
     return Branch((positions.unit * tangent).reshape(-1, 3), dimension, rank, len(reached) == 2)
 
 
-def _reaches(positions: RankedPositions, at: Configuration, end: Configuration | None, way: np.ndarray) -> bool:
-    return end is not None and bool(np.linalg.norm((end.q - at.q) / positions.unit - way) < TANGENT_TOL * np.linalg.norm(way))
+def _reaches(positions: RankedPositions, at: Configuration, end: Configuration | None, tangent: np.ndarray) -> bool:
+    return end is not None and bool(
+        np.linalg.norm((end.q - at.q) / positions.unit - tangent) < TANGENT_TOL * np.linalg.norm(tangent)
+    )

@@ -77,20 +77,20 @@ def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol:
     path = _Path(mechanism, analysis, ts, q, v)
     fine = np.unique(np.concatenate([np.linspace(a, b, SAMPLES_PER_OUTPUT + 1) for a, b in pairwise(ts)] or [ts]))
     sampled = path.singular_values(fine)
-    own = np.searchsorted(fine, ts)
+    output_indices = np.searchsorted(fine, ts)
     rank = np.sum(sampled > rank_tol * sampled[:, :1], axis=1)
     generic_rank = int(rank.max(initial=0))
     if not generic_rank:
-        return Timeline(ts, sampled[own], rank[own], (), (float(ts[0]), 1.0))
+        return Timeline(ts, sampled[output_indices], rank[output_indices], (), (float(ts[0]), 1.0))
     sigma = sampled[:, generic_rank - 1] / sampled[:, 0]
     changes = []
     for k in _kinks(sigma):
         low, high = fine[max(k - 1, 0)], fine[min(k + 1, len(fine) - 1)]
-        found = _locate(_renew(mechanism, analysis, solution, ts, low, high) or path, low, high, generic_rank, rank_tol, tol)
-        changes += [] if found is None else [found]
+        change = _locate(_renew(mechanism, analysis, solution, ts, low, high) or path, low, high, generic_rank, rank_tol, tol)
+        changes += [] if change is None else [change]
     k = int(np.argmin(sigma))
     least, when = min([(float(sigma[k]), float(fine[k])), *((c.smallest, c.time) for c in changes)])
-    return Timeline(ts, sampled[own], rank[own], tuple(changes), (when, least))
+    return Timeline(ts, sampled[output_indices], rank[output_indices], tuple(changes), (when, least))
 
 
 def _tolerance(analysis: Analysis, ts: np.ndarray) -> float:

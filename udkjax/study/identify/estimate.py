@@ -255,7 +255,7 @@ class Estimate:
         """Return the results as plain numbers, lists and strings, for JSON."""
         uncertainty, rows, P = self.uncertainty, self.rows(), len(self.names)
         same = ("success", "converged", "message", "at_bounds", "guesses", "agreeing", "ways", "evaluations", "seconds")
-        found = {
+        results = {
             "parameters": {
                 r.parameter: {"value": r.value, "standard_error": r.standard_error, "units": r.units} for r in rows[:P]
             },
@@ -270,4 +270,4 @@ class Estimate:
             "tolerance": self.tol[0],
             "versions": versions(),
         }
-        return plain({name: getattr(self, name) for name in same} | found)
+        return plain({name: getattr(self, name) for name in same} | results)

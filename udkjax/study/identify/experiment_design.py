@@ -138,8 +138,8 @@ def design_experiment(
     floor = INVISIBLE_RATIO * np.linalg.norm(np.concatenate([prior_rows, *roots]), 2)
 
     def evaluate(which: Sequence[int]) -> tuple[tuple[int, float], np.ndarray]:
-        every = np.concatenate([prior_rows, *(roots[k] for k in which)])
-        return _score(_eliminate(every, np.setdiff1d(np.arange(len(names)), wanted), floor), criterion, floor)
+        rows = np.concatenate([prior_rows, *(roots[k] for k in which)])
+        return _score(_eliminate(rows, np.setdiff1d(np.arange(len(names)), wanted), floor), criterion, floor)
 
     alone = [evaluate([k]) for k in range(len(experiments))]
     chosen: list[int] = []

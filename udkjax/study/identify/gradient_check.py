@@ -103,8 +103,8 @@ class GradientCheck:
 
     def at_best(self, values: Float[np.ndarray, "D S H"]) -> Float[np.ndarray, "D S"]:
         """Return the values at the best step."""
-        found = np.take_along_axis(values, np.maximum(self.best, 0)[..., None], -1)[..., 0]
-        return np.where(self.best < 0, np.nan, found)
+        best_values = np.take_along_axis(values, np.maximum(self.best, 0)[..., None], -1)[..., 0]
+        return np.where(self.best < 0, np.nan, best_values)
 
     @property
     def step(self) -> Float[np.ndarray, "D S"]:

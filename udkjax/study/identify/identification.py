@@ -121,20 +121,20 @@ def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None
     return np.concatenate([first, np.concatenate([z, np.zeros((len(z), problem.K - P))], 1)])
 
 
-def _require_finite(problem: FitProblem, found: SearchResult) -> None:
-    if not np.isfinite(found.fit.cost):
-        code = problem.evaluate(found.fit.z[None], (LOOSE_TOL, LOOSE_TOL)).code[0]
+def _require_finite(problem: FitProblem, result: SearchResult) -> None:
+    if not np.isfinite(result.fit.cost):
+        code = problem.evaluate(result.fit.z[None], (LOOSE_TOL, LOOSE_TOL)).code[0]
         raise IdentificationError([f"the records cannot be simulated with any first guess: {CAUSES[Result(int(code))]}"])
 
 
 # --- the end of a fit
 
 
-def _refit(found: SearchResult, tol: TolerancePair, minimizer: Minimizer) -> tuple[Fit, CostHistory]:
+def _refit(result: SearchResult, tol: TolerancePair, minimizer: Minimizer) -> tuple[Fit, CostHistory]:
     """Fit to the final tolerance, each channel weighted by the noise estimated from its residuals."""
-    problem = found.problem
-    fit = minimizer.minimize(problem, found.fit.z, tol)
-    history = [*found.history, *fit.history]
+    problem = result.problem
+    fit = minimizer.minimize(problem, result.fit.z, tol)
+    history = [*result.history, *fit.history]
     unknown = np.unique(problem.index[~problem.noise_given, 2])
     robust = minimizer.loss is not squares  # outliers depend on the noise
     for _ in range(MOST_REWEIGHTINGS if len(unknown) + problem.noise_given.any() > 1 or (robust and len(unknown)) else 0):

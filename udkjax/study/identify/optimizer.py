@@ -65,9 +65,9 @@ def choose_method(optimizer: Optimizer, loss: str | UserLoss) -> GradientMethod 
 # --- losses
 
 
-def squares(found: Residuals) -> Residuals:
+def squares(residuals: Residuals) -> Residuals:
     """Return the residuals unchanged: the loss of least squares."""
-    return found
+    return residuals
 
 
 def named_loss(name: str, residuals: int) -> Loss:
@@ -79,21 +79,21 @@ def named_loss(name: str, residuals: int) -> Loss:
     raise IdentificationError([f"loss must be 'least_squares', {' or '.join(map(repr, ROBUST))}, is {name!r}"])
 
 
-def robust(found: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:
+def robust(plain: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:
     """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J; s.s and its gradient equal those of the sum of rho.
 
     `rho` returns rho(|r|) and half of its derivative.
     """
-    r = found.r[:, :residuals]
+    r = plain.r[:, :residuals]
     size = np.abs(r)
     value, half_slope = rho(size)
     s = np.sqrt(value)
     slope = np.where(s > 0.0, half_slope / np.where(s > 0.0, s, 1.0), 1.0)
-    further = found.r[:, residuals:], found.J[:, residuals:]
+    further = plain.r[:, residuals:], plain.J[:, residuals:]
     return Residuals(
         np.concatenate([np.sign(r) * s, further[0]], 1),
-        np.concatenate([slope[..., None] * found.J[:, :residuals], further[1]], 1),
-        found.code,
+        np.concatenate([slope[..., None] * plain.J[:, :residuals], further[1]], 1),
+        plain.code,
     )
 
 
@@ -208,17 +208,17 @@ class _LossDescent(Descent):
 
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the value of the loss, and its gradient (K,)."""
-        found, size = self.evaluate(z[None]), self.size
-        if not found.ok[0]:
+        residuals, size = self.evaluate(z[None]), self.size
+        if not residuals.ok[0]:
             if not self.end.history:
                 self.stop(False)
             return self.failed_cost, np.zeros(len(z))
-        value, slope = self.value_and_slope(jnp.asarray(found.r[0]))
-        value, gradient = float(value), found.J[0].T @ np.asarray(slope)
+        value, slope = self.value_and_slope(jnp.asarray(residuals.r[0]))
+        value, gradient = float(value), residuals.J[0].T @ np.asarray(slope)
         if not self.end.history:
             self.failed_cost = FAILED_COST * (abs(value) + 1.0)
         if value < self.end.cost:
-            _, s, vt = np.linalg.svd(found.J[0], full_matrices=False)
+            _, s, vt = np.linalg.svd(residuals.J[0], full_matrices=False)
             shows = s > INVISIBLE_RATIO * s.max(initial=0.0)
             size = float(np.abs(vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)).max(initial=0.0))
             self.end = self.end._replace(z=z.copy(), cost=value)

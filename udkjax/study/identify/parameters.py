@@ -174,10 +174,10 @@ def _is_positive(mechanism: Mechanism, target: Target, guess: float) -> bool:
 
 def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
     numbers = parameters_of(mechanism)
-    found = numbers[split_index(name, numbers)[0]]
-    if not found.path:
+    entry = numbers[split_index(name, numbers)[0]]
+    if not entry.path:
         return False
-    metadata = keys(type(owner_of(mechanism, found)))[found.path[-1]].metadata
+    metadata = keys(type(owner_of(mechanism, entry)))[entry.path[-1]].metadata
     bounds = (*POSITIVE.get("require", ()), *NOT_NEGATIVE.get("require", ()))
     return any(rule in metadata.get("require", ()) for rule in bounds)
 

@@ -89,12 +89,12 @@ class Predictor:
         shapes = tuple((x.shape[1:], str(x.dtype)) for x in jax.tree.leaves(members))
         program = _program(self._run, members.x.shape[1] + members.shift.shape[1], piece, shapes)
         values, slopes = program((self._arrays, np.array(tol)), members, on_threads=True)
-        found = Prediction(values["y"], slopes["y"], values["code"], values.get("ends"), slopes.get("ends"))
-        if sum(part.nbytes for part in found if part is not None) <= CACHE_BYTES:
-            self._cache[key] = found
+        predicted = Prediction(values["y"], slopes["y"], values["code"], values.get("ends"), slopes.get("ends"))
+        if sum(part.nbytes for part in predicted if part is not None) <= CACHE_BYTES:
+            self._cache[key] = predicted
             if len(self._cache) > CACHE_SIZE:
                 self._cache.popitem(last=False)
-        return found
+        return predicted
 
     def guess(self, members: Members, which: int) -> State:
         """Return the guess from which the initial state of a member is closed."""
@@ -137,11 +137,11 @@ class _MemberRun:
         mechanism, guess, settings = self.place(arrays, member)
         closure = close(mechanism, member.runs.ts[0], guess, analysis=settings["analysis"])
         solution = simulate(mechanism, member.runs.ts, closure, rtol, atol, throw=False, **settings)
-        found = {"y": measure(mechanism, solution, self.channels), "code": solution.code}
+        predicted = {"y": measure(mechanism, solution, self.channels), "code": solution.code}
         if self.ends:
             ends = jnp.stack([solution.q[jnp.array([0, -1])], solution.v[jnp.array([0, -1])]], axis=1)
-            found["ends"] = ends.reshape(2, 2, -1)
-        return found
+            predicted["ends"] = ends.reshape(2, 2, -1)
+        return predicted
 
 
 @lru_cache(maxsize=MOST_PROGRAMS)

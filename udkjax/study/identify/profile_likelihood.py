@@ -64,8 +64,8 @@ def fix_unknown(evaluate: Objective, index: int, value: float) -> Objective:
     """Return the residuals as a function of all unknowns except one, which is fixed at `value`."""
 
     def evaluate_others(z: Float[np.ndarray, "B K-1"]) -> Residuals:
-        found = evaluate(np.insert(z, index, value, axis=-1))
-        return found._replace(J=np.delete(found.J, index, axis=2))
+        residuals = evaluate(np.insert(z, index, value, axis=-1))
+        return residuals._replace(J=np.delete(residuals.J, index, axis=2))
 
     return evaluate_others
 
@@ -85,13 +85,13 @@ def profile_likelihood(
         others = np.delete(z0, index)
         if not others.size:
             return z0, _cost(evaluate(z0[None]))
-        found = minimize_squares(fix_unknown(evaluate, index, fixed), others, step_tol=FINE_STEP)
-        return np.insert(found.z, index, fixed), found.cost
+        refitted = minimize_squares(fix_unknown(evaluate, index, fixed), others, step_tol=FINE_STEP)
+        return np.insert(refitted.z, index, fixed), refitted.cost
 
     def value(fixed: float) -> float:
-        every = z[:P].copy()
-        every[k] = fixed
-        return float(unknowns.values(every)[k])
+        unknowns_at_value = z[:P].copy()
+        unknowns_at_value[k] = fixed
+        return float(unknowns.values(unknowns_at_value)[k])
 
     error = float(uncertainty.standard_errors[k] / abs(unknowns.dx_dz(z[:P])[k]))
     noise, freedom = estimated_noise(uncertainty)
@@ -101,9 +101,9 @@ def profile_likelihood(
     )
 
 
-def _cost(found: Residuals) -> float:
+def _cost(residuals: Residuals) -> float:
     """Return r.r / 2 of the first set of unknowns; infinite if it cannot be computed."""
-    return float(0.5 * found.r[0] @ found.r[0]) if found.ok[0] else np.inf
+    return float(0.5 * residuals.r[0] @ residuals.r[0]) if residuals.ok[0] else np.inf
 
 
 def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:
@@ -126,10 +126,10 @@ def profiles_dataset(
     for k, profile in enumerate(profiles):
         at_estimate = np.argmin(np.abs(profile.values - values[profile.name]))
         curves[:, k, : len(profile.values)] = profile.values, 2.0 * (profile.costs - profile.costs[at_estimate]) / noise**2
-    along = "profile", "point"
+    dims = "profile", "point"
     data = {
-        "profile_value": (along, curves[0]),
-        "rise": (along, curves[1]),
+        "profile_value": (dims, curves[0]),
+        "rise": (dims, curves[1]),
         "interval": (
             ("profile", "end"),
             np.array([profile.interval for profile in profiles]),

@@ -159,9 +159,9 @@ class _TableReader:
         if self.table.padded and measured:
             some = np.flatnonzero(~np.isnan(np.stack([values[name][places] for name in measured])).all(0))
             places = places[some[0] : some[-1] + 1]
-        own, sigma = ({name: x[name][places] for name in measured if name in x} for x in (values, noise))
+        of_rows, sigma = ({name: x[name][places] for name in measured if name in x} for x in (values, noise))
         try:
-            yield Record(times[places], own, sigma, name=label)
+            yield Record(times[places], of_rows, sigma, name=label)
         except IdentificationError as error:
             self.problems += [f"{self.table.source}: {problem}" for problem in error.problems]
 
@@ -228,8 +228,8 @@ class _DataReader:
         Raises:
             ValueError: there is no such channel.
         """
-        own = given if isinstance(given, Quantity) else self.quantities.get(str(given))
-        return channel_of(self.mechanism, str(given)) if own is None else own
+        quantity = given if isinstance(given, Quantity) else self.quantities.get(str(given))
+        return channel_of(self.mechanism, str(given)) if quantity is None else quantity
 
     def by_channel(self, given: ByChannel[T], place: str) -> dict[ChannelKey, T]:
         """Return the values by the canonical names of the channels; user-defined channels are keys themselves."""
@@ -247,8 +247,8 @@ class _DataReader:
 
     def with_usual_names(self, record: Record) -> Record:
         """Return the record with the canonical names of its channels."""
-        place = f"record {quote(record.name)}" if record.name else "record"
-        values = self.by_channel(record.values, place)
+        prefix = f"record {quote(record.name)}" if record.name else "record"
+        values = self.by_channel(record.values, prefix)
         if list(values) == list(record.values) or len(values) != len(record.values):
             return record
         noise = dict(zip(values, record.noise.values(), strict=True))

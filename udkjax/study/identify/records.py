@@ -120,8 +120,8 @@ class Record:
 
     def changed(self, **changes: Any) -> "Record":
         """Return the same record with other `values`, `noise` or `initial_state`."""
-        own = {"values": self.values, "noise": self.noise, "initial_state": self.start, "t0": self.t0}
-        return Record(self.times, **own | {"conditions": self.conditions, "name": self.name} | changes)
+        present = {"values": self.values, "noise": self.noise, "initial_state": self.start, "t0": self.t0}
+        return Record(self.times, **present | {"conditions": self.conditions, "name": self.name} | changes)
 
     def __repr__(self) -> str:
         return f"Record({len(self.times)} times, {', '.join(map(str, self.values))})"
@@ -180,10 +180,10 @@ def tabulate(records: Sequence[Record], keys: Sequence[ChannelKey]) -> tuple[np.
     y, sigma = np.full((2, len(records), length, len(keys)), np.nan)
     for k, (record, (ts, first)) in enumerate(zip(records, times, strict=True)):
         for key, values in record.values.items():
-            place = k, slice(first, len(ts)), keys.index(key)
-            y[place] = values
+            entry = k, slice(first, len(ts)), keys.index(key)
+            y[entry] = values
             if (noise := record.noise[key]) is not None:
-                sigma[place] = noise
+                sigma[entry] = noise
     return np.stack([pad_times(ts, length) for ts, _ in times]), y, sigma
 
 
@@ -222,11 +222,11 @@ def key_of(channel: ChannelKey | Channel) -> ChannelKey:
 
 def _numbers(name: str, given: ArrayLike | Sequence[float], shape: tuple[int, ...] | None, problems: list[str]) -> np.ndarray:
     try:
-        found = np.asarray(given, float)
+        array = np.asarray(given, float)
     except (TypeError, ValueError):
         problems.append(f"{quote(name)}: must be numbers, is {given!r:.40}")
         return np.zeros(shape or 0)
-    if shape is not None and found.shape != shape:
-        problems.append(f"{quote(name)}: must have a value for each of the {shape[0]} times, is of shape {found.shape}")
+    if shape is not None and array.shape != shape:
+        problems.append(f"{quote(name)}: must have a value for each of the {shape[0]} times, is of shape {array.shape}")
         return np.zeros(shape)
-    return found
+    return array

@@ -164,8 +164,8 @@ def _read_dataset(
     for k in range(data.sizes[RECORD]):
         label = str(data[RECORD].values[k]) if RECORD in data.coords else str(k)
         found: list[str] = []
-        one = data.isel({RECORD: k}).drop_vars(RECORD, errors="ignore")
-        yield _read_record(one, bodies, source, found, label)._replace(padded=True)
+        record = data.isel({RECORD: k}).drop_vars(RECORD, errors="ignore")
+        yield _read_record(record, bodies, source, found, label)._replace(padded=True)
         problems += [problem for problem in found if problem not in problems]
 
 
@@ -192,11 +192,11 @@ def _state_columns(
     key: str, values: "xarray.DataArray", bodies: Sequence[str], source: str, problems: list[str]
 ) -> dict[str, TableColumn]:
     """Return coordinates or velocities of bodies as columns."""
-    found = {}
+    columns = {}
     for i, body in enumerate(map(str, values["body"].values)):
         if body not in bodies:
             problems.append(f"{source}, {quote(key)}: no body named {quote(body)}{suggestion(body, bodies)}")
             continue
         for k, coordinate in enumerate(map(str, values["coordinate"].values)):
-            found[f"body.{body}.{_STATES[key].get(coordinate, coordinate)}"] = TableColumn(values.values[:, i, k], None)
-    return found
+            columns[f"body.{body}.{_STATES[key].get(coordinate, coordinate)}"] = TableColumn(values.values[:, i, k], None)
+    return columns

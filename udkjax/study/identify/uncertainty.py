@@ -246,28 +246,28 @@ def simplest_basis(
 # --- text
 
 
-def _sentences(found: Uncertainty) -> Iterator[str]:
-    values = found.values
-    if found.dead:
-        it = "it" if len(found.dead) == 1 else "them"
-        yield f"no measured quantity depends on {join_names(found.dead)}: do not identify {it}, or measure other quantities"
-    for flat in found.flat:
+def _sentences(result: Uncertainty) -> Iterator[str]:
+    values = result.values
+    if result.dead:
+        it = "it" if len(result.dead) == 1 else "them"
+        yield f"no measured quantity depends on {join_names(result.dead)}: do not identify {it}, or measure other quantities"
+    for flat in result.flat:
         cure = "fix one of them, give one a prior, or measure more" if len(flat.names) > 1 else "fix it, or measure more"
         yield f"no measured quantity changes with {flat.text}: {cure}"
-    if not np.isfinite(found.noise).all():
+    if not np.isfinite(result.noise).all():
         yield (
-            f"{found.projection.shape[0]} residuals are too few to estimate the noise, and standard errors are unknown: give the "
-            "noise, or more data"
+            f"{result.projection.shape[0]} residuals are too few to estimate the noise, and standard errors are unknown: give "
+            "the noise, or more data"
         )
-    for name in found.poor:
+    for name in result.poor:
         k = list(values.names).index(name)
-        error, unit = found.standard_errors[k], f" {values.units[k]}".rstrip()
+        error, unit = result.standard_errors[k], f" {values.units[k]}".rstrip()
         percent = f" ({100 * error / abs(values.x[k]):.0f} %)" if values.x[k] else ""
         yield f"{name} is poorly determined: {values.x[k]:.4g}{unit} with a standard error of {error:.2g}{unit}{percent}"
-    for one, other, rho in found.correlated:
+    for one, other, rho in result.correlated:
         yield f"{one} and {other} are hard to distinguish: the correlation of their errors is {rho:.4f}"
-    if not found.noise.size and found.degrees_of_freedom > 0:
-        yield from _noise_sentence(found.chi2, found.degrees_of_freedom)
+    if not result.noise.size and result.degrees_of_freedom > 0:
+        yield from _noise_sentence(result.chi2, result.degrees_of_freedom)
 
 
 def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:

@@ -50,8 +50,8 @@ def other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarra
     """Return members that drifted despite projection because other rows are redundant, by these rows."""
     by_rows: dict[tuple[int, ...], list[int]] = {}
     for k in np.flatnonzero(result == Result.drift).tolist():
-        own = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))
-        rows = analyse(group.mechanism(group.shared, own, {})).redundant_rows
+        inputs = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))
+        rows = analyse(group.mechanism(group.shared, inputs, {})).redundant_rows
         if rows is not None and rows != group.redundant:
             by_rows.setdefault(rows, []).append(k)
     return {rows: np.array(which) for rows, which in by_rows.items()}

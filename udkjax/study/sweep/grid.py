@@ -123,96 +123,96 @@ class _GridReader:
             return self.wrong("dt", f"must be positive and at most t1 - t0 = {t1 - t0:g}, is {dt:g}")
         return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # includes t1 if it is t0 + k dt up to rounding
 
-    def axis(self, place: str, name: str, given: Toml) -> Axis | Zipped:
+    def axis(self, path: str, name: str, given: Toml) -> Axis | Zipped:
         """Read one axis: a list of values, or a table."""
         if not isinstance(given, dict):
-            return Axis(self.values(place, name, given))
+            return Axis(self.values(path, name, given))
         if "zipped" in given:
-            self.check_keys(place, given, ("zipped",))
-            axes = self.table(f"{place}.zipped", given["zipped"])
-            return Zipped({k: self.axis(f"{place}.zipped.{key_of(k)}", k, v) for k, v in axes.items()})
-        of, units = self.of(f"{place}.of", given.get("of")), given.get("units")
+            self.check_keys(path, given, ("zipped",))
+            axes = self.table(f"{path}.zipped", given["zipped"])
+            return Zipped({k: self.axis(f"{path}.zipped.{key_of(k)}", k, v) for k, v in axes.items()})
+        of, units = self.of(f"{path}.of", given.get("of")), given.get("units")
         if units is not None and not isinstance(units, str):
-            units = self.wrong(f"{place}.units", f"must be a text, is {abbreviate(units)}")
-        rest = {key: value for key, value in given.items() if key not in ("of", "units")}
-        if "distribution" in rest:
-            return Axis(self.distribution(place, rest), of, units)
-        if "values" in rest:
-            self.check_keys(place, rest, ("values",))
-            return Axis(self.values(f"{place}.values", name, rest["values"]), of, units)
-        return Axis(self.range(place, rest), of, units)
+            units = self.wrong(f"{path}.units", f"must be a text, is {abbreviate(units)}")
+        remaining = {key: value for key, value in given.items() if key not in ("of", "units")}
+        if "distribution" in remaining:
+            return Axis(self.distribution(path, remaining), of, units)
+        if "values" in remaining:
+            self.check_keys(path, remaining, ("values",))
+            return Axis(self.values(f"{path}.values", name, remaining["values"]), of, units)
+        return Axis(self.range(path, remaining), of, units)
 
-    def values(self, place: str, name: str, given: Toml) -> np.ndarray | list[Choice]:
+    def values(self, path: str, name: str, given: Toml) -> np.ndarray | list[Choice]:
         if not isinstance(given, list) or not given:
-            self.wrong(place, f"must be a list of values, or a table with from, to and num, is {abbreviate(given)}")
+            self.wrong(path, f"must be a list of values, or a table with from, to and num, is {abbreviate(given)}")
             return []
         if name not in CHOICES:
-            numbers = self.numbers(place, given)
+            numbers = self.numbers(path, given)
             return [] if numbers is None else numbers
-        return [self.choice(f"{place}[{k}]", name, value) for k, value in enumerate(given)]
+        return [self.choice(f"{path}[{k}]", name, value) for k, value in enumerate(given)]
 
-    def range(self, place: str, given: TomlTable) -> Values:
+    def range(self, path: str, given: TomlTable) -> Values:
         """Read a range: the two ends for a design, otherwise `num` numbers from one end to the other."""
         needed = ("from", "to") if self.drawn else ("from", "to", "num")
-        self.check_keys(place, given, (*needed, "scale"))
+        self.check_keys(path, given, (*needed, "scale"))
         for key in needed:
             if key not in given:
-                self.wrong(f"{place}.{key}", "missing")
-        low, high = (self.number(f"{place}.{key}", given[key]) if key in given else None for key in ("from", "to"))
-        num = self.whole(f"{place}.num", given.get("num", 2), 1)
+                self.wrong(f"{path}.{key}", "missing")
+        low, high = (self.number(f"{path}.{key}", given[key]) if key in given else None for key in ("from", "to"))
+        num = self.whole(f"{path}.num", given.get("num", 2), 1)
         scale = given.get("scale", "linear")
         if scale not in SCALES:
-            self.wrong(f"{place}.scale", f"must be one of {', '.join(map(quote, SCALES))}, is {abbreviate(scale)}")
+            self.wrong(f"{path}.scale", f"must be one of {', '.join(map(quote, SCALES))}, is {abbreviate(scale)}")
         elif scale == "log" and low is not None and high is not None and min(low, high) <= 0:
-            self.wrong(place, 'from and to must be positive if scale is "log"')
+            self.wrong(path, 'from and to must be positive if scale is "log"')
         elif low is not None and high is not None and num is not None:
             if not self.drawn:
                 return SCALES[scale](low, high, num)
             return (low, high) if scale == "linear" else cast(Distribution, stats.loguniform(low, high))
         return ()
 
-    def distribution(self, place: str, given: TomlTable) -> Values:
+    def distribution(self, path: str, given: TomlTable) -> Values:
         """Read a distribution of scipy.stats by its name and arguments."""
         name, numbers = given["distribution"], {key: value for key, value in given.items() if key != "distribution"}
         names = [key for key, value in vars(stats).items() if isinstance(value, stats.rv_continuous)]
         if not self.drawn:
-            self.wrong(f"{place}.distribution", "needs a [design] that draws from it")
+            self.wrong(f"{path}.distribution", "needs a [design] that draws from it")
         elif not isinstance(name, str) or name not in names:
-            self.wrong(f"{place}.distribution", f"scipy.stats has no {abbreviate(name)}{suggestion(name, names)}")
+            self.wrong(f"{path}.distribution", f"scipy.stats has no {abbreviate(name)}{suggestion(name, names)}")
         else:
             try:
                 return getattr(stats, name)(**numbers)
             except TypeError as error:
-                self.wrong(place, str(error).replace("_parse_args()", name))
+                self.wrong(path, str(error).replace("_parse_args()", name))
         return ()
 
-    def of(self, place: str, given: "Toml | None") -> str | tuple[str, ...] | Setter | None:
+    def of(self, path: str, given: "Toml | None") -> str | tuple[str, ...] | Setter | None:
         """Read the target of an axis: names, the length or initial angle of bodies, or names with factors."""
         if given is None or isinstance(given, str):
             return given
         if isinstance(given, list):
-            return self.names(place, given)
+            return self.names(path, given)
         if not isinstance(given, dict) or not given:
-            return self.wrong(place, f"must be a name, a list of names or a table, is {abbreviate(given)}")
+            return self.wrong(path, f"must be a name, a list of names or a table, is {abbreviate(given)}")
         if "length" in given:
-            self.check_keys(place, given, ("length", "as_rod"))
-            return Length(self.names(f"{place}.length", given["length"]), given.get("as_rod", False) is True)
+            self.check_keys(path, given, ("length", "as_rod"))
+            return Length(self.names(f"{path}.length", given["length"]), given.get("as_rod", False) is True)
         if "angle" in given:
-            self.check_keys(place, given, ("angle",))
-            return InitialAngle(self.names(f"{place}.angle", given["angle"]))
-        return Scaled({name: self.number(f"{place}.{key_of(name)}", factor) or 0.0 for name, factor in given.items()})
+            self.check_keys(path, given, ("angle",))
+            return InitialAngle(self.names(f"{path}.angle", given["angle"]))
+        return Scaled({name: self.number(f"{path}.{key_of(name)}", factor) or 0.0 for name, factor in given.items()})
 
     def settings(self, given: TomlTable) -> dict[str, Any]:
         self.check_keys("settings", given, SETTINGS)
         values: dict[str, Any] = {}
         for name, value in given.items():
-            place = f"settings.{name}"
+            path = f"settings.{name}"
             if name in CHOICES:
-                values[name] = self.choice(place, name, value)
+                values[name] = self.choice(path, name, value)
             elif name == "max_steps":
-                values[name] = self.whole(place, value, 1)
+                values[name] = self.whole(path, value, 1)
             elif name in SETTINGS:
-                values[name] = self.number(place, value)
+                values[name] = self.number(path, value)
         return values
 
     def design(self, given: TomlTable) -> SweepDesign | None:
@@ -226,55 +226,55 @@ class _GridReader:
 
     # --- single values
 
-    def wrong(self, place: str, problem: str) -> None:
+    def wrong(self, path: str, problem: str) -> None:
         """Report a mistake."""
-        self.problems.append(f"{place}: {problem}")
+        self.problems.append(f"{path}: {problem}")
 
-    def check_keys(self, place: str, given: TomlTable, expected: Iterable[str]) -> None:
+    def check_keys(self, path: str, given: TomlTable, expected: Iterable[str]) -> None:
         """Report unexpected keys of a table."""
         expected = tuple(expected)
         for key in given:
             if key not in expected:
-                self.wrong(f"{place}.{key_of(key)}" if place else key_of(key), unknown_key(key, expected))
+                self.wrong(f"{path}.{key_of(key)}" if path else key_of(key), unknown_key(key, expected))
 
-    def choice(self, place: str, setting: str, given: Toml) -> Choice:
+    def choice(self, path: str, setting: str, given: Toml) -> Choice:
         """Read a method, solver, stabilization or formulation."""
         try:
             return choice(setting, cast(str, given))
         except (TypeError, ValueError) as error:
-            self.wrong(place, str(error))
+            self.wrong(path, str(error))
             return None
 
-    def table(self, place: str, given: Toml) -> TomlTable:
+    def table(self, path: str, given: Toml) -> TomlTable:
         """Read a table."""
         if isinstance(given, dict):
             return given
-        self.wrong(place, f"must be a table, is {abbreviate(given)}")
+        self.wrong(path, f"must be a table, is {abbreviate(given)}")
         return {}
 
-    def names(self, place: str, given: Toml) -> tuple[str, ...]:
+    def names(self, path: str, given: Toml) -> tuple[str, ...]:
         """Read a name or a list of names."""
         names = [given] if isinstance(given, str) else given
         if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
             return tuple(map(str, names))
-        self.wrong(place, f"must be a list of names, is {abbreviate(given)}")
+        self.wrong(path, f"must be a list of names, is {abbreviate(given)}")
         return ()
 
-    def number(self, place: str, given: Toml) -> float | None:
+    def number(self, path: str, given: Toml) -> float | None:
         """Read a finite number."""
         if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
             return float(given)
-        self.wrong(place, f"must be a finite number, is {abbreviate(given)}")
+        self.wrong(path, f"must be a finite number, is {abbreviate(given)}")
         return None
 
-    def whole(self, place: str, given: "Toml | None", least: int) -> int | None:
+    def whole(self, path: str, given: "Toml | None", smallest: int) -> int | None:
         """Read a whole number."""
-        if isinstance(given, int) and not isinstance(given, bool) and given >= least:
+        if isinstance(given, int) and not isinstance(given, bool) and given >= smallest:
             return given
-        self.wrong(place, "missing" if given is None else f"must be a whole number, at least {least}, is {abbreviate(given)}")
+        self.wrong(path, "missing" if given is None else f"must be a whole number, at least {smallest}, is {abbreviate(given)}")
         return None
 
-    def numbers(self, place: str, given: Toml) -> np.ndarray | None:
+    def numbers(self, path: str, given: Toml) -> np.ndarray | None:
         """Read a list of finite numbers, which may be nested."""
         try:
             values = np.array(given)
@@ -282,7 +282,7 @@ class _GridReader:
             values = np.array(None)
         if values.dtype.kind in "iuf" and values.ndim and np.isfinite(values).all():
             return values.astype(float)
-        self.wrong(place, f"must be a list of finite numbers, is {abbreviate(given)}")
+        self.wrong(path, f"must be a list of finite numbers, is {abbreviate(given)}")
         return None
 
 

@@ -21,15 +21,15 @@ class _BranchMotion(NamedTuple):
     values: list[float]
 
 
-def check_motions(bars: FourBars, found: Classification) -> np.ndarray:
+def check_motions(bars: FourBars, classification: Classification) -> np.ndarray:
     """Return a mask of the positions (M, J) that motions reach; each branch is followed from its first position.
 
     A four-bar drawn in that position is driven by its crank and closed at each value; the traced point of the coupler has to
     reach its place at the value that the classification computed, without leaving the branch.
     """
-    M, J = found.values.shape
+    M, J = classification.values.shape
     confirmed = np.zeros((M, J), bool)
-    motions = [motion for m in range(M) for motion in _motions_of(m, found)]
+    motions = [motion for m in range(M) for motion in _motions_of(m, classification)]
     if not motions:
         return confirmed
     longest = max(len(motion.values) for motion in motions)
@@ -59,14 +59,14 @@ def skeleton() -> PositionBatch:
     return PositionBatch(mechanism, "body.crank.angle", [f"pin.{name}" for name in pins])
 
 
-def _motions_of(m: int, found: Classification) -> list[_BranchMotion]:
+def _motions_of(m: int, classification: Classification) -> list[_BranchMotion]:
     """Return the motions along each branch: one full turn of the crank, or both directions from the first position."""
     motions = []
-    for branch in range(found.branches[m].max() + 1):
-        places = np.flatnonzero(found.branches[m] == branch)
-        first, values = int(places[0]), found.values[m]
+    for branch in range(classification.branches[m].max() + 1):
+        places = np.flatnonzero(classification.branches[m] == branch)
+        first, values = int(places[0]), classification.values[m]
         away = values[places] - values[first]
-        if found.turns[m]:
+        if classification.turns[m]:
             away = np.mod(away, 2 * np.pi)
         for sign in (1, -1):
             of_way = places[(away * sign >= 0)]
