@@ -71,8 +71,8 @@ class RatesOfChange(Rates):
 
     def __call__(self, x: list[Array]) -> list[Array]:
         half = len(x) // 2
-        found, changes = jax.jvp(self.rates, (x[:half],), (x[half:],))
-        return found + changes
+        values, changes = jax.jvp(self.rates, (x[:half],), (x[half:],))
+        return values + changes
 
 
 class StateAfter(DifferentiableFunction):
@@ -93,8 +93,8 @@ class StateAfter(DifferentiableFunction):
 
     def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: PyTree) -> list[Array]:
         del run
-        given = iter(tangents)
-        ds, _, *changes = [next(given) if m else None for m in active[:4]]
+        remaining = iter(tangents)
+        ds, _, *changes = [next(remaining) if m else None for m in active[:4]]
         changes = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(inputs[2:4], changes, strict=True)]
         if ds is None:
             return changes

@@ -1,4 +1,4 @@
-"""Solvers by name, of diffrax and of this package, and the tableaus of the explicit ones.
+"""Solvers by name, from diffrax and from this package, and the tableaus of explicit solvers.
 
 diffrax is imported on demand, since its import takes as long as that of JAX.
 """
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import diffrax
 
 Solver: TypeAlias = "diffrax.AbstractSolver"
-OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # solvers of this folder and their modules
+OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # the solvers of this folder, with their modules
 
 
 def own_solver(name: str) -> "type[diffrax.AbstractSolver]":
@@ -55,6 +55,6 @@ def method_of(solver: "diffrax.AbstractERK | None") -> Method:
     order: Any = solver.error_order(diffrax.ODETerm(lambda t, y, args: y))
     c, stages, b, error = np.append(0.0, tableau.c), tableau.a_lower, np.asarray(tableau.b_sol), np.asarray(tableau.b_error)
     ends = bool(tableau.fsal and error[-1] != 0)
-    if tableau.fsal and not ends:  # the last stage serves interpolation or the next step
+    if tableau.fsal and not ends:  # the last stage is used for interpolation or by the next step
         c, stages, b, error = c[:-1], stages[:-1], b[:-1], error[:-1]
     return Method.of(c, stages, b, error, order, ends)

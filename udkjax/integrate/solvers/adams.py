@@ -1,8 +1,8 @@
 """Adams methods of variable order and step.
 
 Order and step are chosen as in STEP by Shampine and Gordon: at the start of a run the order rises and the step doubles in every
-step. Later the order falls as soon as a lower one promises no larger error, and rises after k + 1 equal steps, when the next
-difference is available.
+step. Later the order falls as soon as the estimated error of a lower order is not larger, and rises after k + 1 equal steps, when
+the next difference is available.
 """
 
 from collections.abc import Callable
@@ -35,15 +35,15 @@ from udkjax.transforms.gradients import stop_gradients
 # Iteration, as in VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), with its names.
 ITERATIONS = 3  # MAXCOR
 ITERATION_SHARE = 0.1  # CORTES: largest remaining error of the iteration, relative to the tolerance
-RATE_MEMORY = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since a single fast one proves little
-# Choice of order and step, as in STEP (Shampine, Gordon 1975, chapter 10): the step doubles at most, and order one, with less
-# reliable estimates, is left or taken only if that halves the error.
+RATE_MEMORY = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since one fast iteration proves little
+# Choice of order and step, as in STEP (Shampine, Gordon 1975, chapter 10): a step at most doubles. Order one has less reliable
+# estimates: the order changes from or to one only if this halves the error.
 LARGEST = 2.0
 HALF = 0.5
-# Own constants: the error of many steps is a few times the tolerance, with no more right-hand sides than STEP or VODE
-# (tests/integrate/test_adams.py).
-SHARE = 0.25  # target error of the next step, relative to the tolerance; STEP, whose steps only halve or double, has 0.5
-RUNGS = 4.0  # a step changes by powers of 2^(1/4), so that it does not follow rounding errors of an estimate
+# Constants of this package: with these the error of many steps is a small multiple of the tolerance, with no more right-hand
+# sides than STEP or VODE (tests/integrate/test_adams.py).
+SHARE = 0.25  # target error of the next step, relative to the tolerance; 0.5 in STEP, whose steps only halve or double
+RUNGS = 4.0  # a step changes by powers of 2^(1/4), to be independent of rounding errors of the estimate
 SMALLEST = 0.25  # smallest factor of a step; STEP halves once or twice
 NEGLIGIBLE = 1e-4  # relative to the tolerance: smaller estimates are rounding errors
 EVEN = 1e-2  # relative: steps that differ by less are equal
@@ -69,9 +69,9 @@ class ErrorEstimates(eqx.Module):
 class OrderControl(eqx.Module):
     """The state of the choice of order and step."""
 
-    order: Int[Array, ""]  # of the next step
+    order: Int[Array, ""]  # order of the next step
     step: Float[Array, ""]  # the planned next step
-    equal_steps: Int[Array, ""]  # number of latest steps of equal size
+    equal_steps: Int[Array, ""]  # number of latest steps with equal size
     starting: Bool[Array, ""]  # whether order and step rise with every step
 
 
@@ -100,7 +100,7 @@ def choose_order(
     equal_steps = jnp.where(jnp.abs(h - control.step) < EVEN * h, control.equal_steps + 1, 1)
     falling = jnp.where(k > 2, jnp.maximum(e.k_minus_1, e.k_minus_2) <= e.k, (k == 2) & (e.k_minus_1 <= HALF * e.k))
     falling = falling & (e.k > NEGLIGIBLE)
-    shrunk = (h < (1 - EVEN) * control.step) & (points > 2)  # rejected before; the first step is only a guess
+    shrunk = (h < (1 - EVEN) * control.step) & (points > 2)  # rejected before, except for the first step, which is a guess
     starting = control.starting & ~shrunk & ~falling & (k < most)
 
     reliable = (equal_steps > k) & (points >= k + 2)
@@ -141,9 +141,9 @@ class Adams(Multistep):
 
     The integral of the polynomial through the k newest values of f predicts the next state; that of the polynomial through one
     more value corrects it (the result has order k + 1). With `corrector="pece"` that value is f at the predicted state, and f at
-    the corrected state enters the history: two calls of f per step, one in a rejected step. With `corrector="iteration"` f is
-    called until the state converges: mostly one or two calls, but less stable at larger steps. Order and step follow from the
-    estimated errors of orders k - 2 to k + 1.
+    the corrected state enters the history: two calls of f per accepted step, one per rejected step. With `corrector="iteration"`
+    f is called until the state converges: mostly one or two calls, but less stable at larger steps. Order and step follow from
+    the estimated errors of orders k - 2 to k + 1.
 
     Use it as any diffrax solver, with a `PIDController` of default factors, which has the tolerances; for a given sequence of
     steps, give them as `root_finder=Tolerances(rtol, atol)`. Its solver state counts `evaluations`.
@@ -222,14 +222,14 @@ class Adams(Multistep):
 
     def _begin(self, h: Float[Array, ""], y: Vector, f: Vector, evaluations: Int[Array, ""]) -> History:
         """Return a history of one value."""
-        rows, one = self.max_order + 2, jnp.array(1)
+        rows, one_point = self.max_order + 2, jnp.array(1)
         phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
         return History(
             h * jnp.arange(rows),
             phi,
             y,
             jnp.array(True),
-            one,
+            one_point,
             first_order_control(stop_gradients(h)),
             jnp.ones_like(h),
             evaluations,
@@ -238,9 +238,9 @@ class Adams(Multistep):
     def _update_newest(
         self, f: Field, t0: Float[Array, ""], h: Float[Array, ""], y: Vector, state: History, made_jump: Flag
     ) -> tuple[History, Bool[Array, ""]]:
-        """Return the history with f(t0, y) as its newest value, or a new one; and whether y is not the end of the last step.
+        """Return the history with f(t0, y) as its newest value, or a new history; and whether y is not the end of the last step.
 
-        Where y was displaced, it will be again: then f at the end of a step is left for the next step to call.
+        If y was displaced, it is likely to be displaced again: f at the end of this step is then evaluated in the next step only.
         """
         displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > SAME_STATE * jnp.max(jnp.abs(y), initial=0.0)
         stale = displaced | ~state.exact | made_jump
@@ -270,8 +270,8 @@ class Adams(Multistep):
 
         expected = stop_gradients(state.rate * rule.h / state.ages[1])  # the rate is proportional to the step
         start = (jnp.zeros_like(y), jnp.zeros_like(weight), expected, jnp.array(False), jnp.array(0))
-        (d, _, rate, found, calls), _ = jax.lax.scan(iterate, start, length=self.root_find_max_steps)
-        return d, found, calls, rate
+        (d, _, rate, converged, calls), _ = jax.lax.scan(iterate, start, length=self.root_find_max_steps)
+        return d, converged, calls, rate
 
 
 def _field(terms: PyTree[diffrax.AbstractTerm], args: PyTree, unravel: Unravel) -> Field:
@@ -280,7 +280,7 @@ def _field(terms: PyTree[diffrax.AbstractTerm], args: PyTree, unravel: Unravel) 
 
 
 def _sizes(tolerances: Tolerances, unravel: Unravel, y0: PyTree, y1: PyTree) -> Size:
-    """Return the function that gives the norms of the rows of a matrix, relative to the tolerance of a step."""
+    """Return a function that computes the norms of the rows of a matrix, relative to the tolerance of a step."""
     tolerances, y0, y1 = stop_gradients((tolerances, y0, y1))
     allowed = error_scale(tolerances, y0, y1)
     size = jax.vmap(lambda x: STRICTER * tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))

@@ -31,17 +31,17 @@ Terms = PyTree[diffrax.AbstractTerm]
 
 HIGHEST = 5  # order six is of little use, and order seven unstable (Hairer, Wanner II, section V.1)
 # Constants of VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), with its names.
-WORTHWHILE = 1.5  # THRESH: least growth of a step; with a constant step M can be reused and the error estimates are good
+WORTHWHILE = 1.5  # THRESH: least growth of a step; while the step is constant, M can be reused and the error estimates are good
 LARGEST, SMALLEST = 10.0, 0.2  # ETAMX3, ETAMXF: factors of a step, the defaults of diffrax.PIDController
 NO_DIVISION_BY_ZERO = 1e-6  # ADDON
 # Ratio of the tolerance to the estimated error of the next step at orders k - 1, k and k + 1 (BIAS1, BIAS2, BIAS3: 6, 6, 10), in
-# addition to STRICTER; and the fraction of the error that an iteration may leave (CORTES: 0.1). VODE's own numbers are in
-# brackets. With these the error of many steps is a few times the tolerance, and the same error takes no more right-hand sides
-# than VODE (tests/integrate/test_bdf.py).
+# addition to STRICTER; and the fraction of the error that an iteration may leave (CORTES: 0.1). The numbers in brackets
+# are those of VODE. With the values below, the error of many steps is a small multiple of the tolerance, and the same error needs
+# no more right-hand sides than with VODE (tests/integrate/test_bdf.py).
 LOWER, SAME, HIGHER = 10.0, 10.0, 15.0
 NEWTON_SHARE = 0.02
-# Own constants.
-BETTER = 1.1  # another order is taken only if it allows a step larger by this factor
+# Constants of this package.
+BETTER = 1.1  # the order changes only if this allows a step larger by this factor
 REPEATED = 1e-3  # relative: a step smaller than planned by more than this was rejected before
 
 
@@ -57,8 +57,8 @@ class BDFState(eqx.Module):
 
     times: Float[Array, "m"]
     phi: Float[Array, "m n"]
-    points: Int[Array, ""]  # in the history
-    order: Int[Array, ""]  # of the next step
+    points: Int[Array, ""]  # number of states in the history
+    order: Int[Array, ""]  # order of the next step
     wait: Int[Array, ""]  # steps before another order is considered
     planned: Float[Array, ""]  # the next step
     newton: newton.NewtonState
@@ -70,7 +70,7 @@ class BDFState(eqx.Module):
 
     @property
     def jacobians(self):
-        """Number of Jacobians; each also gives a value of the vector field, counted among the evaluations."""
+        """Number of Jacobians; each also evaluates the vector field once, which counts as an evaluation."""
         return self.newton.jacobians
 
     @property
@@ -167,27 +167,27 @@ class BDF(Multistep):
         k = jnp.where(h < LOST_STEP * state.planned, 1, state.order)
 
         psi = t1 - state.times  # p and its derivative at t1, from the first k + 1 rows
-        parts = _weights(state.times, t1)[:, None] * state.phi
+        terms_at_t1 = _weights(state.times, t1)[:, None] * state.phi
         slopes = jnp.concatenate([jnp.zeros(1), jnp.cumsum(1 / psi[:-1])])
         i = jnp.arange(len(psi))
-        predicted = jnp.sum(jnp.where((i <= k)[:, None], parts, 0.0), axis=0)
-        v = jnp.sum(jnp.where((i <= k)[:, None], slopes[:, None] * parts, 0.0), axis=0)
+        predicted = jnp.sum(jnp.where((i <= k)[:, None], terms_at_t1, 0.0), axis=0)
+        v = jnp.sum(jnp.where((i <= k)[:, None], slopes[:, None] * terms_at_t1, 0.0), axis=0)
         gamma = jnp.cumsum(1 / (1.0 + i))[k - 1]
         error = _error_constant(k, h / psi)
 
         size = _Size(tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y0))[0], STRICTER * error / NEWTON_SHARE)
         equation = newton.Implicit(terms, args, unravel, t1, predicted, v, h / gamma)
-        e, found, iteration = newton.solve(equation, stop_gradients(size), state.newton, self.root_find_max_steps)
-        e = jnp.where(found, e, 0.0)
+        e, converged, iteration = newton.solve(equation, stop_gradients(size), state.newton, self.root_find_max_steps)
+        e = jnp.where(converged, e, 0.0)
 
-        j = i[:, None]  # new differences: phi[j] = y1 - (the sum of the parts before j), taken from e so that little cancels
+        j = i[:, None]  # new differences phi[j] = y1 - sum of the terms before j, computed from e to avoid cancellation
         signs = jnp.where((j <= i) & (i <= k), 1.0, 0.0) - jnp.where((i > k) & (i < j), 1.0, 0.0)
-        phi = signs @ parts + e
+        phi = signs @ terms_at_t1 + e
         y1 = unravel(phi[0])
 
         weighed = _Size(tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y1))[0], STRICTER)
         errors = stop_gradients(_errors(k, h / psi, phi, weighed).at[1].set(error * weighed(e)))
-        accept = found & (errors[1] <= 1)
+        accept = converged & (errors[1] <= 1)
         factor, order, wait = self._choose(k, errors, state.wait, retried)
         shrink = jnp.minimum(_factor(errors[1], k, SAME), jnp.where(retried, SMALLEST, 1.0))
         points = jnp.minimum(state.points + 1, self.max_order + 1)
@@ -195,7 +195,7 @@ class BDF(Multistep):
         times = jnp.concatenate([t1[None], state.times[:-1]])
         new = BDFState(times, phi, points, order, wait, stop_gradients(h * factor), iteration)
         y_error = steer_error(tolerances, y0, y1, accept, jnp.where(accept, factor, shrink))
-        y_error = jax.tree.map(lambda x: jnp.where(found, x, jnp.inf), y_error)
+        y_error = jax.tree.map(lambda x: jnp.where(converged, x, jnp.inf), y_error)
         through = jnp.where((i <= k)[:, None], phi, 0.0)
         dense = {"times": times, "phi": jax.vmap(unravel)(through)}
         return y1, y_error, dense, new, diffrax.RESULTS.successful
@@ -210,10 +210,10 @@ class BDF(Multistep):
         state: BDFState,
         made_jump: Flag,
     ) -> BDFState:
-        """Return the history, moved to end in y0 if that is not the last state but its projection; or a new one.
+        """Return the history, shifted to end in y0 if y0 is the projection of the last state; or a new history.
 
-        Moved as a whole, its differences remain smooth: with the newest state alone replaced, a run projected at each step took
-        three times the steps.
+        The differences of a shifted history remain smooth: with only the newest state replaced, a run projected at each step
+        needed three times as many steps.
         """
         y = ravel_pytree(y0)[0]
         state = eqx.tree_at(lambda s: s.phi, state, state.phi.at[0].set(y))
@@ -229,7 +229,7 @@ class BDF(Multistep):
     def _choose(
         self, k: Int[Array, ""], errors: Float[Array, "3"], wait: Int[Array, ""], retried: Bool[Array, ""]
     ) -> tuple[Float[Array, ""], Int[Array, ""], Int[Array, ""]]:
-        """Return, after an accepted step, the factor of the next, its order, and the number of steps before another change.
+        """Return, after an accepted step, the growth factor and order of the next, and the number of steps before another change.
 
         A better order is taken even if the step does not grow: since accepted steps do not shrink, the error may be far above
         its target.
@@ -260,7 +260,7 @@ class _Size(eqx.Module):
 
 
 def _weights(times: Float[Array, "m"], t: Float[Array, ""]) -> Float[Array, "m"]:
-    """Return the weights of phi in its polynomial at t."""
+    """Return the weights of phi in the value of its polynomial at t."""
     return jnp.concatenate([jnp.ones(1, times.dtype), jnp.cumprod((jnp.asarray(t) - times[:-1]) / (times[0] - times[1:]))])
 
 
@@ -280,6 +280,6 @@ def _errors(k: Int[Array, ""], alpha: Float[Array, "m"], phi: Float[Array, "m n"
 
 
 def _factor(error: Float[Array, "*k"], order: Int[Array, "*k"], below: Array | float) -> Float[Array, "*k"]:
-    """Return the factor of a step with an error `below` times smaller than the tolerance."""
+    """Return the factor of a step whose error would be the tolerance divided by `below`."""
     size = jnp.power(below * error, 1 / (order + 1))
     return 1 / (size + NO_DIVISION_BY_ZERO)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
-NOT_COUNTED = -1  # before the first step, which returns the evaluations of the start
+NOT_COUNTED = -1  # count before the first step, which also returns the evaluations of the start
 
 
 class Tally(eqx.Module):
@@ -23,12 +23,12 @@ class Tally(eqx.Module):
 def tally(solver: diffrax.AbstractSolver, error: PyTree, before: PyTree, after: PyTree, made_jump: Bool[ArrayLike, ""]) -> Tally:
     """Count the calls of an attempt, from the solver's states before and after it.
 
-    They are known for explicit Runge-Kutta methods, by their tableau, and for methods whose state has a field `evaluations`, the
-    calls so far.
+    The calls are known for explicit Runge-Kutta methods, from their tableau, and for methods whose state has a field
+    `evaluations`, the calls so far.
     """
     if hasattr(before, "evaluations"):
         return Tally(error, after.evaluations - before.evaluations, before.evaluations)
-    if not issubclass(type(solver), diffrax.AbstractERK):  # by its own type: a wrapper may take several steps at once
+    if not issubclass(type(solver), diffrax.AbstractERK):  # checked for its own type: a wrapper may take several steps at once
         return Tally(error, None, None)
     stages = solver.tableau.num_stages  # pyright: ignore[reportAttributeAccessIssue]
     if before is not None:  # the last stage of the previous step is the first of this one
@@ -38,7 +38,7 @@ def tally(solver: diffrax.AbstractSolver, error: PyTree, before: PyTree, after: 
 
 
 class Wrapper(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
-    """A diffrax solver that forwards all attributes and methods to another one, except `step`."""
+    """A diffrax solver that forwards all attributes and methods except `step` to another solver."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
@@ -123,7 +123,7 @@ class CountingController(diffrax.AbstractAdaptiveStepSizeController):
             t0, t1, y0, y1_candidate, args, y_error.error, error_order, state
         )
         if y_error.evaluations is not None:
-            # diffrax replaces NaN in errors, and makes these counts floats by that
+            # diffrax replaces NaN in errors, which converts these counts to floats
             taken, before = (jnp.asarray(x).astype(total.dtype) for x in (y_error.evaluations, y_error.before))
             total = jnp.where(total == NOT_COUNTED, before, total) + taken
         return keep, *times, jumped, (state, total), result
@@ -142,6 +142,6 @@ def count_evaluations(
 def evaluations(controller_state: PyTree) -> Int[Array, ""]:
     """Return the calls of the vector field by a run's solver, or -1 if unknown or without a step.
 
-    Those of the choice of the first step are not included.
+    Calls to choose the first step are not included.
     """
     return controller_state[1]

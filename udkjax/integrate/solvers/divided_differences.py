@@ -23,7 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
-HIGHEST = 12  # order; higher ones are hardly stable
+HIGHEST = 12  # highest order; methods of higher orders are hardly stable
 # Gauss points and weights on [0, 1]: they integrate every c_i exactly, and without cancellation, since no c_i is negative.
 POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST // 2 + 1), (1.0, 0.0)))
 

@@ -1,7 +1,7 @@
 """Control of step and order, common to the multistep methods of variable order.
 
-A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which sees an
-error estimate of one fixed order. `steer_error` therefore returns an error from which `PIDController` computes exactly the factor
+A method of variable order chooses its next order and step together. diffrax leaves the step to its controller, which expects an
+error estimate of fixed order. `steer_error` therefore returns an error from which `PIDController` computes exactly the factor
 that the method has chosen.
 """
 
@@ -20,7 +20,7 @@ Flag = Bool[ArrayLike, ""]
 Unravel = Callable[[Float[Array, "n"]], PyTree[Array]]
 
 SAFETY = 0.9  # default of diffrax.PIDController
-STRICTER = 8.0  # ratio of the tolerance to the target of a step, since the errors of many short steps add up
+STRICTER = 8.0  # ratio of the tolerance to the target error of a step, since the errors of many short steps add up
 LOST_STEP = 0.05  # a step cut to a smaller fraction restarts at order one: there was a jump
 ERROR_ORDER = 2  # for the controller: the order of the error of the first step, which has order one
 
@@ -62,12 +62,12 @@ def steer_error(
 
 def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Float[Array, ""], y: PyTree[Array], args: PyTree) -> Float[Array, "n"]:
     """Return the derivative of y, as a vector."""
-    unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # of the control of a step
+    unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # unit control of the term
     return ravel_pytree(terms.vf_prod(t, y, args, unit))[0]
 
 
 def check_orders(least: int, most: int, highest: int) -> None:
-    """Raise ValueError for orders outside of a family of methods."""
+    """Raise ValueError for orders that a family of methods lacks."""
     if not 1 <= least <= most <= highest:
         raise ValueError(f"orders must satisfy 1 <= min_order <= max_order <= {highest}, not min_order={least}, max_order={most}")
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from udkjax.integrate.solvers.multistep import Unravel, vector_field
 
-ITERATIONS = 3  # MAXCOR: with one matrix; more rarely help
+ITERATIONS = 3  # MAXCOR: iterations with one matrix; more rarely help
 JACOBIAN_STEPS, MATRIX_STEPS = 50, 20  # MSBJ, MSBP: largest ages in steps
 CHANGE = 0.3  # CCMAX: largest relative change of c with the same M
 FASTEST = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since one fast iteration proves little
@@ -59,7 +59,7 @@ class NewtonState(eqx.Module):
     jacobian: Float[Array, "n n"]
     lu: Float[Array, "n n"]
     pivots: Int[Array, "n"]
-    c: Float[Array, ""]  # of M
+    c: Float[Array, ""]  # the c of M
     jacobian_age: Int[Array, ""]
     matrix_age: Int[Array, ""]
     rate: Float[Array, ""]
@@ -140,7 +140,7 @@ def _(primals, tangents):
 def _matrices(equation: Implicit, now: _Iteration) -> tuple[Float[Array, "n"], NewtonState]:
     """Return f, and the state with a new J and a new M if they are due.
 
-    Both are branches, also under vmap as long as no member needs them.
+    Each is computed in a branch: under vmap it is skipped as long as no member needs it.
     """
     state, renew = now.state, now.renew
 

@@ -27,7 +27,7 @@ TABLEAU = diffrax.ButcherTableau(
 )
 
 # Column m: coefficients of s^(m + 1). Among the weights b(s) of the eight stages that meet the conditions of order 4 at every s,
-# these have the smallest residuals in the conditions of order 5, then of order 6. b(1) is b_sol; b'(0) is the first stage alone.
+# these have the smallest residuals in the conditions of order 5, then of order 6. b(1) is b_sol; b'(0) selects the first stage.
 DENSE = np.array(
     [
         [1.0, -2.7926169818074067, 2.6533780544166103, -0.6910024927492995, -0.09940999448060499, 0.0046514146207005174],
@@ -51,7 +51,7 @@ class VernerInterpolation(diffrax.AbstractLocalInterpolation):
     k: PyTree[Array]  # (stages, ...)
 
     def __init__(self, *, t0, t1, y0, y1, k):
-        del y1  # is y0 + sum_i b_i(1) k_i
+        del y1  # equals y0 + sum_i b_i(1) k_i
         self.t0, self.t1, self.y0, self.k = t0, t1, y0, k
 
     def evaluate(self, t0, t1=None, left=True):
