@@ -53,7 +53,7 @@ class Configuration:
 
     @property
     def vt(self) -> np.ndarray:
-        """The right singular vectors, (n, n), row by row."""
+        """The right singular vectors, (n, n), as rows."""
         return self._vectors[1]
 
     @property
@@ -137,7 +137,7 @@ class RankedPositions:
 class JointForces(NamedTuple):
     """Uniqueness of the multipliers of a constraint."""
 
-    unique: tuple[bool, ...]  # row by row
+    unique: tuple[bool, ...]  # for each row
     share: tuple[float, ...]  # norm of each row of N: from 0 (unique) to 1 (arbitrary)
     direction: float | None  # for a joint at a point: the only direction (rad) in which its force is unique, if any
 

@@ -116,7 +116,7 @@ def design_experiment(
         The ranking; a candidate that cannot be simulated contributes no information.
 
     Raises:
-        IdentificationError: with every mistake.
+        IdentificationError: lists every mistake.
     """
     experiments = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
     problems = [] if experiments else ["candidates: the list is empty"]

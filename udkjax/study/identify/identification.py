@@ -61,7 +61,7 @@ def identify(
         mechanism: the scene, with first guesses.
         data: a `Record`, a mapping of times ("time") and channels, a pandas table, an xarray dataset, the path of a CSV or NetCDF
             file, or a sequence of these. Each record has its own initial state.
-        parameters: names of numbers of the scene, `length`s, ties as text (`body.a.mass = body.b.mass`), or `Parameter`s with
+        parameters: names of numbers of the scene, `length`s, ties as strings (`body.a.mass = body.b.mass`), or `Parameter`s with
             bounds and priors.
         noise: standard deviation, in SI units, of all channels or of each by channel; by default estimated from the residuals of
             the fit.

@@ -78,7 +78,7 @@ def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
     """Read parameters: strings, lengths, functions and `Parameter`s.
 
     Raises:
-        IdentificationError: with every mistake.
+        IdentificationError: lists every mistake.
     """
     items = [given] if isinstance(given, str | Length | Parameter) or callable(given) else list(given)
     problems: list[str] = []

@@ -217,7 +217,7 @@ class _DataReader:
             for k, item in enumerate(data):
                 yield from self.read(item, f"{source}[{k}]")
         else:
-            if not isinstance(data, str | os.PathLike) and isinstance(data, Iterable):  # of headings
+            if not isinstance(data, str | os.PathLike) and isinstance(data, Iterable):  # may name quantities
                 self.quantities |= _quantities_by_name(cast("Iterable[Hashable]", data))
             for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems):
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()

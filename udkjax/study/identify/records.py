@@ -77,7 +77,7 @@ class Record:
         name: name in messages.
 
     Raises:
-        IdentificationError: with every mistake.
+        IdentificationError: lists every mistake.
     """
 
     def __init__(

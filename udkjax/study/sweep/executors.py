@@ -47,7 +47,7 @@ def run(plan: SweepPlan, chunk: Chunk) -> Done:
 
 
 def other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Return members that drifted despite projection because other rows are redundant, by these rows."""
+    """Return members that drifted because their redundant rows differ from the group's, by redundant rows."""
     by_rows: dict[tuple[int, ...], list[int]] = {}
     for k in np.flatnonzero(result == Result.drift).tolist():
         inputs = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))

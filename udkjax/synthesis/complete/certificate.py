@@ -1,4 +1,4 @@
-"""Certificates of real solutions: proofs, in floating-point numbers, that a system has exactly one close to an approximation.
+"""Certificates of real solutions: floating-point proofs that a system has one solution close to an approximation.
 
 Krawczyk's theorem: F has continuous derivatives, m is a point, U the box of all u with |u - m| <= r, Y any matrix. If
 

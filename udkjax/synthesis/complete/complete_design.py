@@ -75,7 +75,7 @@ def design_all(
         goal: a `PathGoal` with nine targets for the coupler's pin, or a `PoseGoal` with five for the coupler and its third
             pin (`pin`); without values of the driver. Angles count from the first pose.
         driver: a driver or coordinate that is the angle of a link on the ground; by default the only driver.
-        bounds: (low, high) by the names of pins, such as `pin.O` (m), in the first position. Designs beyond them are left out.
+        bounds: (low, high) by the names of pins, such as `pin.O` (m), in the first position. Designs outside are left out.
         lengths: (least, most) distances (m) by pairs of pins.
         areas: circles and polygons by pin, as for `design`, in the first position.
         transmission: the least distance (rad) of the transmission angle from 0 and pi in all positions.

@@ -226,7 +226,7 @@ def class_keys(z: np.ndarray) -> np.ndarray:
     """Return invariants (4, M) of the six solutions of a class: symmetric functions of the pivots a, b, c of all cognates."""
     x, X, r, R, y, Y, s, S = z[:JOINTS]
     a, A, b, B = x - r, X - R, y - s, Y - S
-    with np.errstate(all="ignore"):  # for ends that are not solutions
+    with np.errstate(all="ignore"):  # ends that are not solutions overflow
         c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
         return np.stack([a + b + c, A + B + C, a * b + b * c + c * a, a * A + b * B + c * C])
 
