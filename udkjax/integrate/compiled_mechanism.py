@@ -109,11 +109,11 @@ def compile_mechanism(
         textbook = textbook_of(equations)
         rows = len(textbook.scales.rows) - len((textbook.redundant or ()) if eliminates(textbook.method) else ())
         missing = unsupported(operation.code)
-        why = f"the scene takes {missing}, which is no arithmetic on numbers" if missing else ""
+        why = f"the scene uses {missing}, which is not arithmetic on numbers" if missing else ""
     elif engine == "auto":
         evaluation = evaluation_of(equations)
     if engine == "native" and why:
-        raise ValueError(f'engine="native" cannot: {why}. engine="auto" takes diffrax instead')
+        raise ValueError(f'engine="native" cannot: {why}. engine="auto" uses diffrax instead')
     plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows)
     return CompiledMechanism(equations, breakpoints, plan)
 

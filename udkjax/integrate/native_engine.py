@@ -119,7 +119,7 @@ def _integrate_along(
 
 
 def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) -> Problem:
-    """Return the cotangents of the `active` numbers from those of the states at the outputs (T, 2n) and of the end (2n,)."""
+    """Return the cotangents of the `active` numbers, from cotangents of the output states (T, 2n) and of the end (2n,)."""
     operation, kept = _operation(problem, active, reverse=True), run.kept[:, None]
     states: Any = [jnp.where(kept, x, x[0]) for x in run.states] or [np.zeros((len(problem.ts), len(problem.q)))] * 2
     inputs = [x[None] for x in (run.record, *states, jnp.where(kept, ys, 0.0), end)]

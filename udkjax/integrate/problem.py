@@ -48,22 +48,22 @@ class Problem:
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
         """Return the units of `atol` for coordinates and for velocities."""
-        one = jnp.ones(len(self.q))
+        unit = jnp.ones(len(self.q))
         if self.length is not None:
-            one = jnp.where(np.arange(len(self.q)) % 3 == 2, one, self.length)
-        return stop_gradients((one, one * self.rate))
+            unit = jnp.where(np.arange(len(self.q)) % 3 == 2, unit, self.length)
+        return stop_gradients((unit, unit * self.rate))
 
 
 class IntegratorOutput(NamedTuple):
     """A run as an integrator returns it: `status` is one of `native.steps`, from `DONE` on."""
 
-    q: Float[Array, "T n"]  # NaN where it was not reached, or after the first lost output
+    q: Float[Array, "T n"]  # NaN at times not reached, or after the first lost output
     v: Float[Array, "T n"]
     reached: Bool[Array, "T"]
-    lost: Float[Array, ""]  # index of the first output at which Psi is violated by more than `drift_tol`; infinite: none
+    lost: Float[Array, ""]  # index of the first output where Psi is violated by more than `drift_tol`, or infinite
     status: Int[Array, ""]
-    t: Float[Array, ""]  # the end
-    y: Float[Array, "2n"]  # at t
+    t: Float[Array, ""]  # the time of the end (s)
+    y: Float[Array, "2n"]  # the state at t
     tried: Int[Array, ""]  # steps
     accepted: Int[Array, ""]
     evaluations: Int[Array, ""]

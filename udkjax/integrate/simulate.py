@@ -89,7 +89,7 @@ def simulate(
         max_steps: the largest number of steps tried.
         drift_tol: the largest violation of Psi, relative to L or in rad.
         dt0: the first step tried (s); by default chosen automatically.
-        formulation: computes accelerations by other equations than that of Udwadia and Kalaba: `Augmented`, `NullSpaceQR`,
+        formulation: the equations for accelerations, other than that of Udwadia and Kalaba: `Augmented`, `NullSpaceQR`,
             `NullSpaceSVD` or `CoordinatePartitioning`; `method` is then used for projection and derivatives only.
         throw: whether a run that does not reach its end raises; a traced run never does.
         progress: True prints the progress of the run; a progress meter of diffrax is used as it is.
@@ -157,7 +157,7 @@ def simulate(
         if not isinstance(mechanism, Mechanism) or choices.adjoint is not None or choices.meter is not None:
             others = "an adjoint of diffrax's" if choices.adjoint else "progress"
             what = others if isinstance(mechanism, Mechanism) else "a ConstrainedSystem"
-            raise ValueError(f"a run with events takes a Mechanism, JAX's own derivatives and no progress meter: not {what}")
+            raise ValueError(f"a run with events needs a Mechanism, JAX's own derivatives and no progress meter: not {what}")
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
         assert analysis is not None  # a mechanism has one
@@ -241,7 +241,7 @@ _compiled, _deferred = eqx.filter_jit(_simulate), deferred(_simulate)
 def _finish(
     run: PreparedRun, raw: IntegratorOutput, bodies: tuple[str, ...], choices: Choices, xp: ModuleType = jnp
 ) -> tuple[Solution, Any, Any]:
-    """Return the results of `_run` from those of the integrator."""
+    """Return the results of `_run`, from the output of the integrator."""
     problem, ts = run.problem, run.ts
     ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows)
     code, time = outcome(ending if xp is np else stop_gradients(ending), xp)

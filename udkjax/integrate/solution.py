@@ -140,10 +140,10 @@ class Solution(PrintsTable):
     @property
     def cause(self) -> str:
         """The end of the run, in words. The first access searches for the cause of a failure, for up to a second."""
-        found = self.found_cause and self.found_cause.text(int(self.code), float(self.time))
+        text = self.found_cause and self.found_cause.text(int(self.code), float(self.time))
         if self.events is not None and (names := self.events.undefined_names):
-            found = f"the condition of {names} is not a number; look at what it divides by, or takes the root of"
-        return f"{self.result.label} at t = {float(self.time):.6g} s: {found or CAUSES[self.result]}"
+            text = f"the condition of {names} is not a number; look at what it divides by, or takes the root of"
+        return f"{self.result.label} at t = {float(self.time):.6g} s: {text or CAUSES[self.result]}"
 
     _units = units(ts="s", q="m, m, rad", v="m/s, m/s, rad/s", time="s")
 
@@ -205,10 +205,10 @@ class Solution(PrintsTable):
         if mechanism is not None:
             data.attrs["parameters"] = json.dumps({k: np.asarray(v).tolist() for k, v in mechanism.parameters().items()})
             data.attrs["scene"] = scene_text(mechanism)
-            if found := efforts(mechanism, self):
-                data = data.assign_coords(driver=list(found))
-                data["effort"] = ("time", "driver"), np.stack([np.asarray(x) for x in found.values()], 1)
-                units = sorted({mechanism.drivers[name].effort_unit for name in found}, reverse=True)
+            if dataset := efforts(mechanism, self):
+                data = data.assign_coords(driver=list(dataset))
+                data["effort"] = ("time", "driver"), np.stack([np.asarray(x) for x in dataset.values()], 1)
+                units = sorted({mechanism.drivers[name].effort_unit for name in dataset}, reverse=True)
                 data["effort"].attrs = {"long_name": "what drivers exert along their coordinates", "units": " or ".join(units)}
         return data
 
@@ -235,10 +235,10 @@ def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     from importlib.metadata import PackageNotFoundError, version
 
-    found = {"python": sys.version.split()[0]}
+    result = {"python": sys.version.split()[0]}
     for package in ("udkjax", "jax", "jaxlib", "diffrax", "equinox", "llvmlite", "numpy"):
         try:
-            found[package] = version(package)
+            result[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "unknown"
-    return found
+            result[package] = "unknown"
+    return result

@@ -133,7 +133,7 @@ def _program(form: Any, max_steps: int, engine: str) -> Callable[..., tuple[Arra
 
     def run(leaves: list[Array], q: Array, v: Array, values: dict[str, Array], numbers: dict[str, Array]) -> tuple[Array, Array]:
         mechanism, analysis = jax.tree.unflatten(form, leaves)
-        found = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_concrete_times=False)
-        return found.q, found.v  # pyright: ignore[reportReturnType]
+        end = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_concrete_times=False)
+        return end.q, end.v  # pyright: ignore[reportReturnType]
 
     return jax.jit(run)

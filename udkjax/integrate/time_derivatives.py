@@ -134,8 +134,8 @@ def _after(rates: Rates, x: list[Array], s: Float[Array, ""]) -> list[Array]:
 def _(primals, tangents):
     rates, x, s = primals
     _, dx, ds = tangents
-    dx = [jnp.zeros_like(one) if d is None else d for one, d in zip(x, dx, strict=True)]
-    found, change = _after(rates, x, s), _after(RatesOfChange(rates), x + dx, s)[len(x) :]
+    dx = [jnp.zeros_like(value) if d is None else d for value, d in zip(x, dx, strict=True)]
+    x, change = _after(rates, x, s), _after(RatesOfChange(rates), x + dx, s)[len(x) :]
     if ds is not None:
-        change = [d + rate * ds for d, rate in zip(change, rates(found), strict=True)]
-    return found, change
+        change = [d + rate * ds for d, rate in zip(change, rates(x), strict=True)]
+    return x, change

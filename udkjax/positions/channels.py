@@ -220,16 +220,16 @@ def _parse_driver(mechanism: Mechanism, text: str) -> Channel:
 
 
 def _parse_distance(mechanism: Mechanism, text: str) -> Channel:
-    one, rest = _split_owner("body", (*mechanism.body_names, GROUND), text)
+    body, rest = _split_owner("body", (*mechanism.body_names, GROUND), text)
     point, rest = _split_point(rest)
     if not rest.startswith("."):
         raise ValueError(f"must be distance.BODY(px, py).BODY2(px, py); after the first point comes {quote(rest)}")
-    two, rest = _split_owner("body", (*mechanism.body_names, GROUND), rest[1:])
-    other, rest = _split_point(rest)
+    body_2, rest = _split_owner("body", (*mechanism.body_names, GROUND), rest[1:])
+    point_2, rest = _split_point(rest)
     if rest:
         raise ValueError(f"must be distance.BODY(px, py).BODY2(px, py); after the second point comes {quote(rest)}")
-    name = f"distance.{_with_point(one, point)}.{_with_point(two, other)}"
-    return Channel(name, "m", "states", "distance", "", (one, two), (point, other), "distance")
+    name = f"distance.{_with_point(body, point)}.{_with_point(body_2, point_2)}"
+    return Channel(name, "m", "states", "distance", "", (body, body_2), (point, point_2), "distance")
 
 
 _PARSERS: dict[str, Callable[[Mechanism, str], Channel]] = {

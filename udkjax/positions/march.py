@@ -71,9 +71,9 @@ def _by_numpy(x: PyTree) -> PyTree:
     return np.asarray(x) if eqx.is_array(x) else x
 
 
-def _march(found: Sequence, xp: ModuleType) -> MarchResult:
-    q, dq, ddq, side = (x[0, APPROACH:] for x in found[:4])
-    return MarchResult(q, dq, ddq, side, found[3][0, 0], xp.maximum(found[4][0, 0].astype(int) - APPROACH, 0))
+def _march(outputs: Sequence, xp: ModuleType) -> MarchResult:
+    q, dq, ddq, side = (x[0, APPROACH:] for x in outputs[:4])
+    return MarchResult(q, dq, ddq, side, outputs[3][0, 0], xp.maximum(outputs[4][0, 0].astype(int) - APPROACH, 0))
 
 
 def _inputs(
@@ -95,15 +95,15 @@ def _inputs(
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:
     """Return the mechanism with all sampled loads zero: positions do not depend on them."""
-    loads = {place: x for place, x in mechanism.samples.items() if place[0] == "_forces"}
-    return mechanism.with_samples({place: with_row(x, np.zeros(row_size(x))) for place, x in loads.items()})
+    loads = {key: x for key, x in mechanism.samples.items() if key[0] == "_forces"}
+    return mechanism.with_samples({key: with_row(x, np.zeros(row_size(x))) for key, x in loads.items()})
 
 
 def _of_unit_masses(mechanism: Mechanism, length: NumberLike, xp: ModuleType) -> Mechanism:
     """Return the mechanism with bodies of 1 kg and the characteristic length as radius of gyration."""
     bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
-    one = xp.ones_like(length)
-    return eqx.tree_at(bodies, mechanism, [one, length**2] * len(mechanism.body_names))
+    unit_mass = xp.ones_like(length)
+    return eqx.tree_at(bodies, mechanism, [unit_mass, length**2] * len(mechanism.body_names))
 
 
 def _operation(mechanism: Mechanism, analysis: Analysis) -> March:

@@ -57,11 +57,11 @@ def second_derivative(guess: Any, active: Any, *changes: tuple[Any, Any]) -> tup
 
 
 def _close_along(guess: Any, operation: Close, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
-    mechanism, n, along = guess[0], len(guess[-1]), []
+    mechanism, n, directions = guess[0], len(guess[-1]), []
     for active, (numbers, dq, dv) in changes:
-        along.append(ActiveNumbers(mechanism, active[0]).tangents(numbers))
-        along += [np.zeros(n) if dx is None else dx for dx in (dq, dv)]
-    dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in along), operation=operation, times=2)[-1][0, 0]
+        directions.append(ActiveNumbers(mechanism, active[0]).tangents(numbers))
+        directions += [np.zeros(n) if dx is None else dx for dx in (dq, dv)]
+    dstate = native_p.bind(*_inputs(*guess), *(x[None, None] for x in directions), operation=operation, times=2)[-1][0, 0]
     return dstate[:n], dstate[n:]
 
 
@@ -72,8 +72,8 @@ def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
     operation = _close(mechanism).with_cotangents(which.mask)
     bars = jnp.concatenate([qbar, vbar])[None]
     numbers, *states = (x[0] for x in native_p.bind(*_inputs(*guess), bars, operation=operation, times=2)[-3:])
-    found = which.cotangents(numbers)
-    return found, *(x if m is True else None for x, m in zip(states, active[-2:], strict=True))
+    results = which.cotangents(numbers)
+    return results, *(x if m is True else None for x, m in zip(states, active[-2:], strict=True))
 
 
 def _inputs(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any, xp: ModuleType = jnp) -> list[Any]:

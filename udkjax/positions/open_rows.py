@@ -15,9 +15,9 @@ MOST_NAMED = 8  # constraints named in one sentence
 def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarray, tol: float) -> str:
     """Name the constraints whose residuals exceed `tol` times their scales, the largest first, with the residual."""
     worst: dict[str, tuple[float, float]] = {}  # residual over the row's scale, and residual
-    for name, r, unit in zip(names, np.abs(residual), scales, strict=True):
-        if not r / unit <= tol:  # also NaN
-            worst[name] = max(worst.get(name, (0.0, 0.0)), (float(np.nan_to_num(r / unit, nan=np.inf)), float(r)))
+    for name, size, unit in zip(names, np.abs(residual), scales, strict=True):
+        if not size / unit <= tol:  # also NaN
+            worst[name] = max(worst.get(name, (0.0, 0.0)), (float(np.nan_to_num(size / unit, nan=np.inf)), float(size)))
     listed = sorted(worst, key=lambda name: -worst[name][0])
     text = ", ".join(f'"{name}" ({worst[name][1]:.2g})' for name in listed[:MOST_NAMED])
     return text + (", ..." if len(listed) > MOST_NAMED else "")

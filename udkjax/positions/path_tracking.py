@@ -145,8 +145,8 @@ class PathTracker:
     def _evaluate(self, z: np.ndarray, t: np.ndarray, bend: float, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the Newton step and dz/dt."""
         n = self.unknowns
-        found = self._program(np.concatenate([np.real(z), np.imag(z), t[None], (bend * t * (1.0 - t))[None]]), shared)
-        step, rate = (found[k : k + n] + 1j * found[k + n : k + 2 * n] for k in (0, 2 * n))
+        outputs = self._program(np.concatenate([np.real(z), np.imag(z), t[None], (bend * t * (1.0 - t))[None]]), shared)
+        step, rate = (outputs[k : k + n] + 1j * outputs[k + n : k + 2 * n] for k in (0, 2 * n))
         return step, rate * (1.0 + 1j * bend * (1.0 - 2.0 * t))
 
     def _advance(self, p: _Points, bend: float, shared: np.ndarray, precision: Precision) -> _Points:
@@ -170,22 +170,22 @@ class PathTracker:
 
 def _ends(p: _Points) -> np.ndarray:
     """Return the statuses of ended paths, by the power of 1 - t of their fastest unknown."""
-    left = 1.0 - p.t
+    remaining = 1.0 - p.t
     with np.errstate(invalid="ignore", divide="ignore"):
-        power = np.max(np.abs(p.rate) / np.abs(p.z), axis=0) * left
-    escapes = (left < NEAR_END) & (power > POWERS[0]) & (power < POWERS[1])
-    found = np.where(escapes, INFINITE, np.where((left < NEAR_END) & (power <= POWERS[0]), SINGULAR, LOST))
-    return np.where(np.max(np.abs(p.z), axis=0) < LARGEST, found, INFINITE)
+        power = np.max(np.abs(p.rate) / np.abs(p.z), axis=0) * remaining
+    escapes = (remaining < NEAR_END) & (power > POWERS[0]) & (power < POWERS[1])
+    status = np.where(escapes, INFINITE, np.where((remaining < NEAR_END) & (power <= POWERS[0]), SINGULAR, LOST))
+    return np.where(np.max(np.abs(p.z), axis=0) < LARGEST, status, INFINITE)
 
 
 def _predict(p: _Points, step: np.ndarray) -> np.ndarray:
     """Extrapolate the cubic through the last two points; the first step, the tangent."""
     has_two = p.last > 0
-    before = np.where(has_two, p.last, 1.0)
-    u = 1.0 + step / before
+    last_step = np.where(has_two, p.last, 1.0)
+    u = 1.0 + step / last_step
     u2, u3 = u * u, u * u * u
-    cubic = (2 * u3 - 3 * u2 + 1) * p.z_before + (u3 - 2 * u2 + u) * before * p.rate_before
-    cubic += (3 * u2 - 2 * u3) * p.z + (u3 - u2) * before * p.rate
+    cubic = (2 * u3 - 3 * u2 + 1) * p.z_before + (u3 - 2 * u2 + u) * last_step * p.rate_before
+    cubic += (3 * u2 - 2 * u3) * p.z + (u3 - u2) * last_step * p.rate
     return np.where(has_two, cubic, p.z + step * p.rate)
 
 

@@ -54,10 +54,10 @@ def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
 
 def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
     """Return the places of the numbers of joints among all numbers of a mechanism; empty for joints that the mechanism lacks."""
-    found = []
+    result = []
     for name in names:
         if name not in mechanism.joint_names:
-            found.append(())
+            result.append(())
             continue
         k = mechanism.joint_names.index(name)
         sizes = jax.tree.map(lambda x: NumberOf(np.size(x)), mechanism._joints[k])
@@ -66,8 +66,8 @@ def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[
         counts = [x.size if isinstance(x, NumberOf) else np.size(x) for x in leaves]
         starts = np.cumsum([0, *counts])
         of_joint = [range(a, a + x.size) for a, x in zip(starts, leaves, strict=False) if isinstance(x, NumberOf)]
-        found.append(tuple(int(i) for places in of_joint for i in places))
-    return tuple(found)
+        result.append(tuple(int(i) for places in of_joint for i in places))
+    return tuple(result)
 
 
 def evaluate_joint(joint: AddedJoint, q: Float[np.ndarray, "b n"], numbers: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b m"]:

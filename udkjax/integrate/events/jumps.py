@@ -51,7 +51,7 @@ def apply_event(
     blocked, adds = xp.zeros_like(releases), ~releases & xp.asarray(plan.adds)[e]
     if plan.adds.any() and (xp is not np or adds.any()):
         joints = system.add_joints(members, xp.where(adds, e, -1), q, joints)
-        # Velocities jump to those that the phase without its contacts at rest allows: these contacts may open.
+        # The new velocities satisfy the phase without its contacts at rest, since these contacts may open.
         q1, _ = system.project(members, RunState(t, q, v, after, joints))
         _, v1 = system.project(members, RunState(t, q1, v, xp.asarray(plan.free)[after], joints), is_free=True)
         moved = xp.abs(q1 - q) / take(system.coordinates, members)
