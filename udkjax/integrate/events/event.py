@@ -1,7 +1,7 @@
 """Events: actions on a mechanism where a scalar condition along its motion crosses zero.
 
-An event is a `condition`, the `direction` in which its zero counts, and an `action`. Conditions receive the frames of all bodies
-by name:
+An event is a `condition`, the `direction` in which its zero counts, and an `action`. A condition receives the
+frames of all bodies by name:
 
     udk.Event(lambda t, at: at["link"].angle, udk.Log(), name="vertical")
 
@@ -43,8 +43,8 @@ class Event(PrintsLine):
     """An `action` that happens when `condition(t, frames)`, a scalar, crosses zero.
 
     `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
-    `direction` is 1 for rising, -1 for falling, 0 for either; for an `Impact`, whose condition is positive before
-    the zero, 0 and -1 mean the same. Only crossings count: a run that starts at a zero, or touches zero and turns back, does not
+    `direction` is 1 for rising, -1 for falling, 0 for either; for an `Impact`, whose condition is positive before the
+    zero, 0 and -1 mean the same. Only crossings count: a run that starts at a zero, or touches zero and turns back, does not
     cross it. But an `Impact` whose condition is zero at the start, and falling, happens at once.
 
     Args:

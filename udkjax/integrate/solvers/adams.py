@@ -240,7 +240,7 @@ class Adams(Multistep):
     ) -> tuple[History, Bool[Array, ""]]:
         """Return the history with f(t0, y) as its newest value, or a new history; and whether y is not the end of the last step.
 
-        If y was displaced, it is likely to be displaced again: f at the end of this step is then evaluated in the next step only.
+        If y was displaced, it will be displaced again: f at the end of this step is then left for the next step to evaluate.
         """
         displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > SAME_STATE * jnp.max(jnp.abs(y), initial=0.0)
         stale = displaced | ~state.exact | made_jump
