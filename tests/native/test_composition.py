@@ -268,7 +268,7 @@ def test_positions_without_memory_are_an_error(monkeypatch):
     monkeypatch.setattr(machine, "library", lambda text, *arguments: compiled(replace(text), *arguments))
     batch = udk.PositionBatch(udk.library.four_bar(), "body.crank.angle", ["pin.B"])
     with pytest.raises(MemoryError, match="no memory for a batch of positions"):
-        batch({"pin.B": [[0.5, 1.0]]}, [0.1, 0.2])
+        batch({"pin.B": np.array([[0.5, 1.0]])}, np.array([0.1, 0.2]))
 
 
 # --- object code on disk
