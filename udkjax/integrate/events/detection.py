@@ -53,7 +53,7 @@ class Detection(NamedTuple):
     """The first crossing of conditions in a window."""
 
     sides: Int[Array, "G C"]  # sides of zero at the nodes
-    place: Int[Array, ""]  # the last node before the first crossing at which its condition is not zero
+    place: Int[Array, ""]  # the last node before the first crossing where the crossing condition is not zero
     behind: Int[Array, ""]  # the first node after the crossing
     is_found: Bool[Array, ""]
     event: Int[Array, ""]

@@ -154,7 +154,7 @@ class Forward(Differentiated):
 
     def _project_end(self, f: Function, begin: Value):
         """Project the tangents of the state at the end of a step."""
-        del begin
+        del begin  # only second derivatives, which project the initial state twice, need it
         with self._each_group(f):
             self._project_tangent(f)
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
