@@ -141,7 +141,8 @@ class LoadedCode:
         )
         assert len(record) == self._field_count
         call = (ctypes.c_int64 * len(record))(*record)
-        threads = max(1, min(members // self._share, thread_count()))
+        shares = members // self._share
+        threads = 1 if shares <= 1 else min(shares, thread_count())
         return PreparedCall(code.run, call, following, threads, inputs, outputs)
 
 
