@@ -23,6 +23,9 @@ from udkjax.native.base.memory import Memory
 from udkjax.native.derivatives import record
 from udkjax.show import doctor
 
+# JAX 0.10, the last for Python 3.11, registers a handler once under a name and words its errors otherwise.
+newer_jax = pytest.mark.skipif(jax.__version_info__ < (0, 11), reason="needs handlers and errors of JAX 0.11")
+
 TS = np.array([0.0, 0.2, 0.4, 0.6])
 PENDULUM = udk.library.compound_pendulum()
 KNOWN = udk.analyse(PENDULUM)
@@ -407,9 +410,6 @@ import udkjax as udk
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.unrolled import Unrolled
 import hashlib
-
-# JAX 0.10, the last for Python 3.11, registers a handler once under a name and words its errors otherwise.
-newer_jax = pytest.mark.skipif(jax.__version_info__ < (0, 11), reason="needs handlers and errors of JAX 0.11")
 mechanism = udk.library.parallelogram()
 programs = scene_programs(mechanism, udk.analyse(mechanism).redundant_rows)
 unrolled = Unrolled(programs, [], ["projection"], [True] * programs.number_count, mode="reverse")
