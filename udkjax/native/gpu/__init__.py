@@ -1,0 +1,1 @@
+"""Machine code in programs that JAX compiles for a graphics card of NVIDIA."""
