@@ -51,7 +51,7 @@ from udkjax.positions.assembly import assemble as assemble
 from udkjax.positions.assembly import check as check
 from udkjax.positions.branches import branches as branches
 from udkjax.positions.continuation import Reached as Reached
-from udkjax.positions.drive import Coordinate as Coordinate
+from udkjax.positions.coordinates import Coordinate as Coordinate
 from udkjax.positions.kinematics import Kinematics as Kinematics
 from udkjax.positions.kinematics import Travel as Travel
 from udkjax.positions.kinematics import kinematics as kinematics

@@ -56,7 +56,8 @@ def kinematics(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.drive import constant_speed, value_of
+    from udkjax.positions.coordinates import value_of
+    from udkjax.positions.drive import constant_speed
     from udkjax.positions.motion_ranges import range_lines
     from udkjax.printing import format_number
     from udkjax.show.summary import table

@@ -16,7 +16,7 @@ from udkjax.arrays import library_for
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSED_TOL
-from udkjax.positions.drive import Coordinate, element_of
+from udkjax.positions.coordinates import Coordinate, element_of
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism, Origin
 

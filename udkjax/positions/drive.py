@@ -4,9 +4,9 @@ With a driver that prescribes `coordinate = t`, Psi(s, q) = 0 are the positions,
 gives d2q/ds2, as for any other mechanism.
 """
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,60 +15,21 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from udkjax.annotations import NumberLike, Numbers
+from udkjax.annotations import NumberLike
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
 from udkjax.equations.redundancy import generic_position, kinematic_rows, owners_of_row
 from udkjax.pinv.row_spaces import null_space
-from udkjax.positions.channels import channel_of, point_of_pin
-from udkjax.printing import PrintsLine
-from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
+from udkjax.positions.coordinates import Coordinate, constant_motion, named_element, value_of
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial
-from udkjax.scene.fields import names
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism, Origin
-from udkjax.wording import join_names, quote, suggestion
+from udkjax.wording import join_names, quote
 
-CoordinateName = Literal["angle", "x", "y", "distance"]
-DRIVEN = get_args(CoordinateName)
 MOVES = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians; less is rounding
-
-
-class Coordinate(PrintsLine):
-    """A coordinate of body 2 relative to body 1 that can be driven, like that of a `Driver`.
-
-    `angle`: theta2 - theta1 (rad), including whole turns; `x`, `y`: point 2 minus point 1 in body 1's frame (m); `distance` (m).
-
-    Args:
-        bodies: the names of two bodies, or "ground".
-        coordinate: "angle", "x", "y" or "distance".
-        points: one point of each body, in its frame (m); by default the origins.
-        axis: for x and y: the direction of x in body 1's frame (rad); by default that of the frame.
-    """
-
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
-    coordinate: CoordinateName = eqx.field(static=True, default="angle")
-    points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
-    axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
-
-    @classmethod
-    def of(cls, driver: Driver) -> "Coordinate":
-        """Return the coordinate that a driver prescribes."""
-        return cls(driver.bodies, driver.coordinate, driver.points, driver.axis)
-
-    def driver(self, motion: Motion) -> Driver:
-        """Return the driver that prescribes this coordinate."""
-        return Driver(self.bodies, self.coordinate, motion, self.points, self.axis)
-
-    @property
-    def effort_unit(self) -> str:
-        """The unit of the effort along the coordinate."""
-        return self.driver(_constant(0.0)).effort_unit
-
-
 Drive = str | Coordinate | None  # the name of a driver or coordinate, a coordinate; None: all drivers along time
 
 
@@ -133,12 +94,12 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
     names: dict[str, str] = {}  # names of coordinates by the drivers that hold them
     for key, value in (held or {}).items():
         try:
-            holder, element = _element(mechanism, key)
+            holder, element = named_element(mechanism, key)
         except SceneError as error:
             raise SceneError([f"held: {problem}" for problem in error.problems], mechanism.name) from None
         names[holder] = f"{quote(key)}, which `held` gives"
-        mechanism = _with_driver(mechanism, holder, element, _constant(value))
-    name, element = _element(mechanism, driver)
+        mechanism = _with_driver(mechanism, holder, element, constant_motion(value))
+    name, element = named_element(mechanism, driver)
     driven = _add_driver(mechanism, name, element, t)
     concrete = _from_guess(driven, name)
     analysis = analyse(concrete)
@@ -153,18 +114,6 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
     return Driven(driven.without_origin, analysis, name, row, unit)
 
 
-def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:
-    """Return the value (rad, m) of a coordinate as a function of q (bodies, 3)."""
-    element = element_of(mechanism, coordinate)
-    places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
-
-    def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
-        rows: Any = q if isinstance(q, Tracer) else np.asarray(q)  # JAX would compile a program to take a row
-        return coordinate_value(element, *(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
-
-    return value
-
-
 def constant_speed(mechanism: Mechanism, driver: str) -> float:
     """Return the constant speed (rad/s, m/s) of a driver; 0 if its speed is not constant, or for another coordinate."""
     motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
@@ -176,56 +125,6 @@ def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | N
     with jax.ensure_compile_time_eval():
         origin = mechanism.origin and Origin(with_drivers(mechanism.origin.mechanism, {}))
     return with_drivers(mechanism, {}, forces, origin)
-
-
-def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
-    """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
-    driver = element.driver(_constant(0.0)).complete()
-    if is_traced((driver, frames)):
-        return jnp.asarray(driver.residual(0.0, *frames)[0])
-    return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
-
-
-def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
-    """Return a coordinate by the name of its driver, or by its name. Raises `SceneError`."""
-    return _element(mechanism, driver)[1]
-
-
-def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
-    """Return the coordinate of a channel's name: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, or a distance.
-
-    Raises `SceneError`.
-    """
-    try:
-        channel = channel_of(mechanism, text)
-    except ValueError as problem:
-        drivers = ", ".join(map(quote, mechanism.driver_names)) or "none"
-        cure = suggestion(text, mechanism.driver_names) or f"; drivers: {drivers}; coordinates: body.NAME.angle, joint.NAME.angle"
-        raise SceneError([f"{quote(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
-    if channel.quantity not in DRIVEN:
-        raise SceneError([f"{quote(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
-    kind = cast(CoordinateName, channel.quantity)
-    with jax.ensure_compile_time_eval():
-        if len(channel.bodies) == 2 and (kind == "angle" or channel.points):
-            return Coordinate(channel.bodies, kind, channel.points or None)
-        if channel.owner:
-            body, point = point_of_pin(mechanism, channel.owner)
-            return Coordinate((GROUND, body), kind, [(0.0, 0.0), point])
-        return Coordinate((GROUND, *channel.bodies), kind, [(0.0, 0.0), *channel.points])
-
-
-def _element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coordinate]:
-    if isinstance(driver, str) and driver in mechanism.drivers:
-        return driver, Coordinate.of(mechanism.drivers[driver])
-    element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
-    return choose_name("value", mechanism.constraints), element
-
-
-def choose_name(name: str, taken: Container[str]) -> str:
-    """Return a free name: `name` with as many primes as needed."""
-    while name in taken:
-        name += "'"
-    return name
 
 
 def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberLike) -> Mechanism:
@@ -242,7 +141,7 @@ def with_halted_drivers(mechanism: Mechanism, t: NumberLike) -> Mechanism:
 
 
 def _halted(mechanism: Mechanism, t: NumberLike) -> dict[str, Driver]:
-    return {key: eqx.tree_at(lambda d: d.motion, d, _constant(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
+    return {key: eqx.tree_at(lambda d: d.motion, d, constant_motion(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
 
 
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
@@ -255,7 +154,7 @@ def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: P
     with jax.ensure_compile_time_eval():
         element = _concrete_element(concrete, name, element)
         # For the analysis, the coordinate is held at its value of the guess.
-        motion = _constant(value_of(concrete, element)(concrete.q0))
+        motion = constant_motion(value_of(concrete, element)(concrete.q0))
         of_origin = {**concrete.drivers, name: element.driver(motion)}
         return with_drivers(mechanism, drivers, origin=Origin(with_drivers(concrete, of_origin)))
 
@@ -291,10 +190,6 @@ def _at_once(given: PyTree) -> AbstractContextManager:
     """Compute at once with concrete numbers, even while something else is traced."""
     traced = is_traced(given)
     return nullcontext() if traced else jax.ensure_compile_time_eval()
-
-
-def _constant(value: Numbers) -> Polynomial:
-    return Polynomial(jnp.stack([value]) if isinstance(value, Tracer) else np.reshape(value, 1))
 
 
 def _value_or(x: NumberLike, otherwise: float) -> NumberLike:

@@ -16,8 +16,9 @@ from udkjax.positions.assembly import State, assemble
 from udkjax.positions.branches import SAME_POSITION
 from udkjax.positions.carried_bodies import carried_bodies
 from udkjax.positions.continuation import Points, Reached, follow, no_points
+from udkjax.positions.coordinates import element_of
 from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
-from udkjax.positions.drive import Drive, Driven, drive, element_of
+from udkjax.positions.drive import Drive, Driven, drive
 from udkjax.positions.march import MarchResult, can_march, march, march_at_once
 from udkjax.positions.position_derivatives import with_derivative, with_derivatives
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units

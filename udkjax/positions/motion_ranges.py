@@ -5,7 +5,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.positions.channels import StateHistory
-from udkjax.positions.drive import Drive, element_of
+from udkjax.positions.coordinates import element_of
+from udkjax.positions.drive import Drive
 from udkjax.positions.transmission import transmission_angle
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, has_numbers
 from udkjax.scene.arguments import checked

@@ -11,7 +11,7 @@ from udkjax.annotations import Numbers
 from udkjax.arrays import number
 from udkjax.positions.assembly import State
 from udkjax.positions.channels import StateHistory
-from udkjax.positions.drive import Coordinate, value_of
+from udkjax.positions.coordinates import Coordinate, value_of
 from udkjax.positions.kinematics import Kinematics, kinematics
 from udkjax.printing import prints_table, units
 from udkjax.scene.arguments import checked

@@ -57,7 +57,6 @@ from udkjax.scene.joints import Distance as Distance
 from udkjax.scene.joints import Gear as Gear
 from udkjax.scene.joints import Joint as Joint
 from udkjax.scene.joints import Prismatic as Prismatic
-from udkjax.scene.joints import Profile as Profile
 from udkjax.scene.joints import Rack as Rack
 from udkjax.scene.joints import Revolute as Revolute
 from udkjax.scene.joints import Slot as Slot
@@ -76,6 +75,7 @@ from udkjax.scene.number_fields import owner_of as owner_of
 from udkjax.scene.number_fields import parameters_in as parameters_in
 from udkjax.scene.number_fields import parameters_of as parameters_of
 from udkjax.scene.number_fields import split_index as split_index
+from udkjax.scene.profiles import Profile as Profile
 from udkjax.scene.reshaping import length_of as length_of
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length

@@ -8,8 +8,8 @@ anticlockwise positive, and not wrapped; rows are in the order in which `residua
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Self, TypeVar
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Self, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,17 +19,8 @@ from udkjax.annotations import Number, Numbers
 from udkjax.arrays import ROUNDING, array_namespace, number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
-from udkjax.scene.fields import (
-    BODY,
-    POSITIVE,
-    PROFILE_ANGLES,
-    PROFILE_RADII,
-    given_direction,
-    given_names,
-    given_number,
-    given_or_guess,
-)
-from udkjax.scene.splines import count_knots, periodic_spline, wrap
+from udkjax.scene.fields import BODY, POSITIVE, given_direction, given_names, given_number, given_or_guess
+from udkjax.scene.profiles import Profile, as_profile
 
 
 class Constraint(PrintsLine):
@@ -283,31 +274,6 @@ class Rack(Joint):
     def _rolling_distance(self, frame1: Frame, frame2: Frame) -> Number:
         direction = frame1.vector((jnp.cos(self.axis), jnp.sin(self.axis)))
         return direction.dot(Point(frame2.x - frame1.x, frame2.y - frame1.y)) + self.radius * (frame2.angle - frame1.angle)
-
-
-class Profile(PrintsLine):
-    """The closed outline of a cam: its radius over the polar angle, a periodic cubic spline.
-
-    Args:
-        angle: polar angles (rad), anticlockwise, increasing within less than one turn; at least three. The first is not repeated.
-        radius: radius at each angle (m), greater than zero.
-    """
-
-    angle: Float[Array, "n"] = eqx.field(converter=given_number, metadata=PROFILE_ANGLES)  # rad, increasing, less than one turn
-    radius: Float[Array, "n"] = eqx.field(converter=given_number, metadata=PROFILE_RADII)  # m
-
-    def __call__(self, angle: Number) -> Array:
-        """Return the radius (m) at a polar angle (rad)."""
-        return periodic_spline(angle, self.angle, self.radius, 2 * jnp.pi)
-
-    def piece(self, angle: Number) -> Array:
-        """Return the index of the cubic at a polar angle (rad)."""
-        return count_knots(wrap(angle, self.angle[0], 2 * jnp.pi), self.angle)
-
-
-def as_profile(value: Any) -> Any:
-    """Convert a table to a profile; return anything else unchanged, to be refused by the mechanism."""
-    return Profile(**value) if isinstance(value, Mapping) and value.keys() == {"angle", "radius"} else value
 
 
 class Cam(Joint):

@@ -17,6 +17,7 @@ from udkjax.scene import drivers, forces, joints
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import FieldMetadata
 from udkjax.scene.held import Held
+from udkjax.scene.profiles import Profile
 
 SECTIONS = ("body", "joint", "driver", "force")
 
@@ -42,7 +43,7 @@ CLASSES_BY_TYPE: dict[str, dict[str, type]] = {
     "motion": _by_type(drivers, drivers.Motion),
 }
 # Classes whose tables have no `type`.
-CLASSES_WITHOUT_TYPE: dict[str, type] = {"body": Body, "driver": drivers.Driver, "profile": joints.Profile, "held": Held}
+CLASSES_WITHOUT_TYPE: dict[str, type] = {"body": Body, "driver": drivers.Driver, "profile": Profile, "held": Held}
 
 
 def is_in_format(cls: type) -> bool:

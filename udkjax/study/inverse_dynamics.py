@@ -29,7 +29,8 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.positions.channels import StateHistory
-from udkjax.positions.drive import Coordinate, choose_name, coordinate_value, element_of, value_of, without_drivers
+from udkjax.positions.coordinates import Coordinate, choose_name, coordinate_value, element_of, value_of
+from udkjax.positions.drive import without_drivers
 from udkjax.positions.kinematics import Kinematics, kinematics
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.programs.deferred import deferred

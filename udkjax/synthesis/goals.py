@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers, NumericArray
 from udkjax.positions.channels import locate
-from udkjax.positions.drive import Coordinate, value_of
+from udkjax.positions.coordinates import Coordinate, value_of
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.requirements import require_finite
 from udkjax.scene.bodies import GROUND, Frame

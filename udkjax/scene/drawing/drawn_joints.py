@@ -8,7 +8,8 @@ from udkjax.arrays import array_namespace
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, line_mistakes
 from udkjax.scene.fields import LINK, PIN, POSITIVE, given_direction, given_names, given_or_none
-from udkjax.scene.joints import Cam, Gear, Prismatic, Profile, Slot, as_profile
+from udkjax.scene.joints import Cam, Gear, Prismatic, Slot
+from udkjax.scene.profiles import Profile, as_profile
 from udkjax.wording import quote
 
 

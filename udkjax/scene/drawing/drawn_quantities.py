@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from udkjax.annotations import TomlTable
 from udkjax.scene.fields import vector_as_angle
-from udkjax.scene.joints import Profile
+from udkjax.scene.profiles import Profile
 from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity, unit_sizes
 from udkjax.wording import abbreviate, quote, suggestion

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.positions.drive import Drive, element_of
+from udkjax.positions.coordinates import element_of
+from udkjax.positions.drive import Drive
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
