@@ -157,8 +157,6 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
         MethodCode.of(method, formulation)
     except UnsupportedError as unknown:
         return f"it does not know {unknown}"
-    if jax.default_backend() != "cpu":
-        return f"it is for the CPU, and JAX runs on {jax.default_backend()}"
     if not jax.config.jax_enable_x64:
         return "it computes in float64, which is off in JAX"
     return ""

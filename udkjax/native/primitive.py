@@ -5,8 +5,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -24,12 +23,14 @@ from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory
+from udkjax.native.base.prepared_call import PreparedCall
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.steps import Status
+from udkjax.native.gpu import host_handler
 from udkjax.native.operations import FindScales, Operation
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
-from udkjax.threads import cores, thread_count
+from udkjax.threads import thread_count
 
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
@@ -84,8 +85,13 @@ class LoadedCode:
 
     @property
     def name(self) -> str:
-        """The name of the FFI target in XLA."""
+        """The name of the FFI target in XLA, in programs of the CPU."""
         return self._optimized.name
+
+    @property
+    def name_on_card(self) -> str:
+        """The name of the FFI target in programs of a graphics card, which the host computes for it."""
+        return host_handler.register(self.name, self._optimized.library["call_frame"])
 
     @cached_property
     def _optimized(self) -> "Code":
@@ -124,7 +130,7 @@ class LoadedCode:
 
     def prepare(
         self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: "Code | None" = None
-    ) -> "PreparedCall":
+    ) -> PreparedCall:
         """Return a call that can be repeated with other numbers in `inputs`, which are the given arrays if these are float64."""
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
         # Each pass of reverse mode writes only a part of the outputs. The rest is zero, as jax.debug_nans would report NaN.
@@ -144,34 +150,6 @@ class LoadedCode:
         shares = members // self._share
         threads = 1 if shares <= 1 else min(shares, thread_count())
         return PreparedCall(code.run, call, following, threads, inputs, outputs)
-
-
-class PreparedCall(NamedTuple):
-    """A call of machine code: its record, with the arrays that it points to."""
-
-    run: Callable[[int], Any]
-    record: ctypes.Array
-    shared: ctypes.Array  # the index of the next member, and whether memory was refused
-    threads: int
-    inputs: list[np.ndarray]  # float64, contiguous in memory
-    outputs: list[np.ndarray]
-
-    def __call__(self) -> list[np.ndarray]:
-        """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
-        self.shared[:], address = (0, 0), ctypes.addressof(self.record)
-        others = [_pool().submit(self.run, address) for _ in range(self.threads - 1)]
-        self.run(address)
-        for other in others:
-            other.result()
-        if self.shared[1]:
-            raise MemoryError("no memory for a computation by machine code")
-        return self.outputs
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    """Return the threads that calls share, as starting a thread takes longer than short runs."""
-    return ThreadPoolExecutor(cores())
 
 
 class Code(NamedTuple):
@@ -236,8 +214,29 @@ def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[
 
 
 def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
-    results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in operation.shapes(inputs, times)]
-    outputs = jax.ffi.ffi_call(_select_code(inputs, operation).name, results)(*inputs)
+    """Lower for the CPU."""
+    return _call_target(_select_code(inputs, operation).name, inputs, operation, times)
+
+
+def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
+    """Lower for a graphics card of NVIDIA: the host computes, whatever the operation and the number of members."""
+    return _call_target(_select_code(inputs, operation).name_on_card, inputs, operation, times)
+
+
+def _lower_for_others(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
+    """Lower for all other devices: the host computes, called by JAX."""
+    results = _result_shapes(inputs, operation, times)
+    call = partial(call_members, operation=operation, times=times)
+    return jax.pure_callback(lambda *arrays: call(*map(np.asarray, arrays)), results, *inputs)
+
+
+def _result_shapes(inputs: Sequence[Any], operation: Operation, times: int) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in operation.shapes(inputs, times)]
+
+
+def _call_target(name: str, inputs: Sequence[Any], operation: Operation, times: int) -> Sequence[Array]:
+    """Call a target of XLA."""
+    outputs = jax.ffi.ffi_call(name, _result_shapes(inputs, operation, times))(*inputs)
     if not operation.is_reverse:
         return outputs
     # The outputs that a pass does not write (`LoadedCode`) are uninitialized memory.
@@ -287,7 +286,9 @@ native_p.multiple_results = True
 native_p.def_impl(_call)
 native_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[native_p] = _batch
+mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_others))
 mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
+mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_card), platform="cuda")
 evaluate_as(native_p, call_members)
 
 
@@ -308,12 +309,13 @@ def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:
 
 def _scales_of_batch(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
     """Evaluate the primitive of scales outside compiled programs; for a few vectors by NumPy, without compilation."""
-    if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or jax.default_backend() != "cpu" or unsupported(programs):
+    if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or unsupported(programs):
         return evaluate_scales(numbers, programs)
     (scales,) = call_members(*_scale_inputs(np.asarray(numbers, float)), operation=FindScales(programs), times=1)
     return scales.reshape(*numbers.shape[:-1], -1)
 
 
-mlir.register_lowering(scales_p, mlir.lower_fun(_find_scales, multiple_results=False), platform="cpu")
+for _platform in ("cpu", "cuda"):
+    mlir.register_lowering(scales_p, mlir.lower_fun(_find_scales, multiple_results=False), platform=_platform)
 scales_p.def_impl(lambda numbers, programs: jax.device_put(_scales_of_batch(np.asarray(numbers), programs)))
 evaluate_as(scales_p, _scales_of_batch)

@@ -22,10 +22,8 @@ Closed = tuple[Array, Array, Array, Array, Array]
 
 
 def can_close(mechanism: Mechanism) -> bool:
-    """Return True if machine code supports the mechanism on this device."""
-    if jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
-        return False
-    return not unsupported(_close(mechanism).code)
+    """Return True if machine code supports the mechanism."""
+    return jax.config.jax_enable_x64 and not unsupported(_close(mechanism).code)
 
 
 def close(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:

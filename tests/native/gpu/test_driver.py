@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from udkjax.native.gpu.driver import CudaError, CudaDriver
+from udkjax.native.gpu.driver import CudaDriver, CudaError
 
 NO_DEVICE = 100
 

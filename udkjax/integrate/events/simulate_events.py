@@ -77,7 +77,7 @@ def simulate_events(
         ValueError: the events do not fit the mechanism, or machine code was requested but cannot run the system.
     """
     listed, phases = _prepare(mechanism, events, analysis)
-    has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax and jax.default_backend() == "cpu"
+    has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax
     conditions = watched_conditions(listed, phases.mechanisms[0]) if has_code else None
     if conditions is not None:
         listed = with_cached_functions(listed, conditions)

@@ -19,9 +19,9 @@ from udkjax.threads import thread_limit
 
 # Offsets in bytes. XLA_FFI_CallFrame: size, extensions, api, context, stage, then the arguments and the results, 40 bytes each:
 # size, extensions, count, types, buffers.
-EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, BUFFERS = 8, 16, 24, 40, 80, 32
+EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, COUNT, BUFFERS = 8, 16, 24, 40, 80, 16, 32
 # Functions of XLA_FFI_Api. The only argument of each is the address of a struct: size, extensions, then the actual arguments.
-CREATE_ERROR, DESTROY_ERROR, SCHEDULE, THREAD_COUNT = 48, 64, 136, 144
+CREATE_ERROR, DESTROY_ERROR, STREAM, SCHEDULE, THREAD_COUNT = 48, 64, 80, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
 # Offset of the address of the metadata in an extension that requests metadata; offsets of the interface version in the metadata.
@@ -32,7 +32,7 @@ VERSION = (0, 1)  # major, minor
 # of `run`.
 USERS, BEGUN, ENDED, NEXT, REFUSED, CALL = range(6)
 CLOSED = 2**32
-RESOURCE_EXHAUSTED = 8  # XLA_FFI_Error_Code_RESOURCE_EXHAUSTED
+RESOURCE_EXHAUSTED, INTERNAL = 8, 13  # XLA_FFI_Error_Code
 NO_MEMORY = b"no memory for a computation by machine code"
 
 
@@ -45,29 +45,21 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
     inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
     frame = f.given["frame"]
 
-    def word(pointer: Value, offset: int, base: str = INT) -> Value:
-        return f.load(f.at(pointer, offset, "i8"), 0, base=base)
-
-    extension = word(frame, EXTENSIONS)
-    with f.if_(extension.is_not(0)):
-        metadata = word(word(frame, EXTENSIONS, POINTER), METADATA, POINTER)
-        for offset, number in ((MAJOR, VERSION[0]), (MINOR, VERSION[1])):
-            f.line(f"store i32 {number}, ptr {f.at(metadata, offset, 'i8').name}, align 4")
-        f.leave("ptr null")
+    answer_metadata(f, frame)
     call = Value(f, f.reserve(INT, len(fields)), POINTER)
 
     def put(field: str, value: Any, base: str = INT):
         f.store(value, call, fields.index(field), base=base)
 
-    buffers = [word(f.at(frame, start, "i8"), BUFFERS, POINTER) for start in (ARGUMENTS, RESULTS)]
+    buffers = [word(f, frame, start + BUFFERS, POINTER) for start in (ARGUMENTS, RESULTS)]
     buffer_of = {}
     for pointers, names in zip(buffers, (inputs, outputs), strict=True):
         for k, field in enumerate(names):
             buffer_of[field] = f.load(pointers, k, base=POINTER)
-            put(field, word(buffer_of[field], DATA, POINTER), POINTER)
+            put(field, word(f, buffer_of[field], DATA, POINTER), POINTER)
 
     def dimension(field: str, k: int) -> Value:
-        return f.load(word(buffer_of[field], DIMS, POINTER), k, base=INT)
+        return f.load(word(f, buffer_of[field], DIMS, POINTER), k, base=INT)
 
     put("members", dimension(outputs[0], 0))
     put("times", dimension("ts", 1))
@@ -77,8 +69,8 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
         put(f"{field} length", dimension(field, 1))
     for field in inputs:
         length = f.variable(1, INT, 1)
-        with f.each(word(buffer_of[field], RANK), 1) as k:
-            length.value = length.value * f.load(word(buffer_of[field], DIMS, POINTER), k, base=INT)
+        with f.each(word(f, buffer_of[field], RANK), 1) as k:
+            length.value = length.value * f.load(word(f, buffer_of[field], DIMS, POINTER), k, base=INT)
         put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
     progress = Value(f, f.reserve(INT, 2), POINTER)
     for k in range(2):
@@ -91,28 +83,56 @@ def handler(trajectory: Memory, name: str) -> list[Function]:
     helpers = f.select(threads.value < shares, threads.value, shares) - 1
     f.choose(helpers > 0, lambda: _run_shared(f, frame, call, len(fields), helpers), lambda: f.call("run", call))
     with f.if_(f.load(progress, 1, base=INT).is_not(0)):
-        f.leave(f"ptr {_no_memory(f, frame).name}")
+        f.leave(f"ptr {no_memory(f, frame).name}")
     f.line("ret ptr null")
     return [_help(), f]
 
 
-def _call_api(f: Function, frame: Value, function: int, *arguments: Value) -> Value:
+def word(f: Function, pointer: Value, offset: int, base: str = INT) -> Value:
+    """Load a field of a struct, at an offset in bytes."""
+    return f.load(f.at(pointer, offset, "i8"), 0, base=base)
+
+
+def answer_metadata(f: Function, frame: Value):
+    """Return from a handler that is called only for its metadata, with the version of the interface."""
+    with f.if_(word(f, frame, EXTENSIONS).is_not(0)):
+        metadata = word(f, word(f, frame, EXTENSIONS, POINTER), METADATA, POINTER)
+        for offset, number in ((MAJOR, VERSION[0]), (MINOR, VERSION[1])):
+            f.line(f"store i32 {number}, ptr {f.at(metadata, offset, 'i8').name}, align 4")
+        f.leave("ptr null")
+
+
+def call_api(f: Function, frame: Value, function: int, *arguments: Value) -> Value:
     """Call one of XLA's functions; return its error, or null."""
+    return call_with(f, frame, function, arguments_struct(f, *arguments))
+
+
+def arguments_struct(f: Function, *arguments: Value) -> Value:
+    """Return the address of a struct of arguments on the stack, into which the called function may write as well."""
     struct = Value(f, f.reserve(INT, 2 + len(arguments)), POINTER)
     for k, x in enumerate((f.const(8 * (2 + len(arguments)), INT), f.const(0, INT), *arguments)):
         f.store(x, struct, k, base=x.base)
-    api = f.load(f.at(frame, API, "i8"), 0, base=POINTER)
-    address = f.load(f.at(api, function, "i8"), 0, base=POINTER)
+    return struct
+
+
+def call_with(f: Function, frame: Value, function: int, struct: Value) -> Value:
+    """Call one of XLA's functions with a struct of arguments; return its error, or null."""
+    address = word(f, word(f, frame, API, POINTER), function, POINTER)
     return f.op(f"call ptr {address.name}(ptr {struct.name})", POINTER)
 
 
-def _no_memory(f: Function, frame: Value) -> Value:
+def no_memory(f: Function, frame: Value) -> Value:
     """Create XLA's error for a computation without memory."""
-    words = np.frombuffer(NO_MEMORY + bytes(8 - len(NO_MEMORY) % 8), np.int64)
-    text = Value(f, f.reserve(INT, len(words)), POINTER)
-    for k, word in enumerate(words):
-        f.store(int(word), text, k, base=INT)
-    return _call_api(f, frame, CREATE_ERROR, text, f.const(RESOURCE_EXHAUSTED, INT))
+    return call_api(f, frame, CREATE_ERROR, text_of(f, NO_MEMORY), f.const(RESOURCE_EXHAUSTED, INT))
+
+
+def text_of(f: Function, characters: bytes, space: int = 0) -> Value:
+    """Return the address of a text on the stack, followed by a zero and by `space` bytes for more."""
+    words = np.frombuffer(characters + bytes(8 - len(characters) % 8), np.int64)
+    text = Value(f, f.reserve(INT, len(words) + space // 8), POINTER)
+    for k, x in enumerate(words):
+        f.store(int(x), text, k, base=INT)
+    return text
 
 
 def _thread_count(f: Function, frame: Value) -> Value:
@@ -123,9 +143,9 @@ def _thread_count(f: Function, frame: Value) -> Value:
     """
     count = Value(f, f.reserve(INT), POINTER)
     f.store(1, count, base=INT)
-    error = _call_api(f, frame, THREAD_COUNT, f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), count)
+    error = call_api(f, frame, THREAD_COUNT, word(f, frame, CONTEXT, POINTER), count)
     with f.if_(~f.is_null(error)):
-        _call_api(f, frame, DESTROY_ERROR, error)
+        call_api(f, frame, DESTROY_ERROR, error)
     available, limit = f.load(count, base=INT), thread_limit()
     return available if limit is None else f.select(available < limit, available, f.const(limit, INT))
 
@@ -162,16 +182,16 @@ def _run_shared(f: Function, frame: Value, call: Value, count: int, helpers: Val
 def _share(f: Function, frame: Value, call: Value, count: int, helpers: Value, work: Value):
     """Run the members in shared work, as `_run_shared`."""
     f.store(helpers + 1, work, USERS, base=INT)
-    for word in (BEGUN, ENDED, NEXT, REFUSED):
-        f.store(0, work, word, base=INT)
+    for k in (BEGUN, ENDED, NEXT, REFUSED):
+        f.store(0, work, k, base=INT)
     with f.each(count - 1) as k:  # all but the last field, the address of the next member
         f.store(f.load(call, k, base=INT), work, k + CALL, base=INT)
     f.store(f.at(work, NEXT, "i64"), work, CALL + count - 1, base=POINTER)
-    context, task = f.load(f.at(frame, CONTEXT, "i8"), 0, base=POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)
+    context, task = word(f, frame, CONTEXT, POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)
     with f.each(helpers):
-        error = _call_api(f, frame, SCHEDULE, context, task, work)
+        error = call_api(f, frame, SCHEDULE, context, task, work)
         with f.if_(~f.is_null(error)):
-            _call_api(f, frame, DESTROY_ERROR, error)
+            call_api(f, frame, DESTROY_ERROR, error)
             _add(f, work, USERS, -1)
     f.call("run", f.at(work, CALL, "i64"))
     begun = _add(f, work, BEGUN, CLOSED)

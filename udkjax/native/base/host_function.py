@@ -10,7 +10,7 @@ import traceback
 import uuid
 from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from udkjax.native.base.ffi import (
     DATA,
     DIMS,
     EXTENSIONS,
+    INTERNAL,
     MAJOR,
     METADATA,
     MINOR,
@@ -34,11 +35,10 @@ from udkjax.native.base.ffi import (
     RESULTS,
     VERSION,
 )
+from udkjax.native.gpu import host_handler
 from udkjax.programs.deferred import deferred_p, trace_once
 from udkjax.programs.numpy_program import Meter, evaluate_as, has_rules, numpy_program
 from udkjax.programs.varying_axes import result_type
-
-INTERNAL = 13  # XLA_FFI_Error_Code_INTERNAL
 
 
 class HostFunction(Hashable, Protocol):
@@ -67,7 +67,7 @@ def call_seldom(function: Callable[..., Any], *given: Any) -> Any:
         function: a top-level function of trees, traced once for all calls of the same structure.
         given: trees of arrays, which may be traced, and of static values.
     """
-    if deferred_p is None or jax.default_backend() != "cpu" or not jax.config.jax_enable_x64:
+    if deferred_p is None or not jax.config.jax_enable_x64:
         return function(*given)
     program, leaves, out = trace_once(function, given)
     if not has_rules(program):  # JAX must not be called from a running program
@@ -131,13 +131,36 @@ def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunc
 
 
 def _lower(*inputs: Any, function: HostFunction) -> Sequence[Array]:
-    results = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in function.shapes(_members(inputs))]
-    return jax.ffi.ffi_call(_register(function), results)(*inputs)
+    """Lower for the CPU."""
+    return jax.ffi.ffi_call(_target(function).name, _result_shapes(inputs, function))(*inputs)
+
+
+def _lower_for_card(*inputs: Any, function: HostFunction) -> Sequence[Array]:
+    """Lower for a graphics card of NVIDIA."""
+    name = host_handler.register(*_target(function))
+    return jax.ffi.ffi_call(name, _result_shapes(inputs, function))(*inputs)
+
+
+def _lower_for_others(*inputs: Any, function: HostFunction) -> Sequence[Array]:
+    """Lower for all other devices: JAX calls the function."""
+    call = lambda *arrays: _evaluate(*map(np.asarray, arrays), function=function)  # noqa: E731
+    return jax.pure_callback(call, _result_shapes(inputs, function), *inputs)
+
+
+def _result_shapes(inputs: Sequence[Any], function: HostFunction) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in function.shapes(_members(inputs))]
+
+
+class _Target(NamedTuple):
+    """A function of Python as a target of XLA."""
+
+    name: str  # unique to this process: stored programs must not call another process's function
+    handler: int  # its address
 
 
 @lru_cache(maxsize=256)
-def _register(function: HostFunction) -> str:
-    """Register a function; return its name, unique to this process: stored programs must not call another process's function."""
+def _target(function: HostFunction) -> _Target:
+    """Register a function in XLA."""
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
     def handle(frame: int) -> int | None:
@@ -155,9 +178,11 @@ def _register(function: HostFunction) -> str:
         return None
 
     name = f"udkjax_host_{uuid.uuid4().hex}"
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.cast(handle, ctypes.c_void_p)), platform="cpu")
+    address = ctypes.cast(handle, ctypes.c_void_p)
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
     _REGISTERED.append(handle)
-    return name
+    assert address.value
+    return _Target(name, address.value)
 
 
 _REGISTERED: list[Any] = []  # XLA may call these for as long as the process runs
@@ -194,5 +219,7 @@ host_p.multiple_results = True
 host_p.def_impl(lambda *inputs, function: jax.device_put(_evaluate(*map(np.asarray, inputs), function=function)))
 host_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[host_p] = _batch
+mlir.register_lowering(host_p, mlir.lower_fun(_lower_for_others))
 mlir.register_lowering(host_p, mlir.lower_fun(_lower), platform="cpu")
+mlir.register_lowering(host_p, mlir.lower_fun(_lower_for_card), platform="cuda")
 evaluate_as(host_p, _evaluate)

@@ -53,7 +53,7 @@ class CudaDriver:
         return address
 
     def words(self, answer: int) -> str:
-        """Return what an answer (CUresult) means, for example "out of memory (CUDA_ERROR_OUT_OF_MEMORY)"."""
+        """Return the meaning of an answer (CUresult), for example "out of memory (CUDA_ERROR_OUT_OF_MEMORY)"."""
         texts = []
         for function in ("cuGetErrorString", "cuGetErrorName"):
             text = ctypes.c_char_p()
@@ -89,7 +89,7 @@ class CudaDriver:
         return self._answer("cuDeviceGet", ctypes.c_int, ordinal)
 
     def _answer(self, name: str, kind: Any, *arguments: int) -> Any:
-        """Return what a function writes to the address that is its first argument."""
+        """Return the number that a function writes to the address in its first argument."""
         found = kind()
         self(name, ctypes.addressof(found), *arguments)
         return found.value

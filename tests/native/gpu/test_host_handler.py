@@ -1,0 +1,235 @@
+"""Operations of the host in programs of a graphics card: the same handler, with a driver that copies from and to the host itself.
+
+Programs are lowered as for a card and run on the CPU. XLA gives the handler its own frames, in which the function that returns
+the stream is replaced.
+"""
+
+import ctypes
+import itertools
+import sys
+import threading
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.interpreters import mlir
+from numpy.testing import assert_array_equal
+
+import udkjax as udk
+from tests.native.test_composition import newer_jax
+from udkjax.native import primitive
+from udkjax.native.base import ffi, host_function
+from udkjax.native.gpu import host_handler
+
+pytestmark = [newer_jax, pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")]
+STREAM, CONTEXT, ERROR = 0x5EED, 0xC0DE, 700
+ADDRESS = ctypes.c_uint64
+
+
+class Card:
+    """A driver that copies within the host. It notes its calls, fails where `failing` says so, and counts running threads."""
+
+    def __init__(self):
+        self.calls, self.failing, self._functions, self._frames = [], {}, {}, itertools.count()
+        self.text = ctypes.c_char_p(b"an illegal memory access was encountered")
+        move = lambda to, source, size, _: ctypes.memmove(to, source, size)  # noqa: E731
+        self.add("cuStreamGetCtx", 2, lambda stream, place: self.write(place, CONTEXT))
+        self.add("cuCtxPushCurrent_v2", 1, lambda context: None)
+        self.add("cuCtxPopCurrent_v2", 1, lambda place: self.write(place, CONTEXT))
+        self.add("cuMemcpyDtoHAsync_v2", 4, move)
+        self.add("cuMemcpyHtoDAsync_v2", 4, move)
+        self.add("cuStreamSynchronize", 1, lambda stream: None)
+        self.add("cuGetErrorString", 2, lambda answer, place: self.write(place, ctypes.cast(self.text, ctypes.c_void_p).value))
+
+    def add(self, name, arguments, act):
+        @ctypes.CFUNCTYPE(ctypes.c_int, *[ADDRESS] * arguments)
+        def function(*given):
+            self.calls.append((name, *given))
+            if self.names.count(name) == self.failing.get(name):
+                return ERROR
+            act(*given)
+            return 0
+
+        self._functions[name] = function
+
+    @property
+    def names(self):
+        return [call[0] for call in self.calls]
+
+    def write(self, place, number):
+        ADDRESS.from_address(place).value = number
+
+    def address(self, name):
+        return ctypes.cast(self._functions[name], ctypes.c_void_p).value
+
+    def within_cpu(self, library):
+        """A handler of the CPU that calls the handler of a library in a frame whose API has the stream of a card."""
+        handle = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(library["copy_and_call"])
+
+        @ctypes.CFUNCTYPE(ctypes.c_void_p, ADDRESS)
+        def stream(struct):
+            self.write(struct + 24, STREAM)
+
+        @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+        def trampoline(frame):
+            if ADDRESS.from_address(frame + ffi.EXTENSIONS).value:
+                return handle(frame)
+            api = ADDRESS.from_address(frame + ffi.API).value
+            copied = ctypes.create_string_buffer(ctypes.string_at(api, ADDRESS.from_address(api).value))
+            self.write(ctypes.addressof(copied) + ffi.STREAM, ctypes.cast(stream, ctypes.c_void_p).value)
+            self.write(frame + ffi.API, ctypes.addressof(copied))
+            try:
+                return handle(frame)
+            finally:
+                self.write(frame + ffi.API, api)
+
+        self._functions[next(self._frames)] = stream, trampoline, library
+        return {"copy_and_call": ctypes.cast(trampoline, ctypes.c_void_p).value}
+
+
+@pytest.fixture
+def card(monkeypatch):
+    """A card; in the test, programs of the CPU are lowered as for the card."""
+    card, load, registered = Card(), host_handler.load, host_handler.register
+    number = next(NUMBERS)
+    monkeypatch.setattr(host_handler, "PLATFORM", "cpu")
+    monkeypatch.setattr(host_handler, "driver", lambda: card)
+    monkeypatch.setattr(host_handler, "load", lambda of, handler: card.within_cpu(load(of, handler, threads=3)))
+    monkeypatch.setattr(host_handler, "register", lambda name, handler: registered(f"{name}_{number}", handler))
+    for p, module in ((primitive.native_p, primitive), (host_function.host_p, host_function)):
+        mlir.register_lowering(p, mlir.lower_fun(module._lower_for_card), platform="cpu")
+    jax.clear_caches()
+    yield card
+    for p, module in ((primitive.native_p, primitive), (host_function.host_p, host_function)):
+        mlir.register_lowering(p, mlir.lower_fun(module._lower), platform="cpu")
+    jax.clear_caches()
+
+
+NUMBERS = itertools.count()
+PENDULUM, TS = udk.library.compound_pendulum(), np.array([0.0, 0.2, 0.4, 0.6])
+KNOWN = udk.analyse(PENDULUM)
+
+
+def angles(inertia):
+    """The angles of the rod at the output times."""
+    mechanism = PENDULUM.with_parameters({"body.rod.inertia": inertia})
+    return udk.simulate(mechanism, TS, udk.State(PENDULUM.q0, PENDULUM.v0), throw=False, analysis=KNOWN).q[:, 0, 2]
+
+
+def slopes(inertia):
+    return jax.jvp(angles, (inertia,), (1.0,))[1], jax.jacrev(angles)(inertia)
+
+
+def test_runs_and_their_derivatives_are_those_of_the_cpu(request):
+    expected = [np.asarray(x) for x in (jax.jit(angles)(0.3), *jax.jit(slopes)(0.3))]
+    card = request.getfixturevalue("card")
+    found = [jax.jit(angles)(0.3), *jax.jit(slopes)(0.3)]
+    for x, y in zip(found, expected, strict=True):
+        assert_array_equal(x, y)
+    runs = card.names.count("cuStreamGetCtx")
+    assert runs == 4  # one, one forward, and two passes of reverse mode
+    assert [card.names.count(x) for x in ("cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2", "cuStreamSynchronize")] == [4, 4, 8]
+    assert all(STREAM in call for call in card.calls if call[0].startswith(("cuMem", "cuStream")))
+
+
+def test_a_batch_runs_on_several_threads(request):
+    inertias = jnp.linspace(0.3, 0.5, 200)
+    expected = np.asarray(jax.jit(jax.vmap(angles))(inertias))
+    request.getfixturevalue("card")
+    assert_array_equal(jax.jit(jax.vmap(angles))(inertias), expected)
+
+
+def test_it_runs_within_loops(card):
+    found = jax.jit(lambda xs: jax.lax.scan(lambda carry, x: (carry, angles(x)), 0.0, xs)[1])(jnp.array([0.3, 0.4, 0.5]))
+    assert card.names.count("cuStreamGetCtx") == 3 and np.isfinite(found).all()
+
+
+@dataclass(frozen=True)
+class Norm:
+    """The norm of each row, or an error."""
+
+    fails: bool = False
+
+    def shapes(self, members):
+        return [(members,)]
+
+    def __call__(self, *inputs):
+        if self.fails:
+            raise ValueError("no norm today")
+        return [np.linalg.norm(inputs[0], axis=1)]
+
+
+def norms(rows, fails=False):
+    return host_function.call_host(Norm(fails), [rows])[0]
+
+
+def test_functions_of_python_are_called(card):
+    rows = jnp.arange(6.0).reshape(3, 2)
+    assert_array_equal(jax.jit(norms)(rows), np.linalg.norm(rows, axis=1))
+    assert [x[:1] + x[3:4] for x in card.calls if x[0].startswith("cuMem")] == [
+        ("cuMemcpyDtoHAsync_v2", 48),
+        ("cuMemcpyHtoDAsync_v2", 24),
+    ]
+    assert jax.jit(norms)(jnp.zeros((0, 2))).shape == (0,)
+
+
+def test_the_error_of_an_operation_is_that_of_the_program(card):
+    with pytest.raises(Exception, match="no norm today"):
+        jax.block_until_ready(jax.jit(lambda x: norms(x, fails=True))(jnp.ones((1, 2))))
+    assert "cuMemcpyHtoDAsync_v2" not in card.names and card.names[-1] == "cuCtxPopCurrent_v2"
+
+
+FAILING = {  # the number of the call that fails, and the last function that is called before the words of the error
+    "cuStreamGetCtx": (1, "cuStreamGetCtx"),
+    "cuCtxPushCurrent_v2": (1, "cuCtxPushCurrent_v2"),
+    "cuMemcpyDtoHAsync_v2": (1, "cuCtxPopCurrent_v2"),
+    "cuStreamSynchronize": (2, "cuCtxPopCurrent_v2"),
+    "cuMemcpyHtoDAsync_v2": (1, "cuCtxPopCurrent_v2"),
+}
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_an_error_of_the_driver_is_in_its_words(card, name):
+    card.failing[name], last = FAILING[name]
+    with pytest.raises(Exception, match="copying between the graphics card and the host failed: an illegal memory access was"):
+        jax.block_until_ready(jax.jit(norms)(jnp.ones((1, 2))))
+    assert card.names[-2:] == [last, "cuGetErrorString"] and card.calls[-1][1] == ERROR
+    if name == "cuMemcpyDtoHAsync_v2":  # the copies before it end before their memory is freed
+        assert "cuStreamSynchronize" in card.names and "cuMemcpyHtoDAsync_v2" not in card.names
+
+
+def test_without_words_the_error_says_so(card):
+    card.failing |= {"cuStreamSynchronize": 1, "cuGetErrorString": 1}
+    with pytest.raises(Exception, match="failed: the driver does not say why"):
+        jax.block_until_ready(jax.jit(norms)(jnp.ones((1, 2))))
+
+
+def test_an_operation_finds_threads_in_its_frame(card):
+    """Their number, and one for each task, beside the thread of the caller."""
+    found, done = [], threading.Event()
+
+    @ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+    def task(data):
+        found.append((data, threading.get_ident()))
+        done.set()
+
+    @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+    def handle(frame):
+        api, context = (ADDRESS.from_address(frame + offset).value for offset in (ffi.API, ffi.CONTEXT))
+        number = ctypes.c_int64()
+        for function, *arguments in (
+            (ffi.THREAD_COUNT, ctypes.addressof(number)),
+            (ffi.SCHEDULE, ctypes.cast(task, ctypes.c_void_p).value, 42),
+        ):
+            call = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(ADDRESS.from_address(api + function).value)
+            given = (ctypes.c_uint64 * 5)(40, 0, context, *arguments)
+            assert call(ctypes.addressof(given)) is None
+        assert done.wait(10.0)
+        found.append((number.value, threading.get_ident()))
+        return
+
+    name = host_handler.register("threads", ctypes.cast(handle, ctypes.c_void_p).value)
+    jax.block_until_ready(jax.jit(lambda x: jax.ffi.ffi_call(name, x)(x))(jnp.zeros(1)))
+    assert [x for x, _ in found] == [42, 3] and found[0][1] != found[1][1]

@@ -1,0 +1,124 @@
+"""Programs for other devices than the CPU: everything that machine code computes is computed by the host there.
+
+No such device is needed: the programs are only written.
+"""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.interpreters import mlir
+
+import udkjax as udk
+from udkjax.native import primitive
+from udkjax.native.base import host_function
+from udkjax.native.base.host_function import call_seldom
+
+TS = np.array([0.0, 0.1, 0.2])
+PENDULUM, LINKAGE = udk.library.compound_pendulum(), udk.library.four_bar(np.pi / 3)
+KNOWN = udk.analyse(PENDULUM)
+FLOOR = udk.Contact("ball", restitution=0.8, name="floor")
+BALL = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, 1.0))})
+FALL = np.linspace(0.0, 0.6, 4)
+
+
+def run(x, **settings):
+    mechanism = PENDULUM.with_parameters({"body.rod.inertia": x})
+    given = {"analysis": KNOWN, "throw": False} | settings
+    return udk.simulate(mechanism, TS, udk.State(PENDULUM.q0, PENDULUM.v0), **given).q[-1, 0, 2]
+
+
+def closed(x):
+    return udk.assemble(LINKAGE.with_parameters({"body.crank.angle": x})).q[1, 2]
+
+
+def moved(x):
+    mechanism = LINKAGE.with_parameters({"gravity": [0.0, x]})
+    return udk.kinematics(mechanism, "body.crank.angle", np.linspace(1.0, 1.2, 3)).q[-1, 1, 2]
+
+
+def bounced(x):
+    return udk.simulate(BALL.with_parameters({"body.ball.position[1]": x}), FALL, events=FLOOR, throw=False).q[-1, 0, 1]
+
+
+def rested(x):
+    return udk.equilibrium(PENDULUM.with_parameters({"body.rod.mass": x})).q[0, 2]
+
+
+def _eigenvalues(x):
+    return jnp.linalg.svd(x * jnp.eye(2), compute_uv=False)
+
+
+DENSE = [udk.SVD(), udk.Householder(), udk.Greville()]
+PROGRAMS = {
+    "run": run,
+    "batch of runs": jax.vmap(lambda k: run(0.3 + 0.1 * k)),
+    "forward mode": lambda x: jax.jvp(run, (x,), (1.0,)),
+    "second order": jax.jacfwd(jax.jacfwd(run)),
+    "reverse mode": jax.grad(run),
+    **{f"run by {type(method).__name__}": lambda x, method=method: run(x, method=method) for method in DENSE},
+    "events": bounced,
+    "events, differentiated": jax.grad(bounced),
+    "closing": closed,
+    "closing, forward mode": jax.jacfwd(closed),
+    "closing, reverse mode": jax.grad(closed),
+    "kinematics": moved,
+    "equilibrium": rested,
+    "rarely reached": lambda x: call_seldom(_eigenvalues, x),
+}
+
+
+SLOW = {"events, differentiated"}  # its program takes JAX seconds
+EXPECTED = {"run": 1, "batch of runs": 1, "forward mode": 1, "second order": 1, "reverse mode": 2, "rarely reached": 1}
+
+
+def given(name):
+    return jnp.arange(4.0) if name == "batch of runs" else jnp.asarray(0.35)
+
+
+def targets(text):
+    """The names of the host's operations in a program."""
+    return re.findall(r"custom_call @(udkjax_\w+)", text)
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW)) for x in PROGRAMS])
+def test_the_host_computes_for_a_graphics_card(name):
+    """The same as on the CPU, by the handlers that copy, and nothing else: no other integrator."""
+    traced = jax.jit(PROGRAMS[name]).trace(given(name))
+    cpu, card = (traced.lower(lowering_platforms=(platform,)).as_text() for platform in ("cpu", "cuda"))
+    assert targets(cpu) and targets(card) == [f"{x}_copied" for x in targets(cpu)]
+    assert len(targets(card)) == EXPECTED.get(name, len(targets(card)))
+    assert card.count("stablehlo.while") <= cpu.count("stablehlo.while")
+    assert not name.startswith("run") or "stablehlo.while" not in card
+
+
+@pytest.mark.parametrize("name", ["run", "reverse mode", "closing", "rarely reached"])
+def test_programs_are_exported_for_graphics_cards(name):
+    """A program for both platforms runs here."""
+    program, x = jax.jit(PROGRAMS[name]), given(name)
+    names = targets(program.trace(x).lower(lowering_platforms=("cpu", "cuda")).as_text())
+    assert {x.endswith("_copied") for x in names} == {True, False}
+    checks = [jax.export.DisabledSafetyCheck.custom_call(x) for x in names]
+    exported = jax.export.export(program, platforms=("cpu", "cuda"), disabled_checks=checks)(x)
+    assert exported.platforms == ("cpu", "cuda")
+    np.testing.assert_array_equal(exported.call(x), program(x))
+
+
+def test_other_devices_call_the_host_by_jax():
+    """The CPU stands in for such a device, for which JAX cannot write calls of Python without it."""
+    expected = [np.asarray(jax.jit(PROGRAMS[name])(given(name))) for name in ("run", "reverse mode", "rarely reached")]
+    for p, module in LOWERED:
+        mlir.register_lowering(p, mlir.lower_fun(module._lower_for_others), platform="cpu")
+    jax.clear_caches()
+    try:
+        for name, known in zip(("run", "reverse mode", "rarely reached"), expected, strict=True):
+            np.testing.assert_array_equal(jax.jit(PROGRAMS[name])(given(name)), known)
+    finally:
+        for p, module in LOWERED:
+            mlir.register_lowering(p, mlir.lower_fun(module._lower), platform="cpu")
+        jax.clear_caches()
+
+
+LOWERED = ((primitive.native_p, primitive), (host_function.host_p, host_function))

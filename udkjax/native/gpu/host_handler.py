@@ -1,0 +1,265 @@
+"""Operations of the host in programs of a graphics card: a handler copies, calls the operation's own handler, and copies back.
+
+XLA calls the handler on the host with buffers of the card, when the program of the card reaches the operation. It copies the
+arguments to the host on the program's stream, waits for them, and calls the operation with the same frame but with buffers of
+the host, and with threads, of which XLA has none here. It copies the results back and waits again, since it frees its memory.
+
+The code is the same for all operations. Each of them loads it once, with its own `words`: the addresses that it calls.
+"""
+
+import ctypes
+from functools import cache
+from threading import Lock
+
+import jax
+
+from udkjax.native.base import machine
+from udkjax.native.base.ffi import (
+    API,
+    ARGUMENTS,
+    BUFFERS,
+    CONTEXT,
+    COUNT,
+    CREATE_ERROR,
+    DATA,
+    DIMS,
+    INTERNAL,
+    RANK,
+    RESULTS,
+    SCHEDULE,
+    STREAM,
+    THREAD_COUNT,
+    answer_metadata,
+    arguments_struct,
+    call_api,
+    call_with,
+    no_memory,
+    text_of,
+    word,
+)
+from udkjax.native.base.ir import INT, POINTER, Function, Value, Variable
+from udkjax.native.gpu.driver import CudaDriver, driver
+from udkjax.threads import cores
+
+PLATFORM = "CUDA"  # XLA's name of the platform
+# Functions of the driver, whose addresses are the first words. Then: the handler of the operation, and the number of threads.
+CONTEXT_OF_STREAM, PUSH, POP = "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"
+TO_HOST, TO_DEVICE, WAIT = "cuMemcpyDtoHAsync_v2", "cuMemcpyHtoDAsync_v2", "cuStreamSynchronize"
+DESCRIBE = "cuGetErrorString"
+FUNCTIONS = (CONTEXT_OF_STREAM, PUSH, POP, TO_HOST, TO_DEVICE, WAIT, DESCRIBE)
+HANDLER, THREADS = len(FUNCTIONS), len(FUNCTIONS) + 1
+GIVEN = 24  # offset in bytes of the first number in a struct of arguments of XLA's functions, after the context
+BUFFER_BYTES = 48  # XLA_FFI_Buffer
+ALIGNMENT = 64  # of arrays, in bytes
+FAILED, UNKNOWN = b"copying between the graphics card and the host failed: ", b"the driver does not say why"
+MOST_WORDS = 400  # bytes of the driver's words in an error
+LIBC = (
+    *("declare ptr @malloc(i64)", "declare void @free(ptr)", "declare ptr @strncat(ptr, ptr, i64)"),
+    *("declare i32 @pthread_create(ptr, ptr, ptr, ptr)", "declare i32 @pthread_detach(i64)"),
+)
+
+
+def register(name: str, handler: int) -> str:
+    """Make an operation of the CPU callable from programs of graphics cards; return the name of its FFI target there.
+
+    Without a graphics card nothing is registered: the program is only written here.
+
+    Args:
+        name: the name of the target on the CPU.
+        handler: the address of its handler.
+    """
+    copied, found = f"{name}_copied", driver()
+    with _REGISTERING:
+        if found is not None and copied not in _REGISTERED:
+            library = load(found, handler)
+            jax.ffi.register_ffi_target(copied, jax.ffi.pycapsule(ctypes.c_void_p(library["copy_and_call"])), platform=PLATFORM)
+            _REGISTERED[copied] = library
+    return copied
+
+
+_REGISTERED: dict[str, machine.Library] = {}  # XLA may call these for as long as the process runs
+_REGISTERING = Lock()
+
+
+def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Library:
+    """Load the handler `copy_and_call(frame)` of one operation.
+
+    Args:
+        of: the driver.
+        handler: the address of the operation's handler on the CPU.
+        threads: the number of threads that it may use; None: one for each core.
+    """
+    library = machine.library(module_text(), ("copy_and_call", "words"))
+    words = (ctypes.c_int64 * (len(FUNCTIONS) + 2)).from_address(library["words"])
+    words[:] = [*map(of.address, FUNCTIONS), handler, cores() if threads is None else threads]
+    return library
+
+
+@cache
+def module_text() -> str:
+    """Return the text of the module."""
+    functions = [_thread_count(), _schedule(), _copy_and_call()]
+    declared = sorted(set(LIBC).union(*(f.declared for f in functions)))
+    words = f"@words = global [{len(FUNCTIONS) + 2} x i64] zeroinitializer"
+    return "\n".join([*declared, words, *(f.text() for f in functions)])
+
+
+def _copy_and_call() -> Function:
+    """Write the handler."""
+    f = Function("copy_and_call", [(POINTER, "frame")], returns="ptr", cold=True)
+    frame = f.given["frame"]
+    answer_metadata(f, frame)
+    asked = arguments_struct(f, word(f, frame, CONTEXT, POINTER), f.const(0, INT))
+    refused = call_with(f, frame, STREAM, asked)
+    with f.if_(~f.is_null(refused)):
+        f.leave(f"ptr {refused.name}")
+    block = f.op(f"call ptr @malloc(i64 {_total_bytes(f, frame).name})", POINTER)
+    with f.if_(f.is_null(block)):
+        f.leave(f"ptr {no_memory(f, frame).name}")
+    on_host = _frame_on_host(f, frame, block)
+    answer, error = _run(f, frame, on_host, word(f, asked, GIVEN, POINTER))
+    f.line(f"call void @free(ptr {block.name})")
+    with f.if_(answer.value.is_not(0)):
+        f.leave(f"ptr {_driver_error(f, frame, answer.value).name}")
+    f.line(f"ret ptr {error.value.name}")
+    return f
+
+
+def _buffers(f: Function, frame: Value, kind: int) -> tuple[Value, Value]:
+    """Return the number of the arguments or results of a frame, and the address of the pointers to their buffers."""
+    return word(f, frame, kind + COUNT), word(f, frame, kind + BUFFERS, POINTER)
+
+
+def _bytes(f: Function, buffer: Value) -> Value:
+    """Return the number of bytes of an array of float64 numbers."""
+    size = f.variable(8, INT, 1)
+    with f.each(word(f, buffer, RANK)) as k:
+        size.value = size.value * f.load(word(f, buffer, DIMS, POINTER), k, base=INT)
+    return size.value
+
+
+def _aligned(f: Function, size: Value) -> Value:
+    """Return a number of bytes rounded up to a multiple of the alignment."""
+    return f.logic("and", size + (ALIGNMENT - 1), -ALIGNMENT)
+
+
+def _total_bytes(f: Function, frame: Value) -> Value:
+    """Return the number of bytes that `_frame_on_host` takes."""
+    fixed = (word(f, frame, 0), word(f, word(f, frame, API, POINTER), 0))
+    total = f.variable(ALIGNMENT, INT, 1)
+    for size in fixed:
+        total.value = total.value + _aligned(f, size)
+    for kind in (ARGUMENTS, RESULTS):
+        count, pointers = _buffers(f, frame, kind)
+        total.value = total.value + _aligned(f, count * 8)
+        with f.each(count) as k:
+            array = _bytes(f, f.load(pointers, k, base=POINTER))
+            total.value = total.value + _aligned(f, array) + ALIGNMENT
+    return total.value
+
+
+def _frame_on_host(f: Function, frame: Value, block: Value) -> Value:
+    """Return a copy of the frame in `block`, with arrays of the host, and with `schedule` and `thread_count` in its API."""
+    start = f.op(f"ptrtoint ptr {block.name} to i64", INT)
+    place = f.variable(_aligned(f, start) - start, INT, 1)
+
+    def take(size: Value) -> Value:
+        taken = f.at(block, place.value, "i8")
+        place.value = place.value + _aligned(f, size)
+        return taken
+
+    def copy(struct: Value, size: Value) -> Value:
+        copied = take(size)
+        with f.each(f.arithmetic("div", size, 8)) as k:
+            f.store(f.load(struct, k, base=INT), copied, k, base=INT)
+        return copied
+
+    def put(x: Value, struct: Value, offset: int):
+        f.store(x, f.at(struct, offset, "i8"), base=POINTER)
+
+    on_host, api = copy(frame, word(f, frame, 0)), word(f, frame, API, POINTER)
+    api = copy(api, word(f, api, 0))
+    put(api, on_host, API)
+    for offset, name in ((SCHEDULE, "@schedule"), (THREAD_COUNT, "@thread_count")):
+        put(Value(f, name, POINTER), api, offset)
+    for kind in (ARGUMENTS, RESULTS):
+        count, given = _buffers(f, frame, kind)
+        pointers = take(count * 8)
+        put(pointers, on_host, kind + BUFFERS)
+        with f.each(count) as k:
+            buffer = copy(f.load(given, k, base=POINTER), f.const(BUFFER_BYTES, INT))
+            f.store(buffer, pointers, k, base=POINTER)
+            put(take(_bytes(f, buffer)), buffer, DATA)
+    return on_host
+
+
+def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Variable, Variable]:
+    """Copy, call the operation, and copy back; return the first error of the driver, or 0, and the operation's, or null."""
+    place, error = Value(f, f.reserve(POINTER), POINTER), f.variable(Value(f, "null", POINTER), POINTER, 1)
+    answer = f.variable(_drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
+
+    def copy(kind: int, function: str):
+        (count, on_card), (_, copies) = _buffers(f, frame, kind), _buffers(f, on_host, kind)
+        with f.each(count) as k:
+            card, host = (f.load(x, k, base=POINTER) for x in (on_card, copies))
+            size = _bytes(f, card)
+            with f.if_(answer.value.is_(0) & (size > 0)):
+                ends = [word(f, x, DATA, POINTER) for x in ((host, card) if function == TO_HOST else (card, host))]
+                answer.value = _drive(f, function, *ends, size, stream)
+        waited = _drive(f, WAIT, stream)  # also after an error, for the copies before it
+        answer.value = f.select(answer.value.is_(0), waited, answer.value)
+
+    with f.if_(answer.value.is_(0)):
+        answer.value = _drive(f, PUSH, f.load(place, base=POINTER))
+        with f.if_(answer.value.is_(0)):
+            copy(ARGUMENTS, TO_HOST)
+            with f.if_(answer.value.is_(0)):
+                handler = f.load("@words", HANDLER, base=POINTER)
+                error.value = f.op(f"call ptr {handler.name}(ptr {on_host.name})", POINTER)
+                with f.if_(f.is_null(error.value)):
+                    copy(RESULTS, TO_DEVICE)
+            _drive(f, POP, place)
+    return answer, error
+
+
+def _drive(f: Function, name: str, *arguments: Value) -> Value:
+    """Call a function of the driver; return its answer, 0 without an error."""
+    address = f.load("@words", FUNCTIONS.index(name), base=POINTER)
+    given = ", ".join(f"{x.type} {x.name}" for x in arguments)
+    answer = f.op(f"call i32 {address.name}({given})", "i32")
+    return f.op(f"zext i32 {answer.name} to i64", INT)
+
+
+def _driver_error(f: Function, frame: Value, answer: Value) -> Value:
+    """Create XLA's error for an error of the driver, in the driver's words."""
+    text, place = text_of(f, FAILED, MOST_WORDS), Value(f, f.reserve(POINTER), POINTER)
+    f.store(Value(f, "null", POINTER), place, base=POINTER)
+    _drive(f, DESCRIBE, answer, place)
+    described = f.load(place, base=POINTER)
+    words = f.select(f.is_null(described), text_of(f, UNKNOWN), described)
+    f.op(f"call ptr @strncat(ptr {text.name}, ptr {words.name}, i64 {MOST_WORDS - 8})", POINTER)
+    return call_api(f, frame, CREATE_ERROR, text, f.const(INTERNAL, INT))
+
+
+def _thread_count() -> Function:
+    """Write XLA_FFI_ThreadPool_NumThreads."""
+    f = Function("thread_count", [(POINTER, "given")], returns="ptr", cold=True)
+    f.store(f.load("@words", THREADS, base=INT), word(f, f.given["given"], GIVEN, POINTER), base=INT)
+    f.line("ret ptr null")
+    return f
+
+
+def _schedule() -> Function:
+    """Write XLA_FFI_ThreadPool_Schedule: a thread for each task, which takes 20 us to start; without one the caller does it."""
+    f = Function("schedule", [(POINTER, "given")], returns="ptr", cold=True)
+    task, data = (word(f, f.given["given"], offset, POINTER) for offset in (GIVEN, GIVEN + 8))
+    thread = Value(f, f.reserve(INT), POINTER)
+    # A thread's function returns a pointer, a task nothing: nobody reads what is in the register.
+    begun = f.op(f"call i32 @pthread_create(ptr {thread.name}, ptr null, ptr {task.name}, ptr {data.name})", "i32")
+    f.choose(
+        f.op(f"zext i32 {begun.name} to i64", INT).is_(0),
+        lambda: f.op(f"call i32 @pthread_detach(i64 {f.load(thread, base=INT).name})", "i32"),
+        lambda: f.line(f"call void {task.name}(ptr {data.name})"),
+    )
+    f.line("ret ptr null")
+    return f
