@@ -111,11 +111,12 @@ def test_an_early_opaque_node_hands_over_its_results():
     graph = Graph()
     m = np.array([graph.input(k, "parameter") for k in range(3)], object)
     q = graph.input("q", "state")
-    (ordered,) = trace(jnp.sort, jnp.asarray(X))(graph, m)
+    solve = lambda x: jnp.linalg.solve(jnp.eye(3)[jnp.array([1, 0, 2])], x)  # noqa: E731
+    (ordered,) = trace(solve, jnp.asarray(X))(graph, m)
     outputs = [ordered[2] * q, ordered[0] + q]
     early = frontier(graph, outputs, lambda node: node.depends <= {"parameter"})
     prologue, later = ScalarProgram(graph, list(m), early), ScalarProgram(graph, [*early, q], outputs)
-    assert "sort" in prologue.count()
+    assert prologue.count() == {"custom_linear_solve": 1}
     assert later.count() == {"mul": 1, "add": 1}
     values = prologue([float(x) for x in X])
     assert later([*map(float, values), 2.0]) == pytest.approx([2.2, 1.3])

@@ -14,7 +14,9 @@ import numpy as np
 from jax.extend import core
 from jax.typing import ArrayLike
 
+from udkjax.expressions.array_rules import RULES, choose, choose_branch, select_unknown
 from udkjax.expressions.graph import BoundPrimitive, Graph, Scalar
+from udkjax.expressions.selection import fold
 
 ClosedJaxpr: TypeAlias = Any  # JAX exports the class, but not to type checkers
 Equation: TypeAlias = Any  # its annotations omit the shapes of its variables
@@ -42,9 +44,10 @@ _REPLACING: dict[str, Callable[[list[np.ndarray]], tuple[np.ndarray, list[np.nda
     "dynamic_update_slice": lambda inputs: (inputs[1], inputs[2:]),
 }
 _ELEMENTWISE = frozenset(
-    """abs acos acosh and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type cos cosh digamma eq erf erf_inv
-    erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p logistic lt max min ne nextafter not one_minus_square or
-    pow reduce_precision rem round rsqrt select_n sign sin sinh tan tanh xor stop_gradient""".split()
+    """abs acos acosh add and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh
+    digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt is_finite le lgamma log log1p log2 logistic lt max min mul ne neg
+    nextafter not one_minus_square or pow reduce_precision rem round rsqrt select_n shift_left shift_right_arithmetic
+    shift_right_logical sign sin sinh sub tan tanh xor stop_gradient""".split()
 )  # fmt: skip
 
 
@@ -118,20 +121,22 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return [_elementwise(partial(_ARITHMETIC[name], **parameters), shape, inputs)]
     if name == "convert_element_type" and all(s.node.dtype == dtype for s in inputs[0].flat):
         return inputs
-    if name in _ELEMENTWISE:
+    if name in _ELEMENTWISE and all(i.shape in ((), shape) for i in inputs):
         return [_elementwise(partial(_apply, graph, equation, dtype), shape, inputs)]
     if name == "reduce_sum" and np.issubdtype(dtype, np.floating):
         zero: Any = graph.constant(0.0, dtype)
         return [np.asarray(np.sum(inputs[0], axis=parameters["axes"], initial=zero), object)]
     if name == "dot_general" and np.issubdtype(dtype, np.floating):
         return [_dot(graph, inputs[0], inputs[1], parameters["dimension_numbers"], shape)]
-    if name in ("dynamic_slice", "gather") and all(s.constant is not None for i in inputs[1:] for s in i.flat):
-        return [np.asarray(_select(equation, inputs), object)]
+    if name in ("dynamic_slice", "gather"):
+        elements = _select(equation, inputs)
+        if elements is not None:
+            return [elements]
     if name in _REPLACING and all(s.constant is not None for i in _REPLACING[name](inputs)[1] for s in i.flat):
         return [np.asarray(_replace(equation, inputs), object)]
     if name in ("pad", "tile"):  # JAX moves the indices of the elements; the index of the padding follows them
         places, size = np.arange(inputs[0].size).reshape(inputs[0].shape), inputs[0].size
-        positions = _fold(equation.primitive, parameters, [places, *(np.asarray(size) for _ in inputs[1:])])
+        positions = fold(equation.primitive, parameters, [places, *(np.asarray(size) for _ in inputs[1:])])
         return [np.concatenate([i.reshape(-1) for i in inputs])[np.asarray(positions)]]
     if name == "scatter-add" and all(s.constant is not None for s in inputs[1].flat):
         return [_add_at(equation, *inputs)]
@@ -141,9 +146,24 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return np.split(inputs[0], np.cumsum(parameters["sizes"])[:-1], parameters["axis"])
     if all(s.constant is not None for i in inputs for s in i.flat) and not equation.effects:
         return _evaluate_constants(graph, equation, inputs)
+    written = _write_out(graph, equation, inputs)
+    if written is not None:
+        return written
     details = BoundPrimitive(equation.primitive, parameters, tuple(i.shape for i in inputs))
     scalars = tuple(s for i in inputs for s in i.flat)
     return graph.call(details, scalars, [(v.aval.shape, v.aval.dtype) for v in equation.outvars])
+
+
+def _write_out(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray] | None:
+    """Return the outputs of a primitive of whole arrays as operations on elements; None if there is no rule."""
+    name = equation.primitive.name
+    if name == "cond":
+        branches = [partial(_read_inner, graph, branch, inputs[1:]) for branch in equation.params["branches"]]
+        return choose_branch(graph, inputs[0].item(), branches)
+    if name == "call_hi_primitive":  # such as `searchsorted`: JAX has an expansion of it
+        expanded = jax.make_jaxpr(equation.params["_prim"].expand)(*(v.aval for v in equation.invars))
+        return read_jaxpr(graph, expanded, inputs)
+    return RULES[name](graph, inputs, equation) if name in RULES else None
 
 
 def _read_inner(graph: Graph, jaxpr: core.Jaxpr | ClosedJaxpr, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -178,14 +198,11 @@ def _apply(graph: Graph, equation: Equation, dtype: np.dtype, *scalars: Scalar) 
     primitive, parameters = equation.primitive, equation.params
     if primitive.name == "select_n" and scalars[0].constant is not None:
         return scalars[1 + int(scalars[0].constant)]
+    if primitive.name == "select_n" and scalars[0].node.dtype != bool:
+        return choose(scalars[0], scalars[1:])
     if primitive.name in ("stop_gradient",):
         return scalars[0]
-    return graph.apply(primitive, parameters, scalars, dtype, lambda *values: _fold(primitive, parameters, values))
-
-
-def _fold(primitive: core.Primitive, parameters: dict, values: Sequence[ArrayLike]) -> np.ndarray:
-    with jax.ensure_compile_time_eval():
-        return np.asarray(primitive.bind(*map(jax.numpy.asarray, values), **parameters))
+    return graph.apply(primitive, parameters, scalars, dtype, lambda *values: fold(primitive, parameters, values))
 
 
 def _evaluate_constants(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -207,7 +224,7 @@ def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
     places = np.arange(elements.size, dtype=equation.outvars[0].aval.dtype)
     numbered = iter(np.split(places, [inputs[0].size]))
     values = [_values(i) if any(i is x for x in indices) else next(numbered).reshape(i.shape) for i in inputs]
-    positions = _fold(equation.primitive, equation.params, values)
+    positions = fold(equation.primitive, equation.params, values)
     return elements[np.asarray(positions, int)]
 
 
@@ -218,18 +235,22 @@ def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates:
         powers = np.zeros(updates.size, dtype)
         powers[first : first + POWERS] = 2.0 ** np.arange(min(POWERS, updates.size - first))
         zeros, places = np.zeros(array.shape, dtype), _values(indices)
-        sums = np.asarray(_fold(equation.primitive, equation.params, [zeros, places, powers.reshape(updates.shape)]), np.int64)
+        sums = np.asarray(fold(equation.primitive, equation.params, [zeros, places, powers.reshape(updates.shape)]), np.int64)
         for k in range(first, min(first + POWERS, updates.size)):
             result[sums >> (k - first) & 1 == 1] += updates.flat[k]
     return result
 
 
-def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
-    """Select elements by constant indices, by letting JAX select from an array of their positions."""
+def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray | None:
+    """Select elements by indices, by letting JAX select from an array of their positions; None if too much is unknown."""
     array, *indices = inputs
+    return select_unknown(lambda known: _select_known(equation, array, known), array, indices)
+
+
+def _select_known(equation: Equation, array: np.ndarray, indices: list[np.ndarray]) -> np.ndarray:
     places, outside = np.arange(array.size).reshape(array.shape), array.size  # the position of indices out of bounds
     parameters = {**equation.params, "fill_value": outside} if "fill_value" in equation.params else equation.params
-    positions = _fold(equation.primitive, parameters, [places, *(_values(i) for i in indices)])
+    positions = fold(equation.primitive, parameters, [places, *(_values(i) for i in indices)])
     if not np.any(positions == outside):
         return array.reshape(-1)[positions]
     graph, fill = array.flat[0].graph, equation.params["fill_value"]

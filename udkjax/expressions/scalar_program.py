@@ -19,28 +19,33 @@ from udkjax.expressions.written_steps import Operand, WrittenSteps
 
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # they have the same names in `math` and NumPy
+_COMMON_OPERATORS = ("add", "sub", "mul", "eq", "ne", "lt", "le", "gt", "ge", "and_", "or_")
 # Other primitives on Python numbers: calling JAX instead takes about a hundred times as long.
 _NUMBER_FUNCTIONS: dict[str, Callable] = {
-    **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_")},
+    **{name.strip("_"): getattr(operator, name) for name in _COMMON_OPERATORS},
+    **{name: getattr(math, name) for name in ("asinh", "atan2", "cbrt", "erf", "erfc")},
     "abs": abs,
-    "atan2": math.atan2,
     "floor": lambda x: float(math.floor(x)),
     "integer_pow": lambda x, y: x**y,
     "max": lambda a, b: a if a > b or a != a else b,  # NaN if either is NaN
     "min": lambda a, b: a if a < b or a != a else b,
     "neg": operator.neg,
+    "rem": math.fmod,
     "select_n": lambda which, *cases: cases[int(which)],
     "sign": lambda x: x if x != x else float((x > 0) - (x < 0)),
     "square": lambda x: x * x,
 }
 # The same on NumPy arrays, element by element.
 _ARRAY_FUNCTIONS: dict[str, Callable] = {
-    **{name.strip("_"): getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and_", "or_", "neg")},
+    **{name.strip("_"): getattr(operator, name) for name in (*_COMMON_OPERATORS, "neg")},
     "abs": np.abs,
+    "asinh": np.arcsinh,
     "atan2": np.arctan2,
+    "cbrt": np.cbrt,
     "floor": np.floor,
     "max": np.maximum,
     "min": np.minimum,
+    "rem": np.fmod,
     "select_n": lambda which, *cases: (
         np.where(which, cases[1], cases[0]) if len(cases) == 2 else np.choose(np.asarray(which, int), cases)
     ),

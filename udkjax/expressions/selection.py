@@ -1,7 +1,13 @@
 """Comparisons and choices between scalars, by primitives of JAX."""
 
+from collections.abc import Sequence
+
+import jax
 import numpy as np
 from jax import lax
+from jax.extend.core import Primitive
+from jax.typing import ArrayLike
+from numpy.typing import DTypeLike
 
 from udkjax.expressions.graph import Scalar
 
@@ -31,3 +37,19 @@ def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
 def both(a: Scalar, b: Scalar) -> Scalar:
     """Return True if two conditions hold."""
     return a.graph.apply(lax.and_p, {}, (a, b), bool, np.logical_and)
+
+
+def either(a: Scalar, b: Scalar) -> Scalar:
+    """Return True if one of two conditions holds."""
+    return apply(lax.or_p, bool, a, b)
+
+
+def apply(primitive: Primitive, dtype: DTypeLike, *arguments: Scalar) -> Scalar:
+    """Apply a primitive of JAX that has no parameters."""
+    return arguments[0].graph.apply(primitive, {}, arguments, dtype, lambda *values: fold(primitive, {}, values))
+
+
+def fold(primitive: Primitive, parameters: dict, values: Sequence[ArrayLike]) -> np.ndarray:
+    """Apply a primitive of JAX to known numbers."""
+    with jax.ensure_compile_time_eval():
+        return np.asarray(primitive.bind(*map(jax.numpy.asarray, values), **parameters))

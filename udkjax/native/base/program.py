@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
+from udkjax.native.base import special_functions
 from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
 
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
@@ -144,7 +145,28 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             return f.intrinsic("exp", a[0]) - 1.0 if a[0].base == INT else _expm1(f, a[0])
         case "log1p":
             return _log1p(f, a[0])
-        case "sign":
+        case "asinh" | "acosh" | "atanh":
+            return getattr(special_functions, name)(f, a[0], _log1p)
+        case "cbrt" | "erf" | "erfc":
+            return getattr(special_functions, name)(f, a[0])
+        case "log2":
+            return f.intrinsic("log", a[0]) * (1 / math.log(2))
+        case "rem" if a[0].base == DOUBLE:
+            return special_functions.remainder(f, a[0], a[1])
+        case "round":
+            return _round(f, a[0], parameters["rounding_method"])
+        case "add" | "sub" | "mul" if a[0].base == INT:
+            return f.arithmetic(name, *a)
+        case "div" | "rem" if a[0].base == INT:
+            return _divide_whole(f, name, *a)
+        case "max" | "min" if a[0].base == INT:
+            return f.select(f.compare("gt" if name == "max" else "lt", a[0], a[1]), a[0], a[1])
+        case "shift_right_arithmetic" | "shift_right_logical" | "shift_left" if a[0].base == INT:
+            return f.logic({"shift_right_arithmetic": "ashr", "shift_right_logical": "lshr", "shift_left": "shl"}[name], *a)
+        case "bitcast_convert_type" if np.dtype(parameters["new_dtype"]).itemsize == 8:
+            base = DOUBLE if np.dtype(parameters["new_dtype"]).kind == "f" else INT
+            return f.op(f"bitcast {a[0].type} {a[0].name} to {llvm_type(base, f.width)}", base, f.width)
+        case "sign" if a[0].base == DOUBLE:
             zero = f.const(0.0, DOUBLE, f.width)
             unit = f.select(a[0] > zero, f.const(1.0, DOUBLE, f.width), f.const(-1.0, DOUBLE, f.width))
             return f.select(a[0].is_(zero) | a[0].is_not(a[0]), a[0], unit)
@@ -152,7 +174,7 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             return f.select(a[0], a[2], a[1])
         case "clamp":
             return f.intrinsic("minimum", f.intrinsic("maximum", a[1], a[0]), a[2])
-        case "and" | "or" | "xor" if a[0].base == BOOL:
+        case "and" | "or" | "xor" if a[0].base in (BOOL, INT):
             return f.logic(name, *a)
         case "not" if a[0].base == BOOL:
             return ~a[0]
@@ -178,9 +200,36 @@ def _convert(f: Function, a: Value, dtype: Any) -> Value:
         return f.like(a, INT, a.width)
     if kind in "iu" and a.base == INT:
         return a
-    if kind == "b" and a.base == DOUBLE:
-        return a.is_not(0.0)
+    if kind in "iu" and a.base == DOUBLE:
+        return _truncate(f, a, np.dtype(dtype))
+    if kind == "b" and a.base != BOOL:
+        return a.is_not(0)
     raise UnsupportedError(f"{a.base} as {dtype}")
+
+
+def _truncate(f: Function, a: Value, dtype: np.dtype) -> Value:
+    """Return the integer part; of a number beyond the range of its type the nearest of the range, and zero of NaN."""
+    bounds = np.iinfo(dtype)
+    kind, of_double = llvm_type(INT, a.width), f"{'v' + str(a.width) if a.width > 1 else ''}f64"
+    full = f"llvm.fpto{'u' if dtype.kind == 'u' else 's'}i.sat.{of_double.replace('f', 'i')}.{of_double}"
+    f.declared.add(f"declare {kind} @{full}({a.type})")
+    whole = f.op(f"call {kind} @{full}({a.type} {a.name})", INT, a.width)
+    if bounds.bits == 64:
+        return whole
+    whole = f.select(whole > bounds.max, int(bounds.max), whole)
+    return f.select(whole < bounds.min, int(bounds.min), whole)
+
+
+def _divide_whole(f: Function, name: str, x: Value, y: Value) -> Value:
+    """Return the quotient of integers, rounded towards zero, or what remains; of zero as in JAX, where a processor would stop."""
+    is_zero, is_minus = y.is_(0), y.is_(-1)
+    ratio = f.select(is_minus, 0 - x, f.arithmetic("div", x, f.select(is_zero | is_minus, 1, y)))
+    return f.select(is_zero, -1, ratio) if name == "div" else f.select(is_zero, x, x - ratio * y)
+
+
+def _round(f: Function, a: Value, method: Any) -> Value:
+    """Round to an integer; halves to the even one, or away from zero."""
+    return f.intrinsic("roundeven" if int(method) == 1 else "round", a)
 
 
 def _expm1(f: Function, x: Value) -> Value:
