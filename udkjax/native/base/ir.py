@@ -5,8 +5,10 @@ W is one; numbers are broadcast to wide values. All lanes take the same branch, 
 `any_of` the lanes needs it; lanes differ only by `select`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import reduce
 from typing import Any
 
 from udkjax.native.base.values import BOOL, DOUBLE, INT, POINTER, Operand, Product, Value, literal, llvm_type
@@ -19,6 +21,8 @@ _COMPARE = {
     "eq": ("oeq", "eq"),
     "ne": ("une", "ne"),
 }
+
+LOCAL_SPACE = 5  # of the memory of one thread, in NVPTX
 
 
 class Variable:
@@ -75,13 +79,27 @@ class Function:
         self._reserved.append(f"{name} = alloca {type_}, i64 {count}, align 64")
         return name
 
-    def text(self) -> str:
-        """Return the definition; the LLVM intrinsics that it calls are in `declared`."""
-        arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{n}" for base, n in self._arguments)
+    def text(self, local: Collection[str] | None = None) -> str:
+        """Return the definition; the LLVM intrinsics that it calls are in `declared`.
+
+        Args:
+            local: For the thread of a GPU, the names of the arguments that point to its own memory. LLVM infers the address
+                space of all that is computed from a pointer that has been cast to it once. Functions are not inlined, as each
+                copy would take room in the cache of instructions.
+        """
+        casts, names = [], {n: n for _, n in self._arguments}
+        for base, n in self._arguments if local is not None else ():
+            if base == POINTER and n in local:
+                names[n] = f"{n}.given"
+                casts.append(f"%{n}.local = addrspacecast ptr %{n}.given to ptr addrspace({LOCAL_SPACE})")
+                casts.append(f"%{n} = addrspacecast ptr addrspace({LOCAL_SPACE}) %{n}.local to ptr")
+        arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{names[n]}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
-        body = "\n  ".join([*self._reserved, *self._lines, *([end] if end else [])])
-        cold = " cold noinline optnone" if self.cold else " noinline" if self.noinline else ""
-        return f"define {self.returns} @{self.name}({arguments}){cold} {{\n  {body}\n}}\n"
+        body = "\n  ".join([*casts, *self._reserved, *self._lines, *([end] if end else [])])
+        attributes = " cold noinline optnone" if self.cold else " noinline" if self.noinline else ""
+        if local is not None:  # arrays of vectors are aligned (`Layout`), and aligned ones are read by fewer instructions
+            attributes, body = " noinline", re.sub(r"((?:load|store) <.*), align 8", r"\1, align 16", body)
+        return f"define {self.returns} @{self.name}({arguments}){attributes} {{\n  {body}\n}}\n"
 
     # --- values
 
@@ -187,6 +205,8 @@ class Function:
 
     def largest_of(self, x: Value) -> Value:
         """Return the maximum over lanes; NaN is not allowed."""
+        if x.width & (x.width - 1):
+            return reduce(self.max, (self.op(f"extractelement {x.type} {x.name}, i64 {k}", x.base) for k in range(x.width)))
         while x.width > 1:
             half, lanes = x.width // 2, range(x.width)
             shuffle = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"

@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.expressions.loop_derivative import FORWARD
-from udkjax.native.base.ir import POINTER, Function, Value
+from udkjax.native.base.ir import BOOL, POINTER, Function, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory
 from udkjax.native.base.program import PointerPlace, consecutive, write
+from udkjax.native.base.running import write_run
 from udkjax.native.base.steps import POINTS
 
 # Rarely called functions: once per run, near singular configurations, or where a piece may end.
@@ -37,6 +38,10 @@ class Module(Memory):
     """
 
     mode = FORWARD  # mode of differentiation
+    ways: tuple[str, ...] = ()  # prefixes of the inputs of each tangent of a group, in forward mode
+    group = 1  # directions of a tangent
+    tangents_begin: int | None = None
+    """Where the memory of directions begins, relative to `work`; None if it is a block of its own."""
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
         self.plan, self.code, self.method = plan, plan.code, plan.method
@@ -124,10 +129,17 @@ class Module(Memory):
         for name, count in sizes.items():
             self.places.add(prefix + name, count)
 
-    def module_text(self) -> str:
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        self.write_functions()
+        write_run(self)
         functions = [*self.functions, *self.loops.functions]
         declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
         return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
+
+    def write_functions(self):
+        """Write all functions but `run`."""
+        raise NotImplementedError
 
     # --- programs
 
@@ -275,6 +287,12 @@ class Module(Memory):
     def end_members(self, f: Function, s: Lane):
         """Hook: called for completed members, in lanes that are `due`."""
 
+    def interpolates(self, f: Function, s: Lane) -> Value:
+        """Return whether states between steps may still be asked for, so that the points before the latest are needed."""
+        if self.pieces:
+            return f.const(True, BOOL, f.width)
+        return s.written + 1.0 < self.field(f, "times") - 1
+
     def goes_on(self, f: Function, s: Lane) -> Value:
         """Return whether any lane is active."""
         return f.any_of(s.active > 0.5)
@@ -287,12 +305,31 @@ class Module(Memory):
         """Fill the lanes of completed members with the next members."""
         fill()
 
-    def allocate_memory(self, f: Function, block: Value) -> list[Value]:
-        """Allocate further memory of a run and store its address in `work`; return the blocks to free.
+    # --- memory of directions
+
+    def groups(self, f: Function) -> Value:
+        """Return the number of groups of directions."""
+        return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
+
+    def first_tangent(self, f: Function) -> Value:
+        """Return the address of the memory of the first direction."""
+        work = f.given["work"]
+        if self.tangents_begin is not None:
+            return f.at(work, self.tangents_begin)
+        return f.load(work, self.start("tangents", "work"), base=POINTER)
+
+    def allocate_tangents(self, f: Function, block: Value) -> list[Value]:
+        """Allocate memory for all directions, and store its address in `work`; return the blocks to free.
 
         Without memory, `block` is freed, and the function returns (`allocate`)."""
-        del f, block
-        return []
+        if not self.ways:
+            return []
+        size = self.groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
+        tangent_block, start = self.allocate(f, size, [block])
+        with f.each(size) as i:
+            f.store(0.0, start, i)
+        f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
+        return [tangent_block]
 
     def accelerate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i at `state`."""

@@ -19,7 +19,7 @@ from udkjax.native.base.tableau import EULER
 from udkjax.native.base.weighted_rows import WeightedRows
 from udkjax.native.closing.corrections import EliminationCorrection, LeastNormCorrection
 from udkjax.native.pseudoinverses.svd import SVDCode
-from udkjax.native.run.members import write_begin, write_run
+from udkjax.native.run.members import write_begin
 
 CORRECTED = "qv"  # corrected quantities, by their index in a record
 
@@ -42,8 +42,7 @@ class Closing(Module):
     def _correction(self, name: str) -> LeastNormCorrection | EliminationCorrection:
         return LeastNormCorrection(self, name, self._rows) if self._rows else EliminationCorrection(self, name)
 
-    def text(self) -> str:
-        """LLVM's text of the whole module."""
+    def write_functions(self):
         self.write_programs()
         if self._rows:
             self._rows.write()
@@ -52,8 +51,6 @@ class Closing(Module):
         self.write_derivatives()
         write_begin(self)
         self._close()
-        write_run(self)
-        return self.module_text()
 
     def program_names(self) -> list[str]:
         return ["psi", "psi_dot"] if self.code.is_small else ["psi", "psi_dot", "rank"]

@@ -94,7 +94,7 @@ class ClosingForward(ClosingDerivative):
     @contextmanager
     def _each_direction(self, f: Function) -> Iterator[Value]:
         """Run the block for every direction; the tangents' addresses become arguments of the function, by name."""
-        first = f.load(f.given["work"], self.places["tangents"], base=POINTER)
+        first = self.first_tangent(f)
         with f.each(self.field(f, "directions")) as p:
             for k, way in enumerate(self.ways):
                 f.given[way] = f.at(first, p * (len(self.ways) * self.tangents.size) + k * self.tangents.size)
@@ -126,14 +126,6 @@ class ClosingForward(ClosingDerivative):
             for k, x in enumerate("qv"):
                 with f.each(self.n) as i:
                     f.store(self.entry(f, f"state {x}", i, self.ways[-1]), to, i + k * self.n)
-
-    def allocate_memory(self, f: Function, block: Value) -> list[Value]:
-        size = self.field(f, "directions") * (len(self.ways) * self.tangents.size)
-        tangent_block, start = self.allocate(f, size, [block])
-        with f.each(size) as i:
-            f.store(0.0, start, i)
-        f.store(start, f.given["work"], self.places["tangents"], base=POINTER)
-        return [tangent_block]
 
 
 class ClosingTwice(ClosingForward):

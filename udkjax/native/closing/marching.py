@@ -21,7 +21,7 @@ from udkjax.native.base.tableau import EULER
 from udkjax.native.base.weighted_rows import WeightedRows
 from udkjax.native.pseudoinverses.lu import LUCode
 from udkjax.native.run.manifold import largest_violation
-from udkjax.native.run.members import write_begin, write_run
+from udkjax.native.run.members import write_begin
 
 CORRECTIONS = 2
 STRAIGHT = 0.95  # cosine of the largest rotation of the tangent in a step
@@ -48,15 +48,12 @@ class Marching(Module):
                     self.places.add(name, count)
             self._rows = WeightedRows(self, _METHOD, chosen=sorted(code.eliminated_rows))
 
-    def text(self) -> str:
-        """LLVM's text of the whole module."""
+    def write_functions(self):
         self.write_programs()
         write_begin(self)
         if self._rows:
             self._rows.write()
         self._march()
-        write_run(self)
-        return self.module_text()
 
     @property
     def _has_sides(self) -> bool:

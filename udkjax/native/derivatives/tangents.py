@@ -75,8 +75,8 @@ class Forward(Differentiated):
     @contextmanager
     def _each_tangent(self, f: Function, step: int = 1) -> Iterator[Value]:
         """Run the block for every `step`-th tangent of all groups."""
-        first = f.load(f.given["work"], self.start("tangents", "work"), base=POINTER)
-        with f.each(self._groups(f) * (len(self.ways) // step)) as p:
+        first = self.first_tangent(f)
+        with f.each(self.groups(f) * (len(self.ways) // step)) as p:
             f.given["tangent"] = f.at(first, p * (step * self.tangents.size * self.tangents.width))
             yield p
 
@@ -91,9 +91,6 @@ class Forward(Differentiated):
     def _way(self, f: Function, way: str) -> Value:
         """Return the address of one of the tangents of a group."""
         return f.at(f.given["tangent"], self.ways.index(way) * self.tangents.size * self.tangents.width)
-
-    def _groups(self, f: Function) -> Value:
-        return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
 
     def _call_derivative(self, f: Function, name: str, stored: str, out: Value | None = None):
         tangent = f.given["tangent"]
@@ -260,15 +257,6 @@ class Forward(Differentiated):
                 self.copy_lane(f, to, self.n, "point3 v", lane, "tangent")
             self._write_change(f, s, k, p, f.const(0, INT), "state q", "state v")
             self._write_change(f, s, k, p, times - 1, "point3 q", "point3 v")
-
-    def allocate_memory(self, f: Function, block: Value) -> list[Value]:
-        """Allocate memory for all directions; return the blocks to free."""
-        size = self._groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
-        tangent_block, start = self.allocate(f, size, [block])
-        with f.each(size) as i:
-            f.store(0.0, start, i)
-        f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
-        return [tangent_block]
 
 
 class ForwardTwice(Forward):

@@ -121,8 +121,10 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
     """Make the end of a step the latest point; return one in lanes whose new point is off the constraint manifold."""
     lost = f.variable(0.0)
     with f.if_(f.any_of(accept)):
+        with f.if_(f.any_of(accept & module.interpolates(f, s))):
+            for k in range(POINTS - 1):
+                module.copy_point(f, accept, f"point{k + 1}", f"point{k}")
         for k in range(POINTS - 1):
-            module.copy_point(f, accept, f"point{k + 1}", f"point{k}")
             s.where(accept, **{f"point{k}_t": getattr(s, f"point{k + 1}_t")})
         module.copy_point(f, accept, ("state q", "result v", "result a"), f"point{POINTS - 1}")
         s.where(accept, point3_t=s.t1)

@@ -1,4 +1,4 @@
-"""Members and lanes: a lane loads a member, steps it to its end, writes the results, and loads the next one."""
+"""The beginning and the end of a member: a lane loads it, steps it to its end, and writes the results."""
 
 from typing import Any
 
@@ -151,37 +151,3 @@ def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
     with f.each((times - valid) * module.n) as i:
         for address in to:
             f.store(nan, address, i)
-
-
-def write_run(module: Module):
-    """Write `run(call)`: integrate all members."""
-    f = Function("run", [(POINTER, "call")], module.plan.width)
-    module.functions.append(f)
-    call, width = f.given["call"], module.plan.width
-    size = module.places.size * width + 2 * module.plan.vector
-    block, work = module.allocate(f, f.const(size, INT))
-    f.given["work"], s = work, Lane(f, module.places)
-    with f.each(size) as i:
-        f.store(0.0, work, i)
-    f.store(call, work, module.start("call", "work"), base=POINTER)
-    module.begin_memory(f)
-    blocks = [block, *module.allocate_memory(f, block)]
-    for name in ("length", "omega", "rtol", "atol", "smallest"):  # for lanes that stay empty
-        setattr(s, name, f.const(1.0, DOUBLE, width))
-    with f.each(-(-module.n // max(module.plan.vector // width, 1)) * max(module.plan.vector // width, 1)) as i:
-        for name in ("scale q", "scale v"):
-            module.put_entry(f, name, i, 1.0)
-    members, following = module.field(f, "members"), module.field(f, "next", POINTER)
-
-    def fill():
-        with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
-            # Threads share the index of the next member.
-            member = f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
-            with f.if_(member < members):
-                f.call("begin", work, call, k, member)
-
-    fill()
-    with f.while_(lambda: module.goes_on(f, s)):
-        module.step_all(f, s, fill)
-    for block in blocks:
-        f.line(f"call void @free(ptr {block.name})")

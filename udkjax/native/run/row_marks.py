@@ -18,7 +18,7 @@ from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
 from udkjax.native.base.tableau import EULER
 from udkjax.native.run.manifold import iterate_newton, largest_violation
-from udkjax.native.run.members import write_begin, write_run
+from udkjax.native.run.members import write_begin
 
 # Length of the step in the scene's units. A row that depends on others only at the start of the step has a relative pivot of
 # about its square at the end: much more than the threshold of dependence. The step is also short enough for Newton's method.
@@ -39,13 +39,10 @@ class RowMarks(Module):
         super().__init__(plan)
         self.places.add("independent", self.m)
 
-    def text(self) -> str:
-        """LLVM's text of the whole module."""
+    def write_functions(self):
         self.write_programs()
         write_begin(self)
         self._find()
-        write_run(self)
-        return self.module_text()
 
     def program_names(self) -> list[str]:
         return ["tangent_part", "newton_q", "psi", "independent_rows"]

@@ -22,7 +22,7 @@ from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.fallback import write_fallback
 from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.manifold import project_output, with_threshold
-from udkjax.native.run.members import write_begin, write_run
+from udkjax.native.run.members import write_begin
 from udkjax.native.run.trajectory import Trajectory
 
 
@@ -50,8 +50,7 @@ class StateFunction(Trajectory):
             )
         )
 
-    def text(self) -> str:
-        """LLVM's text of the whole module."""
+    def write_functions(self):
         self.write_programs()
         if self.falls_back:
             write_fallback(self)
@@ -63,8 +62,6 @@ class StateFunction(Trajectory):
         setattr(s, "state t", s.start)
         self._evaluate(f, s)
         self.write_found(f, s)
-        write_run(self)
-        return self.module_text()
 
     def write_found(self, f: Function, s: Lane):
         """Write the results of the members in all lanes to the output."""

@@ -29,7 +29,7 @@ from udkjax.native.run.dense_equations import DenseEquations
 from udkjax.native.run.dense_output import write_between, write_differences, write_outputs
 from udkjax.native.run.fallback import write_fallback
 from udkjax.native.run.formulations import FORMULATE
-from udkjax.native.run.members import write_begin, write_finish, write_run
+from udkjax.native.run.members import write_begin, write_finish
 from udkjax.native.run.pieces import write_leave
 from udkjax.native.run.runge_kutta import write_attempt
 
@@ -65,8 +65,7 @@ class Trajectory(Module):
     def after_step(self, f: Function, s: Lane):
         """Hook: called after each attempt at a step, when `until` has been set."""
 
-    def text(self) -> str:
-        """LLVM's text of the whole module."""
+    def write_functions(self):
         self.write_programs()
         write_attempt(self)
         if self.pieces:
@@ -82,8 +81,6 @@ class Trajectory(Module):
         write_begin(self)
         write_finish(self)
         self.write_derivatives()
-        write_run(self)
-        return self.module_text()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Take one step in all lanes, and finish completed members."""

@@ -10,7 +10,7 @@ conditions that still vary have a jump or a kink. If jumps repeat, or a conditio
 continues.
 """
 
-from udkjax.native.base.ir import DOUBLE, INT, Function, Value
+from udkjax.native.base.ir import BOOL, DOUBLE, INT, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.program import write
 from udkjax.native.base.steps import POINTS, Status
@@ -41,6 +41,9 @@ class Watching(WatchMemory):
         f.call("watch", f.given["work"])
         with f.if_(f.any_of(s.landing > WANTED + 0.5)):
             f.call("land", f.given["work"])
+
+    def interpolates(self, f: Function, s: Lane) -> Value:
+        return f.const(True, BOOL, f.width)  # for the conditions within each step
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         s.where(accept & (s.begin > 0.5), fresh=s.t1)

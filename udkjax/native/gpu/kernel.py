@@ -1,0 +1,83 @@
+"""A run as a kernel: each thread of a GPU integrates one member, with the functions that serve members on the CPU.
+
+A thread's memory (`Layout`) is local memory, which the hardware interleaves by threads, so that the threads of a warp read one
+stretch of it together. The call record is a parameter of the kernel. The threads of a block begin each step together: all warps
+of a multiprocessor then run the same functions at about the same time, which its cache of instructions has room for.
+"""
+
+import re
+from collections.abc import Collection
+from typing import NamedTuple
+
+from udkjax.native.base.ir import Function
+from udkjax.native.base.module import Module
+from udkjax.native.base.program import UnsupportedError
+from udkjax.native.base.running import memory_size, write_run_member
+from udkjax.native.operations import Operation
+
+NAME = "run_members"  # of the kernel
+VECTOR = 4  # coordinates whose numbers are read together: a thread waits for memory most of the time
+# The arguments of functions that point to the memory of a thread, or into it.
+LOCAL = ("work", "out", "tangent", "stored", "accelerations", "projection")
+INTRINSICS = ("fabs", "sqrt", "floor", "ceil", "fmuladd", "maximum", "minimum")  # of float64, that GPUs have
+# A barrier that also asks whether the condition holds in any thread of the block.
+ANY_OF_BLOCK = "{ .reg .pred p, q; setp.ne.u32 p, $1, 0; barrier.cta.red.or.pred q, 0, p; selp.u32 $0, 1, 0, q; }"
+KERNEL = f"""
+declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()
+declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()
+declare i32 @llvm.nvvm.read.ptx.sreg.ntid.x()
+
+define i1 @meet(i1 %goes_on) alwaysinline {{
+  %mine = zext i1 %goes_on to i32
+  %any = call i32 asm sideeffect "{ANY_OF_BLOCK}", "=r,r"(i32 %mine)
+  %result = icmp ne i32 %any, 0
+  ret i1 %result
+}}
+
+define ptx_kernel void @{NAME}(ptr byval([FIELDS x i64]) align 8 %call) {{
+  %thread = call i32 @llvm.nvvm.read.ptx.sreg.tid.x()
+  %block = call i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()
+  %threads = call i32 @llvm.nvvm.read.ptx.sreg.ntid.x()
+  %before = mul i32 %block, %threads
+  %index = add i32 %before, %thread
+  %member = zext i32 %index to i64
+  %work = alloca [SIZE x double], align 64
+  call void @run_member(ptr %call, ptr %work, i64 %member)
+  ret void
+}}
+"""
+
+
+class KernelCode(NamedTuple):
+    """The functions of a kernel, with the module whose call record it takes."""
+
+    module: Module
+    functions: list[Function]  # `run_member(call, work, member)` and what it calls, but `meet`
+    size: int  # numbers in the memory of a thread
+
+    @property
+    def text(self) -> str:
+        """LLVM's text of the kernel."""
+        kernel = KERNEL.replace("FIELDS", str(len(self.module.call_fields))).replace("SIZE", str(self.size))
+        return self.functions_text(LOCAL) + kernel
+
+    def functions_text(self, local: Collection[str]) -> str:
+        """Return LLVM's text of the functions; `local` are the names of arguments that point to a thread's own memory."""
+        declared = sorted(set().union(*(f.declared for f in self.functions)))
+        return "\n".join([*declared, *self.module.loops.globals, *(f.text(local) for f in self.functions)])
+
+
+def kernel_code(operation: Operation, directions: int = 0) -> KernelCode:
+    """Write the kernel of an operation, for a number of directions; raise `UnsupportedError` if there is none."""
+    module = operation.module(1, 1, VECTOR)
+    if operation.is_reverse or not isinstance(module, Module):
+        raise UnsupportedError(f"{type(operation).__name__} on a GPU")
+    if module.ways:
+        module.tangents_begin = module.places.add("all tangents", directions * len(module.ways) * module.tangents.size)
+    module.write_functions()
+    write_run_member(module)
+    code = KernelCode(module, [*module.functions, *module.loops.functions], memory_size(module))
+    for name in sorted({x[x.index("@") + 1 : x.index("(")] for f in code.functions for x in f.declared}):
+        if not re.fullmatch(rf"llvm\.({'|'.join(INTRINSICS)})\.(v\d+)?f64|llvm\.vector\.reduce\.\w+\.v\d+\w+", name):
+            raise UnsupportedError(f"{name} on a GPU")  # LLVM would end the process
+    return code
