@@ -27,6 +27,7 @@ from udkjax.native.base.prepared_call import PreparedCall
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.steps import Status
 from udkjax.native.gpu import host_handler
+from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
@@ -219,8 +220,10 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
 
 
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
-    """Lower for a graphics card of NVIDIA: the host computes, whatever the operation and the number of members."""
-    return _call_target(_select_code(inputs, operation).name_on_card, inputs, operation, times)
+    """Lower for a graphics card of NVIDIA: large batches run as a kernel; the host computes all else."""
+    members, directions = max(x.shape[0] for x in inputs), inputs[-1].shape[1] if operation.tangents else 0
+    name = kernel_target(operation, members, directions) or _select_code(inputs, operation).name_on_card
+    return _call_target(name, inputs, operation, times)
 
 
 def _lower_for_others(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:

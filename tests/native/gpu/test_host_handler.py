@@ -18,12 +18,11 @@ from jax.interpreters import mlir
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
-from tests.native.test_composition import newer_jax
 from udkjax.native import primitive
 from udkjax.native.base import ffi, host_function
 from udkjax.native.gpu import host_handler
 
-pytestmark = [newer_jax, pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")]
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")
 STREAM, CONTEXT, ERROR = 0x5EED, 0xC0DE, 700
 ADDRESS = ctypes.c_uint64
 

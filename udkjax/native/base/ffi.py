@@ -36,56 +36,65 @@ RESOURCE_EXHAUSTED, INTERNAL = 8, 13  # XLA_FFI_Error_Code
 NO_MEMORY = b"no memory for a computation by machine code"
 
 
-def handler(trajectory: Memory, name: str) -> list[Function]:
+def handler(module: Memory, name: str) -> list[Function]:
     """Write the handler `name(frame)` and its helpers; return the functions, with the handler last.
 
     Inputs are float64 arrays (1 or members, ...). Outputs are (members, ...); derivatives have the directions as the second axis.
     """
-    f, fields = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), trajectory.call_fields
-    inputs, outputs = (*INPUTS, *trajectory.inputs), (*trajectory.results, *trajectory.outputs)
+    f, count = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), len(module.call_fields)
     frame = f.given["frame"]
-
     answer_metadata(f, frame)
-    call = Value(f, f.reserve(INT, len(fields)), POINTER)
-
-    def put(field: str, value: Any, base: str = INT):
-        f.store(value, call, fields.index(field), base=base)
-
-    buffers = [word(f, frame, start + BUFFERS, POINTER) for start in (ARGUMENTS, RESULTS)]
-    buffer_of = {}
-    for pointers, names in zip(buffers, (inputs, outputs), strict=True):
-        for k, field in enumerate(names):
-            buffer_of[field] = f.load(pointers, k, base=POINTER)
-            put(field, word(f, buffer_of[field], DATA, POINTER), POINTER)
-
-    def dimension(field: str, k: int) -> Value:
-        return f.load(word(f, buffer_of[field], DIMS, POINTER), k, base=INT)
-
-    put("members", dimension(outputs[0], 0))
-    put("times", dimension("ts", 1))
-    put("knots", dimension("breaks", 1))
-    put("directions", dimension(inputs[-1], trajectory.directions_in))
-    for field in trajectory.lengths:
-        put(f"{field} length", dimension(field, 1))
-    for field in inputs:
-        length = f.variable(1, INT, 1)
-        with f.each(word(f, buffer_of[field], RANK), 1) as k:
-            length.value = length.value * f.load(word(f, buffer_of[field], DIMS, POINTER), k, base=INT)
-        put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
+    call, members = call_record(f, frame, module)
     progress = Value(f, f.reserve(INT, 2), POINTER)
     for k in range(2):
         f.store(0, progress, k, base=INT)
-    put("next", progress, POINTER)
-    shares = f.arithmetic("div", dimension(outputs[0], 0), SHARE)
+    f.store(progress, call, module.call_fields.index("next"), base=POINTER)
+    shares = f.arithmetic("div", members, SHARE)
     threads = f.variable(1, INT, 1)
     with f.if_(shares > 1):
         threads.value = _thread_count(f, frame)
     helpers = f.select(threads.value < shares, threads.value, shares) - 1
-    f.choose(helpers > 0, lambda: _run_shared(f, frame, call, len(fields), helpers), lambda: f.call("run", call))
+    f.choose(helpers > 0, lambda: _run_shared(f, frame, call, count, helpers), lambda: f.call("run", call))
     with f.if_(f.load(progress, 1, base=INT).is_not(0)):
         f.leave(f"ptr {no_memory(f, frame).name}")
     f.line("ret ptr null")
     return [_help(), f]
+
+
+def call_record(f: Function, frame: Value, module: Memory) -> tuple[Value, Value]:
+    """Write a call record on the stack from the buffers of a frame, all but its last field `next`.
+
+    Returns:
+        The address of the record, and the number of members.
+    """
+    fields, inputs, outputs = module.call_fields, (*INPUTS, *module.inputs), (*module.results, *module.outputs)
+    call, buffers = Value(f, f.reserve(INT, len(fields)), POINTER), {}
+
+    def put(field: str, value: Any, base: str = INT):
+        f.store(value, call, fields.index(field), base=base)
+
+    for start, names in ((ARGUMENTS, inputs), (RESULTS, outputs)):
+        pointers = word(f, frame, start + BUFFERS, POINTER)
+        for k, field in enumerate(names):
+            buffers[field] = f.load(pointers, k, base=POINTER)
+            put(field, word(f, buffers[field], DATA, POINTER), POINTER)
+
+    def dimension(field: str, k: Any) -> Value:
+        return f.load(word(f, buffers[field], DIMS, POINTER), k, base=INT)
+
+    members = dimension(outputs[0], 0)
+    put("members", members)
+    put("times", dimension("ts", 1))
+    put("knots", dimension("breaks", 1))
+    put("directions", dimension(inputs[-1], module.directions_in))
+    for field in module.lengths:
+        put(f"{field} length", dimension(field, 1))
+    for field in inputs:
+        length = f.variable(1, INT, 1)
+        with f.each(word(f, buffers[field], RANK), 1) as k:
+            length.value = length.value * dimension(field, k)
+        put(f"{field} stride", f.select(dimension(field, 0) > 1, length.value, f.const(0, INT)))
+    return call, members
 
 
 def word(f: Function, pointer: Value, offset: int, base: str = INT) -> Value:

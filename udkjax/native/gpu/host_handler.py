@@ -18,43 +18,30 @@ from udkjax.native.base.ffi import (
     API,
     ARGUMENTS,
     BUFFERS,
-    CONTEXT,
     COUNT,
-    CREATE_ERROR,
     DATA,
     DIMS,
-    INTERNAL,
     RANK,
     RESULTS,
     SCHEDULE,
-    STREAM,
     THREAD_COUNT,
     answer_metadata,
-    arguments_struct,
-    call_api,
-    call_with,
     no_memory,
-    text_of,
     word,
 )
 from udkjax.native.base.ir import INT, POINTER, Function, Value, Variable
 from udkjax.native.gpu.driver import CudaDriver, driver
+from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, GIVEN, PLATFORM, POP, PUSH, Words, stream_of
 from udkjax.threads import cores
 
-PLATFORM = "CUDA"  # XLA's name of the platform
-# Functions of the driver, whose addresses are the first words. Then: the handler of the operation, and the number of threads.
-CONTEXT_OF_STREAM, PUSH, POP = "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"
 TO_HOST, TO_DEVICE, WAIT = "cuMemcpyDtoHAsync_v2", "cuMemcpyHtoDAsync_v2", "cuStreamSynchronize"
-DESCRIBE = "cuGetErrorString"
-FUNCTIONS = (CONTEXT_OF_STREAM, PUSH, POP, TO_HOST, TO_DEVICE, WAIT, DESCRIBE)
-HANDLER, THREADS = len(FUNCTIONS), len(FUNCTIONS) + 1
-GIVEN = 24  # offset in bytes of the first number in a struct of arguments of XLA's functions, after the context
+HANDLER, THREADS = "handler", "threads"
+WORDS = Words((TO_HOST, TO_DEVICE, WAIT), (HANDLER, THREADS))  # also the handler of the operation, and the number of threads
 BUFFER_BYTES = 48  # XLA_FFI_Buffer
 ALIGNMENT = 64  # of arrays, in bytes
-FAILED, UNKNOWN = b"copying between the graphics card and the host failed: ", b"the driver does not say why"
-MOST_WORDS = 400  # bytes of the driver's words in an error
+FAILED = b"copying between the graphics card and the host failed: "
 LIBC = (
-    *("declare ptr @malloc(i64)", "declare void @free(ptr)", "declare ptr @strncat(ptr, ptr, i64)"),
+    *("declare ptr @malloc(i64)", "declare void @free(ptr)"),
     *("declare i32 @pthread_create(ptr, ptr, ptr, ptr)", "declare i32 @pthread_detach(i64)"),
 )
 
@@ -90,8 +77,7 @@ def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Li
         threads: the number of threads that it may use; None: one for each core.
     """
     library = machine.library(module_text(), ("copy_and_call", "words"))
-    words = (ctypes.c_int64 * (len(FUNCTIONS) + 2)).from_address(library["words"])
-    words[:] = [*map(of.address, FUNCTIONS), handler, cores() if threads is None else threads]
+    WORDS.fill(library, of, handler, cores() if threads is None else threads)
     return library
 
 
@@ -100,8 +86,7 @@ def module_text() -> str:
     """Return the text of the module."""
     functions = [_thread_count(), _schedule(), _copy_and_call()]
     declared = sorted(set(LIBC).union(*(f.declared for f in functions)))
-    words = f"@words = global [{len(FUNCTIONS) + 2} x i64] zeroinitializer"
-    return "\n".join([*declared, words, *(f.text() for f in functions)])
+    return "\n".join([*declared, WORDS.text, *(f.text() for f in functions)])
 
 
 def _copy_and_call() -> Function:
@@ -109,18 +94,15 @@ def _copy_and_call() -> Function:
     f = Function("copy_and_call", [(POINTER, "frame")], returns="ptr", cold=True)
     frame = f.given["frame"]
     answer_metadata(f, frame)
-    asked = arguments_struct(f, word(f, frame, CONTEXT, POINTER), f.const(0, INT))
-    refused = call_with(f, frame, STREAM, asked)
-    with f.if_(~f.is_null(refused)):
-        f.leave(f"ptr {refused.name}")
+    stream = stream_of(f, frame)
     block = f.op(f"call ptr @malloc(i64 {_total_bytes(f, frame).name})", POINTER)
     with f.if_(f.is_null(block)):
         f.leave(f"ptr {no_memory(f, frame).name}")
     on_host = _frame_on_host(f, frame, block)
-    answer, error = _run(f, frame, on_host, word(f, asked, GIVEN, POINTER))
+    answer, error = _run(f, frame, on_host, stream)
     f.line(f"call void @free(ptr {block.name})")
     with f.if_(answer.value.is_not(0)):
-        f.leave(f"ptr {_driver_error(f, frame, answer.value).name}")
+        f.leave(f"ptr {WORDS.error(f, frame, FAILED, answer.value).name}")
     f.line(f"ret ptr {error.value.name}")
     return f
 
@@ -196,7 +178,7 @@ def _frame_on_host(f: Function, frame: Value, block: Value) -> Value:
 def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Variable, Variable]:
     """Copy, call the operation, and copy back; return the first error of the driver, or 0, and the operation's, or null."""
     place, error = Value(f, f.reserve(POINTER), POINTER), f.variable(Value(f, "null", POINTER), POINTER, 1)
-    answer = f.variable(_drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
+    answer = f.variable(WORDS.drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
 
     def copy(kind: int, function: str):
         (count, on_card), (_, copies) = _buffers(f, frame, kind), _buffers(f, on_host, kind)
@@ -205,46 +187,27 @@ def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Vari
             size = _bytes(f, card)
             with f.if_(answer.value.is_(0) & (size > 0)):
                 ends = [word(f, x, DATA, POINTER) for x in ((host, card) if function == TO_HOST else (card, host))]
-                answer.value = _drive(f, function, *ends, size, stream)
-        waited = _drive(f, WAIT, stream)  # also after an error, for the copies before it
+                answer.value = WORDS.drive(f, function, *ends, size, stream)
+        waited = WORDS.drive(f, WAIT, stream)  # also after an error, for the copies before it
         answer.value = f.select(answer.value.is_(0), waited, answer.value)
 
     with f.if_(answer.value.is_(0)):
-        answer.value = _drive(f, PUSH, f.load(place, base=POINTER))
+        answer.value = WORDS.drive(f, PUSH, f.load(place, base=POINTER))
         with f.if_(answer.value.is_(0)):
             copy(ARGUMENTS, TO_HOST)
             with f.if_(answer.value.is_(0)):
-                handler = f.load("@words", HANDLER, base=POINTER)
+                handler = WORDS.load(f, HANDLER)
                 error.value = f.op(f"call ptr {handler.name}(ptr {on_host.name})", POINTER)
                 with f.if_(f.is_null(error.value)):
                     copy(RESULTS, TO_DEVICE)
-            _drive(f, POP, place)
+            WORDS.drive(f, POP, place)
     return answer, error
-
-
-def _drive(f: Function, name: str, *arguments: Value) -> Value:
-    """Call a function of the driver; return its answer, 0 without an error."""
-    address = f.load("@words", FUNCTIONS.index(name), base=POINTER)
-    given = ", ".join(f"{x.type} {x.name}" for x in arguments)
-    answer = f.op(f"call i32 {address.name}({given})", "i32")
-    return f.op(f"zext i32 {answer.name} to i64", INT)
-
-
-def _driver_error(f: Function, frame: Value, answer: Value) -> Value:
-    """Create XLA's error for an error of the driver, in the driver's words."""
-    text, place = text_of(f, FAILED, MOST_WORDS), Value(f, f.reserve(POINTER), POINTER)
-    f.store(Value(f, "null", POINTER), place, base=POINTER)
-    _drive(f, DESCRIBE, answer, place)
-    described = f.load(place, base=POINTER)
-    words = f.select(f.is_null(described), text_of(f, UNKNOWN), described)
-    f.op(f"call ptr @strncat(ptr {text.name}, ptr {words.name}, i64 {MOST_WORDS - 8})", POINTER)
-    return call_api(f, frame, CREATE_ERROR, text, f.const(INTERNAL, INT))
 
 
 def _thread_count() -> Function:
     """Write XLA_FFI_ThreadPool_NumThreads."""
     f = Function("thread_count", [(POINTER, "given")], returns="ptr", cold=True)
-    f.store(f.load("@words", THREADS, base=INT), word(f, f.given["given"], GIVEN, POINTER), base=INT)
+    f.store(WORDS.load(f, THREADS, INT), word(f, f.given["given"], GIVEN, POINTER), base=INT)
     f.line("ret ptr null")
     return f
 

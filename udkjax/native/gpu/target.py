@@ -13,37 +13,38 @@ from typing import Any
 from udkjax.native.base import code_cache, machine
 
 TRIPLE = "nvptx64-nvidia-cuda"
-PTX = "+ptx78"  # of CUDA 11.8, the first for sm_90
-OLDEST = (7, 0)  # compute capability: the first whose warps part and meet freely
+PTX = "+ptx78"  # the version, of CUDA 11.8: the first for sm_90
+OLDEST = (7, 0)  # compute capability: the first whose threads part and meet freely
 NEWEST = (9, 0)  # that this version of PTX names; later GPUs take it as well
 LEVEL = 2  # of LLVM's code generation
-# Functions are called, not inlined: an inlined copy takes room in the cache of instructions.
+# Functions are called, not inlined: an inlined copy takes room in the cache of instructions. LLVM's combination of instructions
+# would remove the casts that tell pointers to a thread's own memory.
 PASSES = machine.PASSES
 
 
-def architecture(capability: tuple[int, int]) -> str:
-    """Return the name of the target for a GPU's compute capability."""
-    if capability < OLDEST:
-        raise ValueError(f"a GPU of compute capability {capability[0]}.{capability[1]} is too old; the kernels need 7.0")
-    return "sm_{}{}".format(*min(capability, NEWEST))
+def compile_kernel(text: str, capability: tuple[int, int], is_assembled: bool = True) -> bytes:
+    """Compile a kernel for a compute capability, from disk or newly compiled.
 
-
-def compile_kernel(text: str, target: str) -> bytes:
-    """Compile a kernel for a target, to a cubin or, without `ptxas`, to PTX; from disk or newly compiled."""
-    assembler = ptxas()
-    key = machine.digest("\0".join((TRIPLE, target, PTX, *PASSES, str(LEVEL), _version(assembler), text)))
+    Args:
+        text: LLVM's text.
+        capability: major and minor number.
+        is_assembled: whether to assemble it by `ptxas`, if there is one, to a cubin for this capability only. The result is else
+            PTX for this capability and later ones, which the driver assembles in seconds each time it loads it.
+    """
+    assembler = ptxas() if is_assembled else None
+    key = machine.digest("\0".join((TRIPLE, str(capability), PTX, *PASSES, str(LEVEL), _version(assembler), text)))
     code = code_cache.read(key)
     if code is None:
-        code = ptx(text, target)
-        code = assemble(code, target, assembler) if assembler else code.encode() + b"\0"
+        source = ptx(text, min(capability, NEWEST))
+        code = assemble(source, capability, assembler) if assembler else source.encode() + b"\0"
         code_cache.write(key, code)
     return code
 
 
-def ptx(text: str, target: str) -> str:
+def ptx(text: str, capability: tuple[int, int] = NEWEST) -> str:
     """Compile to PTX."""
     llvm = _llvm()
-    compiler = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=target, features=PTX, opt=LEVEL)
+    compiler = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=_name(capability), features=PTX, opt=LEVEL)
     with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
         module.triple, module.data_layout = TRIPLE, str(compiler.target_data)
         module.verify()
@@ -54,14 +55,17 @@ def ptx(text: str, target: str) -> str:
         return compiler.emit_assembly(module)
 
 
-def assemble(code: str, target: str, assembler: str) -> bytes:
-    """Assemble PTX to a cubin."""
+def _name(capability: tuple[int, int]) -> str:
+    return "sm_{}{}".format(*capability)
+
+
+def assemble(code: str, capability: tuple[int, int], assembler: str) -> bytes:
+    """Assemble PTX to a cubin for a compute capability."""
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder, "kernel.ptx"), Path(folder, "kernel.cubin")
         source.write_text(code)
-        done = subprocess.run(
-            [assembler, f"-arch={target}", "-O3", str(source), "-o", str(result)], capture_output=True, text=True, check=False
-        )
+        given = [assembler, f"-arch={_name(capability)}", "-O3", str(source), "-o", str(result)]
+        done = subprocess.run(given, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(f"{assembler} does not assemble a kernel: {done.stderr.strip()}")
         return result.read_bytes()

@@ -1,0 +1,70 @@
+"""Calls of the driver from machine code: handlers have the addresses of its functions in their `words`."""
+
+import ctypes
+
+from udkjax.native.base import machine
+from udkjax.native.base.ffi import CONTEXT, CREATE_ERROR, INTERNAL, STREAM, arguments_struct, call_api, call_with, text_of, word
+from udkjax.native.base.ir import INT, POINTER, Function, Value
+from udkjax.native.gpu.driver import CudaDriver
+
+PLATFORM = "CUDA"  # XLA's name of the platform
+CONTEXT_OF_STREAM, PUSH, POP = "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"
+DESCRIBE = "cuGetErrorString"
+GIVEN = 24  # offset in bytes of the first number in a struct of arguments of XLA's functions, after the context
+UNKNOWN = b"the driver does not say why"
+MOST_WORDS = 400  # bytes of the driver's words in an error
+STRNCAT = "declare ptr @strncat(ptr, ptr, i64)"
+
+
+class Words:
+    """The words of a handler: the addresses of functions of the driver, then further numbers.
+
+    Args:
+        functions: the names of functions, in addition to those that every handler needs.
+        further: the names of further words.
+    """
+
+    def __init__(self, functions: tuple[str, ...], further: tuple[str, ...]):
+        self.functions = (CONTEXT_OF_STREAM, PUSH, POP, DESCRIBE, *functions)
+        self.names = (*self.functions, *further)
+
+    @property
+    def text(self) -> str:
+        """The definition of the words."""
+        return f"@words = global [{len(self.names)} x i64] zeroinitializer"
+
+    def fill(self, library: machine.Library, of: CudaDriver, *further: int):
+        """Set the words of a loaded handler."""
+        words = (ctypes.c_int64 * len(self.names)).from_address(library["words"])
+        words[:] = [*map(of.address, self.functions), *further]
+
+    def load(self, f: Function, name: str, base: str = POINTER) -> Value:
+        """Return a word."""
+        return f.load("@words", self.names.index(name), base=base)
+
+    def drive(self, f: Function, name: str, *arguments: Value | str) -> Value:
+        """Call a function of the driver with values, or with constants in LLVM's text; return its answer, 0 without an error."""
+        address = self.load(f, name)
+        given = ", ".join(x if isinstance(x, str) else f"{x.type} {x.name}" for x in arguments)
+        answer = f.op(f"call i32 {address.name}({given})", "i32")
+        return f.op(f"zext i32 {answer.name} to i64", INT)
+
+    def error(self, f: Function, frame: Value, failed: bytes, answer: Value) -> Value:
+        """Create XLA's error for an error of the driver, in the driver's words after our own."""
+        text, place = text_of(f, failed, MOST_WORDS), Value(f, f.reserve(POINTER), POINTER)
+        f.store(Value(f, "null", POINTER), place, base=POINTER)
+        self.drive(f, DESCRIBE, answer, place)
+        described = f.load(place, base=POINTER)
+        words = f.select(f.is_null(described), text_of(f, UNKNOWN), described)
+        f.op(f"call ptr @strncat(ptr {text.name}, ptr {words.name}, i64 {MOST_WORDS - 8})", POINTER)
+        f.declared.add(STRNCAT)
+        return call_api(f, frame, CREATE_ERROR, text, f.const(INTERNAL, INT))
+
+
+def stream_of(f: Function, frame: Value) -> Value:
+    """Return the stream of a call on a card; the handler returns XLA's error if there is none."""
+    asked = arguments_struct(f, word(f, frame, CONTEXT, POINTER), f.const(0, INT))
+    refused = call_with(f, frame, STREAM, asked)
+    with f.if_(~f.is_null(refused)):
+        f.leave(f"ptr {refused.name}")
+    return word(f, asked, GIVEN, POINTER)

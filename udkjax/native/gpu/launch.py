@@ -1,0 +1,157 @@
+"""Batches as kernels in programs of a graphics card: a handler writes the call record, and launches the kernel on XLA's stream.
+
+The card's driver keeps a kernel for all cards of the machine (a library of cuLibraryLoadData), and loads it on a card when it is
+first launched there. The call record is a parameter of the kernel, so that nothing is allocated in a call.
+"""
+
+import ctypes
+import os
+from functools import lru_cache
+from threading import Lock
+from typing import Any
+
+import jax
+
+from udkjax.native.base import machine
+from udkjax.native.base.ffi import answer_metadata, call_record
+from udkjax.native.base.ir import INT, POINTER, Function, Value
+from udkjax.native.base.program import UnsupportedError
+from udkjax.native.gpu import target
+from udkjax.native.gpu.driver import CudaDriver, CudaError, driver
+from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, PLATFORM, POP, PUSH, Words, stream_of
+from udkjax.native.gpu.kernel import NAME, KernelCode, kernel_code
+from udkjax.native.operations import Operation
+
+# The smallest batch that runs as a kernel, unless `UDKJAX_KERNEL_MEMBERS` sets another number: a thread takes 20 to 40 times as
+# long for a member as a core of the host, so that few members are faster there.
+KERNEL_MEMBERS = 4096
+BLOCK = 128  # threads of a block
+MOST_MEMORY = 2**16  # bytes of a thread; the driver reserves them for each of the 270,000 threads that an H100 can hold
+LAUNCH, KERNEL = "cuLaunchKernel", "kernel"
+WORDS = Words((LAUNCH,), (KERNEL,))
+FAILED = b"launching a kernel for a batch failed: "
+# Attributes of a function and of a device (CUfunction_attribute, CUdevice_attribute).
+LOCAL_BYTES, MAJOR, MINOR, MULTIPROCESSORS, THREADS_EACH = 3, 75, 76, 16, 39
+
+
+def kernel_members() -> float:
+    """Return the smallest number of members that run as a kernel: `UDKJAX_KERNEL_MEMBERS`, infinite for "never"."""
+    setting = os.environ.get("UDKJAX_KERNEL_MEMBERS", "").strip()
+    if not setting:
+        return KERNEL_MEMBERS
+    if setting == "never":
+        return float("inf")
+    if not setting.isdecimal():
+        raise ValueError(f'UDKJAX_KERNEL_MEMBERS is "{setting}", not a number of members or "never"')
+    return int(setting)
+
+
+def kernel_target(operation: Operation, members: int, directions: int) -> str | None:
+    """Return the FFI target that runs a batch as a kernel; None if the host shall run it.
+
+    Args:
+        operation: the operation.
+        members: the number of members.
+        directions: the number of directions of its tangents, 0 without.
+    """
+    if members < kernel_members():
+        return None
+    try:
+        return _load(operation, directions)
+    except UnsupportedError:
+        return None
+
+
+@lru_cache(maxsize=256)
+def _load(operation: Operation, directions: int) -> str | None:
+    """Compile and register the kernel of an operation; return its target, None if its threads take too much memory.
+
+    Without a graphics card nothing is compiled: the program is only written here.
+    """
+    code, found = kernel_code(operation, directions), driver()
+    if 8 * code.size > MOST_MEMORY:
+        return None
+    name = f"udkjax_kernel_{machine.digest(code.text)}"
+    if found is None:
+        return name
+    with _REGISTERING:
+        if name not in _REGISTERED:
+            loaded = load_kernel(found, code)
+            if loaded is None or not _has_memory(found, loaded):
+                return None
+            library = load_handler(found, code, loaded)
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(library["launch"])), platform=PLATFORM)
+            _REGISTERED[name] = library
+    return name
+
+
+_REGISTERED: dict[str, machine.Library] = {}  # XLA may call these for as long as the process runs
+_REGISTERING = Lock()
+_reserved: dict[int, int] = {}  # bytes of all threads' memory that the driver holds, by device
+
+
+def load_kernel(of: CudaDriver, code: KernelCode) -> int | None:
+    """Return the handle of a kernel for all devices; None if the driver or a device is too old for it."""
+    kinds = {(of.attribute(MAJOR, k), of.attribute(MINOR, k)) for k in range(of.device_count())}
+    if min(kinds) < target.OLDEST:
+        return None
+    library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
+    image = target.compile_kernel(code.text, min(kinds), is_assembled=len(kinds) == 1)
+    try:
+        of("cuLibraryLoadData", ctypes.addressof(library), image, 0, 0, 0, 0, 0, 0)
+    except CudaError:  # `ptxas` is newer than the driver
+        image = target.compile_kernel(code.text, min(kinds), is_assembled=False)
+        of("cuLibraryLoadData", ctypes.addressof(library), image, 0, 0, 0, 0, 0, 0)
+    except AttributeError:  # a driver of CUDA 11
+        return None
+    of("cuLibraryGetKernel", ctypes.addressof(kernel), library, NAME.encode())
+    return kernel.value
+
+
+def _has_memory(of: CudaDriver, kernel: int) -> bool:
+    """Return whether each device has the memory that the driver will reserve for the threads of a kernel."""
+    for k in range(of.device_count()):
+        with of.current(k):
+            size, free, total = ctypes.c_int(), ctypes.c_size_t(), ctypes.c_size_t()
+            of("cuKernelGetAttribute", ctypes.addressof(size), LOCAL_BYTES, kernel, k)
+            of("cuMemGetInfo_v2", ctypes.addressof(free), ctypes.addressof(total))
+            needed = size.value * of.attribute(MULTIPROCESSORS, k) * of.attribute(THREADS_EACH, k)
+            if needed - _reserved.get(k, 0) > free.value:
+                return False
+            _reserved[k] = max(needed, _reserved.get(k, 0))
+    return True
+
+
+def load_handler(of: CudaDriver, code: KernelCode, kernel: int) -> machine.Library:
+    """Load the handler `launch(frame)` of a kernel."""
+    f = _launch(code)
+    text = "\n".join([*sorted(f.declared), WORDS.text, f.text()])
+    library = machine.library(text, ("launch", "words"))
+    WORDS.fill(library, of, kernel)
+    return library
+
+
+def _launch(code: KernelCode) -> Function:
+    """Write the handler."""
+    f, module = Function("launch", [(POINTER, "frame")], returns="ptr", cold=True), code.module
+    frame = f.given["frame"]
+    answer_metadata(f, frame)
+    call, members = call_record(f, frame, module)
+    f.store(0, call, module.call_fields.index("next"), base=INT)
+    stream, place = stream_of(f, frame), Value(f, f.reserve(POINTER), POINTER)
+    parameters = Value(f, f.reserve(POINTER), POINTER)
+    f.store(call, parameters, base=POINTER)
+    blocks = f.arithmetic("div", members + (BLOCK - 1), BLOCK)
+    grid = f.op(f"trunc i64 {blocks.name} to i32", "i32")
+    answer = f.variable(WORDS.drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
+    with f.if_(answer.value.is_(0) & (members > 0)):
+        answer.value = WORDS.drive(f, PUSH, f.load(place, base=POINTER))
+        with f.if_(answer.value.is_(0)):
+            one: tuple[Any, ...] = ("i32 1", "i32 1")
+            sizes = (f"i32 {grid.name}", *one, f"i32 {BLOCK}", *one, "i32 0")
+            answer.value = WORDS.drive(f, LAUNCH, WORDS.load(f, KERNEL), *sizes, stream, parameters, "ptr null")
+            WORDS.drive(f, POP, place)
+    with f.if_(answer.value.is_not(0)):
+        f.leave(f"ptr {WORDS.error(f, frame, FAILED, answer.value).name}")
+    f.line("ret ptr null")
+    return f
