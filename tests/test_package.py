@@ -16,7 +16,7 @@ from udkjax.extras import EXTRAS
 ROOT = Path(udkjax.__file__).parent
 
 # every floor may import them
-GROUND_FLOOR = {"annotations", "arrays", "extras", "folders", "lazy_names", "printing", "progress"}
+GROUND_FLOOR = {"annotations", "arrays", "devices", "extras", "folders", "lazy_names", "printing", "progress"}
 GROUND_FLOOR |= {"requirements", "threads", "wording"}
 PROGRAMS = {"expressions", "programs"}
 EQUATIONS = PROGRAMS | {"pinv", "scene", "transforms", "equations"}

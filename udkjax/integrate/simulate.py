@@ -14,6 +14,7 @@ from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays
+from udkjax.devices import on_host
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
@@ -235,7 +236,7 @@ def _simulate(
     return _finish(run, raw, getattr(system, "body_names", ()), choices)
 
 
-_compiled, _deferred = eqx.filter_jit(_simulate), deferred(_simulate)
+_compiled, _deferred = on_host(eqx.filter_jit(_simulate)), deferred(_simulate)
 
 
 def _finish(

@@ -12,7 +12,8 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import is_within_jit, make_module, number
+from udkjax.arrays import is_traced, is_within_jit, make_module, number
+from udkjax.devices import on_host
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
@@ -124,7 +125,7 @@ class MechanismParts(NamedTuple):
 def _parts(mechanism: Mechanism, analysis: Analysis | None) -> MechanismParts:
     """Return the parts of a mechanism, cached for all of its steps."""
     leaves, form = jax.tree.flatten((mechanism.without_origin, analysis or analyse(mechanism)))
-    return MechanismParts(form, leaves)
+    return MechanismParts(form, leaves if is_traced(leaves) else [np.asarray(x) for x in leaves])
 
 
 @lru_cache(maxsize=64)
@@ -136,4 +137,4 @@ def _program(form: Any, max_steps: int, engine: str) -> Callable[..., tuple[Arra
         end = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_concrete_times=False)
         return end.q, end.v  # pyright: ignore[reportReturnType]
 
-    return jax.jit(run)
+    return on_host(jax.jit(run))

@@ -2,7 +2,7 @@
 
 XLA takes about two milliseconds to compile an operation, and NumPy two microseconds to evaluate it: a program that runs once is
 faster without compilation. NumPy therefore evaluates a program until the evaluations have cost as much as compilation; from then
-on the compiled program runs. The results agree to rounding.
+on the compiled program runs, also on the host. The results agree to rounding.
 
 For JAX such a program is one operation, whose derivatives and batches are again deferred programs.
 
@@ -29,6 +29,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from udkjax.devices import on_host
 from udkjax.programs.numpy_program import Meter, TooLongError, count_operations, numpy_program
 from udkjax.programs.varying_axes import varies
 
@@ -45,7 +46,7 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
     Outside of compiled programs, NumPy evaluates it, its derivatives and its batches at first.
     """
-    by_jit = eqx.filter_jit(function)
+    by_jit = on_host(eqx.filter_jit(function))
     if deferred_p is None:
         return by_jit
 
@@ -220,7 +221,7 @@ def _limit(program: Any) -> int:
 
 @lru_cache(maxsize=512)
 def _compiled(program: Any) -> Callable[..., list[Array]]:
-    return jax.jit(jax.extend.core.jaxpr_as_fun(program))
+    return on_host(jax.jit(jax.extend.core.jaxpr_as_fun(program)))
 
 
 _make = getattr(jax.extend.core, "create_call_primitive", None)  # from JAX 0.12 on

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from udkjax.devices import default_devices
 from udkjax.threads import cores, thread_count
 
 MOST_PROGRAMS = 64  # number of programs of identifications, and of sweeps, in memory; each holds the scene that it was made for
@@ -141,7 +142,7 @@ def concurrent_chunks() -> int:
 
     A single CPU device runs a program per thread; several devices share each chunk.
     """
-    devices = jax.local_devices()
+    devices = default_devices()
     return thread_count() if len(devices) == 1 and devices[0].platform in CHUNKED_PLATFORMS else 1
 
 

@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.arrays import is_traced, is_within_jit, number, put_arrays
+from udkjax.devices import computing_on_host, on_host
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
@@ -132,7 +133,7 @@ def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToE
 
 @cached_by_identity
 def _expand_concrete(mechanism: Mechanism, analysis: Analysis, *events: ExpandsToEvents) -> Prepared:
-    with jax.ensure_compile_time_eval():
+    with jax.ensure_compile_time_eval(), computing_on_host():
         return _expand(mechanism, events, analysis)
 
 
@@ -178,7 +179,7 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     return run_events(hybrid, conditions), tuple(x.plan.why_not_native for x in compiled)
 
 
-_compiled_run, _deferred_run = eqx.filter_jit(_run), deferred(_run)
+_compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
 
 
 def _solution(

@@ -17,13 +17,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.annotations import NumericArray
+from udkjax.devices import computing_on_host, on_host
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembly import State, close
 from udkjax.positions.channels import Channel, Quantity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.identify.unknowns import Target, apply_values
-from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Program
+from udkjax.study.members import MOST_PROGRAMS, PIECE_MEMBERS, Program
 
 # Relative and absolute tolerances of the integration: for final estimates (the accuracy of parameters without noise); for
 # singular values and the continuity of pieces; and for the search for a fit.
@@ -75,7 +76,8 @@ class Predictor:
     ):
         self.evaluations = 0
         self._cache: OrderedDict[bytes, Prediction] = OrderedDict()
-        self._arrays, static = eqx.partition((mechanism, dict(settings)), eqx.is_array)
+        arrays, static = eqx.partition((mechanism, dict(settings)), eqx.is_array)
+        self._arrays = jax.tree.map(np.asarray, arrays)
         self._run = _MemberRun(static, targets, channels, ends)
 
     def __call__(self, members: Members, tol: TolerancePair) -> Prediction:
@@ -85,10 +87,11 @@ class Predictor:
         if key in self._cache:
             return self._cache[key]
         self.evaluations += size
-        piece = size if jax.default_backend() not in CHUNKED_PLATFORMS else PIECE_MEMBERS if size >= FEWEST_IN_LANES else 1
+        piece = PIECE_MEMBERS if size >= FEWEST_IN_LANES else 1
         shapes = tuple((x.shape[1:], str(x.dtype)) for x in jax.tree.leaves(members))
         program = _program(self._run, members.x.shape[1] + members.shift.shape[1], piece, shapes)
-        values, slopes = program((self._arrays, np.array(tol)), members, on_threads=True)
+        with computing_on_host():
+            values, slopes = program((self._arrays, np.array(tol)), members, on_threads=True)
         predicted = Prediction(values["y"], slopes["y"], values["code"], values.get("ends"), slopes.get("ends"))
         if sum(part.nbytes for part in predicted if part is not None) <= CACHE_BYTES:
             self._cache[key] = predicted
@@ -150,6 +153,7 @@ def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Prog
     return Program(run, slopes, piece)
 
 
+@on_host
 @partial(jax.jit, static_argnums=0)
 def _guess(run: _MemberRun, arrays: PyTree, member: Members) -> State:
     return run.place(arrays, member)[1]

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Int, PyTree
 
 from udkjax.arrays import number
+from udkjax.devices import default_devices
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
@@ -102,7 +103,7 @@ class GroupRun:
             and self.redundant is not None
         )
         self._placed: Shared | None = None
-        devices = jax.local_devices()
+        devices = default_devices()
         first = plan.first_alike[index]
         self.program = (
             Program(self, len(self.names), _piece(len(self.members), in_lanes, devices[0].platform), devices)

@@ -1,0 +1,59 @@
+"""The devices on which JAX computes by default, and the host among them."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def default_devices() -> list[jax.Device]:
+    """Return the devices on which JAX computes by default: the choice of `jax.default_device`, else all of this process."""
+    chosen = jax.config.jax_default_device
+    if chosen is None:
+        return jax.local_devices()
+    return jax.local_devices(backend=chosen)[:1] if isinstance(chosen, str) else [chosen]
+
+
+def host_device() -> jax.Device | None:
+    """Return the CPU device if JAX computes on other devices by default; else None, as where `JAX_PLATFORMS` excludes the CPU."""
+    if default_devices()[0].platform == "cpu":
+        return None
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
+
+
+def computing_on_host() -> AbstractContextManager[Any]:
+    """Return a context in which JAX computes on the host by default, if it has a CPU device."""
+    host = host_device()
+    return nullcontext() if host is None else jax.default_device(host)
+
+
+def on_host(program: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a compiled function that runs on the host when it is called outside of other programs.
+
+    It is for programs with many small operations: a graphics card needs microseconds to begin each of them, and JAX ten times as
+    long to compile them. Arrays that are committed to a device are computed there. Results are on the default device.
+    """
+
+    @wraps(program)
+    def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if host_device() is None or isinstance(jax.device_put(0.0), Tracer):
+            return program(*args, **kwargs)
+        with computing_on_host():
+            results = program(*args, **kwargs)
+        leaves, tree = jax.tree.flatten(results)
+        places = [k for k, x in enumerate(leaves) if isinstance(x, jax.Array) and not isinstance(x, Tracer)]
+        for k, x in zip(places, jax.device_put([np.asarray(leaves[k]) for k in places]), strict=True):
+            leaves[k] = x
+        return jax.tree.unflatten(tree, leaves)
+
+    return run
