@@ -8,6 +8,7 @@ import ctypes
 import itertools
 import sys
 import threading
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import jax
@@ -21,6 +22,7 @@ import udkjax as udk
 from udkjax.native import primitive
 from udkjax.native.base import ffi, host_function
 from udkjax.native.gpu import host_handler
+from udkjax.native.gpu.driver import CudaError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")
 STREAM, CONTEXT, ERROR = 0x5EED, 0xC0DE, 700
@@ -39,6 +41,7 @@ class Card:
         self.add("cuCtxPopCurrent_v2", 1, lambda place: self.write(place, CONTEXT))
         self.add("cuMemcpyDtoHAsync_v2", 4, move)
         self.add("cuMemcpyHtoDAsync_v2", 4, move)
+        self.add("cuMemHostAlloc", 3, self.pin)
         self.add("cuStreamSynchronize", 1, lambda stream: None)
         self.add("cuGetErrorString", 2, lambda answer, place: self.write(place, ctypes.cast(self.text, ctypes.c_void_p).value))
 
@@ -52,6 +55,18 @@ class Card:
             return 0
 
         self._functions[name] = function
+
+    def __call__(self, name, *arguments):
+        if self._functions[name](*arguments):
+            raise CudaError(name)
+
+    @contextmanager
+    def current(self, ordinal):
+        yield
+
+    def pin(self, place, size, flags):
+        self.pinned = np.full(size // 8, -1)
+        self.write(place, self.pinned.ctypes.data)
 
     @property
     def names(self):
@@ -95,6 +110,7 @@ def card(monkeypatch):
     number = next(NUMBERS)
     monkeypatch.setattr(host_handler, "PLATFORM", "cpu")
     monkeypatch.setattr(host_handler, "driver", lambda: card)
+    monkeypatch.setattr(host_handler, "_device", lambda: 0)
     monkeypatch.setattr(host_handler, "load", lambda of, handler: card.within_cpu(load(of, handler, threads=3)))
     monkeypatch.setattr(host_handler, "register", lambda name, handler: registered(f"{name}_{number}", handler))
     for p, module in ((primitive.native_p, primitive), (host_function.host_p, host_function)):
@@ -130,7 +146,7 @@ def test_runs_and_their_derivatives_are_those_of_the_cpu(request):
     runs = card.names.count("cuStreamGetCtx")
     assert runs == 4  # one, one forward, and two passes of reverse mode
     assert [card.names.count(x) for x in ("cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2", "cuStreamSynchronize")] == [4, 4, 8]
-    assert all(STREAM in call for call in card.calls if call[0].startswith(("cuMem", "cuStream")))
+    assert all(STREAM in call for call in card.calls if call[0].startswith(("cuMemcpy", "cuStream")))
 
 
 def test_a_batch_runs_on_several_threads(request):
@@ -167,11 +183,36 @@ def norms(rows, fails=False):
 def test_functions_of_python_are_called(card):
     rows = jnp.arange(6.0).reshape(3, 2)
     assert_array_equal(jax.jit(norms)(rows), np.linalg.norm(rows, axis=1))
-    assert [x[:1] + x[3:4] for x in card.calls if x[0].startswith("cuMem")] == [
+    assert [x[:1] + x[3:4] for x in card.calls if x[0].startswith("cuMemcpy")] == [
         ("cuMemcpyDtoHAsync_v2", 48),
         ("cuMemcpyHtoDAsync_v2", 24),
     ]
     assert jax.jit(norms)(jnp.zeros((0, 2))).shape == (0,)
+
+
+def test_small_calls_use_pinned_memory_one_at_a_time(card):
+    """Those that find it in use, or too small, use other memory, as all do if none can be pinned."""
+
+    def places(rows):
+        card.calls.clear()
+        assert_array_equal(jax.jit(norms)(rows), np.linalg.norm(rows, axis=1))
+        copies = [x for x in card.calls if x[0].startswith("cuMem")]
+        ends = [copies[-2][1], copies[-1][2]]  # on the host
+        start = card.pinned.ctypes.data
+        return [start <= x < start + card.pinned.nbytes for x in ends]
+
+    jax.jit(norms)(jnp.ones((3, 2)))
+    assert card.names[0] == "cuMemHostAlloc"
+    assert places(jnp.ones((3, 2))) == [True, True] and card.pinned[0] == 0
+    card.pinned[0] = 1  # in use
+    assert places(jnp.ones((3, 2))) == [False, False] and card.pinned[0] == 1
+    card.pinned[0] = 0
+    assert places(jnp.ones((host_handler.PINNED_BYTES // 16, 2))) == [False, False] and card.pinned[0] == 0
+
+
+def test_pinned_memory_is_not_necessary(card):
+    card.failing["cuMemHostAlloc"] = 1
+    assert jax.jit(norms)(jnp.ones((1, 4))) == 2.0 and "cuMemcpyHtoDAsync_v2" in card.names
 
 
 def test_the_error_of_an_operation_is_that_of_the_program(card):

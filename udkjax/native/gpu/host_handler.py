@@ -4,6 +4,9 @@ XLA calls the handler on the host with buffers of the card, when the program of 
 arguments to the host on the program's stream, waits for them, and calls the operation with the same frame but with buffers of
 the host, and with threads, of which XLA has none here. It copies the results back and waits again, since it frees its memory.
 
+The driver waits for the end of each copy unless the memory of the host is pinned. Pinning takes long; hence there is one block of
+pinned memory for all operations, for one call at a time. Calls that find it in use or too small use other memory.
+
 The code is the same for all operations. Each of them loads it once, with its own `words`: the addresses that it calls.
 """
 
@@ -29,16 +32,19 @@ from udkjax.native.base.ffi import (
     no_memory,
     word,
 )
-from udkjax.native.base.ir import INT, POINTER, Function, Value, Variable
+from udkjax.native.base.ir import BOOL, INT, POINTER, Function, Value, Variable
 from udkjax.native.gpu.driver import CudaDriver, driver
 from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, GIVEN, PLATFORM, POP, PUSH, Words, stream_of
 from udkjax.threads import cores
 
 TO_HOST, TO_DEVICE, WAIT = "cuMemcpyDtoHAsync_v2", "cuMemcpyHtoDAsync_v2", "cuStreamSynchronize"
-HANDLER, THREADS = "handler", "threads"
-WORDS = Words((TO_HOST, TO_DEVICE, WAIT), (HANDLER, THREADS))  # also the handler of the operation, and the number of threads
+# The handler of the operation, the number of threads, and the address and the number of bytes of the pinned memory.
+HANDLER, THREADS, PINNED, PINNED_SIZE = "handler", "threads", "pinned", "pinned size"
+WORDS = Words((TO_HOST, TO_DEVICE, WAIT), (HANDLER, THREADS, PINNED, PINNED_SIZE))
 BUFFER_BYTES = 48  # XLA_FFI_Buffer
-ALIGNMENT = 64  # of arrays, in bytes
+ALIGNMENT = 64  # of arrays, in bytes; as many precede the pinned memory, whose first number is 1 while it is in use
+PINNED_BYTES = 2**20
+PORTABLE = 1  # CU_MEMHOSTALLOC_PORTABLE: for all devices
 FAILED = b"copying between the graphics card and the host failed: "
 LIBC = (
     *("declare ptr @malloc(i64)", "declare void @free(ptr)"),
@@ -77,8 +83,27 @@ def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Li
         threads: the number of threads that it may use; None: one for each core.
     """
     library = machine.library(module_text(), ("copy_and_call", "words"))
-    WORDS.fill(library, of, handler, cores() if threads is None else threads)
+    pinned = _pinned(of)
+    WORDS.fill(library, of, handler, cores() if threads is None else threads, pinned, PINNED_BYTES if pinned else 0)
     return library
+
+
+@cache
+def _pinned(of: CudaDriver) -> int:
+    """Return the address of pinned memory; 0 if there is none."""
+    place = ctypes.c_int64()
+    try:
+        with of.current(_device()):
+            of("cuMemHostAlloc", ctypes.addressof(place), ALIGNMENT + PINNED_BYTES, PORTABLE)
+    except RuntimeError:  # the driver has no memory, or JAX does not compute on the card
+        return 0
+    ctypes.memset(place.value, 0, ALIGNMENT)
+    return place.value
+
+
+def _device() -> int:
+    """Return the number of a device on which JAX computes already: a context on another would take its memory."""
+    return jax.local_devices(backend="cuda")[0].local_hardware_id
 
 
 @cache
@@ -95,16 +120,37 @@ def _copy_and_call() -> Function:
     frame = f.given["frame"]
     answer_metadata(f, frame)
     stream = stream_of(f, frame)
-    block = f.op(f"call ptr @malloc(i64 {_total_bytes(f, frame).name})", POINTER)
+    block, is_pinned = _block(f, _total_bytes(f, frame))
     with f.if_(f.is_null(block)):
         f.leave(f"ptr {no_memory(f, frame).name}")
     on_host = _frame_on_host(f, frame, block)
     answer, error = _run(f, frame, on_host, stream)
-    f.line(f"call void @free(ptr {block.name})")
+    f.choose(
+        is_pinned,
+        lambda: f.line(f"store atomic i64 0, ptr {WORDS.load(f, PINNED).name} seq_cst, align 8"),
+        lambda: f.line(f"call void @free(ptr {block.name})"),
+    )
     with f.if_(answer.value.is_not(0)):
         f.leave(f"ptr {WORDS.error(f, frame, FAILED, answer.value).name}")
     f.line(f"ret ptr {error.value.name}")
     return f
+
+
+def _block(f: Function, size: Value) -> tuple[Value, Value]:
+    """Return memory of so many bytes, or null, and whether it is the pinned memory, which is taken here."""
+    block, is_pinned = f.variable(Value(f, "null", POINTER), POINTER, 1), f.variable(False, BOOL, 1)
+    pinned = WORDS.load(f, PINNED)
+    with f.if_(size <= WORDS.load(f, PINNED_SIZE, INT)):
+        is_pinned.value = f.op(f"atomicrmw xchg ptr {pinned.name}, i64 1 seq_cst", INT).is_(0)
+
+    def take():
+        block.value = f.at(pinned, ALIGNMENT, "i8")
+
+    def allocate():
+        block.value = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)
+
+    f.choose(is_pinned.value, take, allocate)
+    return block.value, is_pinned.value
 
 
 def _buffers(f: Function, frame: Value, kind: int) -> tuple[Value, Value]:
