@@ -65,7 +65,7 @@ def run_threads(code: KernelCode, call: Called) -> list[np.ndarray]:
     run = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(library["run_member"])
     outputs = [np.full(x.shape, np.nan) for x in call.outputs]
     record = call_record(code, call, [x.ctypes.data for x in (*call.inputs, *outputs)])
-    block = np.full(code.size + 8, np.nan)
+    block = np.full(code.code.size + 8, np.nan)
     work = -(-block.ctypes.data // 64) * 64
     for member in range(len(outputs[0]) + 3):  # a block has threads without a member
         run(record.ctypes.data, work, member)

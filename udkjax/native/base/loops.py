@@ -19,6 +19,12 @@ class LoopWriter:
         self._kernels: dict[tuple[Kernel, int, int], str] = {}
         self._tables: dict[bytes, str] = {}
 
+    @property
+    def parts(self) -> tuple[list[Function], list[Function]]:
+        """The functions of programs, and those of their kernels."""
+        kernels = {*self._kernels.values()}
+        return [f for f in self.functions if f.name not in kernels], [f for f in self.functions if f.name in kernels]
+
     def write(
         self, program: LoopProgram, name: str, pointers: Sequence[str], at: Mapping[str, PointerPlace], width: int | None = None
     ) -> None:

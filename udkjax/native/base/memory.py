@@ -2,11 +2,21 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.base.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, Plan
+
+
+class ThreadCode(NamedTuple):
+    """The functions of a thread of a GPU, which runs one member."""
+
+    functions: list[Function]  # `run_member(call, work, member)` and what it calls
+    shared: list[Function]  # further functions, whose arguments point to any memory
+    globals: list[str]
+    size: int  # numbers in the memory of a thread
 
 
 class Memory:
@@ -44,6 +54,10 @@ class Memory:
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
+        raise NotImplementedError
+
+    def thread_code(self) -> "ThreadCode":
+        """Write the functions of a thread of a GPU."""
         raise NotImplementedError
 
     def layout(self, pointer: str) -> Layout:

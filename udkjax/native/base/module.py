@@ -7,9 +7,9 @@ from udkjax.expressions.loop_derivative import FORWARD
 from udkjax.native.base.ir import BOOL, POINTER, Function, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter
-from udkjax.native.base.memory import Memory
+from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.program import PointerPlace, consecutive, write
-from udkjax.native.base.running import write_run
+from udkjax.native.base.running import memory_size, write_run, write_run_member
 from udkjax.native.base.steps import POINTS
 
 # Rarely called functions: once per run, near singular configurations, or where a piece may end.
@@ -136,6 +136,12 @@ class Module(Memory):
         functions = [*self.functions, *self.loops.functions]
         declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
         return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
+
+    def thread_code(self) -> ThreadCode:
+        self.write_functions()
+        write_run_member(self)
+        programs, kernels = self.loops.parts
+        return ThreadCode([*self.functions, *programs], kernels, self.loops.globals, memory_size(self))
 
     def write_functions(self):
         """Write all functions but `run`."""

@@ -9,10 +9,9 @@ import re
 from collections.abc import Collection
 from typing import NamedTuple
 
-from udkjax.native.base.ir import Function
+from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.module import Module
 from udkjax.native.base.program import UnsupportedError
-from udkjax.native.base.running import memory_size, write_run_member
 from udkjax.native.operations import Operation
 
 NAME = "run_members"  # of the kernel
@@ -49,35 +48,34 @@ define ptx_kernel void @{NAME}(ptr byval([FIELDS x i64]) align 8 %call) {{
 
 
 class KernelCode(NamedTuple):
-    """The functions of a kernel, with the module whose call record it takes."""
+    """The code of a kernel, with the module whose call record it takes."""
 
-    module: Module
-    functions: list[Function]  # `run_member(call, work, member)` and what it calls, but `meet`
-    size: int  # numbers in the memory of a thread
+    module: Memory
+    code: ThreadCode
 
     @property
     def text(self) -> str:
         """LLVM's text of the kernel."""
-        kernel = KERNEL.replace("FIELDS", str(len(self.module.call_fields))).replace("SIZE", str(self.size))
+        kernel = KERNEL.replace("FIELDS", str(len(self.module.call_fields))).replace("SIZE", str(self.code.size))
         return self.functions_text(LOCAL) + kernel
 
     def functions_text(self, local: Collection[str]) -> str:
         """Return LLVM's text of the functions; `local` are the names of arguments that point to a thread's own memory."""
-        declared = sorted(set().union(*(f.declared for f in self.functions)))
-        return "\n".join([*declared, *self.module.loops.globals, *(f.text(local) for f in self.functions)])
+        functions, shared = self.code.functions, self.code.shared
+        declared = sorted(set().union(*(f.declared for f in (*functions, *shared))))
+        texts = [*(f.text(local) for f in functions), *(f.text(()) for f in shared)]
+        return "\n".join([*declared, *self.code.globals, *texts])
 
 
 def kernel_code(operation: Operation, directions: int = 0) -> KernelCode:
     """Write the kernel of an operation, for a number of directions; raise `UnsupportedError` if there is none."""
-    module = operation.module(1, 1, VECTOR)
-    if operation.is_reverse or not isinstance(module, Module):
+    if operation.is_reverse:
         raise UnsupportedError(f"{type(operation).__name__} on a GPU")
-    if module.ways:
+    module = operation.module(1, 1, VECTOR)
+    if isinstance(module, Module) and module.ways:
         module.tangents_begin = module.places.add("all tangents", directions * len(module.ways) * module.tangents.size)
-    module.write_functions()
-    write_run_member(module)
-    code = KernelCode(module, [*module.functions, *module.loops.functions], memory_size(module))
-    for name in sorted({x[x.index("@") + 1 : x.index("(")] for f in code.functions for x in f.declared}):
+    code = module.thread_code()
+    for name in sorted({x[x.index("@") + 1 : x.index("(")] for f in (*code.functions, *code.shared) for x in f.declared}):
         if not re.fullmatch(rf"llvm\.({'|'.join(INTRINSICS)})\.(v\d+)?f64|llvm\.vector\.reduce\.\w+\.v\d+\w+", name):
             raise UnsupportedError(f"{name} on a GPU")  # LLVM would end the process
-    return code
+    return KernelCode(module, code)

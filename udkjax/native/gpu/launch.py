@@ -69,7 +69,7 @@ def _load(operation: Operation, directions: int) -> str | None:
     Without a graphics card nothing is compiled: the program is only written here.
     """
     code, found = kernel_code(operation, directions), driver()
-    if 8 * code.size > MOST_MEMORY:
+    if 8 * code.code.size > MOST_MEMORY:
         return None
     name = f"udkjax_kernel_{machine.digest(code.text)}"
     if found is None:

@@ -15,7 +15,7 @@ from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter
-from udkjax.native.base.memory import Memory
+from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.steps import NEAREST_STAGE, ROUNDING_PIVOT
 from udkjax.native.base.tableau import EULER
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -199,10 +199,7 @@ class ScaleCode(Memory):
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
-        loops, size = LoopWriter(1, cold=True), self._code.scale_count
-        at = {name: ("work", place) for name, place in self.places.places.items()}
-        at |= {"numbers": ("numbers", 0), "scales": ("scales", 0)}
-        loops.write(self._code.scales.program, "find_scales", ("numbers", "work", "scales"), at)
+        loops = self._write_loops()
         f = Function("run", [(POINTER, "call")])
         block, work = self.allocate(f, f.const(self.places.size, INT))
         members, following = self.field(f, "members"), self.field(f, "next", POINTER)
@@ -212,10 +209,29 @@ class ScaleCode(Memory):
 
         member = f.variable(take(), INT)
         with f.while_(lambda: member.value < members):
-            numbers, to = self.member_address(f, "numbers", member.value), self.result_address(f, "scales", member.value, size)
-            f.call("find_scales", numbers, work, to)
+            self._find_scales(f, work, member.value)
             member.value = take()
         f.line(f"call void @free(ptr {block.name})")
         functions = [*loops.functions, f]
         declared = sorted(set().union(*(x.declared for x in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
         return "\n".join([*declared, *loops.globals, *(x.text() for x in functions)])
+
+    def thread_code(self) -> ThreadCode:
+        loops = self._write_loops()
+        f = Function("run_member", [(POINTER, "call"), (POINTER, "work"), (INT, "member")])
+        with f.if_(f.given["member"] < self.field(f, "members")):
+            self._find_scales(f, f.given["work"], f.given["member"])
+        programs, kernels = loops.parts
+        return ThreadCode([f, *programs], kernels, loops.globals, self.places.size)
+
+    def _write_loops(self) -> LoopWriter:
+        """Write `find_scales(numbers, work, scales)`."""
+        loops = LoopWriter(1, cold=True)
+        at = {name: ("work", place) for name, place in self.places.places.items()}
+        at |= {"numbers": ("numbers", 0), "scales": ("scales", 0)}
+        loops.write(self._code.scales.program, "find_scales", ("numbers", "work", "scales"), at)
+        return loops
+
+    def _find_scales(self, f: Function, work: Value, member: Value):
+        numbers, to = self.member_address(f, "numbers", member), self.result_address(f, "scales", member, self._code.scale_count)
+        f.call("find_scales", numbers, work, to)
