@@ -21,6 +21,7 @@ NAMES = (
     "identification",
     "uniqueness",
     "live",
+    "gpu",
     "peers",
 )
 

@@ -78,9 +78,9 @@ class Card:
     def address(self, name):
         return ctypes.cast(self._functions[name], ctypes.c_void_p).value
 
-    def within_cpu(self, library):
+    def within_cpu(self, library, name="copy_and_call"):
         """A handler of the CPU that calls the handler of a library in a frame whose API has the stream of a card."""
-        handle = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(library["copy_and_call"])
+        handle = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(library[name])
 
         @ctypes.CFUNCTYPE(ctypes.c_void_p, ADDRESS)
         def stream(struct):
@@ -100,7 +100,7 @@ class Card:
                 self.write(frame + ffi.API, api)
 
         self._functions[next(self._frames)] = stream, trampoline, library
-        return {"copy_and_call": ctypes.cast(trampoline, ctypes.c_void_p).value}
+        return {name: ctypes.cast(trampoline, ctypes.c_void_p).value}
 
 
 @pytest.fixture

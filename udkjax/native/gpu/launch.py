@@ -28,6 +28,7 @@ KERNEL_MEMBERS = 4096
 BLOCK = 128  # threads of a block
 MOST_MEMORY = 2**16  # bytes of a thread; the driver reserves them for each of the 270,000 threads that an H100 can hold
 LAUNCH, KERNEL = "cuLaunchKernel", "kernel"
+TARGET = "udkjax_kernel_"  # how names of FFI targets begin
 WORDS = Words((LAUNCH,), (KERNEL,))
 FAILED = b"launching a kernel for a batch failed: "
 # Attributes of a function and of a device (CUfunction_attribute, CUdevice_attribute).
@@ -71,7 +72,7 @@ def _load(operation: Operation, directions: int) -> str | None:
     code, found = kernel_code(operation, directions), driver()
     if 8 * code.code.size > MOST_MEMORY:
         return None
-    name = f"udkjax_kernel_{machine.digest(code.text)}"
+    name = f"{TARGET}{machine.digest(code.text)}"
     if found is None:
         return name
     with _REGISTERING:

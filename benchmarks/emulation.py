@@ -9,7 +9,7 @@ import numpy as np
 
 from udkjax.native import primitive
 from udkjax.native.base import machine
-from udkjax.native.gpu.kernel import KernelCode
+from udkjax.native.gpu.kernel import VECTOR, KernelCode
 from udkjax.native.operations import Operation
 
 ALONE = "define i1 @meet(i1 %goes_on) { ret i1 %goes_on }\n"  # a block of one thread
@@ -34,16 +34,23 @@ def calls_of(function: Callable, *given: Any) -> list[Called]:
 
     def record(*inputs: Any, operation: Operation, times: int) -> list[np.ndarray]:
         arrays = [np.ascontiguousarray(x, float) for x in inputs]
-        outputs = call_members(*arrays, operation=operation, times=times)
+        code = primitive.machine_code(operation, 1, 1)  # dense methods round otherwise in lanes
+        outputs = code(arrays, operation.shapes(arrays, times))
         calls.append(Called(operation, arrays, times, [np.array(x) for x in outputs]))
         return outputs
 
-    primitive.call_members = record
+    caches, lanes = (primitive.generate, primitive.machine_code), machine.lanes
+    for cache in caches:
+        cache.cache_clear()
+    # Sums over vectors depend on the size of a register.
+    primitive.call_members, machine.lanes = record, lambda: VECTOR
     try:
         with jax.disable_jit():
             function(*given)
     finally:
-        primitive.call_members = call_members
+        primitive.call_members, machine.lanes = call_members, lanes
+        for cache in caches:
+            cache.cache_clear()
     return [call for call in calls if call.outputs[0].shape[0] > 1]
 
 
@@ -58,15 +65,24 @@ def call_record(code: KernelCode, call: Called, addresses: Sequence[int]) -> np.
     return np.array(words, np.int64)
 
 
+class Thread:
+    """A thread of a kernel on this processor."""
+
+    def __init__(self, code: KernelCode):
+        self._library = machine.Library([machine.compile_module(ALONE + code.functions_text(()))], ["run_member"])
+        kinds = ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64
+        self._run = ctypes.CFUNCTYPE(None, *kinds)(self._library["run_member"])
+        self._memory = np.full(code.code.size + 8, np.nan)
+
+    def __call__(self, record: int, member: int):
+        """Run a member, from the address of the call record."""
+        self._run(record, -(-self._memory.ctypes.data // 64) * 64, member)
+
+
 def run_threads(code: KernelCode, call: Called) -> list[np.ndarray]:
     """What the threads write, one after another."""
-    text = ALONE + code.functions_text(())
-    library = machine.Library([machine.compile_module(text)], ["run_member"])
-    run = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(library["run_member"])
-    outputs = [np.full(x.shape, np.nan) for x in call.outputs]
+    thread, outputs = Thread(code), [np.full(x.shape, np.nan) for x in call.outputs]
     record = call_record(code, call, [x.ctypes.data for x in (*call.inputs, *outputs)])
-    block = np.full(code.code.size + 8, np.nan)
-    work = -(-block.ctypes.data // 64) * 64
     for member in range(len(outputs[0]) + 3):  # a block has threads without a member
-        run(record.ctypes.data, work, member)
+        thread(record.ctypes.data, member)
     return outputs

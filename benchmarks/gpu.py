@@ -1,0 +1,246 @@
+"""Runs on a graphics card of NVIDIA: batches as kernels, and what a user gets in eager, jitted and batched calls.
+
+Where a card is, it takes at most five minutes and needs nothing but this repository's folders, JAX, diffrax and llvmlite. Without
+one it says so, and runs the threads of the kernels one after another on this processor.
+"""
+
+import json
+import os
+import statistics
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import udkjax as udk
+from benchmarks.batch import SPREAD, angles, ours, states
+from benchmarks.emulation import calls_of, run_threads
+from benchmarks.scripts import solve
+from udkjax.native.gpu.kernel import kernel_code
+
+END, OUTPUTS = 20.0, 101  # s; output times of runs with dense output
+TOLERANCES = (1e-6, 1e-9)
+SIZES = (1, 64, 256, 1024, 4096, 16_384, 65_536, 262_144, 1_048_576)
+MANY, CHECKED = 262_144, 4096  # members of throughputs, and of comparisons
+SCENES = {"excavator": 20.0, "andrews_squeezer": 0.03, "n_four_bar": 20.0, "slider_crank": 20.0, "four_bar": 20.0}  # ends (s)
+SCRIPT_LANES = 4096
+LIMIT = 280.0  # s of all measurements together
+
+
+class Report:
+    """The figures of this benchmark; a measurement that fails is a figure with its error, and the others go on."""
+
+    def __init__(self, limit: float):
+        self.figures: list[dict[str, Any]] = []
+        self._end = time.perf_counter() + limit
+
+    def add(self, name: str, **values: Any):
+        self.figures.append({"name": name} | values)
+        print(json.dumps(self.figures[-1], default=float), flush=True)
+
+    def take(self, measure: Callable[..., None], *arguments: Any):
+        """Run a measurement, unless the time is up."""
+        if time.perf_counter() > self._end:
+            self.add(measure.__name__, skipped="the time is up")
+            return
+        try:
+            measure(self, *arguments)
+        except Exception as error:
+            self.add(measure.__name__, failed=repr(error)[:500], where=traceback.format_exc()[-800:])
+
+
+def seconds(call: Callable[[], Any], repetitions: int = 3, most: float = 10.0) -> float:
+    """Return the median time of a call (s), after one that is not counted."""
+    jax.block_until_ready(call())
+    times: list[float] = []
+    while len(times) < repetitions and sum(times) < most:
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def _scene(name: str) -> Any:
+    make = getattr(udk.library, name)
+    return make(5) if name == "n_four_bar" else make()
+
+
+def _released(members: int) -> jax.Array:
+    return jax.device_put(states(angles(-45.0, members) if members > 1 else np.deg2rad([-45.0])))
+
+
+def equality(report: Report):
+    """Whether a kernel's results equal those of the host in all bits."""
+    mechanism = udk.library.parallelogram()
+    for outputs in (2, 11):
+        run, y = ours(mechanism, np.linspace(0.0, END, outputs)), states(angles(-45.0, CHECKED))
+        for tol in TOLERANCES:
+            on_card = np.asarray(jax.jit(run)(jax.device_put(y), tol))
+            with jax.default_device(jax.devices("cpu")[0]):
+                on_host = np.asarray(jax.jit(run)(jax.device_put(y, jax.devices("cpu")[0]), tol))
+            same = np.all(on_card == on_host, axis=(1, 2))
+            report.add("equality", outputs=outputs, tol=tol, equal=same.mean(), largest=np.abs(on_card - on_host).max())
+
+
+def throughput(report: Report, outputs: int, sizes: tuple[int, ...], tolerances: tuple[float, ...] = TOLERANCES):
+    """Runs a second, over numbers of members."""
+    run = jax.jit(ours(udk.library.parallelogram(), np.linspace(0.0, END, outputs)))
+    for members in sizes:
+        y = _released(members)
+        for tol in tolerances:
+            start = time.perf_counter()
+            jax.block_until_ready(run(y, tol))
+            first, each = time.perf_counter() - start, seconds(lambda y=y, tol=tol: run(y, tol))
+            of = {"outputs": outputs, "members": members, "tol": tol}
+            report.add("throughput", **of, first=first, ms=each * 1e3, a_second=members / each)
+
+
+def numbers(report: Report):
+    """Runs a second of mechanisms with different masses, which are assembled and scaled as well."""
+    mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, END, 2)
+
+    def one(mass):
+        return udk.simulate(mechanism.with_parameters({"body.coupler.mass": mass}), ts, rtol=1e-6, atol=1e-6, throw=False).q[-1]
+
+    run, masses = jax.jit(jax.vmap(one)), jnp.linspace(1.0, 3.0, MANY)
+    each = seconds(lambda: run(masses))
+    report.add("numbers", members=MANY, ms=each * 1e3, a_second=MANY / each)
+
+
+def tangents(report: Report):
+    """Runs a second with a derivative by a mass."""
+    mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, END, 2)
+    known = udk.analyse(mechanism)
+
+    def one(mass, y0):
+        state = udk.State(y0[:12].reshape(4, 3), y0[12:].reshape(4, 3))
+        moved = mechanism.with_parameters({"body.coupler.mass": mass})
+        return udk.simulate(moved, ts, state, 1e-6, 1e-6, throw=False, analysis=known).q[-1].ravel()
+
+    for members in (CHECKED, MANY):
+        masses, y = jnp.linspace(1.0, 3.0, members), _released(members)
+        batch = lambda m, y: jax.vmap(lambda m, y: jax.jvp(lambda m: one(m, y), (m,), (1.0,)))(m, y)  # noqa: E731
+        run = jax.jit(batch)
+        if members == CHECKED:
+            on_card = [np.asarray(x) for x in run(masses, y)]
+            cpu = jax.devices("cpu")[0]
+            with jax.default_device(cpu):
+                on_host = [np.asarray(x) for x in jax.jit(batch)(jax.device_put(masses, cpu), jax.device_put(y, cpu))]
+            report.add("tangents", equal=[bool(np.array_equal(a, b)) for a, b in zip(on_card, on_host, strict=True)])
+        each = seconds(lambda m=masses, y=y, run=run: run(m, y))
+        report.add("tangents", members=members, ms=each * 1e3, a_second=members / each)
+
+
+def gradients(report: Report):
+    """A gradient in reverse mode, of one run and of a batch: computed by the host."""
+    mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, 2.0, 11)
+    known = udk.analyse(mechanism)
+
+    def loss(mass):
+        moved = mechanism.with_parameters({"body.coupler.mass": mass})
+        return jnp.sum(udk.simulate(moved, ts, rtol=1e-6, atol=1e-6, throw=False, analysis=known).q ** 2)
+
+    gradient = jax.grad(loss)
+    for kind, run, given in (
+        ("one", jax.jit(gradient), jnp.asarray(2.0)),
+        ("batch", jax.jit(jax.vmap(gradient)), jnp.linspace(1.0, 3.0, CHECKED)),
+    ):
+        each = seconds(lambda run=run, given=given: run(given))
+        report.add("gradients", kind=kind, members=given.size, ms=each * 1e3)
+
+
+def scenes(report: Report, name: str):
+    """Runs a second of a mechanism from the library, with gravity and masses of the members from 80 to 120 percent."""
+    mechanism, members, end = _scene(name), 65_536, SCENES[name]
+    mass = next(x for x in mechanism.parameters() if x.endswith(".mass"))
+    given, known = float(mechanism.parameters()[mass]), udk.analyse(mechanism)
+
+    def one(share):
+        moved = mechanism.with_parameters({mass: given * share})
+        return udk.simulate(moved, np.linspace(0.0, end, 2), rtol=1e-6, atol=1e-6, throw=False, analysis=known).q[-1]
+
+    run, shares = jax.jit(jax.vmap(one)), jnp.linspace(0.8, 1.2, members)
+    start = time.perf_counter()
+    few = np.asarray(run(shares)[:64])
+    first, each = time.perf_counter() - start, seconds(lambda: run(shares))
+    cpu = jax.devices("cpu")[0]
+    with jax.default_device(cpu):
+        on_host = np.asarray(jax.jit(jax.vmap(one))(jax.device_put(np.asarray(shares[:64]), cpu)))
+    equal = np.mean(np.all(few == on_host, axis=(1, 2)))
+    report.add("scenes", scene=name, members=members, first=first, ms=each * 1e3, a_second=members / each, equal=equal)
+
+
+def calls(report: Report):
+    """What one run takes: eager, jitted, in a scan; on this machine's default device, and on its processor."""
+    mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, END, 2)
+    y = states(np.deg2rad([-45.0]))[0]
+
+    def one(y0):
+        state = udk.State(y0[:12].reshape(4, 3), y0[12:].reshape(4, 3))
+        return udk.simulate(mechanism, ts, state, 1e-6, 1e-6, throw=False).q[-1]
+
+    def many(y0):
+        return jax.lax.scan(lambda y, _: (y, one(y)[0, 0]), y0, length=100)[1]
+
+    for device in (jax.devices()[0], jax.devices("cpu")[0]):
+        with jax.default_device(device):
+            given = jax.device_put(y, device)
+            start = time.perf_counter()
+            udk.simulate(mechanism, ts, rtol=1e-6, atol=1e-6)
+            first = time.perf_counter() - start
+            eager = seconds(lambda: udk.simulate(mechanism, ts, rtol=1e-6, atol=1e-6).q, 20)
+            jitted, scanned = jax.jit(one), jax.jit(many)
+            report.add(
+                "calls",
+                device=device.platform,
+                first=first,
+                eager_ms=eager * 1e3,
+                jitted_ms=seconds(lambda given=given, jitted=jitted: jitted(given), 50) * 1e3,
+                of_scan_ms=seconds(lambda given=given, scanned=scanned: scanned(given)) * 10,
+            )
+
+
+def script(report: Report):
+    """Runs a second by a script with diffrax under vmap, on the same card."""
+    ts = jnp.linspace(0.0, END, 2)
+    run, y = jax.jit(jax.vmap(solve(ts), in_axes=(0, None))), _released(SCRIPT_LANES)
+    each = seconds(lambda: run(y, 1e-6), 2)
+    report.add("script", members=SCRIPT_LANES, ms=each * 1e3, a_second=SCRIPT_LANES / each)
+
+
+def emulated(smoke: bool) -> list[dict[str, Any]]:
+    """Compare the threads of kernels, one after another on this processor, with the engine."""
+    figures, mechanism = [], udk.library.parallelogram()
+    members, end = (3, 0.2) if smoke else (64, END)
+    for outputs in (2, 11):
+        run, y = ours(mechanism, np.linspace(0.0, end, outputs)), states(angles(-45.0, members))
+        for call in calls_of(run, y, 1e-6):
+            results = run_threads(kernel_code(call.operation, call.directions), call)
+            same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(results, call.outputs, strict=True))
+            figures.append({"name": "emulation", "operation": type(call.operation).__name__, "outputs": outputs, "equal": same})
+            print(figures[-1])
+    return figures
+
+
+def main(smoke: bool = False) -> list[dict[str, Any]]:
+    """Print the figures, a line for each."""
+    if jax.default_backend() != "gpu":
+        print("no graphics card: the threads of kernels one after another on this processor, beside the engine")
+        return emulated(smoke)
+    report = Report(LIMIT)
+    report.add("card", card=jax.devices()[0].device_kind, jax=jax.__version__, cores=os.cpu_count(), spread=SPREAD)
+    report.take(equality)
+    report.take(throughput, 2, SIZES)
+    report.take(calls)
+    report.take(throughput, OUTPUTS, (4096, 65_536, 262_144), (1e-6,))
+    report.take(tangents)
+    report.take(numbers)
+    report.take(gradients)
+    report.take(script)
+    for name in SCENES:
+        report.take(scenes, name)
+    return report.figures

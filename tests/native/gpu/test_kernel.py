@@ -1,0 +1,210 @@
+"""Kernels without a graphics card: their threads one after another, equal to the engine in all bits, also in programs of JAX."""
+
+import itertools
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.interpreters import mlir
+from numpy.testing import assert_array_equal
+
+import udkjax as udk
+from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
+from udkjax.native import primitive
+from udkjax.native.base import machine
+from udkjax.native.base.program import UnsupportedError
+from udkjax.native.gpu import launch, target
+from udkjax.native.gpu.kernel import VECTOR, kernel_code
+
+emulation = pytest.importorskip("benchmarks.emulation", reason="not in a source tree")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")
+
+LINKAGE, FOUR_BAR, PENDULUM = udk.library.parallelogram(), udk.library.four_bar(), udk.library.compound_pendulum()
+MASSES = np.linspace(1.0, 2.0, 5)
+BOUNCER = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, 1.0))})
+FLOOR = udk.Contact("ball", restitution=0.8, name="floor")
+
+
+def last(mechanism, name, times=2, end=0.5, **options):
+    """A function of a parameter: the last positions."""
+    ts = np.linspace(0.0, end, times)
+
+    def run(x):
+        return udk.simulate(mechanism.with_parameters({name: x}), ts, rtol=1e-7, atol=1e-7, throw=False, **options).q
+
+    return run
+
+
+def with_tangent(f):
+    return lambda x: jax.jvp(f, (x,), (1.0,))
+
+
+def with_second(f):
+    return lambda x: jax.jvp(jax.jacfwd(f), (x,), (1.0,))
+
+
+RUNS = {
+    "redundant": last(LINKAGE, "body.coupler.mass"),
+    "outputs": last(LINKAGE, "body.coupler.mass", 7),
+    "closed": last(FOUR_BAR, "pin.B[0]", 3),
+    "Baumgarte": last(LINKAGE, "body.coupler.mass", stabilization=udk.Baumgarte()),
+    "Tsit5": last(LINKAGE, "body.coupler.mass", solver=diffrax.Tsit5()),
+    "SVD": last(LINKAGE, "body.coupler.mass", method=udk.SVD()),
+    "tangent": with_tangent(last(PENDULUM, "body.rod.mass", 4)),
+    "two tangents": jax.jacfwd(lambda x: last(FOUR_BAR, "pin.B", 3)(jnp.stack([x, 1.0]))),
+    "second tangent": with_second(last(PENDULUM, "body.rod.mass", 3)),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_threads_compute_what_the_engine_computes(name):
+    calls = emulation.calls_of(jax.vmap(RUNS[name]), MASSES)
+    served = 0
+    for call in calls:
+        if call.operation.is_reverse:
+            continue
+        results = emulation.run_threads(kernel_code(call.operation, call.directions), call)
+        for found, known in zip(results, call.outputs, strict=True):
+            assert_array_equal(found, known)
+        served += 1
+    assert served
+
+
+def test_operations_without_a_kernel_are_refused():
+    calls = emulation.calls_of(jax.vmap(jax.grad(lambda x: RUNS["tangent"](x)[0].sum())), MASSES)
+    (name, *_) = (type(x.operation).__name__ for x in calls if x.operation.is_reverse)
+    with pytest.raises(UnsupportedError, match=f"{name} on a GPU"):
+        kernel_code(next(x.operation for x in calls if x.operation.is_reverse))
+
+
+class Launching(Card):
+    """A card that runs the threads of a kernel one after another."""
+
+    def __init__(self):
+        super().__init__()
+        self.threads, self.grids = [], []
+        self.add("cuLaunchKernel", 11, self._launch)
+
+    def _launch(self, kernel, *given):
+        x, y, z, threads, *others, shared = (word & 0xFFFFFFFF for word in given[:7])
+        stream, parameters, extra = given[7:]
+        assert (y, z, *others, shared, stream, extra) == (1, 1, 1, 1, 0, STREAM, 0)
+        self.grids.append((x, threads))
+        for member in range(x * threads):
+            self.threads[kernel - 1](ADDRESS.from_address(parameters).value, member)
+
+    def load_kernel(self, of, code):
+        assert of is self
+        self.threads.append(emulation.Thread(code))
+        return len(self.threads)
+
+
+@pytest.fixture
+def card(monkeypatch):
+    """A card; in the test, programs of the CPU are lowered as for the card, and all batches are kernels."""
+    card, load = Launching(), launch.load_handler
+    for name, value in {
+        "PLATFORM": "cpu",
+        "TARGET": f"udkjax_test_{next(NUMBERS)}_",
+        "KERNEL_MEMBERS": 2,
+        "BLOCK": 4,
+        "driver": lambda: card,
+        "load_kernel": card.load_kernel,
+        "load_handler": lambda *given: card.within_cpu(load(*given), "launch"),
+        "_has_memory": lambda of, kernel: True,
+    }.items():
+        monkeypatch.setattr(launch, name, value)
+    monkeypatch.setattr(machine, "lanes", lambda: VECTOR)
+    mlir.register_lowering(primitive.native_p, mlir.lower_fun(as_for_a_card), platform="cpu")
+    _forget()
+    yield card
+    mlir.register_lowering(primitive.native_p, mlir.lower_fun(primitive._lower), platform="cpu")
+    _forget()
+
+
+def as_for_a_card(*inputs, operation, times):
+    """A kernel, or else what the CPU does."""
+    name = launch.kernel_target(operation, max(x.shape[0] for x in inputs), inputs[-1].shape[1] if operation.tangents else 0)
+    if name is None:
+        return primitive._lower(*inputs, operation=operation, times=times)
+    return primitive._call_target(name, inputs, operation, times)
+
+
+def _forget():
+    for cache in (launch._load, primitive.generate, primitive.machine_code):
+        cache.cache_clear()
+    jax.clear_caches()
+
+
+NUMBERS = itertools.count()
+
+
+def both(request, function, *given):
+    """What a compiled function returns with the CPU's code and with kernels; and the card."""
+    machine_lanes = machine.lanes
+    machine.lanes = lambda: VECTOR
+    try:
+        _forget()
+        known = jax.tree.map(np.asarray, jax.jit(function)(*given))
+    finally:
+        machine.lanes = machine_lanes
+    card = request.getfixturevalue("card")
+    return known, jax.tree.map(np.asarray, jax.jit(function)(*given)), card
+
+
+@pytest.mark.parametrize("name", ["redundant", "tangent"])
+def test_programs_launch_batches(request, name):
+    known, found, card = both(request, jax.vmap(RUNS[name]), MASSES)
+    jax.tree.map(assert_array_equal, found, known)
+    assert card.grids and set(card.grids) == {(2, 4)}  # five members
+    pushed = [x for x in card.names if x.startswith("cuCtx")]
+    assert pushed == ["cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"] * len(card.grids)
+
+
+def test_scans_and_gradients_launch_batches(request):
+    run = jax.vmap(lambda x: RUNS["tangent"](x)[0].sum())
+
+    def scanned(xs):
+        return jax.lax.scan(lambda total, x: (total + run(x * MASSES).sum(), run(x * MASSES)), 0.0, xs)
+
+    def slopes(xs):
+        return jax.grad(lambda xs: (run(xs) ** 2).sum())(xs)
+
+    known, found, card = both(request, lambda xs: (scanned(xs), slopes(MASSES * xs[0])), np.array([1.0, 1.1]))
+    jax.tree.map(assert_array_equal, found, known)
+    assert len(card.grids) >= 2
+
+
+def test_an_error_of_the_launch_is_that_of_the_program(card):
+    card.failing["cuLaunchKernel"] = 1
+    with pytest.raises(Exception, match="launching a kernel for a batch failed: an illegal memory access was"):
+        jax.block_until_ready(jax.jit(jax.vmap(RUNS["redundant"]))(MASSES))
+    assert card.names[-2:] == ["cuCtxPopCurrent_v2", "cuGetErrorString"] and card.calls[-1][1] == ERROR
+
+
+def test_small_batches_stay_with_the_host(monkeypatch):
+    (call,) = (x for x in emulation.calls_of(jax.vmap(RUNS["redundant"]), MASSES) if type(x.operation).__name__ == "RunStates")
+    least = launch.KERNEL_MEMBERS
+    assert launch.kernel_target(call.operation, least - 1, 0) is None
+    assert launch.kernel_target(call.operation, least, 0).startswith(launch.TARGET)
+    for setting, members, served in (("7", 7, True), ("7", 6, False), ("never", 10**9, False)):
+        monkeypatch.setenv("UDKJAX_KERNEL_MEMBERS", setting)
+        assert (launch.kernel_target(call.operation, members, 0) is not None) == served
+    monkeypatch.setenv("UDKJAX_KERNEL_MEMBERS", "few")
+    with pytest.raises(ValueError, match='UDKJAX_KERNEL_MEMBERS is "few", not a number of members or "never"'):
+        launch.kernel_target(call.operation, 7, 0)
+
+
+@pytest.mark.parametrize("name", ["redundant", "tangent"])
+def test_kernels_are_assembled(name):
+    assembler = target.ptxas()
+    if assembler is None:
+        pytest.skip("no ptxas")
+    for call in emulation.calls_of(jax.vmap(RUNS[name]), MASSES):
+        if not call.operation.is_reverse:
+            text = target.ptx(kernel_code(call.operation, call.directions).text)
+            assert "ld.local" in text or type(call.operation).__name__ == "FindScales"
+            assert target.assemble(text, target.NEWEST, assembler)[:4] == b"\x7fELF"
