@@ -9,7 +9,7 @@ import numpy as np
 
 from udkjax.native import primitive
 from udkjax.native.base import machine
-from udkjax.native.gpu.kernel import VECTOR, KernelCode
+from udkjax.native.gpu.kernel import VECTOR, KernelCode, kernel_code
 from udkjax.native.operations import Operation
 
 ALONE = "define i1 @meet(i1 %goes_on) { ret i1 %goes_on }\n"  # a block of one thread
@@ -24,8 +24,9 @@ class Called(NamedTuple):
     outputs: list[np.ndarray]
 
     @property
-    def directions(self) -> int:
-        return self.inputs[-1].shape[1] if self.operation.tangents else 0
+    def kernel(self) -> KernelCode:
+        directions = self.inputs[-1].shape[1] if self.operation.tangents else 0
+        return kernel_code(self.operation, directions, len(self.inputs[0]) == 1)
 
 
 def calls_of(function: Callable, *given: Any) -> list[Called]:

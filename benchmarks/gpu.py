@@ -20,7 +20,6 @@ import udkjax as udk
 from benchmarks.batch import SPREAD, angles, ours, states
 from benchmarks.emulation import calls_of, run_threads
 from benchmarks.scripts import solve
-from udkjax.native.gpu.kernel import kernel_code
 
 END, OUTPUTS = 20.0, 101  # s; output times of runs with dense output
 TOLERANCES = (1e-6, 1e-9)
@@ -219,7 +218,7 @@ def emulated(smoke: bool) -> list[dict[str, Any]]:
     for outputs in (2, 11):
         run, y = ours(mechanism, np.linspace(0.0, end, outputs)), states(angles(-45.0, members))
         for call in calls_of(run, y, 1e-6):
-            results = run_threads(kernel_code(call.operation, call.directions), call)
+            results = run_threads(call.kernel, call)
             same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(results, call.outputs, strict=True))
             figures.append({"name": "emulation", "operation": type(call.operation).__name__, "outputs": outputs, "equal": same})
             print(figures[-1])

@@ -221,8 +221,7 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
 
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     """Lower for a graphics card of NVIDIA: large batches run as a kernel; the host computes all else."""
-    members, directions = max(x.shape[0] for x in inputs), inputs[-1].shape[1] if operation.tangents else 0
-    name = kernel_target(operation, members, directions) or _select_code(inputs, operation).name_on_card
+    name = kernel_target(operation, inputs) or _select_code(inputs, operation).name_on_card
     return _call_target(name, inputs, operation, times)
 
 

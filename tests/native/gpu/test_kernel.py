@@ -66,7 +66,7 @@ def test_threads_compute_what_the_engine_computes(name):
     for call in calls:
         if call.operation.is_reverse:
             continue
-        results = emulation.run_threads(kernel_code(call.operation, call.directions), call)
+        results = emulation.run_threads(call.kernel, call)
         for found, known in zip(results, call.outputs, strict=True):
             assert_array_equal(found, known)
         served += 1
@@ -127,7 +127,7 @@ def card(monkeypatch):
 
 def as_for_a_card(*inputs, operation, times):
     """A kernel, or else what the CPU does."""
-    name = launch.kernel_target(operation, max(x.shape[0] for x in inputs), inputs[-1].shape[1] if operation.tangents else 0)
+    name = launch.kernel_target(operation, inputs)
     if name is None:
         return primitive._lower(*inputs, operation=operation, times=times)
     return primitive._call_target(name, inputs, operation, times)
@@ -188,14 +188,18 @@ def test_an_error_of_the_launch_is_that_of_the_program(card):
 def test_small_batches_stay_with_the_host(monkeypatch):
     (call,) = (x for x in emulation.calls_of(jax.vmap(RUNS["redundant"]), MASSES) if type(x.operation).__name__ == "RunStates")
     least = launch.KERNEL_MEMBERS
-    assert launch.kernel_target(call.operation, least - 1, 0) is None
-    assert launch.kernel_target(call.operation, least, 0).startswith(launch.TARGET)
-    for setting, members, served in (("7", 7, True), ("7", 6, False), ("never", 10**9, False)):
+
+    def target_of(members):
+        return launch.kernel_target(call.operation, [np.zeros((members, *x.shape[1:])) for x in call.inputs])
+
+    assert target_of(least - 1) is None
+    assert target_of(least).startswith(launch.TARGET)
+    for setting, members, served in (("7", 7, True), ("7", 6, False), ("never", 10**4, False)):
         monkeypatch.setenv("UDKJAX_KERNEL_MEMBERS", setting)
-        assert (launch.kernel_target(call.operation, members, 0) is not None) == served
+        assert (target_of(members) is not None) == served
     monkeypatch.setenv("UDKJAX_KERNEL_MEMBERS", "few")
     with pytest.raises(ValueError, match='UDKJAX_KERNEL_MEMBERS is "few", not a number of members or "never"'):
-        launch.kernel_target(call.operation, 7, 0)
+        target_of(7)
 
 
 @pytest.mark.parametrize("name", ["redundant", "tangent"])
@@ -205,6 +209,6 @@ def test_kernels_are_assembled(name):
         pytest.skip("no ptxas")
     for call in emulation.calls_of(jax.vmap(RUNS[name]), MASSES):
         if not call.operation.is_reverse:
-            text = target.ptx(kernel_code(call.operation, call.directions).text)
+            text = target.ptx(call.kernel.text)
             assert "ld.local" in text or type(call.operation).__name__ == "FindScales"
             assert target.assemble(text, target.NEWEST, assembler)[:4] == b"\x7fELF"

@@ -22,7 +22,7 @@ _COMPARE = {
     "ne": ("une", "ne"),
 }
 
-LOCAL_SPACE = 5  # of the memory of one thread, in NVPTX
+SHARED_SPACE, LOCAL_SPACE = 3, 5  # of the memory of a block and of one thread, in NVPTX
 
 
 class Variable:
@@ -60,6 +60,7 @@ class Function:
         self._arguments, self._lines, self._reserved = list(arguments), [], []
         self._count, self.declared = 0, set()
         self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
+        self.given["shared"] = Value(self, "%shared", POINTER)  # memory of the block, in a thread of a GPU
 
     # --- text
 
@@ -83,9 +84,9 @@ class Function:
         """Return the definition; the LLVM intrinsics that it calls are in `declared`.
 
         Args:
-            local: For the thread of a GPU, the names of the arguments that point to its own memory. LLVM infers the address
-                space of all that is computed from a pointer that has been cast to it once. Functions are not inlined, as each
-                copy would take room in the cache of instructions.
+            local: For the thread of a GPU, the names of the arguments that point to its own memory; empty to run it on this
+                processor. LLVM infers the address space of all that is computed from a pointer that has been cast to it once.
+                Functions are not inlined, as each copy would take room in the cache of instructions.
         """
         casts, names = [], {n: n for _, n in self._arguments}
         for base, n in self._arguments if local is not None else ():
@@ -93,6 +94,12 @@ class Function:
                 names[n] = f"{n}.given"
                 casts.append(f"%{n}.local = addrspacecast ptr %{n}.given to ptr addrspace({LOCAL_SPACE})")
                 casts.append(f"%{n} = addrspacecast ptr addrspace({LOCAL_SPACE}) %{n}.local to ptr")
+        if any("ptr %shared" in line for line in self._lines):
+            casts.append(
+                f"%shared = addrspacecast ptr addrspace({SHARED_SPACE}) @shared to ptr"
+                if local
+                else "%shared = getelementptr i8, ptr @shared, i64 0"
+            )
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{names[n]}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None
         body = "\n  ".join([*casts, *self._reserved, *self._lines, *([end] if end else [])])

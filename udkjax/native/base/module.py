@@ -40,6 +40,7 @@ class Module(Memory):
     mode = FORWARD  # mode of differentiation
     ways: tuple[str, ...] = ()  # prefixes of the inputs of each tangent of a group, in forward mode
     group = 1  # directions of a tangent
+    shares_constants = False  # whether the members of a block of threads have the same constants, in its shared memory
     tangents_begin: int | None = None
     """Where the memory of directions begins, relative to `work`; None if it is a block of its own."""
 
@@ -220,9 +221,14 @@ class Module(Memory):
         """Write an unrolled program."""
 
         def find(places: Sequence[PointerPlace]) -> list[PointerPlace]:
-            return [(at[x][0], at[x][1] + k) if x in at else (pointers[0], 0) for x, k in places]
+            return [place(x, k) if x in at else (pointers[0], 0) for x, k in places]
 
-        lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers}
+        def place(x: str, k: int) -> PointerPlace:
+            pointer, index = at[x][0], at[x][1] + k
+            is_shared = self.shares_constants and (x, pointer) == ("constants", "work")
+            return ("shared", k) if is_shared and index != self.drop_tol_place else (pointer, index)  # which a run changes
+
+        lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers} | {"shared": 1}
         inputs, outputs = find(program.inputs), find(program.outputs)
         self.functions.append(
             write(

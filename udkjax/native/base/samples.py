@@ -50,6 +50,8 @@ def write_enter(module: Module):
     f.call("prologue", numbers, constants)
     with f.each(module.constants) as i:
         module.put_lane_entry(f, "constants", lane, f.load(constants, i), i)
+        if module.shares_constants:  # all threads write the same
+            f.store(f.load(constants, i), f.given["shared"], i)
     if module.falls_back and not module.unrolled:
         count = len(module.code.constants)
         all_constants, tol = Value(f, f.reserve(DOUBLE, count), POINTER), module.lane_entry(f, "fallback_tol", lane)

@@ -9,6 +9,7 @@ import re
 from collections.abc import Collection
 from typing import NamedTuple
 
+from udkjax.native.base.ir import SHARED_SPACE
 from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.module import Module
 from udkjax.native.base.program import UnsupportedError
@@ -52,6 +53,7 @@ class KernelCode(NamedTuple):
 
     module: Memory
     code: ThreadCode
+    constants: int  # in the shared memory of a block
 
     @property
     def text(self) -> str:
@@ -64,18 +66,30 @@ class KernelCode(NamedTuple):
         functions, shared = self.code.functions, self.code.shared
         declared = sorted(set().union(*(f.declared for f in (*functions, *shared))))
         texts = [*(f.text(local) for f in functions), *(f.text(()) for f in shared)]
-        return "\n".join([*declared, *self.code.globals, *texts])
+        space = f"addrspace({SHARED_SPACE}) " if local else ""
+        shared_memory = f"@shared = internal {space}global [{max(self.constants, 1)} x double] undef, align 16"
+        return "\n".join([*declared, shared_memory, *self.code.globals, *texts])
 
 
-def kernel_code(operation: Operation, directions: int = 0) -> KernelCode:
-    """Write the kernel of an operation, for a number of directions; raise `UnsupportedError` if there is none."""
+def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool = False) -> KernelCode:
+    """Write the kernel of an operation; raise `UnsupportedError` if there is none.
+
+    Args:
+        operation: The operation.
+        directions: The number of directions of its tangents.
+        shares_numbers: Whether all members have the same numbers. Their constants are then in the shared memory of a block,
+            which leaves room for other numbers in the caches.
+    """
     if operation.is_reverse:
         raise UnsupportedError(f"{type(operation).__name__} on a GPU")
     module = operation.module(1, 1, VECTOR)
     if isinstance(module, Module) and module.ways:
         module.tangents_begin = module.places.add("all tangents", directions * len(module.ways) * module.tangents.size)
+    shares = shares_numbers and isinstance(module, Module) and module.unrolled is not None and not module.plan.sampled
+    if shares:
+        module.shares_constants = True
     code = module.thread_code()
     for name in sorted({x[x.index("@") + 1 : x.index("(")] for f in (*code.functions, *code.shared) for x in f.declared}):
         if not re.fullmatch(rf"llvm\.({'|'.join(INTRINSICS)})\.(v\d+)?f64|llvm\.vector\.reduce\.\w+\.v\d+\w+", name):
             raise UnsupportedError(f"{name} on a GPU")  # LLVM would end the process
-    return KernelCode(module, code)
+    return KernelCode(module, code, module.constants if shares else 0)

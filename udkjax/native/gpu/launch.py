@@ -6,6 +6,7 @@ first launched there. The call record is a parameter of the kernel, so that noth
 
 import ctypes
 import os
+from collections.abc import Sequence
 from functools import lru_cache
 from threading import Lock
 from typing import Any
@@ -47,29 +48,29 @@ def kernel_members() -> float:
     return int(setting)
 
 
-def kernel_target(operation: Operation, members: int, directions: int) -> str | None:
+def kernel_target(operation: Operation, inputs: Sequence[Any]) -> str | None:
     """Return the FFI target that runs a batch as a kernel; None if the host shall run it.
 
     Args:
         operation: the operation.
-        members: the number of members.
-        directions: the number of directions of its tangents, 0 without.
+        inputs: arrays, or their shapes, (1 or members, ...).
     """
-    if members < kernel_members():
+    if max(x.shape[0] for x in inputs) < kernel_members():
         return None
+    directions, shares_numbers = inputs[-1].shape[1] if operation.tangents else 0, inputs[0].shape[0] == 1
     try:
-        return _load(operation, directions)
+        return _load(operation, directions, shares_numbers)
     except UnsupportedError:
         return None
 
 
 @lru_cache(maxsize=256)
-def _load(operation: Operation, directions: int) -> str | None:
+def _load(operation: Operation, directions: int, shares_numbers: bool) -> str | None:
     """Compile and register the kernel of an operation; return its target, None if its threads take too much memory.
 
     Without a graphics card nothing is compiled: the program is only written here.
     """
-    code, found = kernel_code(operation, directions), driver()
+    code, found = kernel_code(operation, directions, shares_numbers), driver()
     if 8 * code.code.size > MOST_MEMORY:
         return None
     name = f"{TARGET}{machine.digest(code.text)}"
