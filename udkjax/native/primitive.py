@@ -26,6 +26,7 @@ from udkjax.native.base.memory import Memory
 from udkjax.native.base.prepared_call import PreparedCall
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.steps import Status
+from udkjax.native.derivatives import record
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
@@ -37,6 +38,9 @@ QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled co
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
 TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
+# Smallest batch whose records are not copied to a graphics card and back: members are integrated again, which takes as long.
+RECORDS = 64
+GIVEN_RECORD = 5  # place of the record among the inputs of reverse mode, from the last
 FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
 
@@ -222,7 +226,15 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     """Lower for a graphics card of NVIDIA: large batches run as a kernel; the host computes all else."""
     name = kernel_target(operation, inputs) or _select_code(inputs, operation).name_on_card
-    return _call_target(name, inputs, operation, times)
+    if not operation.is_reverse or max(x.shape[0] for x in inputs) < RECORDS:
+        return _call_target(name, inputs, operation, times)
+    # The record is copied without its points, so that members are integrated again.
+    if inputs[-1].shape[0]:
+        given = [x[:, : record.TITLE] if k == len(inputs) - GIVEN_RECORD else x for k, x in enumerate(inputs)]
+        return _call_target(name, given, operation, times)
+    *outputs, title = _call_target(name, inputs, operation, times, record.TITLE)
+    length = operation.shapes(inputs, times)[-1][1]
+    return [*outputs, jnp.pad(title, ((0, 0), (0, length - record.TITLE)))]
 
 
 def _lower_for_others(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
@@ -236,16 +248,21 @@ def _result_shapes(inputs: Sequence[Any], operation: Operation, times: int) -> l
     return [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in operation.shapes(inputs, times)]
 
 
-def _call_target(name: str, inputs: Sequence[Any], operation: Operation, times: int) -> Sequence[Array]:
-    """Call a target of XLA."""
-    outputs = jax.ffi.ffi_call(name, _result_shapes(inputs, operation, times))(*inputs)
+def _call_target(
+    name: str, inputs: Sequence[Any], operation: Operation, times: int, last_length: int | None = None
+) -> Sequence[Array]:
+    """Call a target of XLA; the last output may have another length than usual."""
+    shapes = _result_shapes(inputs, operation, times)
+    if last_length is not None:
+        shapes[-1] = jax.ShapeDtypeStruct((shapes[-1].shape[0], last_length), jnp.float64)
+    outputs = jax.ffi.ffi_call(name, shapes)(*inputs)
     if not operation.is_reverse:
         return outputs
     # The outputs that a pass does not write (`LoadedCode`) are uninitialized memory.
-    results, (*bars, record) = outputs[: len(OUTPUTS)], outputs[len(OUTPUTS) :]
+    results, (*bars, last) = outputs[: len(OUTPUTS)], outputs[len(OUTPUTS) :]
     if inputs[-1].shape[0]:
-        return [*map(jnp.zeros_like, results), *bars, record]
-    return [*results, *map(jnp.zeros_like, bars), jnp.where(jnp.isfinite(record), record, 0.0)]
+        return [*map(jnp.zeros_like, results), *bars, last]
+    return [*results, *map(jnp.zeros_like, bars), jnp.where(jnp.isfinite(last), last, 0.0)]
 
 
 def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:

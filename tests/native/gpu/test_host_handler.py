@@ -149,6 +149,17 @@ def test_runs_and_their_derivatives_are_those_of_the_cpu(request):
     assert all(STREAM in call for call in card.calls if call[0].startswith(("cuMemcpy", "cuStream")))
 
 
+def test_batches_do_not_copy_their_records(request):
+    inertias = jnp.linspace(0.3, 0.5, primitive.RECORDS)
+    slope = jax.vmap(jax.grad(lambda x: angles(x)[-1]))
+    expected = np.asarray(jax.jit(slope)(inertias))
+    card = request.getfixturevalue("card")
+    assert_array_equal(jax.jit(slope)(inertias), expected)
+    assert (
+        max(call[3] for call in card.calls if call[0].startswith("cuMem")) < 8 * len(inertias) * 100
+    )  # a record has 2,403 numbers
+
+
 def test_a_batch_runs_on_several_threads(request):
     inertias = jnp.linspace(0.3, 0.5, 200)
     expected = np.asarray(jax.jit(jax.vmap(angles))(inertias))

@@ -59,7 +59,10 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("name", RUNS)
+FAST = ("redundant", "closed", "tangent", "SVD")
+
+
+@pytest.mark.parametrize("name", [x if x in FAST else pytest.param(x, marks=pytest.mark.slow) for x in RUNS])
 def test_threads_compute_what_the_engine_computes(name):
     calls = emulation.calls_of(jax.vmap(RUNS[name]), MASSES)
     served = 0
