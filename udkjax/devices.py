@@ -13,7 +13,7 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def default_devices() -> list[jax.Device]:
+def default_devices() -> list[Any]:
     """Return the devices on which JAX computes by default: the choice of `jax.default_device`, else all of this process."""
     chosen = jax.config.jax_default_device
     if chosen is None:
@@ -21,7 +21,7 @@ def default_devices() -> list[jax.Device]:
     return jax.local_devices(backend=chosen)[:1] if isinstance(chosen, str) else [chosen]
 
 
-def host_device() -> jax.Device | None:
+def host_device() -> Any:
     """Return the CPU device if JAX computes on other devices by default; else None, as where `JAX_PLATFORMS` excludes the CPU."""
     if default_devices()[0].platform == "cpu":
         return None

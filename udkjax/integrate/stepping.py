@@ -118,7 +118,7 @@ class MechanismParts(NamedTuple):
     """A mechanism and its analysis, split into structure and numbers."""
 
     form: Hashable  # the tree structure
-    leaves: list[Array]
+    leaves: list[Any]  # arrays
 
 
 @cached_by_identity

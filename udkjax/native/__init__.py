@@ -20,6 +20,8 @@ How the code of a run is made, and where to look:
 7. `operations`, `runs` and `position_operations` list the modules with the shapes of their inputs and outputs; `primitive` makes
    the operations a JAX primitive with a batching rule. `udkjax.integrate` calls this primitive and defines its derivatives.
 8. wasm/ compiles the same text for pages.
+9. gpu/ serves programs that JAX compiles for a graphics card: `host_handler` calls the code of the host, and `launch` runs large
+   batches as kernels.
 """
 
 from udkjax.lazy_names import lazy_names

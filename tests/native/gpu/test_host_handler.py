@@ -8,6 +8,7 @@ import ctypes
 import itertools
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -281,6 +282,18 @@ def test_an_operation_finds_threads_in_its_frame(card):
         found.append((number.value, threading.get_ident()))
         return
 
-    name = host_handler.register("threads", ctypes.cast(handle, ctypes.c_void_p).value)
+    address = ctypes.cast(handle, ctypes.c_void_p).value
+    assert address
+    name = host_handler.register("threads", address)
     jax.block_until_ready(jax.jit(lambda x: jax.ffi.ffi_call(name, x)(x))(jnp.zeros(1)))
     assert [x for x, _ in found] == [42, 3] and found[0][1] != found[1][1]
+
+
+def test_calls_of_several_threads_do_not_mix(card):
+    """Those that share the pinned memory, and those that find it in use."""
+    run = jax.jit(norms)
+    given = [jnp.full((3, 2), float(k)) for k in range(40)]
+    run(given[0])
+    with ThreadPoolExecutor(8) as pool:
+        for x, found in zip(given, pool.map(run, given), strict=True):
+            assert_array_equal(found, np.linalg.norm(x, axis=1))

@@ -267,7 +267,7 @@ class Function:
         index, stored = self.like(k, INT, 1), INT if base == POINTER else base
         return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
 
-    def load(self, pointer: Value, k: Operand = 0, width: int = 1, base: str = DOUBLE) -> Value:
+    def load(self, pointer: Value | str, k: Operand = 0, width: int = 1, base: str = DOUBLE) -> Value:
         place = self.at(pointer, k, base)
         return self.op(f"load {llvm_type(base, width)}, ptr {place.name}, align 8", base, width)
 

@@ -267,7 +267,7 @@ def _schedule() -> Function:
     begun = f.op(f"call i32 @pthread_create(ptr {thread.name}, ptr null, ptr {task.name}, ptr {data.name})", "i32")
     f.choose(
         f.op(f"zext i32 {begun.name} to i64", INT).is_(0),
-        lambda: f.op(f"call i32 @pthread_detach(i64 {f.load(thread, base=INT).name})", "i32"),
+        lambda: f.line(f"call i32 @pthread_detach(i64 {f.load(thread, base=INT).name})"),
         lambda: f.line(f"call void {task.name}(ptr {data.name})"),
     )
     f.line("ret ptr null")
