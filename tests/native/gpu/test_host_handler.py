@@ -203,7 +203,7 @@ def test_functions_of_python_are_called(card):
 
 
 def test_small_calls_use_pinned_memory_one_at_a_time(card):
-    """Those that find it in use, or too small, use other memory, as all do if none can be pinned."""
+    """A call that finds it in use, or too small, uses other memory."""
 
     def places(rows):
         card.calls.clear()
@@ -290,7 +290,7 @@ def test_an_operation_finds_threads_in_its_frame(card):
 
 
 def test_calls_of_several_threads_do_not_mix(card):
-    """Those that share the pinned memory, and those that find it in use."""
+    """Some use the pinned memory, the others find it in use."""
     run = jax.jit(norms)
     given = [jnp.full((3, 2), float(k)) for k in range(40)]
     run(given[0])
