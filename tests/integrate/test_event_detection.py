@@ -167,3 +167,32 @@ def test_a_condition_that_is_not_a_number_is_data_in_a_batch(engine):
         np.asarray(sol.events.undefined) == [[1, 0], [0, 0], [1, 0]]
     ).all()
     assert np.isfinite(sol.q[0, :2]).all() and np.isnan(sol.q[0, 2]).all()
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+def test_an_event_at_a_sample_or_an_output_happens_once(engine):
+    """Its root is found to rounding: a state from before it would cross again."""
+    held = udk.Held(np.random.default_rng(0).normal(size=(4, 2)), 0.25)
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", held)})
+    for output in ([], [0.5]):
+        clock = udk.Event(lambda t, at: t - 0.5, udk.Log(), 1, name="clock")
+        found = udk.simulate(body, [0.0, *output, 1.0], events=[clock], engine=engine).events
+        assert np.asarray(found.time).tolist() == pytest.approx([0.5], abs=1e-15)
+
+
+def test_a_wall_at_a_sample_is_hit_once():
+    held = udk.Held(np.arange(4.0)[:, None] * [0.0, 1.0], 0.25)
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 0.0])}, forces={"u": udk.Force("b", held)})
+    wall = udk.Event(lambda t, at: 0.25 - at["b"].x, udk.Impact(1.0), name="wall")
+    run = udk.simulate(body, [0.0, 0.5], events=[wall])
+    assert int(run.events.count) == 1
+    np.testing.assert_allclose(run.q[-1, 0, 0], 0.0, atol=1e-14)
+
+
+def test_an_event_just_before_a_sample_happens_with_the_force_before_it():
+    """The step that ends at the event must not take the next row of samples."""
+    held = udk.Held(np.array([1.0, -20.0])[:, None] * [1.0, 0.0], 0.25)
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", held)})
+    for time in (0.2, 0.249, 0.25 - 1e-9):
+        place = udk.Event(lambda t, at, x=0.5 * time**2: at["b"].x - x, udk.Stop(), name="place")
+        assert float(udk.simulate(body, [0.0, 0.5], events=[place]).time) == pytest.approx(time, abs=1e-13)

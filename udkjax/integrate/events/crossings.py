@@ -86,10 +86,13 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
 
 
 def cubic_root(cubic: Cubic, side: Array) -> Array:
-    """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1."""
+    """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1, to rounding."""
     low, width, places = jnp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
     for _ in range(DIVISIONS):
         width /= PARTS
         x = low + width * places.reshape(-1, *[1] * low.ndim)
         low = low + width * jnp.sum(cubic_value(cubic, x) * side > 0, axis=0)
-    return low + width / 2
+    middle = low + width / 2
+    slope = cubic_slope(cubic, middle)
+    step = cubic_value(cubic, middle) / jnp.where(slope == 0, 1.0, slope)  # Newton's: the part is so short that one is enough
+    return jnp.clip(middle - step, low, low + width)

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 from udkjax.expressions import ScalarProgram
+from udkjax.native.base.steps import UNIT
 
 
 class Resolution(NamedTuple):
@@ -92,6 +93,7 @@ LAST_CHANGE = 1e-7  # largest final correction of the event time, in T; as a Tay
 MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; usually one
 LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long
 WANTED, UNDER_WAY = 1, 2  # states of a landing: a step from the point before the crossing is requested, or has been planned
+ACROSS_BREAK = 8 * UNIT  # time from the last state before a breakpoint to the first behind it, at most, in smallest steps
 SHORTEST_SPAN = 100  # shortest span, in smallest steps, that is refined
 VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is unresolved, or NaN
 FORCE_STEP = 1e-7  # time difference, in T, for the rate of a contact force

@@ -34,7 +34,9 @@ def write_locate(module: WatchMemory):
     f.call("look", work)
     event, seeks = crossed(), s.seeks > 0.5
     is_found = seeks & (event >= 0.0)
-    lands = is_found & (s.high - s.point0_t > s.smallest * LEAST_STEP)
+    # A step to the crossing lies between two breakpoints. Right behind the first, and if the second has been reached, the
+    # crossing on the polynomial is taken: it is as accurate as the states.
+    lands = is_found & (s.high - f.max(s.point0_t, s.fresh) > s.smallest * LEAST_STEP) & (s.lands < 0.5)
     s.where(seeks, stops=f.select(lands, zero, one), seeks=zero)
     s.where(is_found, event=event, sure_t=s.high, target=s.high)
     s.where(lands, landing=float(WANTED))

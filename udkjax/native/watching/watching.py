@@ -16,7 +16,7 @@ from udkjax.native.base.program import write
 from udkjax.native.base.steps import POINTS, Status
 from udkjax.native.run.manifold import project_output
 from udkjax.native.watching.condition_intervals import write_classification
-from udkjax.native.watching.conditions import FIRST, FORCE_STEP, SECOND, THIRD, WANTED
+from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, MIDDLE, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate
 from udkjax.native.watching.watch_memory import WatchMemory
 
@@ -46,7 +46,10 @@ class Watching(WatchMemory):
         return f.const(True, BOOL, f.width)  # for the conditions within each step
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        s.where(accept & (s.begin > 0.5), fresh=s.t1)
+        begins = accept & (s.begin > 0.5)
+        # Intervals that were cut at a breakpoint continue from the first state after it.
+        s.where(begins & (s.t1 - s.first_t <= s.smallest * ACROSS_BREAK), which=float(FIRST), node=s.t1)
+        s.where(begins, fresh=s.t1)
 
     def program_names(self) -> list[str]:
         return [*super().program_names(), *(["multipliers"] if self.conditions.rows else [])]
@@ -117,6 +120,13 @@ class Watching(WatchMemory):
                 q = f.fma(q, d, self.vector(f, f"difference{k}", r))
             self.put(f, "node a", r, a)
 
+    def _cut_intervals(self, f: Function, s: Lane):
+        """Cut two intervals that cross the breakpoint at which a step has ended."""
+        cut = (s.lands > 0.5) & (s.until >= s.t1) & (s.behind_middle > s.t1) & s.which.is_not(float(FIRST))
+        cut = cut & (s.t1 - s.first_t > s.smallest * ACROSS_BREAK)
+        node = f.fma(s.t1 - s.first_t, MIDDLE, s.first_t)
+        s.where(cut, which=float(SECOND), node=node, behind_middle=s.t1)
+
     def _write_watch(self):
         """Write `watch(work)`: evaluate all nodes within accepted steps."""
         f, s = self.function("watch")
@@ -125,6 +135,8 @@ class Watching(WatchMemory):
         s.where(s.landing > 0.5, until=-float("inf"))
 
         def due() -> Value:
+            if self.plan.breaks:
+                self._cut_intervals(f, s)
             goes_on = s.code.is_(float(Status.RUNNING)) | s.code.is_(float(Status.DONE))
             s.due = f.select((s.active > 0.5) & goes_on & (s.node <= s.until), one, 0.0)
             return f.any_of(s.due > 0.5)
