@@ -123,6 +123,7 @@ def ratios(problem, run):
     return found[np.isfinite(found)]  # at the loosest tolerances VODE itself has lost the orbit
 
 
+@pytest.mark.slow
 def test_cost_beside_vode(pendulums):
     found = ratios(NOT_STIFF["pendulum"], pendulums)
     assert len(found) >= 6 and found.max() < 1.5 and found.mean() < 1
@@ -176,7 +177,7 @@ def test_polynomials_are_integrated_exactly(steps):
         assert errors[0] < 1e-12 < 100 * errors[0] < errors[1] or errors[0] < 1e-13 < errors[1]
 
 
-@pytest.mark.parametrize("steps", ["pece", pytest.param("iteration", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
 def test_order_of_convergence(steps):
     """The result of order k is corrected to order k + 1."""
     run = steps(lambda t, y, args: -(y**2), lambda t, args: jnp.array([1 / (args + t)]))

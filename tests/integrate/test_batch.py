@@ -60,7 +60,8 @@ def test_outputs_of_a_batch_are_kept_once(pendulum):
     assert memory.temp_size_in_bytes < 1.5 * memory.output_size_in_bytes
 
 
-@pytest.mark.parametrize("solver", [diffrax.Tsit5(), pytest.param(udk.Verner65(), marks=pytest.mark.slow)], ids=str)
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), udk.Verner65()], ids=str)
 def test_the_same_motion_as_by_diffrax(pendulum, solver):
     ours = udk.simulate(pendulum, TS, solver=solver)
     theirs = udk.simulate(pendulum, TS, solver=solver, adjoint=diffrax.DirectAdjoint(), max_steps=4096)

@@ -134,6 +134,7 @@ def test_eager_transformations_over_a_geometry_take_few_operations(simulated):
     assert len(jax.make_jaxpr(lambda a: simulated(a).q)(1.0).eqns) < 300
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(deferred_p is None, reason="this JAX has another cache")
 def test_an_event_that_is_written_in_the_function_it_serves_is_traced_once():
     """Its condition is a new function in each call; one that compares with another level is another condition."""

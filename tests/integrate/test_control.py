@@ -50,7 +50,7 @@ def restarted(mechanism, ts, tolerances=EXACT):
     return np.stack([found[t].q for t in ts]), np.stack([found[t].v for t in ts])
 
 
-@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
 def test_a_run_is_the_one_that_is_started_anew_at_each_sample(engine):
     mechanism = held_cart()
     found = udk.simulate(mechanism, TS, engine=engine, **EXACT)
@@ -91,12 +91,16 @@ def loss():
     return jax.jit(lambda torque, force: _loss(mechanism, torque, force))
 
 
-def test_derivatives_by_the_samples_forward_in_reverse_and_in_lanes(loss):
+def test_derivatives_by_the_samples_forward_and_in_reverse(loss):
     gradient = jax.jit(jax.grad(loss, (0, 1)))
     _check_gradient(loss, gradient, 1e-4)
-    forward = jax.jit(jax.jacfwd(loss, (0, 1)))
-    for a, b in zip(gradient(TORQUE, FORCE), forward(TORQUE, FORCE), strict=True):
+    for a, b in zip(gradient(TORQUE, FORCE), jax.jit(jax.jacfwd(loss, (0, 1)))(TORQUE, FORCE), strict=True):
         assert_allclose(a, b, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_derivatives_by_the_samples_in_lanes(loss):
+    gradient, forward = jax.jit(jax.grad(loss, (0, 1))), jax.jit(jax.jacfwd(loss, (0, 1)))
     batch = TORQUE * np.linspace(0.0, 1.0, 11)[:, None]
     for function in (gradient, forward):  # eleven members in eight lanes
         found = jax.jit(jax.vmap(function, (0, None)))(batch, FORCE)
@@ -172,24 +176,31 @@ def test_steps_are_the_run_of_the_same_inputs():
     by_step = jax.jit(jax.grad(lambda *x: jnp.sum(rollout(*x).v[:, 1, 2] ** 2), (0, 1)))(torque, force)
     by_run = jax.jit(jax.grad(lambda *x: jnp.sum(run(*x).v[1:, 1, 2] ** 2), (0, 1)))(torque, force)
     jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-8, atol=1e-10), by_step, by_run)
-    several = jax.jit(jax.vmap(rollout))(np.stack([torque, 0 * torque, -torque]), np.stack([force] * 3))
-    assert_allclose(several.q[0], found.q, rtol=0, atol=1e-12)
     state = udk.assemble(mechanism)
     for k in range(2):  # outside of a trace, too
         state = udk.step(mechanism, state, dict(zip(NAMES, (torque[k], force[k]), strict=True)), dt, **EXACT)
     assert_allclose(state.q, found.q[1], rtol=0, atol=1e-12)
 
 
-def test_steps_of_a_driven_mechanism_by_both_engines():
+@pytest.mark.slow
+def test_steps_of_several_side_by_side():
+    mechanism, dt = cart(0.0, [0.0, 0.0]), 0.05
+    torque, force = np.sin(np.arange(8.0)), np.cos(np.arange(16.0)).reshape(8, 2)
+    rollout = jax.jit(controlled(mechanism, dt))
+    several = jax.jit(jax.vmap(rollout))(np.stack([torque, 0 * torque, -torque]), np.stack([force] * 3))
+    assert_allclose(several.q[0], rollout(torque, force).q, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+def test_steps_of_a_driven_mechanism(engine):
     """The time goes on from step to step."""
     drive = udk.Driver(["ground", "rod"], "angle", udk.Sine(1.0, 2.0))
     bodies, pin = {"rod": udk.Body(1.0, 1 / 12, [0.5, 0.0])}, udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])
     mechanism, dt = udk.Mechanism(bodies, {"pin": pin}, {"drive": drive}), 0.1
     state = udk.assemble(mechanism)
     for k in range(3):
-        state = udk.step(mechanism, state, None, dt, k * dt)
+        state = udk.step(mechanism, state, None, dt, k * dt, engine=engine)
     assert_allclose(state.q[0, 2], np.sin(0.6), atol=1e-12)
-    assert_allclose(udk.step(mechanism, udk.assemble(mechanism), {}, dt, engine="diffrax").q[0, 2], np.sin(0.2), atol=1e-12)
 
 
 def test_a_step_that_fails_says_why_or_is_not_a_number():

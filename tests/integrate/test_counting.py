@@ -92,6 +92,7 @@ def test_every_call_is_counted(calls, solver):
         assert rejected >= 1 and found == calls.value > 20
 
 
+@pytest.mark.slow
 def test_counting_changes_nothing():
     """Steps, result and gradient are those of the solver alone."""
 
@@ -221,11 +222,12 @@ def counted(held):
     return udk.ConstrainedSystem(lambda q: jnp.eye(2), force, (lambda t, q: q @ q - 1.0) if held else None), count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "held"),
     [
         pytest.param(diffrax.Tsit5(), True, id="Tsit5-projected"),
-        *(pytest.param(s(), False, id=f"{s.__name__}-free", marks=pytest.mark.slow) for s in (diffrax.Dopri8, diffrax.Heun)),
+        *(pytest.param(s(), False, id=f"{s.__name__}-free") for s in (diffrax.Dopri8, diffrax.Heun)),
     ],
 )
 def test_right_hand_sides_are_counted(solver, held):

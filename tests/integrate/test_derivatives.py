@@ -52,7 +52,6 @@ def of_pendulum(x, **choices):
 
 AT = {of_linkage: jnp.array([np.deg2rad(-50.0), 1.0]), of_pendulum: jnp.array([-0.3, 1.2])}
 FAST = ((of_pendulum, "hessian"), (of_linkage, "forward over forward"))
-BOTH = pytest.mark.parametrize("f", AT, ids=lambda f: f.__name__)
 
 
 def differences(f, x, h):
@@ -88,7 +87,7 @@ def test_directions_side_by_side(count):
         assert_allclose(found, alone(d), rtol=1e-10, atol=1e-12 * np.abs(found).max())
 
 
-@BOTH
+@pytest.mark.parametrize("f", [of_linkage, pytest.param(of_pendulum, marks=pytest.mark.slow)], ids=lambda f: f.__name__)
 def test_first_derivatives(f, slopes):
     """Forward and reverse mode, and a direction: the same, and that of differences."""
     x = AT[f]
@@ -137,6 +136,7 @@ def test_a_number_that_a_batch_shares():
     assert_allclose(found, each.sum(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_both_engines_start_beside_the_manifold_alike():
     """They project the start: second derivatives take first ones of both, also along directions that open the loops."""
     state, opening = linkage_at(-0.8), 1e-4 * np.eye(4, 3)
@@ -191,7 +191,7 @@ def test_second_derivatives_of_assembly_by_machine_code(opening):
 
 @pytest.mark.parametrize(
     "stabilization",
-    [udk.Projection(), udk.Baumgarte(5.0, 5.0), pytest.param(None, marks=pytest.mark.slow)],
+    [udk.Projection(), *(pytest.param(s, marks=pytest.mark.slow) for s in (udk.Baumgarte(5.0, 5.0), None))],
     ids=lambda x: type(x).__name__,
 )
 def test_second_derivatives_of_outputs_in_a_batch(stabilization):

@@ -76,6 +76,7 @@ def test_gradients_of_what_comes_to_rest():
     assert np.abs(np.array(jax.grad(end, (0, 1, 2))(*x)) - np.array([1.0, 0.0, 0.0])).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_gradients_of_a_contact_that_lets_go():
     """A shaking table throws the ball where its own acceleration is -g; the time of that, and the end, by its amplitude."""
     ball = BALL.with_parameters({"body.ball.position": [0.0, 0.0], "body.ball.velocity": [0.0, 1.5]})

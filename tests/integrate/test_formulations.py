@@ -86,12 +86,9 @@ def of_rod(mech, sol):
     return np.stack([0.75 * np.sin(phi), -0.75 * np.cos(phi), phi - np.pi / 2], 1)[:, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("mech", "expected"),
-    [
-        pytest.param(udk.library.compound_pendulum(), of_rod, id="pendulum"),
-        pytest.param(LINKAGE, exact, id="linkage", marks=pytest.mark.slow),
-    ],
+    ("mech", "expected"), [(udk.library.compound_pendulum(), of_rod), (LINKAGE, exact)], ids=["pendulum", "linkage"]
 )
 def test_constraints_hold_without_stabilization(mech, expected):
     """To rounding at every output, positions and velocities; and the motion is the exact one."""

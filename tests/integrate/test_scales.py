@@ -45,7 +45,7 @@ def deviation(mechanism, units, method=None, times=TS):
     return np.abs(other.q / unit - own.q).max(), np.abs(other.v * time / unit - own.v).max()
 
 
-@pytest.mark.parametrize("name", fast(["parallelogram", "slider crank", "planetary gear", "trammel"], SCENES))
+@pytest.mark.parametrize("name", fast(["parallelogram", "trammel"], SCENES))
 def test_the_motion_is_the_same_in_all_units(name):
     for units in UNITS:
         dq, dv = deviation(SCENES[name](), units)
