@@ -44,8 +44,9 @@ if [ "$other" != python3 ] || ! suits "$venv/bin/python" "$wanted" || ! "$venv/b
 fi
 printf 'udkjax: %s, with what it needs, goes into %s\n' "$("$venv/bin/python" --version)" "$venv"
 uv pip install --quiet --python "$venv/bin/python" -c constraints.txt -e ".[$extras]" 2>/dev/null ||
-    "$venv/bin/python" -m pip --disable-pip-version-check install --quiet -c constraints.txt -e ".[$extras]"
-# A first run, which leaves bytecode of all that it imports: uv writes none, and where PYTHONDONTWRITEBYTECODE is set nobody would.
+    "$venv/bin/python" -m pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt -e ".[$extras]"
+# A first run, which leaves bytecode of all that it imports. Neither uv nor pip is to write any, which takes pip two thirds of its
+# time, of many modules that nobody imports; and where PYTHONDONTWRITEBYTECODE is set Python would not, either.
 env -u PYTHONDONTWRITEBYTECODE "$venv/bin/python" -c 'import numpy, udkjax.cli
 udkjax.simulate(udkjax.library.parallelogram(), numpy.linspace(0.0, 1.0, 11))'
 "$venv/bin/udkjax" --help >/dev/null

@@ -30,7 +30,7 @@ def along(mechanism, q, v, method):
 IN_LINE = np.array([0.0, 0.0, np.pi, np.pi, 1e-9]), np.array([0.0, 2.0, 0.0, -3.0, 1.0])
 
 
-@pytest.fixture(scope="module", params=fast(["Auto", "Varga", "Elimination"], METHODS))
+@pytest.fixture(scope="module", params=fast(["Auto", "Varga"], METHODS))
 def moved(request, linkage, placed, data):
     """By a method: angles and angular velocities, accelerations and multipliers; in line; and where reactions are known."""
     angles = np.concatenate([np.linspace(-3.0, -0.15, 12), np.linspace(0.15, 3.0, 12)])

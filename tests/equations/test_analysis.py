@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import dense_rows, position_closure, redundancy, scale_program, scales, sparse_rows
+from udkjax.equations import dense_rows, position_closure, position_rows, redundancy, scale_program, scales, sparse_rows
 from udkjax.equations.scene_programs import _scene_programs as scene_program_cache
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
@@ -168,7 +168,7 @@ def test_what_drivers_cannot_reach_is_given_up_soon(monkeypatch, large):
     assert len(solved) < 400
 
 
-MODULES = position_closure, dense_rows, redundancy, scale_program, sparse_rows
+MODULES = position_closure, position_rows, dense_rows, redundancy, scale_program, sparse_rows
 DENSE = [
     "CLOSED_TOL",
     "ROUNDING_UNITS",

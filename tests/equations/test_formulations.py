@@ -177,6 +177,7 @@ def test_in_line(linkage, placed):
 # --- derivatives
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CoordinatePartitioning", *but_slow("Augmented NullSpaceQR NullSpaceSVD")])
 def test_derivatives(name, closed):
     """With respect to time, state, masses and loads, forward and backward, against differences; and second ones."""

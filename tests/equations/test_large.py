@@ -6,6 +6,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.equations import redundancy
+from udkjax.equations.position_rows import GENERIC_TOL
 
 # --- redundant rows
 
@@ -34,7 +35,7 @@ def test_sparse_analysis_finds_as_many_rows_as_singular_values_which_do_as_well(
         monkeypatch.setattr(redundancy, "kinematic_rows", lambda mech, size=size: choose(mech, size))
         found.append(redundancy.redundant_rows(mech))
     dense = choose(mech, False)
-    null_spaces = [p.null_space for p in redundancy.sample_positions(dense, q) if p.smallest > redundancy.GENERIC_TOL]
+    null_spaces = [p.null_space for p in dense.sample(q) if p.smallest > GENERIC_TOL]
     assert len(found[0]) == len(found[1]) == null_spaces[0].shape[1]
     one, other = (min(np.linalg.svd(N[list(rows)])[1][-1] for N in null_spaces) for rows in found)
     assert one > 0.05 and other > 0.2 * one

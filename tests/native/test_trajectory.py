@@ -192,6 +192,7 @@ def test_cams():
     assert_allclose(batch.q, np.broadcast_to(solution.q, batch.q.shape), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_along_cams():
     def lifted(lift):
         return udk.simulate(turned_by_a_cam(lift), np.linspace(0.0, 1.5, 4), rtol=1e-11, atol=1e-11).q[-1, 0, 2]

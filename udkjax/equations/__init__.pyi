@@ -54,6 +54,9 @@ from udkjax.equations.position_closure import is_closed as is_closed
 from udkjax.equations.position_programs import PositionPrograms as PositionPrograms
 from udkjax.equations.position_programs import TracedModel as TracedModel
 from udkjax.equations.position_programs import trace_model as trace_model
+from udkjax.equations.position_rows import GENERIC_TOL as GENERIC_TOL
+from udkjax.equations.position_rows import PositionRows as PositionRows
+from udkjax.equations.position_rows import choose_dispensable as choose_dispensable
 from udkjax.equations.quantities import Energy as Energy
 from udkjax.equations.quantities import accelerations as accelerations
 from udkjax.equations.quantities import efforts as efforts
@@ -62,16 +65,9 @@ from udkjax.equations.quantities import equations_of as equations_of
 from udkjax.equations.quantities import violation as violation
 from udkjax.equations.reactions import reactions as reactions
 from udkjax.equations.reactions import unique_reactions as unique_reactions
-from udkjax.equations.redundancy import GENERIC_TOL as GENERIC_TOL
-from udkjax.equations.redundancy import PositionRows as PositionRows
-from udkjax.equations.redundancy import choose_dispensable as choose_dispensable
-from udkjax.equations.redundancy import choose_redundant_rows as choose_redundant_rows
-from udkjax.equations.redundancy import dense as dense
 from udkjax.equations.redundancy import dependent_constraints as dependent_constraints
 from udkjax.equations.redundancy import generic_position as generic_position
 from udkjax.equations.redundancy import kinematic_rows as kinematic_rows
-from udkjax.equations.redundancy import owners_of_row as owners_of_row
-from udkjax.equations.redundancy import sample_positions as sample_positions
 from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales
 from udkjax.equations.scales import concrete_scales as concrete_scales

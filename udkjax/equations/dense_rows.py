@@ -1,6 +1,6 @@
 """Psi and D of a small mechanism with concrete numbers, by NumPy on the scene's programs, without compilation.
 
-This module is used to close a mechanism and to find its redundant rows (redundancy.py).
+This module is used to close a mechanism and to find its redundant rows (position_rows.py).
 """
 
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
 from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
+from udkjax.equations.position_rows import PositionRows
 from udkjax.equations.scales import Scales, concrete_scales
 from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
@@ -21,7 +22,6 @@ from udkjax.scene.mechanism import Mechanism
 # threshold count as zero, because rounding errors of redundant rows reach half of the digits. Values above the second are
 # nonzero. In between, near a singular configuration, the rank is uncertain.
 DEPENDENT_TOL, CLEAR_TOL = float(np.sqrt(np.finfo(float).eps)), 1e-4
-NEGLIGIBLE_SHARE = 1e-6  # coefficients of unit rows up to this size are rounding errors
 
 
 class TruncatedPseudoinverse(NamedTuple):
@@ -160,7 +160,7 @@ class DensePosition(NamedTuple):
         return self.u[:, self.rank :]
 
 
-class KinematicRows(DenseRows):
+class KinematicRows(DenseRows, PositionRows[DensePosition]):
     """The rows of a mechanism with concrete numbers in the metric (A, A, 1) for each body, with A the longest lever arm."""
 
     def __init__(self, mechanism: Mechanism):
@@ -169,18 +169,18 @@ class KinematicRows(DenseRows):
         self.driver_time_step = driver_time_step(self.scales)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Psi, the lengths of the rows of D, and D with unit rows, which does not change solutions of consistent rows."""
         D = self.jacobian(t, q) * self.metric
         length = np.linalg.norm(D, axis=1)
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rounding errors are not scaled up
         return self.psi(t, q), length, D / length[:, None]
 
+    def dense(self, matrix: np.ndarray) -> np.ndarray:
+        return matrix
+
     def split_rows(self, positions: list[DensePosition]) -> list[tuple[np.ndarray, list[DensePosition]]]:
-        """Return independent sets of rows, each with its positions: here a single set of all rows."""
-        return [(np.arange(self.count), positions)]
+        return [(np.arange(self.count), positions)]  # a single set of all rows
 
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> DensePosition | None:
-        """Return a closed position near q, or None; `give_up` early if it seems not to exist."""
         q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
         at_rest = np.zeros_like(q)

@@ -1,93 +1,12 @@
-"""Redundant rows of Psi, which `analyse` finds once for all runs.
-
-Redundancy depends on numbers (three equal cranks) as well as on topology, and a single position does not suffice to find it: in a
-singular configuration more rows are dependent than elsewhere. So the mechanism is closed and moved along a random motion, and the
-rows to leave out are chosen such that the others stay independent. For a left null space N of D (N^T D = 0), the rows outside S
-are independent exactly where N[S] is invertible: if an x row and a y row depend on each other with coefficients cos and sin of an
-angle, only a row whose coefficient does not vanish can be left out, and the motion shows which one. Everything is NumPy on the
-scene's programs, without compilation.
-"""
-
-from collections.abc import Sequence
-from typing import Any, Protocol, TypeVar
+"""Redundant rows of Psi, which `analyse` finds once for all runs, and generic positions (position_rows.py)."""
 
 import numpy as np
 
-from udkjax.annotations import Time
-from udkjax.equations.dense_rows import NEGLIGIBLE_SHARE, KinematicRows
+from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import LONGEST_STEP
-from udkjax.equations.scales import Scales
+from udkjax.equations.position_rows import NEGLIGIBLE_SHARE, PositionRows
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
-
-POSITION_SAMPLES = 24  # positions of the random motion, if the first one has dependent rows
-MANY_ROWS = 300  # rows of Psi above which only a third of the positions is used, to save time
-FAILURES = 3  # after this many positions in succession that cannot be closed, the drivers are contradictory
-CREEP = 1e-3  # fraction of the drivers' time step to try next if the first positions cannot be closed
-HEADING_NOISE = 0.3  # fraction of the direction of the random motion that is new at each position
-GENERIC_TOL = 0.05  # smallest singular value, relative to the largest, of positions that are used to choose rows
-
-
-def dense(matrix: Any) -> np.ndarray:
-    """Return a matrix of NumPy or SciPy as a NumPy array."""
-    return matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
-
-
-class ClosedPosition(Protocol):
-    """A closed position and the rank of D at it: a `DensePosition` or a `SparsePosition`."""
-
-    @property
-    def q(self) -> np.ndarray:
-        """The coordinates (n,)."""
-        ...
-
-    @property
-    def rank(self) -> int:
-        """The rank of D."""
-        ...
-
-    @property
-    def is_clear(self) -> bool:
-        """True if the rank is certain."""
-        ...
-
-    def tangent_part(self, heading: np.ndarray) -> np.ndarray:
-        """Return the part of a displacement that the constraints allow."""
-        ...
-
-
-Position = TypeVar("Position", bound=ClosedPosition)
-
-
-class PositionRows(Protocol[Position]):
-    """Psi and D of a mechanism with concrete numbers: `KinematicRows` or `SparseRows`."""
-
-    count: int
-    size: int
-    names: list[tuple[str, int]]
-    scales: Scales
-    metric: np.ndarray
-    driver_time_step: float
-
-    def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Return Psi, the lengths of the rows of D, and D with unit rows."""
-        ...
-
-    def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
-        """Return Psi, each row divided by its scale."""
-        ...
-
-    def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
-        """Return -W D^+ Psi."""
-        ...
-
-    def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> Position | None:
-        """Return a closed position near q, or None; `give_up` early if it seems not to exist."""
-        ...
-
-    def split_rows(self, positions: list[Position]) -> Sequence[tuple[np.ndarray, Sequence[Any]]]:
-        """Return sets of dependent rows, each with its `smallest` singular value and its `null_space` at each position."""
-        ...
 
 
 @np.errstate(all="ignore")  # non-finite coordinates are not closed
@@ -96,57 +15,8 @@ def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
     rows = kinematic_rows(mechanism)
     if not rows.count:
         return ()
-    positions = sample_positions(rows, np.asarray(mechanism.q0, float).ravel())
-    return choose_redundant_rows(rows, positions) if positions else None
-
-
-@np.errstate(all="ignore")
-def sample_positions(rows: PositionRows[Position], q: np.ndarray) -> list[Position]:
-    """Return closed positions of maximum rank along a random motion from a guess q; a single one if no row is redundant.
-
-    The list is empty if the guess cannot be closed or moved.
-    """
-    first = rows.close(0.0, q)
-    if first is None:
-        return []
-    positions, failures, time_step = [first], 0, rows.driver_time_step
-    random = np.random.default_rng(0)
-    heading = random.standard_normal(rows.size)
-    for k in range(POSITION_SAMPLES if rows.count <= MANY_ROWS else POSITION_SAMPLES // 3):
-        full_rank = [p for p in positions if p.is_clear and p.rank == rows.count]
-        if full_rank:
-            return full_rank[:1]
-        if failures == FAILURES:
-            if any(p.is_clear for p in positions[1:]):
-                break
-            time_step = CREEP * rows.driver_time_step
-        last = positions[-1]
-        heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(rows.size) / np.sqrt(rows.size)
-        heading = last.tangent_part(heading)  # keep the direction, so that the motion covers the range
-        step = rows.metric * heading
-        moved = last.q + LONGEST_STEP * step / max(rows.scales.size(step, np), 1e-300)
-        position = rows.close(time_step * (k + 1), moved, give_up=True)
-        if position is None or not position.is_clear or not np.any(heading):  # stuck: jump
-            heading, jump = random.standard_normal(rows.size), random.uniform(-1.0, 1.0, rows.size)
-            position = rows.close(time_step * (k + 1), first.q + LONGEST_STEP * rows.metric * jump, give_up=True)
-        failures = 0 if position is not None else failures + 1
-        positions.extend([] if position is None else [position])
-    positions = [p for p in positions if p.is_clear]
-    if not positions or (len(positions) == 1 and positions[0] is first and first.rank < rows.size):
-        return []
-    rank = max(p.rank for p in positions)
-    return [p for p in positions if p.rank == rank]
-
-
-def choose_redundant_rows(rows: PositionRows[Position], positions: list[Position]) -> tuple[int, ...]:
-    """Return the rows to leave out, such that the others stay independent at all positions of full rank."""
-    if positions[0].rank == rows.count:
-        return ()
-    chosen = []
-    for members, subsets in rows.split_rows(positions):
-        generic = [subset for subset in subsets if subset.smallest > GENERIC_TOL] or subsets
-        chosen += members[list(choose_dispensable([subset.null_space for subset in generic]))].tolist()
-    return tuple(sorted(chosen))
+    positions = rows.sample(np.asarray(mechanism.q0, float).ravel())
+    return rows.redundant(positions) if positions else None
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:
@@ -186,29 +56,3 @@ def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionR
     from udkjax.equations.sparse_rows import SparseRows  # imports SciPy, which small scenes do not need
 
     return SparseRows(mechanism, kinematic=True)
-
-
-def choose_dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
-    """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as possible for every N.
-
-    Greedy: take the row whose smallest length over all N is largest; then project the direction of that row out of each N. Among
-    equal rows the last is chosen, so that a copy is left out and its original stays.
-    """
-    chosen: list[int] = []
-    while null_spaces[0].shape[1]:
-        length = np.min([np.linalg.norm(N, axis=1) for N in null_spaces], axis=0)
-        length[chosen] = -1.0
-        row = int(np.flatnonzero(length >= 0.999 * length.max())[-1])
-        chosen.append(row)
-        null_spaces = [N @ np.linalg.svd(N[row : row + 1])[2][1:].T for N in null_spaces]
-    return tuple(sorted(chosen))
-
-
-def owners_of_row(rows: PositionRows, t: Time, q: np.ndarray, name: str) -> set[str] | None:
-    """Return the constraints on whose rows the first row of constraint `name` depends; None if it is independent."""
-    D, owners = dense(rows.at(t, q)[2]), np.array([owner for owner, _ in rows.names])  # D has unit rows
-    row, others = D[owners == name][0], D[owners != name]
-    shares = np.linalg.lstsq(others.T, row, rcond=NEGLIGIBLE_SHARE)[0]
-    if np.linalg.norm(row - others.T @ shares) > NEGLIGIBLE_SHARE:
-        return None
-    return set(owners[owners != name][np.abs(shares) > NEGLIGIBLE_SHARE])

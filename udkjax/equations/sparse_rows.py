@@ -18,9 +18,10 @@ from scipy.sparse.linalg import splu
 
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
-from udkjax.equations.dense_rows import CLEAR_TOL, NEGLIGIBLE_SHARE, RowTerms
+from udkjax.equations.dense_rows import CLEAR_TOL, RowTerms
 from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
+from udkjax.equations.position_rows import NEGLIGIBLE_SHARE, PositionRows
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.elimination import default_rank_tol
@@ -99,10 +100,10 @@ def _stack_columns(blocks: list[SparseMatrix], rows: int) -> SparseMatrix:
     return coo_array((np.concatenate([p.data for p in blocks]), indices), shape=(rows, shift[-1]))
 
 
-class SparseRows(RowTerms):
+class SparseRows(RowTerms, PositionRows[SparsePosition]):
     """Psi and sparse D of a mechanism with concrete numbers, in the metric M^(-1/2), or (A, A, 1) to find redundant rows.
 
-    The interface is that of `DenseRows` and of `KinematicRows`.
+    It also has what assembly needs of `DenseRows`.
     """
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
@@ -120,10 +121,12 @@ class SparseRows(RowTerms):
         return minimum_degree(rows)
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, SparseMatrix]:
-        """Return Psi, the lengths of the rows of D, and D with unit rows, which does not change solutions of consistent rows."""
         psi, _, values = self.geometry(t, q, q)
         D, length = self._normalize_rows(values)
         return psi, length, D
+
+    def dense(self, matrix: SparseMatrix) -> np.ndarray:
+        return matrix.toarray()
 
     def _normalize_rows(self, values: np.ndarray) -> tuple[SparseMatrix, np.ndarray]:
         D = csr_array((values * self.metric[self.entries[1]], self.entries), shape=(self.count, self.size))
@@ -146,7 +149,6 @@ class SparseRows(RowTerms):
         return -self.metric * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
 
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> SparsePosition | None:
-        """Return a closed position near q, or None; `give_up` early if it seems not to exist."""
         q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)
         psi, _, D = self.at(t, q)
         if not np.all(np.isfinite(D.data)) or not is_closed(self.scales, q, 0 * q, psi, 0 * psi, np):
@@ -167,7 +169,6 @@ class SparseRows(RowTerms):
         return q, v, psi, self.geometry(t, q, v)[1], rank
 
     def split_rows(self, positions: list[SparsePosition]) -> Sequence[tuple[np.ndarray, Sequence["RowSubset"]]]:
-        """Return sets of rows that depend on each other, each with its null space at each position."""
         return split_dependent_rows(positions)
 
     def _position(self, t: Time, q: np.ndarray, D: SparseMatrix) -> SparsePosition:

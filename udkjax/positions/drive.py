@@ -20,7 +20,7 @@ from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
-from udkjax.equations.redundancy import generic_position, kinematic_rows, owners_of_row
+from udkjax.equations.redundancy import generic_position, kinematic_rows
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.coordinates import Coordinate, constant_motion, named_element, value_of
 from udkjax.scene.checks import SceneError
@@ -236,7 +236,7 @@ def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, nam
         SceneError: the coordinate is held; the message names the drivers that hold it.
     """
     q = generic_position(bare)
-    involved = None if q is None else owners_of_row(kinematic_rows(driven), 0.0, q, name)
+    involved = None if q is None else kinematic_rows(driven).owners_of_row(0.0, q, name)
     if involved is None:
         return
     holding = [names.get(other, f"driver {quote(other)}") for other in driven.driver_names if other in involved]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from udkjax.equations.position_rows import PositionRows
 from udkjax.equations.redundancy import kinematic_rows
 from udkjax.scene.joints import Gear, Revolute
 from udkjax.study.identify import loop_consistency
@@ -74,7 +75,7 @@ def test_all_three_tied_are_legal_and_so_are_masses(linkage):
 
 
 def test_of_masses_nothing_is_looked_at(linkage, monkeypatch):
-    monkeypatch.setattr(loop_consistency, "sample_positions", None)
+    monkeypatch.setattr(PositionRows, "sample", None)
     assert asked(linkage, "body.link1.mass", "gravity[1]") == []
 
 
@@ -133,7 +134,7 @@ def test_a_tie_that_is_legal_at_one_position_only_is_refused(monkeypatch):
     assert "larger cannot vary by itself" in problem
     monkeypatch.setattr(loop_consistency.RedundantLoops, "_closes", lambda *_: True)
     assert loop_problems(mechanism, apply, [0.0], ["larger"]) == [problem]
-    monkeypatch.setattr(loop_consistency, "sample_positions", lambda rows, q: [rows.close(0.0, q)])
+    monkeypatch.setattr(PositionRows, "sample", lambda rows, q: [rows.close(0.0, q)])
     assert loop_problems(mechanism, apply, [0.0], ["larger"]) == []
 
 

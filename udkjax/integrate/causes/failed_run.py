@@ -7,7 +7,8 @@ import numpy as np
 
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.redundancy import PositionRows, dense, kinematic_rows
+from udkjax.equations.position_rows import PositionRows
+from udkjax.equations.redundancy import kinematic_rows
 from udkjax.integrate.solution import Result
 from udkjax.positions.open_rows import name_open_rows
 from udkjax.scene.mechanism import Mechanism
@@ -64,7 +65,7 @@ class FailedRun:
 
     def decomposed(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the left singular vectors and the singular values of D, with rows of length one."""
-        D = dense(self.rows.at(t, q)[2])
+        D = self.rows.dense(self.rows.at(t, q)[2])
         return np.linalg.svd(D, full_matrices=False)[:2] if np.all(np.isfinite(D)) else (D, np.full(len(D), np.nan))
 
     def open_rows(self, t: float, q: np.ndarray) -> str:

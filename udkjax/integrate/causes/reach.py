@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.redundancy import dense, generic_position, kinematic_rows, owners_of_row
+from udkjax.equations.redundancy import generic_position, kinematic_rows
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver
@@ -97,7 +97,7 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
     """Return the constraints whose demands after a time are impossible: outside the range of D."""
     rows = run.rows
     psi, length, D = rows.at(t, q)
-    u, sigma, _ = np.linalg.svd(dense(D))
+    u, sigma, _ = np.linalg.svd(rows.dense(D))
     null = np.ones(len(u), bool)
     null[: len(sigma)] = sigma <= DEAD_POINT_TOL * sigma[0]
     N = u[:, null]
@@ -109,7 +109,7 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
 def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
     """Return True if the rows of drivers depend on the others in a generic configuration, too."""
     q = generic_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
-    return q is not None and owners_of_row(kinematic_rows(mechanism), 0.0, q, names[-1]) is not None
+    return q is not None and kinematic_rows(mechanism).owners_of_row(0.0, q, names[-1]) is not None
 
 
 def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:

@@ -10,7 +10,8 @@ import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import LONGEST_STEP, close_position, is_closed
-from udkjax.equations.redundancy import PositionRows, kinematic_rows
+from udkjax.equations.position_rows import PositionRows
+from udkjax.equations.redundancy import kinematic_rows
 from udkjax.scene.mechanism import Mechanism
 
 NEIGHBOUR_STEP = 0.1  # step from one neighbour to the next, relative to the characteristic length, and rad

@@ -3,7 +3,7 @@
 import numpy as np
 
 from udkjax.equations import determinacy
-from udkjax.equations.redundancy import choose_dispensable
+from udkjax.equations.position_rows import choose_dispensable
 from udkjax.positions.assembly import State, close, require_closed
 from udkjax.positions.channels import StateHistory
 from udkjax.scene.arguments import checked

@@ -20,7 +20,8 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.redundancy import GENERIC_TOL, PositionRows, choose_redundant_rows, dense, kinematic_rows, sample_positions
+from udkjax.equations.position_rows import GENERIC_TOL, PositionRows
+from udkjax.equations.redundancy import kinematic_rows
 from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.positions.assembly import close, require_closed
@@ -134,14 +135,14 @@ class RedundantLoops:
         original = changed(np.zeros(len(x)))
         self.x, rows = x, kinematic_rows(original)
         with np.errstate(all="ignore"):
-            positions = sample_positions(rows, np.asarray(original.q0, float).ravel())
+            positions = rows.sample(np.asarray(original.q0, float).ravel())
         self.redundant = rows.count - positions[0].rank if positions else 0
         if not self.redundant:
             return
         self._drivers = mechanism.driver_names
         self._positions = [p for p in positions if p.smallest > GENERIC_TOL] or positions
         self._names = [name for name, _ in rows.names]
-        self._redundant_rows = list(choose_redundant_rows(rows, positions))
+        self._redundant_rows = list(rows.redundant(positions))
         self._measure(rows, steps, _length(original))
 
     def _measure(self, rows: PositionRows, steps: np.ndarray, length_scale: float):
@@ -154,7 +155,7 @@ class RedundantLoops:
             columns.append(np.array(moved) / (2 * step.sum()))
         slope = np.stack(columns, -1)  # (positions, rows, P)
         # The natural size of a row is the longest lever arm of its rotations, which is 1 for angular rows.
-        arms = np.max([length * np.abs(dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in evaluated], axis=0)
+        arms = np.max([length * np.abs(rows.dense(D[:, 2::3]) / rows.metric[2::3]).max(1) for _, length, D in evaluated], axis=0)
         largest = np.abs(slope / np.where(arms > 0.0, arms, length_scale)[:, None]).max((0, 1))
         by_effect = 1.0 / np.where(largest > 0.0, largest, np.inf)
         magnitude = np.abs(self.x)
@@ -163,7 +164,7 @@ class RedundantLoops:
         total = np.sqrt((effect**2).sum((0, 1)) / len(effect))
         self._unit = 1.0 / np.where(total > 0, total, 1.0)  # change of each parameter whose effect is one
         self._effect = effect * self._unit
-        null_spaces = [dense(p.null_space) for p in self._positions]
+        null_spaces = [rows.dense(p.null_space) for p in self._positions]
         self._unclosed = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])
         # A combination of rows for each redundant row: it expresses this row by the others.
         self._circuits = np.array([N @ np.linalg.inv(N[self._redundant_rows]) for N in null_spaces])
