@@ -1,4 +1,5 @@
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import pytest
@@ -19,6 +20,14 @@ def test_a_good_environment_gets_no_advice():
 def test_single_precision_is_reported():
     with jax.enable_x64(False):
         assert any("float64 is off" in line for line in doctor._advice("native", ""))
+
+
+def test_a_graphics_card_without_the_cpu_beside_it_is_reported(monkeypatch):
+    monkeypatch.setattr(doctor, "default_devices", lambda: [SimpleNamespace(platform="gpu")])
+    monkeypatch.setattr(doctor, "host_device", lambda: jax.devices()[0])
+    assert list(doctor._advice("native", "")) == []
+    monkeypatch.setattr(doctor, "host_device", lambda: None)
+    assert ["JAX_PLATFORMS must name the cpu, too, as in cuda,cpu" in line for line in doctor._advice("native", "")] == [True]
 
 
 def test_the_cache_of_machine_code_is_reported(monkeypatch, tmp_path):

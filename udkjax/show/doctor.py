@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from udkjax.devices import default_devices, host_device
 from udkjax.extras import EXTRAS
 from udkjax.folders import is_writable
 from udkjax.integrate import Solution, simulate
@@ -88,6 +89,9 @@ def _advice(engine: str, reason: str) -> Iterator[str]:
         yield "float64 is off, so loops close only to single precision: unset JAX_ENABLE_X64, or set it to 1"
     if engine != "native":
         yield f"machine code is not used here ({reason}): simulations take up to a hundred times as long"
+    kind = default_devices()[0].platform
+    if kind != "cpu" and host_device() is None:
+        yield f"small programs run on the {kind}, which is slow: JAX_PLATFORMS must name the cpu, too, as in cuda,cpu"
     folder = cache_folder()
     if os.environ.get("UDKJAX_CACHE") != "0" and (folder is None or not is_writable(folder)):
         location = "without a home folder" if folder is None else f"in {folder}"
