@@ -106,3 +106,23 @@ def test_conditions_do_not_close_over_traced_numbers():
     for function in (jax.grad(end), jax.jit(end)):
         with pytest.raises(ValueError, match="closes over traced numbers"):
             function(0.5)
+
+
+def rocking_box(p):
+    """A box that falls on two feet, which take turns until it rests."""
+    feet = [udk.Contact("box", point=[-0.5, -0.2], name="L"), udk.Contact("box", point=[0.5, -0.2], name="R")]
+    box = udk.Body(1.0, 0.3, position=jnp.stack([0.0 * p[0], p[0]]), angle=p[1], angular_velocity=p[2])
+    return udk.simulate(udk.Mechanism({"box": box}), [0.0, 1.5], events=feet, rtol=1e-10, atol=1e-10)
+
+
+def test_times_of_events_never_decrease():
+    run = rocking_box(np.array([0.6, 0.0, -1.0]))
+    assert np.diff(run.events.time).min() >= 0.0
+    np.testing.assert_allclose(run.v[-1], 0.0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_what_rests_does_not_depend_on_how_it_fell():
+    """The event at which the second foot comes to rest counts, however close it is to the one before."""
+    slopes = jax.jacfwd(lambda p: rocking_box(p).v[-1, 0])(jnp.array([0.6, 0.0, -1.0]))
+    np.testing.assert_allclose(slopes, 0.0, atol=1e-12)

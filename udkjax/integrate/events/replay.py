@@ -161,7 +161,7 @@ def _integrate_piece(
     j = jnp.minimum(event, K - 1)
     target = jnp.where(has_next, found.event_time[j], found.time)
     end = jnp.maximum(jnp.where(output[-1] < T - 1, jnp.minimum(target, requested[-1]), target), state.t)
-    happens = has_next & (end == target)
+    happens = has_next & (end >= target)
     is_short = end - state.t <= 2 * hybrid.smallest
     times = jnp.concatenate([state.t[None], jnp.clip(requested, state.t, end), end[None]])
     raw = hybrid.flow(jnp.where(is_short, state.t + 100 * hybrid.smallest * np.arange(width + 2), times), state, derivatives=True)
