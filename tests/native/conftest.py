@@ -13,18 +13,17 @@ from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.native.base import machine
 from udkjax.native.base.ir import POINTER, Function
 from udkjax.native.base.program import write
+from udkjax.native.base.text import text_of_module
 
 WIDTHS = sorted({1, 2, machine.lanes()})
 
 
 def loaded(*functions: Function, globals: Sequence[str] = ()) -> Callable[..., None]:
     """The last of some functions, to be called with arrays, whole numbers and numbers."""
-    declared = sorted(set().union(*(f.declared for f in functions)))
     last = functions[-1]
-    text = "\n".join([*declared, *globals, *(f.text() for f in functions)])
-    library = machine.Library([machine.compile_module(text)], [last.name])
+    library = machine.Library([machine.compile_module(text_of_module(functions, globals))], [last.name])
     kinds = {POINTER: ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
-    run = machine.function(library[last.name], *(kinds[value.base] for value in last.given.values()))
+    run = machine.function(library[last.name], *(kinds[x.base] for name, x in last.given.items() if name != "shared"))
 
     def call(*arguments: Any, _alive: Any = library):
         assert all(a.flags.c_contiguous for a in arguments if isinstance(a, np.ndarray))

@@ -17,6 +17,7 @@ from udkjax.native.base import machine
 from udkjax.native.base.ir import POINTER, Function
 from udkjax.native.base.layout import Layout
 from udkjax.native.base.memory import Memory
+from udkjax.native.base.text import text_of_module
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 
@@ -52,9 +53,7 @@ class Solver(Memory):
             else:
                 getattr(code, name)(DenseMatrices(layout, f))
             functions.append(f)
-        declared = sorted(set().union(*(f.declared for f in functions)))
-        text = "\n".join([*declared, *(f.text() for f in functions)])
-        self._library = machine.library(text, names)
+        self._library = machine.library(text_of_module(functions), names)
         self._layout = layout
 
     def _view(self, memory, name):

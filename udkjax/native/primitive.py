@@ -26,6 +26,7 @@ from udkjax.native.base.memory import Memory
 from udkjax.native.base.prepared_call import PreparedCall
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.steps import Status
+from udkjax.native.base.text import text_of_module
 from udkjax.native.derivatives import record
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
@@ -52,8 +53,7 @@ def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
     """
     module = operation.module(width, tangent_lanes, machine.lanes())
     handlers = handler(module, "call_frame")
-    declared = sorted(set().union(*(f.declared for f in handlers)))
-    module.written_text = "\n".join([module.text(), *declared, *(f.text() for f in handlers)])
+    module.written_text = f"{module.text()}\n{text_of_module(handlers)}"
     return module
 
 

@@ -59,6 +59,7 @@ class Function:
         self.noinline = False  # whether inlining is forbidden
         self._arguments, self._lines, self._reserved = list(arguments), [], []
         self._count, self.declared = 0, set()
+        self.evaluated: dict[str, Function] = {}  # functions called by `evaluate`; the same module has to define them
         self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
         self.given["shared"] = Value(self, "%shared", POINTER)  # memory of the block, in a thread of a GPU
 
@@ -182,7 +183,7 @@ class Function:
         return self.op(f"select {mask.type} {mask.name}, {a.type} {a.name}, {b.type} {b.name}", base, width)
 
     def intrinsic(self, name: str, *arguments: Operand) -> Value:
-        """Call an intrinsic function of LLVM on numbers, lane by lane: fmuladd, sqrt, fabs, maximum, floor, exp, log, pow, ..."""
+        """Call an intrinsic function of LLVM on numbers, lane by lane: fmuladd, sqrt, fabs, maximum, floor, ..."""
         width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
         values = [self.like(x, DOUBLE, width) for x in arguments]
         kind = llvm_type(DOUBLE, width)
@@ -280,6 +281,12 @@ class Function:
         variable = Variable(self, base, self.width if width is None else width)
         variable.value = start
         return variable
+
+    def evaluate(self, function: "Function", *arguments: Value) -> Value:
+        """Call a function that returns numbers in as many lanes as its arguments have."""
+        self.evaluated[function.name] = function
+        given = ", ".join(f"{a.type} {a.name}" for a in arguments)
+        return self.op(f"call {function.returns} @{function.name}({given})", DOUBLE, arguments[0].width)
 
     def call(self, name: str, *arguments: Value):
         self.line(f"call void @{name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")

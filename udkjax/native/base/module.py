@@ -11,6 +11,7 @@ from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.running import memory_size, write_run, write_run_member
 from udkjax.native.base.steps import POINTS
+from udkjax.native.base.text import ALLOCATION, text_of_module
 
 # Rarely called functions: once per run, near singular configurations, or where a piece may end.
 COLD = (
@@ -134,9 +135,7 @@ class Module(Memory):
         """LLVM's text of the whole module."""
         self.write_functions()
         write_run(self)
-        functions = [*self.functions, *self.loops.functions]
-        declared = sorted(set().union(*(f.declared for f in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
-        return "\n".join([*declared, *self.loops.globals, *(f.text() for f in functions)])
+        return text_of_module([*self.functions, *self.loops.functions], self.loops.globals, ALLOCATION)
 
     def thread_code(self) -> ThreadCode:
         self.write_functions()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.base import special_functions
+from udkjax.native.base import elementary
 from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
 
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
@@ -19,11 +19,7 @@ COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
 HALF_PI = (math.pi / 2, 6.123233995736766e-17)  # in two parts: their sum is exact to 107 binary digits
 ROUND = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
 _COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
-_INTRINSIC = {
-    "abs": "fabs", "exp": "exp", "log": "log", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum", "pow": "pow",
-    "tanh": "tanh", "tan": "tan", "sinh": "sinh", "cosh": "cosh", "asin": "asin", "acos": "acos", "atan": "atan", "exp2": "exp2",
-    "atan2": "atan2",
-}  # fmt: skip
+_INTRINSIC = {"abs": "fabs", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum"}
 
 
 class UnsupportedError(ValueError):
@@ -140,19 +136,7 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
         case "integer_pow":
             return integer_power(a[0], parameters["y"])
         case "logistic":
-            return 1.0 / (f.intrinsic("exp", -a[0]) + 1.0)
-        case "expm1":
-            return f.intrinsic("exp", a[0]) - 1.0 if a[0].base == INT else _expm1(f, a[0])
-        case "log1p":
-            return _log1p(f, a[0])
-        case "asinh" | "acosh" | "atanh":
-            return getattr(special_functions, name)(f, a[0], _log1p)
-        case "cbrt" | "erf" | "erfc":
-            return getattr(special_functions, name)(f, a[0])
-        case "log2":
-            return f.intrinsic("log", a[0]) * (1 / math.log(2))
-        case "rem" if a[0].base == DOUBLE:
-            return special_functions.remainder(f, a[0], a[1])
+            return 1.0 / (elementary.call(f, "exp", -a[0]) + 1.0)
         case "round":
             return _round(f, a[0], parameters["rounding_method"])
         case "add" | "sub" | "mul" if a[0].base == INT:
@@ -188,6 +172,8 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             return f.compare(name, *a)
         case _ if name in _INTRINSIC and all(x.base == DOUBLE for x in a):
             return f.intrinsic(_INTRINSIC[name], *a)
+        case _ if name in elementary.NAMES and all(x.base == DOUBLE for x in a):
+            return elementary.call(f, name, *a)
         case _:
             raise UnsupportedError(name)
 
@@ -229,22 +215,10 @@ def _divide_whole(f: Function, name: str, x: Value, y: Value) -> Value:
 
 def _round(f: Function, a: Value, method: Any) -> Value:
     """Round to an integer; halves to the even one, or away from zero."""
-    return f.intrinsic("roundeven" if int(method) == 1 else "round", a)
-
-
-def _expm1(f: Function, x: Value) -> Value:
-    """Return e^x - 1 (Kahan), accurate also for small x."""
-    u = f.intrinsic("exp", x)
-    small, vanishes = u.is_(1.0), (u - 1.0).is_(-1.0)
-    exact = (u - 1.0) * x / f.intrinsic("log", f.select(small | vanishes | ~f.is_finite(u), 2.0, u))
-    return f.select(small, x, f.select(vanishes | ~f.is_finite(u), u - 1.0, exact))
-
-
-def _log1p(f: Function, x: Value) -> Value:
-    """Return log(1 + x) (Kahan)."""
-    u = x + 1.0
-    small = u.is_(1.0)
-    return f.select(small | ~(u < math.inf), x, f.intrinsic("log", u) * x / f.select(small, 1.0, u - 1.0))
+    if int(method) == 1:
+        return f.intrinsic("roundeven", a)
+    below_half = f.intrinsic("copysign", math.nextafter(0.5, 0.0), a)  # half itself would round up the number below one half
+    return f.intrinsic("trunc", a + below_half)
 
 
 def integer_power(a: Value, n: int) -> Value:

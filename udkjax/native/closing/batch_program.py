@@ -8,6 +8,7 @@ from udkjax.expressions import ScalarProgram
 from udkjax.native.base import machine
 from udkjax.native.base.ir import INT, POINTER, Function
 from udkjax.native.base.program import Writer, from_memory
+from udkjax.native.base.text import text_of_module
 
 
 class BatchProgram:
@@ -22,7 +23,7 @@ class BatchProgram:
         self.program, self.width = program, machine.lanes()
         self._input_count = len(program.inputs) - shared
         f = self._write()
-        self._library = machine.library("\n".join([*sorted(f.declared), f.text()]), (f.name,))
+        self._library = machine.library(text_of_module([f]), (f.name,))
         self._run = machine.function(self._library[f.name], *[ctypes.c_void_p] * 3, ctypes.c_int64)
 
     def __call__(self, members: np.ndarray, shared: np.ndarray | None = None) -> np.ndarray:

@@ -17,6 +17,7 @@ from udkjax.equations.position_programs import PositionPrograms
 from udkjax.native.base import machine
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value, Variable
 from udkjax.native.base.program import consecutive, write
+from udkjax.native.base.text import ALLOCATION, text_of_module
 from udkjax.threads import thread_count
 
 # A Newton step shorter than this, in units of the coordinates, is the last: the next would be of the order of its square.
@@ -134,8 +135,7 @@ class _Text:
         ]  # fmt: skip
         for f in functions[:3]:
             f.noinline = True
-        declared = {"declare ptr @malloc(i64)", "declare void @free(ptr)"}.union(*(f.declared for f in functions))
-        return "\n".join([*sorted(declared), *(f.text() for f in functions)])
+        return text_of_module(functions, declared=ALLOCATION)
 
     # --- memory
 

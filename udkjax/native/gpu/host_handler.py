@@ -33,6 +33,7 @@ from udkjax.native.base.ffi import (
     word,
 )
 from udkjax.native.base.ir import BOOL, INT, POINTER, Function, Value, Variable
+from udkjax.native.base.text import text_of_module
 from udkjax.native.gpu.driver import CudaDriver, driver
 from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, GIVEN, PLATFORM, POP, PUSH, Words, stream_of
 from udkjax.threads import cores
@@ -110,8 +111,7 @@ def _device() -> int:
 def module_text() -> str:
     """Return the text of the module."""
     functions = [_thread_count(), _schedule(), _copy_and_call()]
-    declared = sorted(set(LIBC).union(*(f.declared for f in functions)))
-    return "\n".join([*declared, WORDS.text, *(f.text() for f in functions)])
+    return text_of_module(functions, [WORDS.text], LIBC)
 
 
 def _copy_and_call() -> Function:

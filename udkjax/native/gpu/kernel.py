@@ -5,7 +5,6 @@ stretch of it together. The call record is a parameter of the kernel. The thread
 of a multiprocessor then run the same functions at about the same time, which its cache of instructions has room for.
 """
 
-import re
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -13,13 +12,13 @@ from udkjax.native.base.ir import SHARED_SPACE
 from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.module import Module
 from udkjax.native.base.program import UnsupportedError
+from udkjax.native.base.text import external_functions, text_of_module, with_evaluated
 from udkjax.native.operations import Operation
 
 NAME = "run_members"  # of the kernel
 VECTOR = 4  # coordinates whose numbers are read together: a thread waits for memory most of the time
 # The arguments of functions that point to the memory of a thread, or into it.
 LOCAL = ("work", "out", "tangent", "stored", "accelerations", "projection")
-INTRINSICS = ("fabs", "sqrt", "floor", "ceil", "fmuladd", "maximum", "minimum")  # of float64, that GPUs have
 # A barrier that also asks whether the condition holds in any thread of the block.
 ANY_OF_BLOCK = "{ .reg .pred p, q; setp.ne.u32 p, $1, 0; barrier.cta.red.or.pred q, 0, p; selp.u32 $0, 1, 0, q; }"
 KERNEL = f"""
@@ -63,12 +62,9 @@ class KernelCode(NamedTuple):
 
     def functions_text(self, local: Collection[str]) -> str:
         """Return LLVM's text of the functions; `local` are the names of arguments that point to a thread's own memory."""
-        functions, shared = self.code.functions, self.code.shared
-        declared = sorted(set().union(*(f.declared for f in (*functions, *shared))))
-        texts = [*(f.text(local) for f in functions), *(f.text(()) for f in shared)]
         space = f"addrspace({SHARED_SPACE}) " if local else ""
         shared_memory = f"@shared = internal {space}global [{max(self.constants, 1)} x double] undef, align 16"
-        return "\n".join([*declared, shared_memory, *self.code.globals, *texts])
+        return text_of_module(self.code.functions, [shared_memory, *self.code.globals], local=local, shared=self.code.shared)
 
 
 def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool = False) -> KernelCode:
@@ -89,7 +85,7 @@ def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool 
     if shares:
         module.shares_constants = True
     code = module.thread_code()
-    for name in sorted({x[x.index("@") + 1 : x.index("(")] for f in (*code.functions, *code.shared) for x in f.declared}):
-        if not re.fullmatch(rf"llvm\.({'|'.join(INTRINSICS)})\.(v\d+)?f64|llvm\.vector\.reduce\.\w+\.v\d+\w+", name):
-            raise UnsupportedError(f"{name} on a GPU")  # LLVM would end the process
+    declared = (x for f in with_evaluated([*code.functions, *code.shared]) for x in f.declared)
+    for name in sorted(external_functions("\n".join(declared))):
+        raise UnsupportedError(f"{name} on a GPU")  # LLVM would end the process
     return KernelCode(module, code, module.constants if shares else 0)

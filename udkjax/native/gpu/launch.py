@@ -17,6 +17,7 @@ from udkjax.native.base import machine
 from udkjax.native.base.ffi import answer_metadata, call_record
 from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.program import UnsupportedError
+from udkjax.native.base.text import text_of_module
 from udkjax.native.gpu import target
 from udkjax.native.gpu.driver import CudaDriver, CudaError, driver
 from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, PLATFORM, POP, PUSH, Words, stream_of
@@ -127,7 +128,7 @@ def _has_memory(of: CudaDriver, kernel: int) -> bool:
 def load_handler(of: CudaDriver, code: KernelCode, kernel: int) -> machine.Library:
     """Load the handler `launch(frame)` of a kernel."""
     f = _launch(code)
-    text = "\n".join([*sorted(f.declared), WORDS.text, f.text()])
+    text = text_of_module([f], [WORDS.text])
     library = machine.library(text, ("launch", "words"))
     WORDS.fill(library, of, kernel)
     return library

@@ -18,6 +18,7 @@ from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.steps import NEAREST_STAGE, ROUNDING_PIVOT
 from udkjax.native.base.tableau import EULER
+from udkjax.native.base.text import ALLOCATION, text_of_module
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.fallback import write_fallback
 from udkjax.native.run.formulations import FormulationCode
@@ -177,9 +178,7 @@ class Evaluation:
         loops.write(self._code.prologue, "prologue", ("numbers", "work"), at | {"numbers": ("numbers", 0)})
         for name in ("accelerations", "energy"):
             loops.write(getattr(self._code, name), name, ("work", "out"), at)
-        functions = [*self._further, *loops.functions]
-        declared = sorted(set().union(*(f.declared for f in functions)))
-        return "\n".join([*declared, *loops.globals, *(f.text() for f in functions)])
+        return text_of_module([*self._further, *loops.functions], loops.globals)
 
 
 class ScaleCode(Memory):
@@ -212,9 +211,7 @@ class ScaleCode(Memory):
             self._find_scales(f, work, member.value)
             member.value = take()
         f.line(f"call void @free(ptr {block.name})")
-        functions = [*loops.functions, f]
-        declared = sorted(set().union(*(x.declared for x in functions)) | {"declare ptr @malloc(i64)", "declare void @free(ptr)"})
-        return "\n".join([*declared, *loops.globals, *(x.text() for x in functions)])
+        return text_of_module([*loops.functions, f], loops.globals, ALLOCATION)
 
     def thread_code(self) -> ThreadCode:
         loops = self._write_loops()
