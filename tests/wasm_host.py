@@ -26,8 +26,7 @@ class Host:
         functions = {"malloc": self._reserve, "free": lambda address: None}
         for imported in module.imports:
             if imported.name not in given:
-                function = functions.get(imported.name) or getattr(math, imported.name)
-                given[imported.name] = wasmtime.Func(store, imported.type, function)
+                given[imported.name] = wasmtime.Func(store, imported.type, functions[imported.name])
         self.exports = wasmtime.Instance(store, module, [given[imported.name] for imported in module.imports]).exports(store)
 
     def _reserve(self, size: int) -> int:

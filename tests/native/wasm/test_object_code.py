@@ -1,11 +1,15 @@
 """Modules out of LLVM's object code: exports, imports and constants, and refusal of other bytes."""
 
+import math
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from tests.wasm_host import Host
-from udkjax.native.base import machine
+from udkjax.native.base import elementary, machine
 from udkjax.native.base.ir import POINTER, Function
+from udkjax.native.base.text import text_of_module
 from udkjax.native.wasm import compile_wasm
 from udkjax.native.wasm.object_code import MAGIC, Reader, leb128, link
 
@@ -39,16 +43,28 @@ def test_each_of_several_functions_is_exported_by_its_name():
     assert linked.imports == () and linked.data_end == 0
 
 
-def test_functions_that_are_no_instructions_are_imports():
-    f = Function("both", [(POINTER, "x"), (POINTER, "y")])
-    f.store(f.intrinsic("exp", f.load(f.given["x"])) + f.intrinsic("sqrt", f.load(f.given["x"])), f.given["y"])
-    linked = compile_wasm("\n".join([*f.declared, f.text()]), ("both",))
-    assert linked.imports == ("exp",)
+def test_functions_that_a_module_does_not_define_are_imports():
+    text = "declare void @free(ptr)\ndefine void @forget(ptr %x) {\n  call void @free(ptr %x)\n  ret void\n}\n"
+    assert compile_wasm(text, ("forget",)).imports == ("free",)
+
+
+@pytest.mark.parametrize("width", [1, 2, 4])
+def test_elementary_functions_are_in_the_module(width):
+    f, names = Function("all", [(POINTER, "x"), (POINTER, "y")], width), sorted(elementary.NAMES - {"atan2", "pow", "rem"})
+    x = f.load(f.given["x"], 0, width)
+    for k, name in enumerate(names):
+        f.store(elementary.call(f, name, x), f.given["y"], k * width, width)
+    linked = compile_wasm(text_of_module([f]), ("all",))
+    assert linked.imports == ()
     host = Host(linked.code, linked.data_end)
     host.begin()
-    x, y = host.put([2.0]), host.put([0.0])
-    host.call("both", x, y)
-    assert host.numbers(y, 1)[0] == pytest.approx(np.exp(2.0) + np.sqrt(2.0), rel=1e-15)
+    numbers = np.linspace(0.3, 0.9, width)
+    x, y = host.put(numbers), host.put(np.zeros((len(names), width)))
+    host.call("all", x, y)
+    library = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "asinh": "arcsinh", "acosh": "arccosh", "atanh": "arctanh"}
+    with np.errstate(invalid="ignore"):
+        exact = [(getattr(np, library.get(name, name), None) or np.vectorize(getattr(math, name)))(numbers) for name in names]
+    assert_allclose(host.numbers(y, len(names) * width).reshape(-1, width), exact, rtol=1e-15)
 
 
 def test_constants_are_at_the_beginning_of_memory():

@@ -1,7 +1,7 @@
 """The compiler for WebAssembly: 32-bit addresses, registers of two float64, no fused multiply-add. Its code is stored on disk.
 
 LLVM's text is the same: the call record of `run` has fields of 8 bytes, of which addresses use four; products and sums are
-rounded separately. Functions without instructions (exp, pow, atan2) and memory management (malloc, free) are imports.
+rounded separately. The functions of memory management (malloc, free) are imports.
 """
 
 from functools import cache
