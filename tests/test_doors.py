@@ -1,6 +1,7 @@
 """Doors: what floors import of each other is listed in the `__init__.pyi` of the folder it comes from, and nothing else is."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,11 +15,16 @@ Name = tuple[str, str]  # the module, and the name in it
 MOST_NAMES = {"scene": 91, "equations": 92, "native": 40}
 
 
+@cache
+def nodes_of(text: str) -> list[ast.ImportFrom | ast.Attribute]:
+    """The nodes of a text that say what it imports and what it takes of that."""
+    return [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.ImportFrom | ast.Attribute)]
+
+
 def imported_names(file: Path) -> list[Name]:
     """Every name that a file imports from the package, wherever in the file it does so."""
-    nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-    froms = [n for n in nodes if isinstance(n, ast.ImportFrom) and (n.module or "").split(".")[0] == "udkjax"]
-    return [(n.module or "", name.name) for n in froms for name in n.names]
+    nodes = [n for n in nodes_of(file.read_text(encoding="utf-8")) if isinstance(n, ast.ImportFrom)]
+    return [(n.module or "", name.name) for n in nodes if (n.module or "").split(".")[0] == "udkjax" for name in n.names]
 
 
 def door(root: Path, floor: str) -> set[Name]:
@@ -50,8 +56,8 @@ def names_through_modules(root: Path) -> dict[str, set[Name]]:
     """The names of each floor that other floors use, where those reached through an imported module count one by one."""
     found = {floor: set(names) for floor, names in used_names(root).items()}
     for file in sorted(root.rglob("*.py")):
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        for node in (n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and (n.module or "").startswith("udkjax")):
+        nodes = nodes_of(file.read_text(encoding="utf-8"))
+        for node in (n for n in nodes if isinstance(n, ast.ImportFrom) and (n.module or "").startswith("udkjax")):
             for name in node.names:
                 module = f"{node.module}.{name.name}"
                 place = root.joinpath(*module.split(".")[1:])
@@ -59,7 +65,7 @@ def names_through_modules(root: Path) -> dict[str, set[Name]]:
                 if floor not in found or floor == file.relative_to(root).parts[0] or module.count(".") < 2:
                     continue
                 if place.is_dir() or place.with_suffix(".py").exists():
-                    values = [n for n in ast.walk(tree) if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name)]
+                    values = [n for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name)]
                     taken = {(module, n.attr) for n in values if n.value.id == (name.asname or name.name)}  # pyright: ignore
                     if taken:
                         found[floor] = found[floor] - {(node.module or "", name.name)} | taken
