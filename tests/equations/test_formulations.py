@@ -166,6 +166,7 @@ def test_and_by_nothing_where_a_joint_is_given_twice():
     assert_allclose(reference, all_of(single, T0, q, v, {})[0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_in_line(linkage, placed):
     """All links in line, turning: the rank is 10, and the accelerations are still those of the parallelogram."""
     q, v = (x.ravel() for x in placed(0.0, 1.3))

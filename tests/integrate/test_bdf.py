@@ -234,6 +234,7 @@ def test_step_without_a_solution_is_rejected(reacted):
     np.testing.assert_allclose(run.ys["x"], 1 / (1 + 3 * TS), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_gradients(reacted):
     """By rate and initial state; of x exactly, of z by differences."""
     k, h = 3.0, 1e-3

@@ -68,7 +68,7 @@ def slopes():
     return {f: jax.jit(jax.jacfwd(f)) for f in AT}
 
 
-@pytest.mark.parametrize("count", [2, 11])
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 11])
 def test_directions_side_by_side(count):
     """Many directions of one run at once are what each of them is alone: with outputs, and with lanes that stay empty."""
     names = [n for n in LINKAGE.parameters() if n.endswith(("mass", "inertia", "gravity", "link1.points", "angular_velocity"))]

@@ -63,7 +63,7 @@ STOPS = [udk.JointLimit(next(iter(FIVE_BAR.joints)), lower=-2.0, restitution=0.6
     ("mechanism", "events", "end"),
     [
         pytest.param(PENDULUM, LIMITS, 2.0, id="limits"),
-        pytest.param(CATCH, CAUGHT, 0.8, id="catch"),
+        pytest.param(CATCH, CAUGHT, 0.8, id="catch", marks=pytest.mark.slow),
         pytest.param(BOX, FEET, 0.41, id="box", marks=pytest.mark.slow),
         pytest.param(PENDULUM, [*CHANGE, *LIMITS[1:]], 0.8, id="change"),
         pytest.param(PENDULUM, LOCKS, 1.5, id="locks", marks=pytest.mark.slow),

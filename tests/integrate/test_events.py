@@ -194,6 +194,7 @@ def test_two_at_one_instant():
     assert np.abs(sol.v[-1, 1]).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_pendulums_of_a_batch_have_events_of_their_own():
     speeds, ts = np.linspace(-6.0, 6.0, 200), np.linspace(0.0, 4.0, 5)
     stops = [

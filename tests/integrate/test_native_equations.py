@@ -138,6 +138,7 @@ def test_projection(method):
         assert np.linalg.norm(x - np.linalg.pinv(D, rcond=1e-4) @ (D @ x)) < 1e-3 * np.linalg.norm(x)
 
 
+@pytest.mark.slow
 def test_batches_and_derivatives():
     mechanism = udk.library.parallelogram(angle=-0.7, angular_velocity=0.7)
     native, plain = both(mechanism, udk.Householder())

@@ -34,9 +34,11 @@ def differences(f, x, h=1e-4):
 @pytest.mark.parametrize(
     ("name", "transform"),
     [
-        ("driven", jax.jacfwd),
         ("splined", jax.jacrev),
-        *(pytest.param(name, jax.jacrev, marks=pytest.mark.slow) for name in ("driven", "held")),
+        *(
+            pytest.param(*x, marks=pytest.mark.slow)
+            for x in (("driven", jax.jacfwd), ("driven", jax.jacrev), ("held", jax.jacrev))
+        ),
     ],
 )
 def test_states_change_by_times_as_by_differences(name, transform):

@@ -389,6 +389,7 @@ def test_a_large_scene_moves_as_its_parts_do(linkages, angle, bound):
     assert_allclose(all_of_them.q.reshape(6, 8, 4, 3), np.repeat(one.q[:, None], 8, 1), atol=bound)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_large_scene_are_those_of_its_parts(linkages):
     """Derivatives of runs and of closing their initial states, in forward and reverse mode."""
     ts, slopes = np.linspace(0.0, 0.3, 4), []

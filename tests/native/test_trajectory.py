@@ -19,7 +19,7 @@ from tests.textbook import terms
 
 TOL = 1e-9
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
-FAST = "parallelogram", "slider_crank", "andrews_squeezer"
+FAST = "parallelogram", "slider_crank"
 
 
 def by_scipy(mechanism, ts, state=None, gains=(0.0, 0.0)):

@@ -97,7 +97,7 @@ def test_travel_has_two_ends_and_exact_derivatives():
     assert (float(free.lower), float(free.upper)) == (-np.inf, np.inf)
 
 
-@pytest.mark.parametrize("stages", fast([3, 5], [1, 2, 3, 4, 5]))
+@pytest.mark.parametrize("stages", fast([3], [1, 2, 3, 4, 5]))
 def test_travel_ends_at_toggles_where_branches_meet(stages):
     """All bars of a lift are upright there, and each may turn to either side; on the way all are level."""
     found = udk.travel(udk.library.scissor_lift(stages, 0.7, length=2.5), "body.platform.y")
