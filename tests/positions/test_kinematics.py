@@ -489,6 +489,7 @@ def test_a_motion_stays_on_its_branch_where_another_comes_close(gap, count, leng
         assert min(np.max(np.abs(found - x)) for x in exact) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_traced_motion_stays_on_its_branch_and_has_derivatives():
     """Of a batch in reverse mode, of a position, a velocity and an acceleration together, against differences."""
     gaps, angle = np.array([1e-3, 1e-4, 1e-5]), np.linspace(1.0, 1.0 + 2 * np.pi, 25)
