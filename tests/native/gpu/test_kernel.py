@@ -1,6 +1,8 @@
 """Kernels without a graphics card: their threads one after another, equal to the engine in all bits, also in programs of JAX."""
 
 import itertools
+import platform
+import shutil
 import sys
 
 import diffrax
@@ -12,6 +14,7 @@ from jax.interpreters import mlir
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
+from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import primitive
 from udkjax.native.base import machine
@@ -215,3 +218,19 @@ def test_kernels_are_assembled(name):
             text = target.ptx(call.kernel.text)
             assert "ld.local" in text or type(call.operation).__name__ == "FindScales"
             assert target.assemble(text, target.NEWEST, assembler)[:4] == b"\x7fELF"
+
+
+@pytest.mark.skipif(shutil.which("cc") is None or platform.machine() != "x86_64", reason="no C compiler for this processor")
+@pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "tangent"])
+def test_ptx_computes_what_the_engine_computes(name, tmp_path):
+    """What LLVM writes for a graphics card, transliterated to C: all bits, and the address spaces of its pointers."""
+    for k, call in enumerate(emulation.calls_of(jax.vmap(RUNS[name]), MASSES)):
+        if call.operation.is_reverse:
+            continue
+        folder, code = tmp_path / str(k), call.kernel
+        folder.mkdir()
+        outputs = [np.full(x.shape, np.nan) for x in call.outputs]
+        record = emulation.call_record(code, call, [x.ctypes.data for x in (*call.inputs, *outputs)])
+        ptx_as_c.compiled(target.ptx(code.text), folder)(record.ctypes.data, len(outputs[0]))
+        for found, known in zip(outputs, call.outputs, strict=True):
+            assert_array_equal(found, known)
