@@ -153,13 +153,14 @@ def gradients(report: Report):
 
 
 def scenes(report: Report, name: str):
-    """Runs a second of a mechanism from the library, with gravity and masses of the members from 80 to 120 percent."""
+    """Runs a second of a mechanism from the library under 80 to 120 percent of gravity, or of a mass where there is none."""
     mechanism, members, end = _scene(name), 65_536, SCENES[name]
+    known, gravity = udk.analyse(mechanism), np.asarray(mechanism.gravity)
     mass = next(x for x in mechanism.parameters() if x.endswith(".mass"))
-    given, known = float(mechanism.parameters()[mass]), udk.analyse(mechanism)
+    varied, given = ("gravity", gravity) if gravity.any() else (mass, mechanism.parameters()[mass])
 
     def one(share):
-        moved = mechanism.with_parameters({mass: given * share})
+        moved = mechanism.with_parameters({varied: jnp.asarray(given) * share})
         return udk.simulate(moved, np.linspace(0.0, end, 2), rtol=1e-6, atol=1e-6, throw=False, analysis=known).q[-1]
 
     run, shares = jax.jit(jax.vmap(one)), jnp.linspace(0.8, 1.2, members)
@@ -203,6 +204,16 @@ def calls(report: Report):
             )
 
 
+def swept(report: Report):
+    """Members a second of `udk.sweep`, with what it stores; it needs xarray."""
+    ts, members = np.linspace(0.0, END, 2), 1_000_000
+    axes = {"body.coupler.mass": np.linspace(1.0, 3.0, members)}
+    start = time.perf_counter()
+    data = udk.sweep(udk.library.parallelogram(), axes, ts, rtol=1e-6, atol=1e-6)
+    each = time.perf_counter() - start
+    report.add("swept", members=members, seconds=each, a_second=members / each, succeeded=float((data.result == 0).mean()))
+
+
 def script(report: Report):
     """Runs a second by a script with diffrax under vmap, on the same card."""
     ts = jnp.linspace(0.0, END, 2)
@@ -240,6 +251,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
     report.take(numbers)
     report.take(gradients)
     report.take(script)
+    report.take(swept)
     for name in SCENES:
         report.take(scenes, name)
     return report.figures

@@ -30,7 +30,9 @@ from udkjax.study.sweep.plan import SweepPlan, stack_choices
 
 RESULT, END, STEPS = "result", "end_time", "steps"  # variables stored for every member
 LANE_WIDTH = 8  # number of members in the widest vector unit; the size of a piece is a multiple of it
-DEVICE_PIECE = 4096  # number of members of a piece on devices that compute a batch at once
+# Number of members of a piece on devices that compute a batch at once, and bytes of all their states and slopes: a graphics card
+# computes ten times as many members a second in batches of 65,536 as in batches of 1,024.
+DEVICE_PIECE, DEVICE_BYTES = 65_536, 2**30
 LARGEST_PIECE = 8  # largest piece relative to `PIECE_MEMBERS`; since a call takes as long as ten members, larger ones save little
 LEAST_PIECES = 16  # number of pieces of a group before pieces become larger, to keep all devices busy
 STRAIGHT_METHODS = (type(None), Auto, Elimination)  # without branches: fast in vector lanes even without machine code
@@ -104,9 +106,10 @@ class GroupRun:
         )
         self._placed: Shared | None = None
         devices = default_devices()
+        states = 16 * len(plan.ts) * fixed["mechanism"].q0.size * (1 + len(self.names))  # bytes of a member
         first = plan.first_alike[index]
         self.program = (
-            Program(self, len(self.names), _piece(len(self.members), in_lanes, devices[0].platform), devices)
+            Program(self, len(self.names), _piece(len(self.members), in_lanes, devices[0].platform, states), devices)
             if first == index
             else _group_run(plan, first, redundant).program
         )
@@ -209,11 +212,11 @@ def _with(choice: PyTree, name: str, value: np.ndarray | Array) -> PyTree:
     return eqx.tree_at(lambda c: getattr(c, name), choice, value, is_leaf=lambda x: x is None)
 
 
-def _piece(members: int, in_lanes: bool, platform: str) -> int:
-    """Return the number of members in a piece on each device: several in vector lanes, or one."""
+def _piece(members: int, in_lanes: bool, platform: str, states: int) -> int:
+    """Return the number of members, with `states` bytes each, in a piece on each device: several in vector lanes, or one."""
     full = -(-members // LANE_WIDTH) * LANE_WIDTH
     if platform not in CHUNKED_PLATFORMS:
-        return min(DEVICE_PIECE, full)
+        return min(DEVICE_PIECE, max(LANE_WIDTH, DEVICE_BYTES // states), full)
     return min(PIECE_MEMBERS * max(1, min(LARGEST_PIECE, members // (PIECE_MEMBERS * LEAST_PIECES))), full) if in_lanes else 1
 
 
