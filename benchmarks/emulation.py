@@ -16,7 +16,7 @@ ALONE = "define i1 @meet(i1 %goes_on) { ret i1 %goes_on }\n"  # a block of one t
 
 
 class Called(NamedTuple):
-    """A call of machine code: what a batch made it do."""
+    """A call of machine code with a batch."""
 
     operation: Operation
     inputs: list[np.ndarray]
@@ -81,7 +81,7 @@ class Thread:
 
 
 def run_threads(code: KernelCode, call: Called) -> list[np.ndarray]:
-    """What the threads write, one after another."""
+    """Run the threads one after another; return the outputs."""
     thread, outputs = Thread(code), [np.full(x.shape, np.nan) for x in call.outputs]
     record = call_record(code, call, [x.ctypes.data for x in (*call.inputs, *outputs)])
     for member in range(len(outputs[0]) + 3):  # a block has threads without a member

@@ -1,6 +1,6 @@
-"""Runs on a graphics card of NVIDIA: batches as kernels, and what a user gets in eager, jitted and batched calls.
+"""Runs on an NVIDIA GPU: batches as kernels, and eager, jitted and batched calls as users write them.
 
-Where a card is, it takes at most five minutes and needs nothing but this repository's folders, JAX, diffrax and llvmlite. Without
+With a GPU, it takes at most five minutes and needs nothing but this repository's folders, JAX, diffrax and llvmlite. Without
 one it says so, and runs the threads of the kernels one after another on this processor.
 """
 
@@ -73,7 +73,7 @@ def _released(members: int) -> jax.Array:
 
 
 def equality(report: Report):
-    """Whether a kernel's results equal those of the host in all bits."""
+    """Compare all bits of a kernel's results with those of the host."""
     mechanism = udk.library.parallelogram()
     for outputs in (2, 11):
         run, y = ours(mechanism, np.linspace(0.0, END, outputs)), states(angles(-45.0, CHECKED))
@@ -153,7 +153,7 @@ def gradients(report: Report):
 
 
 def scenes(report: Report, name: str):
-    """Runs a second of a mechanism from the library under 80 to 120 percent of gravity, or of a mass where there is none."""
+    """Runs a second of a mechanism from the library under 80 to 120 percent of gravity, or, without gravity, of a mass."""
     mechanism, members, end = _scene(name), 65_536, SCENES[name]
     known, gravity = udk.analyse(mechanism), np.asarray(mechanism.gravity)
     mass = next(x for x in mechanism.parameters() if x.endswith(".mass"))
@@ -175,7 +175,7 @@ def scenes(report: Report, name: str):
 
 
 def calls(report: Report):
-    """What one run takes: eager, jitted, in a scan; on this machine's default device, and on its processor."""
+    """Time one run: eager, jitted, in a scan; on the default device, and on the CPU."""
     mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, END, 2)
     y = states(np.deg2rad([-45.0]))[0]
 
@@ -205,7 +205,7 @@ def calls(report: Report):
 
 
 def swept(report: Report):
-    """Members a second of `udk.sweep`, with what it stores; it needs xarray."""
+    """Members a second of `udk.sweep`; it needs xarray."""
     ts, members = np.linspace(0.0, END, 2), 1_000_000
     axes = {"body.coupler.mass": np.linspace(1.0, 3.0, members)}
     start = time.perf_counter()

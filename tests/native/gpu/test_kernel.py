@@ -149,7 +149,7 @@ NUMBERS = itertools.count()
 
 
 def both(request, function, *given):
-    """What a compiled function returns with the CPU's code and with kernels; and the card."""
+    """Results of a compiled function with the CPU's code and with kernels; and the card."""
     machine_lanes = machine.lanes
     machine.lanes = lambda: VECTOR
     try:
@@ -223,7 +223,7 @@ def test_kernels_are_assembled(name):
 @pytest.mark.skipif(shutil.which("cc") is None or platform.machine() != "x86_64", reason="no C compiler for this processor")
 @pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "tangent"])
 def test_ptx_computes_what_the_engine_computes(name, tmp_path):
-    """What LLVM writes for a graphics card, transliterated to C: all bits, and the address spaces of its pointers."""
+    """LLVM's text for a graphics card, transliterated to C: all bits, and the address spaces of its pointers."""
     for k, call in enumerate(emulation.calls_of(jax.vmap(RUNS[name]), MASSES)):
         if call.operation.is_reverse:
             continue
