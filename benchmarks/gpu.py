@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 import udkjax as udk
 from benchmarks.batch import SPREAD, angles, ours, states
@@ -83,6 +84,32 @@ def equality(report: Report):
                 on_host = np.asarray(jax.jit(run)(jax.device_put(y, jax.devices("cpu")[0]), tol))
             same = np.all(on_card == on_host, axis=(1, 2))
             report.add("equality", outputs=outputs, tol=tol, equal=same.mean(), largest=np.abs(on_card - on_host).max())
+
+
+class Wind(udk.ForceElement):
+    """A force with elementary functions, which machine code writes itself."""
+
+    strength: Float[Array, ""]
+
+    def loads(self, t, *frames):
+        v = frames[0].velocity((0.0, 0.0))
+        along = jnp.tanh(v.x) + jnp.arctan2(v.y, 1.0 + v.x**2) + jnp.exp(-(v.x**2)) + jnp.log1p(v.y**2)
+        return [(self.strength * along, jnp.arcsinh(v.x) - jnp.power(1.0 + v.y**2, 0.3), jnp.cbrt(v.x) * jnp.sinh(v.y))]
+
+
+def functions(report: Report):
+    """Compare all bits of runs under a force with elementary functions."""
+    stone = udk.Mechanism({"stone": udk.Body(1.0, 0.01)}, forces={"wind": Wind(["stone"], strength=0.1)})
+
+    def one(x):
+        moved = stone.with_parameters({"force.wind.strength": x})
+        return udk.simulate(moved, np.linspace(0.0, 1.0, 3), rtol=1e-8, atol=1e-8, throw=False).q
+
+    given, cpu = np.linspace(0.1, 2.0, CHECKED), jax.devices("cpu")[0]
+    on_card = np.asarray(jax.jit(jax.vmap(one))(jax.device_put(given)))
+    with jax.default_device(cpu):
+        on_host = np.asarray(jax.jit(jax.vmap(one))(jax.device_put(given, cpu)))
+    report.add("functions", equal=np.mean(on_card == on_host), largest=np.abs(on_card - on_host).max())
 
 
 def throughput(report: Report, outputs: int, sizes: tuple[int, ...], tolerances: tuple[float, ...] = TOLERANCES):
@@ -244,6 +271,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
     report = Report(LIMIT)
     report.add("card", card=jax.devices()[0].device_kind, jax=jax.__version__, cores=os.cpu_count(), spread=SPREAD)
     report.take(equality)
+    report.take(functions)
     report.take(throughput, 2, SIZES)
     report.take(calls)
     report.take(throughput, OUTPUTS, (4096, 65_536, 262_144), (1e-6,))

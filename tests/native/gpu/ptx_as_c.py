@@ -26,7 +26,8 @@ UNORDERED = {"equ": "ne", "neu": "eq", "ltu": "ge", "leu": "gt", "gtu": "le", "g
 SIGNS = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 OF_DOUBLES = {
     "neg": "-{}", "abs": "fabs({})", "sqrt": "sqrt({})", "rcp": "1.0 / {}", "fma": "fma({}, {}, {})", "max": "fmax({}, {})",
-    "min": "fmin({}, {})",
+    "min": "fmin({}, {})", "copysign": "copysign({1}, {0})",
+    "rni": "rint({})", "rzi": "trunc({})", "rmi": "floor({})", "rpi": "ceil({})",
 }  # fmt: skip
 OF_WHOLE = {
     "add": "{} + {}", "sub": "{} - {}", "mul": "{} * {}", "mad": "{} * {} + {}", "and": "{} & {}", "or": "{} | {}",
@@ -119,6 +120,10 @@ def instruction(text: str) -> str:
         return f"{to} = U((double)(s){x[0]});"
     if name == "cvt.rn.f64.u32":
         return f"{to} = U((double)(uint32_t){x[0]});"
+    if parts[0] == "bfe":
+        return f"{to} = {x[0]} >> {x[1]} & ((1ULL << {x[2]}) - 1);"
+    if parts[0] == "cvt" and parts[2:] == ["f64", "f64"]:
+        return f"{to} = U({OF_DOUBLES[parts[1]].format(*d)});"
     if parts[-1] == "f64":
         return (
             f"{to} = U({d[0]} {SIGNS[parts[0]]} {d[1]});"

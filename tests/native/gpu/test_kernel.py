@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.interpreters import mlir
+from jaxtyping import Array, Float
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
@@ -49,11 +50,25 @@ def with_second(f):
     return lambda x: jax.jvp(jax.jacfwd(f), (x,), (1.0,))
 
 
+class Wind(udk.ForceElement):
+    """A force with elementary functions."""
+
+    strength: Float[Array, ""]
+
+    def loads(self, t, *frames):
+        v = frames[0].velocity((0.0, 0.0))
+        along = jnp.tanh(v.x) + jnp.arctan2(v.y, 1.0 + v.x**2) + jnp.exp(-(v.x**2)) + jnp.log1p(v.y**2)
+        return [(self.strength * along, jnp.arcsinh(v.x) - jnp.power(1.0 + v.y**2, 0.3), jnp.cbrt(v.x) * jnp.sinh(v.y))]
+
+
+STONE = udk.Mechanism({"stone": udk.Body(1.0, 0.01)}, forces={"wind": Wind(["stone"], strength=0.1)})
+
 RUNS = {
     "redundant": last(LINKAGE, "body.coupler.mass"),
     "outputs": last(LINKAGE, "body.coupler.mass", 7),
     "closed": last(FOUR_BAR, "pin.B[0]", 3),
     "Baumgarte": last(LINKAGE, "body.coupler.mass", stabilization=udk.Baumgarte()),
+    "elementary functions": last(STONE, "force.wind.strength", 3),
     "Tsit5": last(LINKAGE, "body.coupler.mass", solver=diffrax.Tsit5()),
     "SVD": last(LINKAGE, "body.coupler.mass", method=udk.SVD()),
     "tangent": with_tangent(last(PENDULUM, "body.rod.mass", 4)),
@@ -62,7 +77,7 @@ RUNS = {
 }
 
 
-FAST = ("redundant", "closed", "tangent", "SVD")
+FAST = ("redundant", "closed", "elementary functions", "tangent", "SVD")
 
 
 @pytest.mark.parametrize("name", [x if x in FAST else pytest.param(x, marks=pytest.mark.slow) for x in RUNS])
@@ -221,7 +236,7 @@ def test_kernels_are_assembled(name):
 
 
 @pytest.mark.skipif(shutil.which("cc") is None or platform.machine() != "x86_64", reason="no C compiler for this processor")
-@pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "tangent"])
+@pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "elementary functions", "tangent"])
 def test_ptx_computes_what_the_engine_computes(name, tmp_path):
     """LLVM's text for a graphics card, transliterated to C: all bits, and the address spaces of its pointers."""
     for k, call in enumerate(emulation.calls_of(jax.vmap(RUNS[name]), MASSES)):
