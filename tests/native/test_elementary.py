@@ -1,6 +1,7 @@
 """Elementary functions in LLVM's text: their errors, special values, and freedom from functions outside the module."""
 
 import math
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from udkjax.native.base import elementary, machine
 from udkjax.native.base.ir import POINTER, Function
 from udkjax.native.base.program import write
 from udkjax.native.base.text import external_functions, text_of_module
+from udkjax.native.gpu.target import ptx
 
 COUNT = 4_000  # arguments per function, which are 80,000 in all
 INF, NAN = math.inf, math.nan
@@ -243,6 +245,17 @@ def test_modules_of_runs_and_derivatives_need_memory_management_alone(monkeypatc
     assert_allclose(jax.jacfwd(jax.jacfwd(angle))(inertia), curvature, rtol=1e-3)
     assert any("@erf_f64" in text for text in texts)
     assert frozenset().union(*map(external_functions, texts)) <= {"malloc", "free", "realloc"}
+
+
+def test_graphics_cards_round_as_processors_do():
+    """PTX neither calls functions outside nor fuses further products and sums."""
+    functions = [program(name, 1) for name in CASES]
+    for k, f in enumerate(functions):
+        f.name = f"apply{k}"
+    text = text_of_module(functions)
+    code = ptx(text)
+    assert ".extern" not in code and not re.search(r"(add|sub|mul|fma|div|sqrt)\.f64", code)
+    assert len(re.findall(r"fma\.rn\.f64", code)) == len(re.findall(r"call double @llvm\.fmuladd", text))
 
 
 def test_functions_outside_of_a_module_are_named():

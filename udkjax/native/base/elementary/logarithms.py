@@ -4,6 +4,8 @@ x = 2^k (1 + f) with 1 + f between sqrt(1/2) and sqrt(2); log(1 + f) = f - f^2 /
 s = f / (2 + f) (the method of fdlibm). R interpolates at Chebyshev nodes.
 """
 
+from collections.abc import Callable
+
 from udkjax.native.base.elementary.exponentials import LOG2, LOG2_PARTS
 from udkjax.native.base.elementary.parts import (
     INFINITY,
@@ -51,32 +53,31 @@ def _with_limits(x: Value, result: Value) -> Value:
 
 def log(f: Function, x: Value) -> Value:
     """Return the natural logarithm."""
-    unusual, normal = any_unusual(x), Normal(x)
-    with f.if_(unusual):
-        normal.scale()
-    k, m = normal.mantissa(SQRT_HALF)
-    result = f.variable(_log_of_parts(k, m - 1.0), width=x.width)
-    with f.if_(unusual):
-        result.value = _with_limits(x, result.value)
-    return result.value
+    return _of_all_numbers(x, lambda k, m: _log_of_parts(k, m - 1.0))
 
 
 def log2(f: Function, x: Value) -> Value:
     """Return the logarithm to base 2."""
-    unusual, normal = any_unusual(x), Normal(x)
-    with f.if_(unusual):
-        normal.scale()
-    k, m = normal.mantissa(SQRT_HALF)
-    part = m - 1.0
-    half_square = rounded(part * 0.5 * part)
-    high = upper_half(part - half_square)
-    low = part - high - half_square + _rest(part, half_square)
-    main = rounded(high * INVERSE_LOG2[0])
-    total = k + main
-    rest = f.fma(low + high, INVERSE_LOG2[1], f.fma(low, INVERSE_LOG2[0], main - (total - k)))
-    result = f.variable(total + rest, width=x.width)
-    with f.if_(unusual):
-        result.value = _with_limits(x, result.value)
+
+    def of_parts(k: Value, m: Value) -> Value:
+        part = m - 1.0
+        half_square = rounded(part * 0.5 * part)
+        high = upper_half(part - half_square)
+        low = part - high - half_square + _rest(part, half_square)
+        main = rounded(high * INVERSE_LOG2[0])
+        total = k + main
+        return total + f.fma(low + high, INVERSE_LOG2[1], f.fma(low, INVERSE_LOG2[0], main - (total - k)))
+
+    return _of_all_numbers(x, of_parts)
+
+
+def _of_all_numbers(x: Value, of_parts: Callable[[Value, Value], Value]) -> Value:
+    """Return a logarithm, which `of_parts` computes from k and m with x = 2^k m; once more if any number is unusual."""
+    f, result = x.f, x.f.variable(of_parts(*Normal(x).mantissa(SQRT_HALF)), width=x.width)
+    with f.if_(any_unusual(x)):
+        number = Normal(x)
+        number.scale()
+        result.value = _with_limits(x, of_parts(*number.mantissa(SQRT_HALF)))
     return result.value
 
 
