@@ -5,8 +5,8 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from functools import cached_property, lru_cache, partial
-from threading import Lock
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,9 +21,9 @@ from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base import machine
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
+from udkjax.native.base.loading import Code, load
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory
-from udkjax.native.base.prepared_call import PreparedCall
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.steps import Status
 from udkjax.native.base.text import text_of_module
@@ -33,7 +33,7 @@ from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
-from udkjax.threads import thread_count
+from udkjax.threads import cores, thread_count
 
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
@@ -99,12 +99,12 @@ class LoadedCode:
         return host_handler.register(self.name, self._optimized.library["call_frame"])
 
     @cached_property
-    def _optimized(self) -> "Code":
+    def _optimized(self) -> Code:
         self._seconds = 0.0
         return load(self._module.written_text)
 
     @cached_property
-    def _quick(self) -> "Code":
+    def _quick(self) -> Code:
         return load(self._module.written_text, machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
@@ -134,8 +134,8 @@ class LoadedCode:
         return outputs
 
     def prepare(
-        self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: "Code | None" = None
-    ) -> PreparedCall:
+        self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: Code | None = None
+    ) -> "PreparedCall":
         """Return a call that can be repeated with other numbers in `inputs`, which are the given arrays if these are float64."""
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
         # Each pass of reverse mode writes only a part of the outputs. The rest is zero, as jax.debug_nans would report NaN.
@@ -157,35 +157,32 @@ class LoadedCode:
         return PreparedCall(code.run, call, following, threads, inputs, outputs)
 
 
-class Code(NamedTuple):
-    """Loaded machine code: the name of its FFI target in XLA, if optimized, and its function `run`."""
+class PreparedCall(NamedTuple):
+    """A call of machine code: its record, with the arrays that it points to."""
 
-    name: str
     run: Callable[[int], Any]
-    library: machine.Library
+    record: ctypes.Array
+    shared: ctypes.Array  # the index of the next member, and whether memory was refused
+    threads: int
+    inputs: list[np.ndarray]  # float64, contiguous in memory
+    outputs: list[np.ndarray]
+
+    def __call__(self) -> list[np.ndarray]:
+        """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
+        self.shared[:], address = (0, 0), ctypes.addressof(self.record)
+        others = [_pool().submit(self.run, address) for _ in range(self.threads - 1)]
+        self.run(address)
+        for other in others:
+            other.result()
+        if self.shared[1]:
+            raise MemoryError("no memory for a computation by machine code")
+        return self.outputs
 
 
-_LOADED: dict[str, Code] = {}
-_LOADING = Lock()
-
-
-def load(text: str, level: int = machine.LEVEL) -> Code:
-    """Load the code of a module at a level of optimization, or optimized code if available.
-
-    XLA keeps one address for each name, and compiled programs may call it at any time: loaded code is never freed, and serves all
-    callers with the same text.
-    """
-    name = f"udkjax_{machine.digest(text)}"
-    with _LOADING:
-        if name in _LOADED:
-            return _LOADED[name]
-        library = machine.library(text, ("run", "call_frame"), level)
-        code = Code(name, machine.function(library["run"], ctypes.c_void_p), library)
-        if library.is_optimized:
-            capsule = jax.ffi.pycapsule(ctypes.c_void_p(library["call_frame"]))
-            jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-            _LOADED[name] = code
-        return code
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """Return the threads that calls share, as starting a thread takes longer than short runs."""
+    return ThreadPoolExecutor(cores())
 
 
 @lru_cache(maxsize=256)
