@@ -210,6 +210,7 @@ def test_a_mass_matrix_that_is_not_diagonal():
     assert_allclose(udk.accelerations(plain, 0.0, q, v), jnp.linalg.solve(plain.mass(q), plain.force(0.0, q, v)), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_without_constraints_it_is_an_ordinary_equation():
     q, v = [1.0, -0.4], [0.3, 1.2]
     sol = udk.simulate(double(False), TS, udk.State(q, v), **CHOICES)

@@ -285,7 +285,8 @@ class OnCircle(Wrapper):
         return y1 / jnp.linalg.norm(y1), error, dense, state, result
 
 
-@pytest.mark.parametrize("corrector", ["pece", pytest.param("iteration", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("corrector", ["pece", "iteration"])
 def test_projected_states_enter_the_history(corrector):
     """The newest point is replaced, at no more than two calls an attempt, instead of a new start at every step."""
     on_circle = lambda solver, control: (OnCircle(solver), CountingController(control))  # noqa: E731

@@ -39,7 +39,8 @@ def chunks(folder: Path) -> dict[str, int]:
     return {file.name: file.stat().st_mtime_ns for file in (folder / "chunks").glob("*.npz")}
 
 
-@pytest.mark.parametrize("when", [pytest.param("between two chunks", marks=pytest.mark.slow), "before a chunk has its name"])
+@pytest.mark.slow
+@pytest.mark.parametrize("when", ["between two chunks", "before a chunk has its name"])
 def test_a_killed_sweep_goes_on(tmp_path, whole, when):
     if when == "between two chunks":
         arrange = f"progress = lambda status: status.done < {3 * PIECE} or kill()"
