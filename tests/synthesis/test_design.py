@@ -119,6 +119,7 @@ def test_all_classic_cases_are_solved_at_least_as_well_as_published_from_any_see
         assert bounded and turns
 
 
+@pytest.mark.slow
 def test_a_slider_crank_is_found_again_from_its_path():
     mechanism = SLIDER_CRANK.mechanism()
     values, moved = motion(mechanism, 8, 5.0)
@@ -185,7 +186,7 @@ GOALS = {
 }
 
 
-@pytest.mark.parametrize("kind", fast({*KINDS} - {"pins of a six-bar"}, KINDS))
+@pytest.mark.parametrize("kind", fast(["pins of a four-bar", "points of joints", "radii of a cam"], KINDS))
 def test_the_loss_moves_when_any_parameter_does(kind):
     mechanism, free, point = KINDS[kind]
     driver = mechanism.driver_names[0] if mechanism.driver_names else "body.crank.angle"

@@ -62,6 +62,7 @@ def test_limits_leave_out_what_is_beyond_them(published):
         udk.design_all(FOUR_BAR, udk.PathGoal("P", DATA["points"]), lengths={("O", "Z"): (0, 1)})
 
 
+@pytest.mark.slow
 def test_other_ends_are_listed():
     """Of places that repeat in one coordinate some solutions meet, and others go to infinity: each is counted and listed."""
     y = [1, 2, -1, 0.5, 3, 0.5, -1, 2, 1]
