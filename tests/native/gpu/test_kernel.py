@@ -130,7 +130,8 @@ def card(monkeypatch):
     for name, value in {
         "PLATFORM": "cpu",
         "TARGET": f"udkjax_test_{next(NUMBERS)}_",
-        "KERNEL_MEMBERS": 2,
+        "MEMBERS_OF_CORE": 1,
+        "thread_count": lambda: 2,
         "BLOCK": 4,
         "driver": lambda: card,
         "load_kernel": card.load_kernel,
@@ -208,7 +209,7 @@ def test_an_error_of_the_launch_is_that_of_the_program(card):
 
 def test_small_batches_stay_with_the_host(monkeypatch):
     (call,) = (x for x in emulation.calls_of(jax.vmap(RUNS["redundant"]), MASSES) if type(x.operation).__name__ == "RunStates")
-    least = launch.KERNEL_MEMBERS
+    least = launch.MEMBERS_OF_CORE * launch.thread_count()
 
     def target_of(members):
         return launch.kernel_target(call.operation, [np.zeros((members, *x.shape[1:])) for x in call.inputs])

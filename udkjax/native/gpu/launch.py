@@ -23,10 +23,11 @@ from udkjax.native.gpu.driver import CudaDriver, CudaError, driver
 from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, PLATFORM, POP, PUSH, Words, stream_of
 from udkjax.native.gpu.kernel import NAME, KernelCode, kernel_code
 from udkjax.native.operations import Operation
+from udkjax.threads import thread_count
 
-# The smallest batch that runs as a kernel, unless `UDKJAX_KERNEL_MEMBERS` sets another number: a thread takes 20 to 40 times as
-# long for a member as a core of the host, so that few members are faster there.
-KERNEL_MEMBERS = 4096
+# A kernel takes as long, however small the batch, as a core of the host takes for this number of members; measured on an H100.
+# Batches of fewer members for each core run on the host, unless `UDKJAX_KERNEL_MEMBERS` sets the smallest batch.
+MEMBERS_OF_CORE = 128
 BLOCK = 128  # threads of a block
 MOST_MEMORY = 2**16  # bytes of a thread; the driver reserves them for each of the 270,000 threads that an H100 can hold
 LAUNCH, KERNEL = "cuLaunchKernel", "kernel"
@@ -41,7 +42,7 @@ def kernel_members() -> float:
     """Return the smallest number of members that run as a kernel: `UDKJAX_KERNEL_MEMBERS`, infinite for "never"."""
     setting = os.environ.get("UDKJAX_KERNEL_MEMBERS", "").strip()
     if not setting:
-        return KERNEL_MEMBERS
+        return MEMBERS_OF_CORE * thread_count()
     if setting == "never":
         return float("inf")
     if not setting.isdecimal():
