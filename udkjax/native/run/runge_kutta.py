@@ -74,23 +74,26 @@ def _measure_error(module: Module, f: Function, s: Lane):
     rtol = module.broadcast(f, s.rtol)
     weight = NORMAL_ERROR_WEIGHT if module.plan.projected else 0.0
 
-    def relative(r: Value) -> list[Value]:
-        ratios = []
+    # The largest ratio of an error to its tolerance is found by products: divisions take longer, most of all those of zero.
+    # Comparisons ignore NaN, so non-finite numbers are detected by their product with zero.
+    check, error, tolerance = (f.variable(x, width=module.plan.vector) for x in (0.0, 0.0, 1.0))
+    with f.each(module.rowcount) as r:
         for d, scale, y0, y1 in (("dq", "scale q", q0, q1), ("dv", "scale v", v0, v1)):
             tangent_error = module.vector(f, f"result {d}", r)
             if weight:
                 tangent_error = f.fma(module.vector(f, f"state {d}", r) - tangent_error, weight, tangent_error)
             size = f.max(f.abs(module.vector(f, y0, r)), f.abs(module.vector(f, y1, r)))
-            ratios.append(f.abs(tangent_error) / f.fma(rtol, size, module.vector(f, scale, r)))
-        return ratios
-
-    # Maxima ignore NaN, so non-finite numbers are detected by their product with zero.
-    check = f.variable(0.0, width=module.plan.vector)
-    with f.each(module.rowcount) as r:
-        for x in (*relative(r), module.vector(f, "result a", r)):
-            check.value = f.fma(x, 0.0, check.value)
+            given = f.fma(rtol, size, module.vector(f, scale, r))
+            tangent_error = f.abs(tangent_error)
+            is_larger = tangent_error * tolerance.value > error.value * given
+            error.where(is_larger, tangent_error)
+            tolerance.where(is_larger, given)
+            check.value = f.fma(tangent_error, 0.0, check.value)
+            check.value = f.fma(given, 0.0, check.value)
+        check.value = f.fma(module.vector(f, "result a", r), 0.0, check.value)
     total = check.value if module.plan.width > 1 else f.total(check.value)
-    s.error = module.largest(f, relative)
+    ratio = error.value / tolerance.value
+    s.error = ratio if module.plan.width > 1 else f.largest_of(ratio)
     s.where((s.ok < 0.5) | total.is_not(0.0), error=np.nan)
     s.where(~(s.distance >= 0.0), distance=0.0)
 
