@@ -99,7 +99,7 @@ class Wind(udk.ForceElement):
 
 def functions(report: Report):
     """Compare all bits of runs under a force with elementary functions."""
-    stone = udk.Mechanism({"stone": udk.Body(1.0, 0.01)}, forces={"wind": Wind(["stone"], strength=0.1)})
+    stone = udk.Mechanism({"stone": udk.Body(1.0, 0.01)}, forces={"wind": Wind(["stone"], strength=jnp.asarray(0.1))})
 
     def one(x):
         moved = stone.with_parameters({"force.wind.strength": x})

@@ -87,7 +87,8 @@ def instruction(text: str) -> str:
         return f"{q} = {p};"
     a = re.split(r",\s*(?![^\[]*\])", rest.strip())
     if "v2" in parts:
-        pair, at = [operand(x) for x in re.search(r"\{(.*)\}", rest)[1].split(",")], re.search(r"\[(.*)\]", rest)[1]
+        pair = [operand(x) for x in rest[rest.index("{") + 1 : rest.index("}")].split(",")]
+        at = rest[rest.index("[") + 1 : rest.index("]")]
         both = [(pair[k], f"((u *){place(at)})[{k}]") for k in (0, 1)]
         return " ".join(f"{x} = {y};" if parts[0] == "ld" else f"{y} = {x};" for x, y in both)
     if parts[0] == "ld":
@@ -145,7 +146,7 @@ def as_c(code: str) -> str:
     def define(match: re.Match) -> str:
         result, name, given = match[1], match[2], re.findall(r"\w+_param_\d+", match[3])
         heads.append(f"static {'u' if result else 'void'} {name}({', '.join(f'u {x}' for x in given)})")
-        returns.append(re.search(r"\w*retval\d+", result)[0] if result else None)
+        returns.append(re.sub(r".*?(\w*retval\d+).*", r"\1", result, flags=re.DOTALL) if result else None)
         return f"DEFINE {len(heads) - 1}\n"
 
     code = re.sub(r"\.visible \.func\s+(?:\([^)]*\)\s*)?\w+\s*\([^)]*\)\s*(?:\.noinline\s*)?;", "", code)

@@ -90,8 +90,8 @@ class Function:
                 Functions are not inlined, as each copy would take room in the cache of instructions.
         """
         casts, names = [], {n: n for _, n in self._arguments}
-        for base, n in self._arguments if local is not None else ():
-            if base == POINTER and n in local:
+        for base, n in self._arguments:
+            if base == POINTER and n in (local or ()):
                 names[n] = f"{n}.given"
                 casts.append(f"%{n}.local = addrspacecast ptr %{n}.given to ptr addrspace({LOCAL_SPACE})")
                 casts.append(f"%{n} = addrspacecast ptr addrspace({LOCAL_SPACE}) %{n}.local to ptr")

@@ -1,17 +1,15 @@
 """One module of machine code: its functions, and the arrays in the memory of a run."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.expressions.loop_derivative import FORWARD
 from udkjax.native.base.ir import BOOL, POINTER, Function, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter
-from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.program import PointerPlace, consecutive, write
-from udkjax.native.base.running import memory_size, write_run, write_run_member
+from udkjax.native.base.running import Running
 from udkjax.native.base.steps import POINTS
-from udkjax.native.base.text import ALLOCATION, text_of_module
 
 # Rarely called functions: once per run, near singular configurations, or where a piece may end.
 COLD = (
@@ -29,7 +27,7 @@ COLD = (
 )
 
 
-class Module(Memory):
+class Module(Running):
     """The text of one module of machine code: its functions.
 
     Args:
@@ -39,11 +37,7 @@ class Module(Memory):
     """
 
     mode = FORWARD  # mode of differentiation
-    ways: tuple[str, ...] = ()  # prefixes of the inputs of each tangent of a group, in forward mode
-    group = 1  # directions of a tangent
     shares_constants = False  # whether the members of a block of threads have the same constants, in its shared memory
-    tangents_begin: int | None = None
-    """Where the memory of directions begins, relative to `work`; None if it is a block of its own."""
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
         self.plan, self.code, self.method = plan, plan.code, plan.method
@@ -131,22 +125,6 @@ class Module(Memory):
         for name, count in sizes.items():
             self.places.add(prefix + name, count)
 
-    def text(self) -> str:
-        """LLVM's text of the whole module."""
-        self.write_functions()
-        write_run(self)
-        return text_of_module([*self.functions, *self.loops.functions], self.loops.globals, ALLOCATION)
-
-    def thread_code(self) -> ThreadCode:
-        self.write_functions()
-        write_run_member(self)
-        programs, kernels = self.loops.parts
-        return ThreadCode([*self.functions, *programs], kernels, self.loops.globals, memory_size(self))
-
-    def write_functions(self):
-        """Write all functions but `run`."""
-        raise NotImplementedError
-
     # --- programs
 
     @property
@@ -225,7 +203,8 @@ class Module(Memory):
         def place(x: str, k: int) -> PointerPlace:
             pointer, index = at[x][0], at[x][1] + k
             is_shared = self.shares_constants and (x, pointer) == ("constants", "work")
-            return ("shared", k) if is_shared and index != self.drop_tol_place else (pointer, index)  # which a run changes
+            is_shared = is_shared and index != self.drop_tol_place  # a run changes this threshold
+            return ("shared", k) if is_shared else (pointer, index)
 
         lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers} | {"shared": 1}
         inputs, outputs = find(program.inputs), find(program.outputs)
@@ -278,11 +257,6 @@ class Module(Memory):
         if "weights" not in self.places.places:
             self.places.add("weights", self.m)
 
-    def begin_memory(self, f: Function):
-        """Store the numbers that all members share, once per run, in zeroed memory."""
-        for begin in self.begins:
-            begin(f)
-
     def begin_rows(self, f: Function, lane: Value, length: Value):
         """Compute the weights of rows of a member from the scales in its lane."""
         if "weights" in self.places.places:
@@ -303,44 +277,6 @@ class Module(Memory):
         if self.pieces:
             return f.const(True, BOOL, f.width)
         return s.written + 1.0 < self.field(f, "times") - 1
-
-    def goes_on(self, f: Function, s: Lane) -> Value:
-        """Return whether any lane is active."""
-        return f.any_of(s.active > 0.5)
-
-    def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Take one step in all lanes, and finish completed members."""
-        raise NotImplementedError
-
-    def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Fill the lanes of completed members with the next members."""
-        fill()
-
-    # --- memory of directions
-
-    def groups(self, f: Function) -> Value:
-        """Return the number of groups of directions."""
-        return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
-
-    def first_tangent(self, f: Function) -> Value:
-        """Return the address of the memory of the first direction."""
-        work = f.given["work"]
-        if self.tangents_begin is not None:
-            return f.at(work, self.tangents_begin)
-        return f.load(work, self.start("tangents", "work"), base=POINTER)
-
-    def allocate_tangents(self, f: Function, block: Value) -> list[Value]:
-        """Allocate memory for all directions, and store its address in `work`; return the blocks to free.
-
-        Without memory, `block` is freed, and the function returns (`allocate`)."""
-        if not self.ways:
-            return []
-        size = self.groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
-        tangent_block, start = self.allocate(f, size, [block])
-        with f.each(size) as i:
-            f.store(0.0, start, i)
-        f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
-        return [tangent_block]
 
     def accelerate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i at `state`."""

@@ -1,77 +1,147 @@
-"""The functions that run the members of a module: `run` for the threads of a processor, `run_member` for a thread of a GPU.
+"""The run of the members of a module: `run` for the threads of a processor, `run_member` for a thread of a GPU."""
 
-Lanes load members by `begin(work, call, lane, member)`, and `step_all` takes them a step further and finishes them.
-"""
-
-from typing import TYPE_CHECKING
+from abc import abstractmethod
+from collections.abc import Callable
 
 from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane
-
-if TYPE_CHECKING:
-    from udkjax.native.base.module import Module
-
-
-def memory_size(module: "Module") -> int:
-    """Return the count of numbers in the memory of a run."""
-    return module.places.size * module.plan.width + 2 * module.plan.vector
+from udkjax.native.base.loops import LoopWriter
+from udkjax.native.base.memory import Memory, ThreadCode
+from udkjax.native.base.text import ALLOCATION, text_of_module
 
 
-def _clear_memory(module: "Module", f: Function):
-    """Clear the memory at `work`, and store what all members share, and numbers with which lanes that stay empty compute."""
-    work, width = f.given["work"], module.plan.width
-    s = Lane(f, module.places)
-    with f.each(memory_size(module)) as i:
-        f.store(0.0, work, i)
-    f.store(f.given["call"], work, module.start("call", "work"), base=POINTER)
-    module.begin_memory(f)
-    for name in ("length", "omega", "rtol", "atol", "smallest"):
-        setattr(s, name, f.const(1.0, DOUBLE, width))
-    with f.each(-(-module.n // max(module.plan.vector // width, 1)) * max(module.plan.vector // width, 1)) as i:
-        for name in ("scale q", "scale v"):
-            module.put_entry(f, name, i, 1.0)
+class Running(Memory):
+    """A module that runs members in lanes.
 
-
-def write_run(module: "Module"):
-    """Write `run(call)`: run all members."""
-    f = Function("run", [(POINTER, "call")], module.plan.width)
-    module.functions.append(f)
-    call, width = f.given["call"], module.plan.width
-    block, work = module.allocate(f, f.const(memory_size(module), INT))
-    f.given["work"], s = work, Lane(f, module.places)
-    _clear_memory(module, f)
-    blocks = [block, *module.allocate_tangents(f, block)]
-    members, following = module.field(f, "members"), module.field(f, "next", POINTER)
-
-    def fill():
-        with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
-            # Threads share the index of the next member.
-            member = f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
-            with f.if_(member < members):
-                f.call("begin", work, call, k, member)
-
-    fill()
-    with f.while_(lambda: module.goes_on(f, s)):
-        module.step_all(f, s, fill)
-    for block in blocks:
-        f.line(f"call void @free(ptr {block.name})")
-
-
-def write_run_member(module: "Module"):
-    """Write `run_member(call, work, member)`: run one member in the memory at `work`.
-
-    It is what a thread of a GPU does, with the other threads of its block: `meet(goes_on)` waits for them before each step, and
-    returns whether one of them goes on, so that all run the same instructions at the same time.
+    Lanes load members by the function `begin(work, call, lane, member)`, and `step_all` takes them a step further and finishes
+    them.
     """
-    f = Function("run_member", [(POINTER, "call"), (POINTER, "work"), (INT, "member")], module.plan.width)
-    module.functions.append(f)
-    call, work, member, s = f.given["call"], f.given["work"], f.given["member"], Lane(f, module.places)
-    _clear_memory(module, f)
-    with f.if_(member < module.field(f, "members")):
-        f.call("begin", work, call, f.const(0, INT), member)
 
-    def any_goes_on() -> Value:
-        return f.op(f"call i1 @meet(i1 {module.goes_on(f, s).name})", BOOL)
+    ways: tuple[str, ...] = ()  # prefixes of the inputs of each tangent of a group, in forward mode
+    group = 1  # directions of a tangent
+    tangents_begin: int | None = None
+    """Where the memory of directions begins, relative to `work`; None if it is a block of its own."""
 
-    with f.while_(any_goes_on), f.if_(module.goes_on(f, s)):
-        module.step_all(f, s, lambda: None)
+    functions: list[Function]
+    loops: LoopWriter
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        self.write_functions()
+        self._write_run()
+        return text_of_module([*self.functions, *self.loops.functions], self.loops.globals, ALLOCATION)
+
+    def thread_code(self) -> ThreadCode:
+        self.write_functions()
+        self._write_run_member()
+        programs, kernels = self.loops.parts
+        return ThreadCode([*self.functions, *programs], kernels, self.loops.globals, self._memory_size)
+
+    @abstractmethod
+    def write_functions(self):
+        """Write all functions but `run`."""
+
+    def goes_on(self, f: Function, s: Lane) -> Value:
+        """Return whether any lane is active."""
+        return f.any_of(s.active > 0.5)
+
+    @abstractmethod
+    def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Take one step in all lanes, and finish completed members."""
+
+    def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Fill the lanes of completed members with the next members."""
+        fill()
+
+    def begin_memory(self, f: Function):
+        """Store the numbers that all members share, once per run, in zeroed memory."""
+        for begin in self.begins:
+            begin(f)
+
+    @property
+    def _memory_size(self) -> int:
+        """The count of numbers in the memory of a run."""
+        return self.places.size * self.plan.width + 2 * self.plan.vector
+
+    def _clear_memory(self, f: Function):
+        """Clear the memory at `work`, and store what all members share, and numbers with which lanes that stay empty compute."""
+        work, width = f.given["work"], self.plan.width
+        s = Lane(f, self.places)
+        with f.each(self._memory_size) as i:
+            f.store(0.0, work, i)
+        f.store(f.given["call"], work, self.start("call", "work"), base=POINTER)
+        self.begin_memory(f)
+        for name in ("length", "omega", "rtol", "atol", "smallest"):
+            setattr(s, name, f.const(1.0, DOUBLE, width))
+        with f.each(-(-self.n // max(self.plan.vector // width, 1)) * max(self.plan.vector // width, 1)) as i:
+            for name in ("scale q", "scale v"):
+                self.put_entry(f, name, i, 1.0)
+
+    def _write_run(self):
+        """Write `run(call)`: run all members."""
+        f = Function("run", [(POINTER, "call")], self.plan.width)
+        self.functions.append(f)
+        call, width = f.given["call"], self.plan.width
+        block, work = self.allocate(f, f.const(self._memory_size, INT))
+        f.given["work"], s = work, Lane(f, self.places)
+        self._clear_memory(f)
+        blocks = [block, *self.allocate_tangents(f, block)]
+        members, following = self.field(f, "members"), self.field(f, "next", POINTER)
+
+        def fill():
+            with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
+                # Threads share the index of the next member.
+                member = f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
+                with f.if_(member < members):
+                    f.call("begin", work, call, k, member)
+
+        fill()
+        with f.while_(lambda: self.goes_on(f, s)):
+            self.step_all(f, s, fill)
+        for block in blocks:
+            f.line(f"call void @free(ptr {block.name})")
+
+    def _write_run_member(self):
+        """Write `run_member(call, work, member)`: run one member in the memory at `work`.
+
+        A thread of a GPU calls it, together with the other threads of its block: `meet(goes_on)` waits for them before each
+        step, and returns whether one of them goes on, so that all run the same instructions at the same time.
+        """
+        f = Function("run_member", [(POINTER, "call"), (POINTER, "work"), (INT, "member")], self.plan.width)
+        self.functions.append(f)
+        call, work, member, s = f.given["call"], f.given["work"], f.given["member"], Lane(f, self.places)
+        self._clear_memory(f)
+        with f.if_(member < self.field(f, "members")):
+            f.call("begin", work, call, f.const(0, INT), member)
+
+        def any_goes_on() -> Value:
+            return f.op(f"call i1 @meet(i1 {self.goes_on(f, s).name})", BOOL)
+
+        with f.while_(any_goes_on), f.if_(self.goes_on(f, s)):
+            self.step_all(f, s, lambda: None)
+
+    # --- memory of directions
+
+    def groups(self, f: Function) -> Value:
+        """Return the number of groups of directions."""
+        return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
+
+    def first_tangent(self, f: Function) -> Value:
+        """Return the address of the memory of the first direction."""
+        work = f.given["work"]
+        if self.tangents_begin is not None:
+            return f.at(work, self.tangents_begin)
+        return f.load(work, self.start("tangents", "work"), base=POINTER)
+
+    def allocate_tangents(self, f: Function, block: Value) -> list[Value]:
+        """Allocate memory for all directions, and store its address in `work`; return the blocks to free.
+
+        Without memory, `block` is freed, and the function returns (`allocate`)."""
+        if not self.ways:
+            return []
+        size = self.groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
+        tangent_block, start = self.allocate(f, size, [block])
+        with f.each(size) as i:
+            f.store(0.0, start, i)
+        f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
+        return [tangent_block]

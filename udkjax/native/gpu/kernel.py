@@ -16,7 +16,7 @@ from udkjax.native.base.text import external_functions, text_of_module, with_eva
 from udkjax.native.operations import Operation
 
 NAME = "run_members"  # of the kernel
-VECTOR = 4  # coordinates whose numbers are read together: a thread waits for memory most of the time
+VECTOR = 2  # coordinates whose numbers are read together: a thread waits for memory most of the time
 # The arguments of functions that point to the memory of a thread, or into it.
 LOCAL = ("work", "out", "tangent", "stored", "accelerations", "projection")
 # A barrier that also asks whether the condition holds in any thread of the block.
@@ -79,13 +79,14 @@ def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool 
     if operation.is_reverse:
         raise UnsupportedError(f"{type(operation).__name__} on a GPU")
     module = operation.module(1, 1, VECTOR)
-    if isinstance(module, Module) and module.ways:
-        module.tangents_begin = module.places.add("all tangents", directions * len(module.ways) * module.tangents.size)
-    shares = shares_numbers and isinstance(module, Module) and module.unrolled is not None and not module.plan.sampled
-    if shares:
-        module.shares_constants = True
+    constants = 0
+    if isinstance(module, Module):
+        if module.ways:
+            module.tangents_begin = module.places.add("all tangents", directions * len(module.ways) * module.tangents.size)
+        module.shares_constants = shares_numbers and module.unrolled is not None and not module.plan.sampled
+        constants = module.constants if module.shares_constants else 0
     code = module.thread_code()
     declared = (x for f in with_evaluated([*code.functions, *code.shared]) for x in f.declared)
     for name in sorted(external_functions("\n".join(declared))):
         raise UnsupportedError(f"{name} on a GPU")  # LLVM would end the process
-    return KernelCode(module, code, module.constants if shares else 0)
+    return KernelCode(module, code, constants)

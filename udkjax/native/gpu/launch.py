@@ -31,7 +31,7 @@ MEMBERS_OF_CORE = 128
 BLOCK = 128  # threads of a block
 MOST_MEMORY = 2**16  # bytes of a thread; the driver reserves them for each of the 270,000 threads that an H100 can hold
 LAUNCH, KERNEL = "cuLaunchKernel", "kernel"
-TARGET = "udkjax_kernel_"  # how names of FFI targets begin
+TARGET = "udkjax_kernel_"  # prefix of the names of FFI targets
 WORDS = Words((LAUNCH,), (KERNEL,))
 FAILED = b"launching a kernel for a batch failed: "
 # Attributes of a function and of a device (CUfunction_attribute, CUdevice_attribute).

@@ -15,7 +15,7 @@ from udkjax.native.base import code_cache, machine
 TRIPLE = "nvptx64-nvidia-cuda"
 PTX = "+ptx78"  # the version, of CUDA 11.8: the first for sm_90
 OLDEST = (7, 0)  # compute capability: the first whose threads part and meet freely
-NEWEST = (9, 0)  # that this version of PTX names; later GPUs take it as well
+NEWEST = (9, 0)  # the newest capability in this version of PTX, which later GPUs accept as well
 LEVEL = 2  # of LLVM's code generation
 # Functions are called, not inlined: an inlined copy takes room in the cache of instructions. LLVM's combination of instructions
 # would remove the casts that tell pointers to a thread's own memory.
