@@ -50,6 +50,11 @@ _WORTH_A_PROGRAM = 60  # calls after which a program is compiled, in 15 ms; it s
 _calls: Counter[tuple[tuple[int, ...], ...]] = Counter()  # number of calls by the shapes of the arrays
 
 
+def by_numpy(x: Any) -> Any:
+    """Return a number as a NumPy array unless it is traced or absent: what follows from concrete numbers stays concrete."""
+    return x if x is None or isinstance(x, Tracer) else np.asarray(x)
+
+
 def put_arrays(arrays: Any) -> Any:
     """Convert a tree of NumPy arrays and numbers to JAX arrays."""
     leaves, tree = jax.tree.flatten(arrays)
@@ -70,6 +75,8 @@ def make_module(cls: type[Module], **fields: Any) -> Module:
 def number(value: Numbers) -> Float[Array, "..."]:
     """Convert a number to an array leaf: a Python float as a field would be static, and each new value would be compiled."""
     dtype = jnp.result_type(float)
+    if isinstance(value, jax.Array) and value.dtype == dtype and not value.weak_type:  # the same object: a leaf stays this leaf
+        return value
     if all(isinstance(x, float | int | np.number | np.ndarray) for x in jax.tree.leaves(value)):
         value = np.asarray(value, dtype)
         array = jax.device_put(value)  # jnp.asarray would compile a program for each shape

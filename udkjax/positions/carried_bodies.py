@@ -18,7 +18,8 @@ from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSED_TOL
 from udkjax.positions.coordinates import Coordinate, element_of
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.mechanism import Mechanism, Origin
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.origin import Origin
 
 ANY_MOTION = (
     0.3,

@@ -26,7 +26,8 @@ from udkjax.positions.coordinates import Coordinate, constant_motion, named_elem
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial
 from udkjax.scene.forces import ForceElement
-from udkjax.scene.mechanism import Mechanism, Origin
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.origin import Origin
 from udkjax.wording import join_names, quote
 
 MOVES = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians; less is rounding

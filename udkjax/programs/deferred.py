@@ -14,6 +14,7 @@ All means of avoiding repeated work in the package, and their uses:
     control_flow.solve              an algorithm too long to trace: Python loops if everything is concrete, else one program
     native call_seldom              a rarely reached part of a compiled program: NumPy evaluates it there
     cached_by_identity              a result that does not depend on numbers: cached by the identity of objects
+    cached_within_trace             a result whose numbers may be traced: cached likewise, within the trace
 """
 
 from collections.abc import Callable, Hashable, Sequence

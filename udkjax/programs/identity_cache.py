@@ -10,9 +10,13 @@ from functools import wraps
 from threading import RLock
 from typing import Any, ParamSpec, TypeVar
 
+import jax
+import jax.extend.core
 import numpy as np
+from jax.core import Tracer
 
 Arguments = ParamSpec("Arguments")
+Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
 CACHE_SIZE = 64  # results stored per function; the least recently used one is dropped
@@ -53,6 +57,49 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
         return result
 
     return call
+
+
+def cached_within_trace(function: Callable[[Argument], Result]) -> Callable[[Argument], Result]:
+    """Cache the results of a function of one tree by its identity, like `cached_by_identity`, also while numbers are traced.
+
+    The result must not contain the tree itself. With traced numbers it is stored if some of them belong to the current trace, so
+    that it lives no longer than this trace, and is used in this trace only.
+    """
+    cache: OrderedDict[int, tuple[Any, Any, Result]] = OrderedDict()  # a reference, the trace (None if concrete), the result
+    lock = RLock()
+
+    def forget(key: int) -> None:
+        with lock:
+            cache.pop(key, None)
+
+    @wraps(function)
+    def call(argument: Argument) -> Result:
+        key = id(argument)
+        stored = cache.get(key)
+        if stored is not None and (stored[1] is None or stored[1] is _current_trace()):
+            return stored[2]
+        result = function(argument)
+        traces = [getattr(x, "_trace", None) for x in jax.tree.leaves(argument) if isinstance(x, Tracer)]
+        trace = _current_trace() if traces else None
+        if not traces or any(trace is x for x in traces):
+            with lock:
+                cache[key] = _reference(argument, lambda _: forget(key)), trace, result
+                while len(cache) > CACHE_SIZE:
+                    cache.popitem(last=False)
+        return result
+
+    return call
+
+
+_take_trace = getattr(jax.extend.core, "take_current_trace", None)
+
+
+def _current_trace() -> Any:
+    """Return the trace of operations that are called now; an object of its own if JAX does not tell."""
+    if _take_trace is None:
+        return object()
+    with _take_trace() as trace:
+        return trace
 
 
 def _reference(x: object, forget: Callable[[Any], None]) -> Any:

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
-from udkjax.arrays import array_namespace
+from udkjax.arrays import array_namespace, is_traced, number
 from udkjax.printing import PrintsLine, one_line
 from udkjax.scene.fields import POSITIVE, given_number
 
@@ -169,3 +170,11 @@ def between(points: Float[Array, "2 2"] | Sequence[PlaneVector], one: Frame, two
     """
     p, q = one.point(points[0]), two.point(points[1])
     return Point(q.x - p.x, q.y - p.y)
+
+
+def stack_coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
+    """Return vectors (2,) and numbers, those of each body, as the rows of one array."""
+    concrete = not is_traced((vectors, numbers))  # NumPy is faster for many small arrays
+    if concrete:
+        return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
+    return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])

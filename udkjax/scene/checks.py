@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 from udkjax.annotations import TomlTable
 from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import FieldMetadata
+from udkjax.scene.fields import FieldMetadata, StaticValue
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
@@ -139,6 +139,7 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
 
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
     """Iterate over the mistakes in one value. `sizes` collects the lengths of the named dimensions."""
+    value = value.value if isinstance(value, StaticValue) else value
     if get_origin(annotation) is UnionType:  # a number, or samples of it
         annotation, sampled_class = get_args(annotation)
         if isinstance(value, sampled_class | dict):

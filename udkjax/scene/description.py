@@ -17,7 +17,7 @@ LEFT_OUT = ("velocity", "angular_velocity")  # fields omitted if zero
 
 def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str]]) -> PrintedTable:
     """Return the table of a mechanism; `frame_names` maps an element to its bodies."""
-    groups = {"body": mechanism.bodies, "joint": mechanism.joints, "driver": mechanism.drivers, "force": mechanism.forces}
+    groups = mechanism.groups
     rows = [
         (
             section,

@@ -3,14 +3,15 @@
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any
+from functools import cache
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 
 from udkjax.annotations import Numbers
-from udkjax.arrays import is_traced, number
+from udkjax.arrays import is_traced, make_module, number
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, problems_of
 from udkjax.scene.drivers import Driver
@@ -19,6 +20,8 @@ from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
 from udkjax.scene.schema import table_of, type_name
 from udkjax.wording import abbreviate
+
+AnyModule = TypeVar("AnyModule", bound=eqx.Module)
 
 
 def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:
@@ -74,6 +77,11 @@ def _has_load(cls: type) -> bool:
     return cls.potential is not ForceElement.potential or cls.loads is not ForceElement.loads
 
 
+def as_leaves(element: AnyModule) -> AnyModule:
+    """Return an element whose plain numbers, which would be static, are arrays, and whose other leaves are static."""
+    return jax.tree.map(lambda leaf: _as_static(_as_number(leaf)), element)
+
+
 def _as_number(leaf: object) -> object:
     """Convert the plain numbers of user-written elements, which would be static."""
     return given_number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
@@ -91,14 +99,45 @@ def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstr
     if method is Constraint.complete or (number_name and getattr(constraint, number_name) is not None):
         return constraint  # the usual case; the sines and cosines of the bodies are not needed
     places = {name: (bodies[name].position, bodies[name].angle) for name in constraint.frame_names if name != GROUND}
-    is_concrete = not is_traced((constraint, places))
+    is_concrete, same = not is_traced((constraint, places)), dict[int, Any]()
     if is_concrete:  # NumPy compiles nothing
+        given = constraint
         constraint, places = jax.tree.map(np.asarray, (constraint, places))
+        same = {id(x): leaf for x, leaf in zip(jax.tree.leaves(constraint), jax.tree.leaves(given), strict=True)}
     frames = [Frame.at(*places[name]) if name in places else GROUND_FRAME for name in constraint.frame_names]
     eager = jax.ensure_compile_time_eval() if is_concrete else nullcontext()  # concrete even while something else is traced
     with eager, np.errstate(all="ignore"):
         completed = constraint.complete(*frames)
-        return jax.tree.map(number, completed) if is_concrete else completed
+        return jax.tree.map(lambda x: same[id(x)] if id(x) in same else number(x), completed) if is_concrete else completed
+
+
+@cache
+def constants_of(cls: type) -> tuple[str, ...]:
+    """Return the numbers of a class of constraints that always follow from the initial guess: no arguments of its constructor."""
+    if cls.complete is Constraint.complete:
+        return ()
+    names = ((f.name, f.default if f.default_factory is dataclasses.MISSING else f.default_factory()) for f in _made(cls))
+    return tuple(name for name, default in names if default is None)
+
+
+def _made(cls: type) -> Iterator[dataclasses.Field]:
+    """Iterate over the fields of a class that are leaves, but no arguments of its constructor."""
+    yield from (field for field in dataclasses.fields(cls) if not field.init and not field.metadata.get("static"))
+
+
+def without_constants(constraint: AnyConstraint) -> AnyConstraint:
+    """Return a constraint without the numbers that always follow from the initial guess."""
+    names = constants_of(type(constraint))
+    return make_module(type(constraint), **vars(constraint) | dict.fromkeys(names)) if names else constraint
+
+
+def with_constants(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstraint:
+    """Return a constraint with the numbers that always follow from the initial guess; all others stay the same objects."""
+    names = constants_of(type(constraint))
+    if not names:
+        return constraint
+    completed = complete(constraint, bodies)
+    return make_module(type(constraint), **vars(constraint) | {name: getattr(completed, name) for name in names})
 
 
 def completion_mistakes(before: Mapping[str, list[tuple[str, Any]]], after: Mapping[str, list[tuple[str, Any]]]) -> list[str]:

@@ -1,6 +1,5 @@
 """A mechanism: the checked pytree of everything that exists in a scene, with named access to every number."""
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from types import MappingProxyType
@@ -15,86 +14,47 @@ from jaxtyping import Array, Float
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, make_module, number
 from udkjax.printing import PrintedTable, PrintsTable
-from udkjax.programs.identity_cache import cached_by_identity
-from udkjax.scene.bodies import Body
+from udkjax.programs.identity_cache import cached_by_identity, cached_within_trace
+from udkjax.scene.bodies import Body, stack_coordinates
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import mechanism_table
-from udkjax.scene.direct_changes import count_marks, directly_changed, mark_changes, marks_by_name
+from udkjax.scene.direct_numbers import DirectNumbers
 from udkjax.scene.drivers import Driver
-from udkjax.scene.element_setup import attached_bodies, check_elements, complete, completion_mistakes, name_elements
+from udkjax.scene.element_setup import (
+    attached_bodies,
+    check_elements,
+    complete,
+    completion_mistakes,
+    constants_of,
+    name_elements,
+    without_constants,
+)
 from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.number_fields import (
-    groups_of,
+    SECTIONS,
+    ElementGroups,
     parameters_in,
     parameters_of,
     replace_numbers,
     require_values,
     split_index,
 )
+from udkjax.scene.origin import Origin
+from udkjax.scene.sources import AbstractDrawing, Drawn, Elements, ElementsWithConstants, Source, names_of
 
 Element = TypeVar("Element", bound=eqx.Module)
 Module = TypeVar("Module", bound=eqx.Module)
 
 
-class Origin:
-    """The concrete mechanism from which one with traced numbers was made. It is hashable, and compares by value."""
-
-    def __init__(self, mechanism: "Mechanism"):
-        self.mechanism = mechanism
-        leaves, structure = jax.tree.flatten(mechanism)
-        self._key = structure, tuple(np.asarray(leaf).tobytes() for leaf in leaves)
-        self._hash = hash(self._key)
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Origin) and self._key == other._key)
-
-
-class AbstractDrawing(PrintsTable):
-    """The source of a mechanism, whose numbers (pins, widths, densities) determine those of the bodies."""
-
-    @property
-    @abstractmethod
-    def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
-        """The elements that hold the drawing's numbers, by section and name."""
-
-    @abstractmethod
-    def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "AbstractDrawing":
-        """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
-
-    @abstractmethod
-    def locate_pin(self, name: str) -> tuple[str, Array] | None:
-        """Return a body (or the ground) at a pin and the pin's position in the body's frame (m); None for an unknown pin."""
-
-    @abstractmethod
-    def shapes(self) -> dict[str, Array]:
-        """Return the points (n, 2) through which each body is drawn, in the frame of the body (m), by name."""
-
-    @property
-    @abstractmethod
-    def polygons(self) -> list[str]:
-        """The bodies that are polygons with these points, in order, as corners."""
-
-    @abstractmethod
-    def free_pins(self) -> dict[str, tuple[str, Array]]:
-        """Return the pins that belong to a single body: the body, and the position in its frame (m)."""
-
-    @abstractmethod
-    def mechanism(self) -> "Mechanism":
-        """Return the mechanism of the drawing."""
-
-
 class Mechanism(PrintsTable):
     """Bodies, joints, drivers and force elements by name, and gravity.
 
-    It is only data; `udkjax.analyse` finds its properties, such as redundant rows. All numbers are leaves of the pytree; names,
-    topology and types are static. The user's order is kept: `constraints` are the joints in their order, then the drivers.
-    `forces` may be a list: unnamed elements are numbered by type, TYPE1, TYPE2, ... Numbers that a joint leaves to the initial
-    guess are filled in here.
+    It is only data; `udkjax.analyse` finds its properties, such as redundant rows. All independent numbers are leaves of the
+    pytree, and others are computed from them at use; names, topology and types are static. The user's order is kept:
+    `constraints` are the joints in their order, then the drivers. `forces` may be a list: unnamed elements are numbered by type,
+    TYPE1, TYPE2, ... Numbers that a joint leaves to the initial guess are filled in here.
 
     Raises a `SceneError` that lists all mistakes. For traced numbers only shapes are checked.
 
@@ -106,26 +66,15 @@ class Mechanism(PrintsTable):
         gravity: in m/s^2.
         name: of the mechanism, for titles and files.
         origin: for internal use: the concrete mechanism from which one with traced numbers was made.
-        drawing: the `Drawing` from which it is made, if any.
-        changed: for internal use: 1 for each entry of a number that no longer follows from the drawing, 0 for other entries.
     """
 
     name: str = eqx.field(static=True)
-    gravity: Float[Array, "2"]  # m/s^2
     body_names: tuple[str, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
     driver_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
     origin: Origin | None = eqx.field(static=True)  # the mechanism from which one with traced numbers was made
-    # JAX sorts the keys of a dict: tuples keep the user's order.
-    _bodies: tuple[Body, ...]
-    _joints: tuple[Joint, ...]
-    _drivers: tuple[Driver, ...]
-    _forces: tuple[ForceElement, ...]
-    drawing: AbstractDrawing | None = None
-    # In a drawn mechanism: 1 for each entry of a number that was changed directly, 0 if it follows from the drawing. These
-    # marks are numbers, so that mechanisms with and without changes have the same structure and share programs.
-    changed: Float[Array, "K"] | None = None
+    _source: Source  # the independent numbers
 
     def __init__(
         self,
@@ -136,8 +85,6 @@ class Mechanism(PrintsTable):
         gravity: Numbers = (0.0, -9.81),
         name: str = "",
         origin: Origin | None = None,
-        drawing: AbstractDrawing | None = None,
-        changed: Float[Array, "K"] | None = None,
     ):
         forces = forces or {}
         given = {
@@ -147,19 +94,77 @@ class Mechanism(PrintsTable):
             "force": list(forces.items() if isinstance(forces, Mapping) else zip(name_elements(forces), forces, strict=True)),
         }
         checked = check_elements(given, gravity, name)
-        self.name, self.gravity = name, number(gravity)
-        self.body_names, self._bodies = _unzip(checked["body"])
         known = dict(checked["body"])
         completed = {section: [(key, complete(c, known)) for key, c in checked[section]] for section in ("joint", "driver")}
         if mistakes := completion_mistakes(checked, completed):
             raise SceneError(mistakes, name)
-        self.joint_names, self._joints = _unzip(completed["joint"])
-        self.driver_names, self._drivers = _unzip(completed["driver"])
-        self.force_names, self._forces = _unzip(checked["force"])
+        independent = {section: [(key, without_constants(c)) for key, c in items] for section, items in completed.items()}
+        sections = checked | independent
+        self.name = name
+        names = tuple(tuple(key for key, _ in sections[section]) for section in SECTIONS)
+        self.body_names, self.joint_names, self.driver_names, self.force_names = names
+        elements = [[element for _, element in sections[section]] for section in SECTIONS]
+        has_constants = any(constants_of(type(c)) for items in independent.values() for _, c in items)
+        more: Any = {"names": names} if has_constants else {}
+        self._source = (ElementsWithConstants if has_constants else Elements).of(number(gravity), elements, **more)
         self.origin = None if self.is_concrete else origin
-        self.drawing, self.changed = drawing, changed
-        if drawing is not None and changed is None:
-            self.changed = number(np.zeros(count_marks(self)))
+
+    @classmethod
+    def of_drawing(cls, source: Drawn, name: str, origin: Origin | None = None) -> "Mechanism":
+        """Return the mechanism of a drawing; raise a `SceneError` that lists all mistakes of its elements."""
+        names, held = names_of(source), source.drawing.groups
+        found = {section: list(group.items()) for section, group in source.elements.groups(names).items()}
+        # Elements that a drawing holds are checked as given, before numbers were taken from the initial guess.
+        given = {section: [(key, held[section].get(key, x)) for key, x in items] for section, items in found.items()}
+        try:
+            check_elements(given, source.gravity, name)
+        except SceneError as error:
+            raise SceneError([source.drawing.explain(problem) for problem in error.problems], name) from None
+        if mistakes := completion_mistakes(given, {section: found[section] for section in ("joint", "driver")}):
+            raise SceneError(mistakes, name)
+        static = dict(zip((f"{section}_names" for section in SECTIONS), names, strict=True))
+        return make_module(cls, name=name, **static, origin=None if _is_concrete(source) else origin, _source=source)
+
+    @property
+    def gravity(self) -> Float[Array, "2"]:
+        """The acceleration of gravity (m/s^2)."""
+        return self._source.gravity
+
+    @property
+    def drawing(self) -> AbstractDrawing | None:
+        """The `Drawing` of a mechanism that was made from one: pins and links, whose numbers are the mechanism's leaves."""
+        return self._source.drawing if isinstance(self._source, Drawn) else None
+
+    @property
+    def direct(self) -> Mapping[str, Any]:
+        """The numbers of a drawn mechanism that were given directly and no longer follow from its drawing, by name."""
+        direct = self._source.direct if isinstance(self._source, Drawn) else None
+        return MappingProxyType({} if direct is None else direct.by_name)
+
+    @property
+    def groups(self) -> ElementGroups:
+        """The elements by section (body, joint, driver, force) and name."""
+        return self._source.elements.groups(self._names)
+
+    @property
+    def _names(self) -> tuple[tuple[str, ...], ...]:
+        return self.body_names, self.joint_names, self.driver_names, self.force_names
+
+    @property
+    def _bodies(self) -> tuple[Body, ...]:
+        return self._source.elements.bodies or ()
+
+    @property
+    def _joints(self) -> tuple[Joint, ...]:
+        return self._source.elements.joints or ()
+
+    @property
+    def _drivers(self) -> tuple[Driver, ...]:
+        return self._source.elements.drivers or ()
+
+    @property
+    def _forces(self) -> tuple[ForceElement, ...]:
+        return self._source.elements.forces or ()
 
     @property
     def bodies(self) -> Mapping[str, Body]:
@@ -193,12 +198,12 @@ class Mechanism(PrintsTable):
     @property
     def q0(self) -> Float[Array, "bodies 3"]:
         """The initial guess of the coordinates: x, y (m) and angle (rad) of each body."""
-        return _coordinates([body.position for body in self._bodies], [body.angle for body in self._bodies])
+        return stack_coordinates([body.position for body in self._bodies], [body.angle for body in self._bodies])
 
     @property
     def v0(self) -> Float[Array, "bodies 3"]:
         """The initial guess of the velocities (m/s, rad/s)."""
-        return _coordinates([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
+        return stack_coordinates([body.velocity for body in self._bodies], [body.angular_velocity for body in self._bodies])
 
     @property
     def breakpoints(self) -> Float[Array, "k"] | None:
@@ -226,7 +231,8 @@ class Mechanism(PrintsTable):
         changed = {section: list(getattr(self, section)) for section in ("_drivers", "_forces")}
         for (section, k, name), value in samples.items():
             changed[section][k] = _copy(changed[section][k], {name: value})
-        return _copy(self, {section: tuple(elements) for section, elements in changed.items()})
+        drivers, forces = (tuple(elements) or None for elements in changed.values())
+        return _copy(self, {"_source": _copy(self._source.elements, {"drivers": drivers, "forces": forces})})
 
     @property
     def without_samples(self) -> "Mechanism":
@@ -243,10 +249,11 @@ class Mechanism(PrintsTable):
 
     @property
     def without_origin(self) -> "Mechanism":
-        """The mechanism without `origin` and `drawing`: one program serves all mechanisms that agree apart from these."""
-        if self.origin is None and self.drawing is None:
-            return self
-        return _copy(self, {"origin": None, "drawing": None, "changed": None})
+        """The mechanism of its elements alone, without `origin` and `drawing`: programs are shared by all that agree in these.
+
+        All numbers of the equations are leaves of it, also those that follow from others.
+        """
+        return self if type(self._source) is Elements and self.origin is None else _without_origin(self)
 
     @property
     def is_concrete(self) -> bool:
@@ -255,8 +262,8 @@ class Mechanism(PrintsTable):
 
     @property
     def numbers(self) -> list[Array]:
-        """All numbers of the equations, in the order of the arguments of programs: the leaves without those of the drawing."""
-        return jax.tree.leaves((self.gravity, self._bodies, self._joints, self._drivers, self._forces))
+        """All numbers of the equations, in the order of the arguments of programs."""
+        return jax.tree.leaves(self._source.elements)
 
     @property
     def elements(self) -> tuple[Any, ...]:
@@ -269,8 +276,23 @@ class Mechanism(PrintsTable):
     _shapes = _table  # the table marks traced numbers
 
     def parameters(self) -> dict[str, Array]:
-        """Return all numbers of the scene by name, such as `body.link1.mass`, except absent ones, such as an optional damping."""
+        """Return all numbers of the scene by name, such as `body.link1.mass`, except absent ones, such as an optional damping.
+
+        Numbers that follow from others, such as the masses of a drawn mechanism, are computed: in a tree of derivatives, as from
+        `eqx.filter_grad`, they mean nothing, and `independent_parameters` are the derivatives.
+        """
         return {name: p.value for name, p in parameters_of(self).items() if p.value is not None}
+
+    def independent_parameters(self) -> dict[str, Array]:
+        """Return the numbers by name that follow from no others, the leaves of the mechanism: those of a drawing, if it has one.
+
+        Numbers given directly instead of those that follow from the drawing are among them.
+        """
+        source = self._source
+        groups = source.drawing.groups if isinstance(source, Drawn) else source.groups(self._names)
+        found = {name: p.value for name, p in parameters_in(groups).items() if p.value is not None}
+        direct = [(f"{key}.values", x.values) if isinstance(x, Held) else (key, x) for key, x in self.direct.items()]
+        return {"gravity": self.gravity, **found, **dict(direct)}
 
     def with_parameters(self, values: Mapping[str, Numbers | Held]) -> "Mechanism":
         """Return the mechanism with new values of some numbers. The function is pure, and values may be traced.
@@ -281,49 +303,31 @@ class Mechanism(PrintsTable):
         that a joint has taken from the initial guess do not change, except the constants of gears and racks.
 
         Numbers of a drawing (`pin.A`, `link.crank.width`) change everything that follows from them. A number that follows from
-        the drawing (`body.crank.mass`) may be changed as well, and keeps its value when the drawing changes. Raises `SceneError`.
+        the drawing (`body.crank.mass`) may be given directly: it is a leaf from then on. Raises `SceneError`.
         """
         require_values(values, self.name)
-        traced = is_traced(dict(values))
-        origin = Origin(self) if traced and self.is_concrete else self.origin
-        base, new_values, changed = self, values, None
-        if self.drawing is not None:
-            base, new_values, direct = self._redraw(self.drawing, values)
-        new, gravity = replace_numbers(groups_of(base), base.gravity, new_values, parameters_of(base), self.name)
-        if self.drawing is not None:
-            changed = mark_changes(self, new, direct)
-        elements = new["body"], new["joint"], new["driver"], new["force"]
-        return Mechanism(*elements, gravity, self.name, origin, base.drawing, changed)
+        origin = Origin(self) if is_traced(dict(values)) and self.is_concrete else self.origin
+        if isinstance(self._source, Drawn):
+            return self._redrawn(self._source, values, origin)
+        elements, gravity = replace_numbers(self.groups, self.gravity, values, parameters_of(self), self.name)
+        parts = elements["body"], elements["joint"], elements["driver"], elements["force"]
+        return Mechanism(*parts, gravity, self.name, origin)
 
     @property
     def departs_from_drawing(self) -> bool:
-        """True if a number no longer follows from the drawing, or if the marks are traced."""
-        return self.changed is not None and (is_traced(self.changed) or bool(np.any(np.asarray(self.changed))))
+        """True if a number was given directly and no longer follows from the drawing."""
+        return bool(self.direct)
 
-    @property
-    def changed_names(self) -> list[str]:
-        """Names of the concrete numbers with an entry that no longer follows from the drawing."""
-        return [name for name, mark in marks_by_name(self).items() if np.any(np.asarray(mark))]
-
-    def _redraw(self, drawing: AbstractDrawing, values: Mapping[str, Any]) -> tuple[Any, dict[str, Any], list[str]]:
-        """Return the redrawn mechanism, its directly changed numbers, and the names of those that are changed now."""
-        drawn, known = parameters_in(drawing.groups), parameters_of(self)
-        of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in (*drawn, "gravity")}
-        new_values = {name: value for name, value in values.items() if name not in of_drawing}
-        if not of_drawing:
-            return self, new_values, list(new_values)
-        replace_numbers(groups_of(self), self.gravity, new_values, known, self.name)  # raises an error if names are wrong
-        drawn["gravity"] = known["gravity"]
-        groups, gravity = replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name)
-        redrawn = drawing.with_groups(groups, gravity).mechanism()
-        return redrawn, directly_changed(self, redrawn) | new_values, list(new_values)
-
-
-def _coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
-    concrete = not is_traced((vectors, numbers))  # NumPy is faster for many small arrays
-    if concrete:
-        return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))
-    return jnp.column_stack([jnp.stack(vectors), jnp.stack(numbers)])
+    def _redrawn(self, source: Drawn, values: Mapping[str, Any], origin: Origin | None) -> "Mechanism":
+        drawing, known = source.drawing, parameters_of(self)
+        drawn = parameters_in(drawing.groups) | {"gravity": known["gravity"]}
+        of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in drawn}
+        direct = {name: value for name, value in values.items() if name not in of_drawing}
+        if direct:
+            replace_numbers(self.groups, self.gravity, direct, known, self.name)  # raises an error if they do not fit
+        if of_drawing:
+            drawing = drawing.with_groups(*replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name))
+        return Mechanism.of_drawing(Drawn(drawing, DirectNumbers.of(direct, source.direct)), self.name, origin)
 
 
 def _copy(module: Module, changes: dict[str, object]) -> Module:
@@ -331,14 +335,15 @@ def _copy(module: Module, changes: dict[str, object]) -> Module:
     return make_module(type(module), **vars(module) | changes)
 
 
-def _unzip(items: Sequence[tuple[str, Element]]) -> tuple[tuple[str, ...], tuple[Element, ...]]:
-    return tuple(key for key, _ in items), tuple(element for _, element in items)
-
-
 def _by_name(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[str, Element]:
     return MappingProxyType(dict(zip(names, elements, strict=True)))
 
 
 @cached_by_identity
-def _is_concrete(mechanism: Mechanism) -> bool:
-    return not is_traced(mechanism)
+def _is_concrete(tree: Any) -> bool:
+    return not is_traced(tree)
+
+
+@cached_within_trace
+def _without_origin(mechanism: Mechanism) -> Mechanism:
+    return _copy(mechanism, {"origin": None, "_source": mechanism._source.elements})

@@ -14,7 +14,6 @@ from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, find_class, pr
 from udkjax.scene.element_setup import name_elements
 from udkjax.scene.fields import vector_as_angle
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import groups_of
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
 from udkjax.wording import abbreviate, unknown_key
 
@@ -26,7 +25,7 @@ def mechanism_text(mechanism: Mechanism) -> str:
     check_known(mechanism, mechanism.name)
     entries = [
         SceneEntry(section, index, name, type(element), table_of(element))
-        for section, elements in groups_of(mechanism).items()
+        for section, elements in mechanism.groups.items()
         for index, (name, element) in enumerate(elements.items())
     ]
     problems = [problem for entry in entries for problem in check_classes(entry.where, entry.cls or object, entry.table)]

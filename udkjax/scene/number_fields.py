@@ -14,11 +14,11 @@ from udkjax.scene.held import Held, given_sampled
 from udkjax.scene.schema import numbers_in
 from udkjax.wording import abbreviate, quote, suggestion
 
-_SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
+SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
 ElementGroups = dict[str, dict[str, Any]]  # elements by section and name
 
 
-class Drawn(Protocol):
+class ElementsOfDrawing(Protocol):
     """Elements of a drawing, by section (pin, link, motor, ...) and name."""
 
     @property
@@ -29,18 +29,13 @@ class Sections(Protocol):
     """The parts of a mechanism that hold numbers: its elements by section and name, and gravity."""
 
     name: str
-    gravity: Array
 
     @property
-    def bodies(self) -> Mapping[str, eqx.Module]: ...
+    def gravity(self) -> Array: ...
     @property
-    def joints(self) -> Mapping[str, eqx.Module]: ...
+    def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]: ...
     @property
-    def drivers(self) -> Mapping[str, eqx.Module]: ...
-    @property
-    def forces(self) -> Mapping[str, eqx.Module]: ...
-    @property
-    def drawing(self) -> Drawn | None: ...
+    def drawing(self) -> ElementsOfDrawing | None: ...
 
 
 class NumberField(NamedTuple):
@@ -57,7 +52,7 @@ def parameters_of(mechanism: Sections) -> dict[str, NumberField]:
     """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
     drawn = {} if mechanism.drawing is None else parameters_in(mechanism.drawing.groups)
     gravity = {"gravity": NumberField("", "", (), mechanism.gravity, mechanism.gravity.shape)}
-    return gravity | drawn | parameters_in(groups_of(mechanism))
+    return gravity | drawn | parameters_in(mechanism.groups)
 
 
 def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
@@ -71,16 +66,10 @@ def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, N
     return fields
 
 
-def groups_of(mechanism: Sections) -> ElementGroups:
-    """Return the elements of a mechanism by section and name."""
-    return {section: dict(getattr(mechanism, plural)) for section, plural in _SECTIONS.items()}
-
-
 def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
     """Return the element that holds a number, or the motion law or profile within the element."""
-    plural = _SECTIONS.get(parameter.section)
-    groups = mechanism.drawing.groups if plural is None and mechanism.drawing is not None else {}
-    elements = groups[parameter.section] if plural is None else getattr(mechanism, plural)
+    drawing = None if parameter.section in SECTIONS else mechanism.drawing
+    elements = (mechanism if drawing is None else drawing).groups[parameter.section]
     return _at(elements[parameter.owner], parameter.path[:-1])
 
 

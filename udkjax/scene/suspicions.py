@@ -24,7 +24,7 @@ def suspicions(mechanism: Mechanism) -> list[str]:
 
 def body_sizes(mechanism: Mechanism) -> dict[str, float]:
     """Return the size of each body (m): the distance of its farthest point from its centre, or twice its radius of gyration."""
-    mechanism = jax.tree.map(np.asarray, mechanism)  # in a traced function, JAX would trace concrete numbers, too
+    mechanism = jax.tree.map(np.asarray, mechanism.without_origin)  # in a traced function, JAX would trace concrete numbers, too
     return {
         name: max(2 * _gyration(body), *(_length(p) for _, p in attachments(mechanism, name)), 0.0)
         for name, body in mechanism.bodies.items()

@@ -76,7 +76,7 @@ def units_of(mechanism: Sections, name: str) -> str:
         return ""
     if not field.path:
         return _FIELDS[name.partition("[")[0]]
-    driven = getattr(mechanism.drivers.get(field.owner), "coordinate", "")
+    driven = getattr(mechanism.groups["driver"].get(field.owner), "coordinate", "")
     owner = owner_of(mechanism, field)
     if isinstance(owner, Held):
         field = field._replace(path=field.path[:-1])

@@ -12,7 +12,8 @@ from udkjax.positions.drive import Drive
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.positions.kinematics import FULL_TURN, Kinematics, kinematics
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers
-from udkjax.scene.mechanism import AbstractDrawing, Mechanism
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.sources import AbstractDrawing
 from udkjax.synthesis.design_problem import DesignProblem
 
 AGREEMENT = 1e-6  # tolerance between the losses of search and motion, relative to the loss and to the squared scale

@@ -20,7 +20,8 @@ from udkjax.integrate.events.conditions import Frames, frames_of
 from udkjax.integrate.events.event import Event
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.joints import Joint
-from udkjax.scene.mechanism import Mechanism, Origin
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.origin import Origin
 from udkjax.wording import quote, suggestion
 
 MOST_PHASES = 32  # each is compiled

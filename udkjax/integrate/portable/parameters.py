@@ -13,7 +13,7 @@ from udkjax.native.base.ir import Function
 from udkjax.native.base.program import vector_function
 from udkjax.native.packing import SampleRows
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import parameters_in, split_index
+from udkjax.scene.number_fields import split_index
 
 
 def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) -> dict[str, float]:
@@ -31,7 +31,7 @@ def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) 
         SceneError: a name is unknown.
     """
     known, scalars = mechanism.parameters(), {}
-    for name in independent_parameters(mechanism) if names is None else names:
+    for name in mechanism.independent_parameters() if names is None else names:
         owner, index = split_index(name, known)
         if owner not in known or (index and index not in np.ndindex(*np.shape(known[owner])[: len(index)])):
             mechanism.with_parameters({name: 0.0})  # raises an error that names the parameter
@@ -39,15 +39,6 @@ def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) 
         for inner in np.ndindex(*value.shape[len(index) :]):
             scalars[owner + "".join(f"[{k}]" for k in (*index, *inner))] = float(value[(*index, *inner)])
     return scalars
-
-
-def independent_parameters(mechanism: Mechanism) -> list[str]:
-    """Return the names of all parameters that do not follow from a drawing."""
-    known = mechanism.parameters()
-    if mechanism.drawing is None:
-        return list(known)
-    independent = {"gravity", *parameters_in(mechanism.drawing.groups), *mechanism.changed_names}
-    return [name for name in known if name in independent]
 
 
 class NumberProgram:

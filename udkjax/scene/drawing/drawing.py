@@ -1,15 +1,14 @@
 """A drawing: a mechanism defined as on paper, by pins in world coordinates and links through them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers, TomlTable
-from udkjax.arrays import make_module, number
+from udkjax.arrays import by_numpy, make_module, number
 from udkjax.printing import PrintedTable
-from udkjax.programs.deferred import deferred_if_traced
 from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneEntry, SceneError
 from udkjax.scene.description import drawing_table
@@ -18,7 +17,6 @@ from udkjax.scene.drawing.drawing_reader import (
     DRAWN,
     SECTIONS,
     DrawingElements,
-    concrete_elements,
     placement_of,
     read_drawing,
 )
@@ -31,8 +29,10 @@ from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import name_elements
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint, Revolute
-from udkjax.scene.mechanism import AbstractDrawing, Mechanism
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import ElementGroups
 from udkjax.scene.schema import table_of
+from udkjax.scene.sources import AbstractDrawing, Drawn
 from udkjax.wording import abbreviate, quote, suggestion
 
 
@@ -75,7 +75,7 @@ class Drawing(AbstractDrawing):
     ground: tuple[str, ...] = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # the units in which it was written
     _names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # names of the elements of each section
-    _elements: tuple[tuple[Any, ...], ...]
+    _elements: tuple[tuple[Any, ...] | None, ...]
 
     def __init__(
         self,
@@ -124,7 +124,7 @@ class Drawing(AbstractDrawing):
     def groups(self) -> dict[str, dict[str, Any]]:
         """All elements by section (pin, link, motor, ...) and name."""
         sections = zip((*DRAWN, *BY_HAND), self._names, self._elements, strict=True)
-        return {section: dict(zip(names, elements, strict=True)) for section, names, elements in sections}
+        return {section: dict(zip(names, elements or (), strict=True)) for section, names, elements in sections}
 
     @property
     def pins(self) -> dict[str, Float[Array, "2"]]:
@@ -138,7 +138,7 @@ class Drawing(AbstractDrawing):
 
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
         """Return the last link at a pin, or the ground, and the pin's position in its frame (m); None for an unknown pin."""
-        placement = placement_of(concrete_elements(self.groups), self.ground)
+        placement = placement_of(self.groups, self.ground)
         if name not in placement.places:
             return None
         body = placement.members(name)[-1]
@@ -151,15 +151,15 @@ class Drawing(AbstractDrawing):
 
     def shapes(self) -> dict[str, Array]:
         """Return the pins or the outline (n, 2) of each link, in the frame of the link (m), by name."""
-        placement, shapes = placement_of(concrete_elements(self.groups), self.ground), {}
+        placement, shapes = placement_of(self.groups, self.ground), {}
         for name, link in placement.links.items():
-            positions = [placement.places[pin] for pin in link.pins] if link.outline is None else list(link.outline)
+            positions = [placement.places[pin] for pin in link.pins] if link.outline is None else list(by_numpy(link.outline))
             shapes[name] = number([placement.local(name, position) for position in positions])
         return shapes
 
     def free_pins(self) -> dict[str, tuple[str, Array]]:
         """Return the pins that belong to a single link, by name: the link, and the position in its frame (m)."""
-        placement, free = placement_of(concrete_elements(self.groups), self.ground), {}
+        placement, free = placement_of(self.groups, self.ground), {}
         for pin, position in placement.places.items():
             members = placement.members(pin)
             if len(members) == 1 and members[0] in placement.links:
@@ -171,10 +171,13 @@ class Drawing(AbstractDrawing):
 
     _shapes = _table  # the table marks traced numbers
 
-    @deferred_if_traced
     def mechanism(self) -> Mechanism:
         """Return the mechanism of the drawing; its numbers follow from those of the drawing, which may be traced."""
-        groups = concrete_elements(self.groups)
+        return Mechanism.of_drawing(Drawn(self), self.name)
+
+    def elements(self) -> ElementGroups:
+        """Return the elements of the mechanism, by section (body, joint, driver, force) and name, without checks."""
+        groups = self.groups
         placement = placement_of(groups, self.ground)
         bodies = {name: drawn.body for name, drawn in placement.drawn.items()} | groups["body"]
         joints: dict[str, Joint] = {}
@@ -185,12 +188,15 @@ class Drawing(AbstractDrawing):
         joints |= {name: part.joint for name, part in parts.items() if part.joint is not None}
         drivers = {name: part.driver for name, part in motors.items() if part.driver is not None}
         forces = {name: part.force for name, part in (*parts.items(), *motors.items()) if part.force is not None}
-        given = self.groups
-        joints, drivers, forces = joints | given["joint"], drivers | given["driver"], forces | given["force"]
-        try:
-            return Mechanism(bodies, joints, drivers, forces, self.gravity, self.name, drawing=self)
-        except SceneError as error:
-            raise SceneError([_with_link(problem, placement.drawn) for problem in error.problems], self.name) from None
+        joints, drivers, forces = joints | groups["joint"], drivers | groups["driver"], forces | groups["force"]
+        return {"body": bodies, "joint": joints, "driver": drivers, "force": forces}
+
+    def explain(self, problem: str) -> str:
+        """Return a mistake; if it is in the body of a link, add that the body's numbers follow from the link."""
+        name = next((name for name in self.links if problem.startswith(f"body {abbreviate(name)} ")), None)
+        return (
+            problem if name is None else f"{problem}; it follows from the mass or density, pins and width of link {quote(name)}"
+        )
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
@@ -201,10 +207,10 @@ class Drawing(AbstractDrawing):
         return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(checked.groups)[1]})
 
 
-def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...], ...]]:
-    """Return the names and the elements of each section as tuples: JAX would sort the keys of a dict."""
+def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...] | None, ...]]:
+    """Return the names and the elements of each section as tuples, None if empty: JAX would sort the keys of a dict."""
     sections = [groups[section] for section in (*DRAWN, *BY_HAND)]
-    return tuple(map(tuple, sections)), tuple(tuple(group.values()) for group in sections)
+    return tuple(map(tuple, sections)), tuple(tuple(group.values()) or None for group in sections)
 
 
 def _pins(pins: Mapping[str, Any], velocities: Mapping[str, Any]) -> dict[str, Any]:
@@ -233,9 +239,3 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
             problem = f"{where(section, k, name)}: must be a table or of class {cls.__name__}, is a {type(item).__name__}"
             entries.append(SceneEntry(section, k, name, None, {}, problem))
     return entries
-
-
-def _with_link(problem: str, links: Iterable[str]) -> str:
-    """Return a mistake; if it is in the body of a link, add that the body's numbers follow from the link."""
-    name = next((name for name in links if problem.startswith(f"body {abbreviate(name)} ")), None)
-    return problem if name is None else f"{problem}; it follows from the mass or density, pins and width of link {quote(name)}"

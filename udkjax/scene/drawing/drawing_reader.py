@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from udkjax.annotations import TomlTable
-from udkjax.arrays import is_traced
+from udkjax.arrays import by_numpy, is_traced
 from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
@@ -16,6 +16,7 @@ from udkjax.scene.drawing.link import Link, Pin, with_concrete_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, shape_mistakes, where
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.drivers import Driver
+from udkjax.scene.element_setup import as_leaves
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint, Revolute
 from udkjax.scene.schema import build
@@ -107,7 +108,8 @@ def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, gro
         mistakes = [problem.replace(f"{path}.position", path, 1) for problem in mistakes]
     problems += mistakes
     if not mistakes and isinstance(entry.name, str):
-        group.setdefault(entry.name, entry.element if isinstance(entry.element, cls) else build(cls, table))
+        element: Any = entry.element
+        group.setdefault(entry.name, as_leaves(element) if isinstance(element, cls) else build(cls, table))
 
 
 def units_of_element(cls: type, table: TomlTable) -> tuple[str, str]:
@@ -122,10 +124,10 @@ def units_of_element(cls: type, table: TomlTable) -> tuple[str, str]:
 def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str]) -> Placement:
     """Return the placement of the elements of a drawing, with NumPy or traced numbers."""
     links = groups["link"]
-    places = {name: pin.position for name, pin in groups["pin"].items()}
-    speeds = {name: np.zeros(2) if pin.velocity is None else pin.velocity for name, pin in groups["pin"].items()}
+    places = {name: by_numpy(pin.position) for name, pin in groups["pin"].items()}
+    speeds = {name: np.zeros(2) if pin.velocity is None else by_numpy(pin.velocity) for name, pin in groups["pin"].items()}
     drawn = {name: link.body(places, speeds) for name, link in links.items()}
-    frames = {name: Frame.at(body.position, body.angle) for name, body in groups["body"].items()}
+    frames = {name: Frame.at(by_numpy(body.position), by_numpy(body.angle)) for name, body in groups["body"].items()}
     return Placement(PinLayout(links, ground, groups["slide"]), places, drawn, frames)
 
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
+import jax
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
-from udkjax.arrays import array_namespace
+from udkjax.arrays import array_namespace, by_numpy
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, pair_mistakes
 from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
@@ -68,9 +69,10 @@ class Motor(DrawnElement):
 
     def _law(self, start: Number) -> Motion:
         if self.motion is not None:
-            return shift_motion(self.motion, start)
+            return shift_motion(jax.tree.map(by_numpy, self.motion), start)
         assert self.speed is not None
-        return Polynomial(array_namespace(start, self.speed).stack([start, self.speed]))
+        speed = by_numpy(self.speed)
+        return Polynomial(array_namespace(start, speed).stack([start, speed]))
 
 
 class PinSpring(DrawnElement):
@@ -104,7 +106,7 @@ class PinSpring(DrawnElement):
     def parts(self, placement):
         if self.pin is not None:
             pair = placement.pair(self.pin, self.of)
-            free = placement.angle_between(*pair) + (0.0 if self.angle is None else self.angle)
+            free = placement.angle_between(*pair) + (0.0 if self.angle is None else by_numpy(self.angle))
             return Parts(force=TorsionSpring(pair, self.stiffness, self.damping, free))
         length = placement.distance(*self.between) if self.length is None else self.length
         return Parts(force=_spring_between(placement, self.between, self.stiffness, length, self.damping))
@@ -170,7 +172,7 @@ class Load(DrawnElement):
         point = (0.0, 0.0) if self.pin is None else placement.local(body, placement.places[self.pin])
         vector = self.force
         if self.frame == "body":  # the vector is drawn in world coordinates, and turns with the body
-            vector = _turn_back(self.force, placement.angle(body))
+            vector = _turn_back(by_numpy(self.force), placement.angle(body))
         return Parts(force=Force(body, vector, point, self.frame))
 
     def _body(self, layout: PinLayout) -> str:

@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
-from udkjax.arrays import array_namespace
+from udkjax.arrays import array_namespace, by_numpy
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, line_mistakes
 from udkjax.scene.fields import LINK, PIN, POSITIVE, given_direction, given_names, given_or_none
@@ -96,7 +96,8 @@ class GearPair(DrawnElement):
         if radii is None:  # chosen so that the wheels touch
             assert self.teeth is not None
             centre1, centre2 = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
-            radii = self.teeth * (placement.distance(centre1, centre2) / self._apart(self.teeth))
+            teeth = by_numpy(self.teeth)
+            radii = teeth * (placement.distance(centre1, centre2) / self._apart(teeth))
         return Parts(joint=Gear(self.links, radii, self.internal, self.carrier))
 
     def misfit(self, placement: Placement) -> tuple[float, float] | None:

@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
-from udkjax.arrays import array_namespace
+from udkjax.arrays import array_namespace, by_numpy
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Body, Frame
 from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, given_names, given_number, given_or_none
@@ -125,9 +125,9 @@ class Link(PrintsLine):
 
     def shape(self, places: Places) -> Shape:
         """Return the link's shape, given the positions of the pins. A disc needs a width; a bar without one is a thin rod."""
-        width = 0.0 if self.width is None else self.width
+        width = 0.0 if self.width is None else by_numpy(self.width)
         if self.outline is not None:
-            return polygon(self.outline)
+            return polygon(by_numpy(self.outline))
         if self.kind == "disc":
             return disc(places[self.pins[0]], width)
         if self.kind == "bar":
@@ -138,16 +138,16 @@ class Link(PrintsLine):
     def body(self, places: Places, velocities: Places) -> "DrawnBody":
         """Return the link's mass properties, position and velocity, given the positions (m) and velocities (m/s) of the pins."""
         if self.inertia is not None and self.centre is not None and self.mass is not None:
-            shape = Shape(0.0, self.centre, 0.0)  # area and radius are not used
+            shape = Shape(0.0, by_numpy(self.centre), 0.0)  # area and radius are not used
         else:
             shape = self.shape(places)
-        if self.mass is not None:
-            mass = self.mass
-        else:
+        mass = self.mass  # a number that the link gives is the same object in the body: one leaf
+        if mass is None:
             assert self.density is not None and self.thickness is not None
-            mass = self.density * self.thickness * shape.area
-        inertia = mass * shape.square_radius if self.inertia is None else self.inertia
-        centre = shape.centre if self.centre is None else self.centre
+            mass = by_numpy(self.density) * by_numpy(self.thickness) * shape.area
+        inertia = by_numpy(mass) * shape.square_radius if self.inertia is None else self.inertia
+        position = shape.centre if self.centre is None else self.centre
+        centre = by_numpy(position)
         first, angle, rate = places[self.pins[0]], 0.0, 0.0
         first_velocity = velocities[self.pins[0]]
         if len(self.pins) > 1:
@@ -159,7 +159,7 @@ class Link(PrintsLine):
         velocity = array_namespace(arm, rate, first_velocity).stack(
             [first_velocity[0] - rate * arm[1], first_velocity[1] + rate * arm[0]]
         )
-        return DrawnBody(Frame.at((centre[0], centre[1]), angle), Body(mass, inertia, centre, angle, velocity, rate))
+        return DrawnBody(Frame.at((centre[0], centre[1]), angle), Body(mass, inertia, position, angle, velocity, rate))
 
 
 class DrawnBody(NamedTuple):

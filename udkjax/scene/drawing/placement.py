@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
-from udkjax.arrays import array_namespace
+from udkjax.arrays import array_namespace, by_numpy
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.drawing.link import DrawnBody, Link, PointArray
@@ -92,7 +92,7 @@ class Placement(PinLayout):
             line = self.places[along[1]] - self.places[along[0]]
             direction = array_namespace(line).arctan2(line[1], line[0])
         assert direction is not None  # given, because `along` is not
-        return direction - self.angle(on)
+        return direction if on == GROUND else by_numpy(direction) - self.angle(on)
 
 
 class Parts(NamedTuple):

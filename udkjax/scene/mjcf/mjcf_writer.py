@@ -12,10 +12,11 @@ from udkjax.annotations import Number
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
 from udkjax.scene.checks import SceneError
+from udkjax.scene.drawing import Drawing
 from udkjax.scene.forces import Spring, Torque, TorsionSpring
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Angle, Constraint, Distance, Gear, Prismatic, Revolute, Slot, Weld
-from udkjax.scene.mechanism import AbstractDrawing, Mechanism
+from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import EVEN
@@ -41,7 +42,7 @@ class _TreeJoint(NamedTuple):
 
 
 @checked
-def mjcf_text(mechanism: Mechanism | AbstractDrawing) -> str:
+def mjcf_text(mechanism: Mechanism | Drawing) -> str:
     """Return a mechanism as an MJCF model, the XML format of MuJoCo, in the world's x-z plane; `read_mjcf` reads it back.
 
     The joints of a spanning tree become hinges and slides, the others equalities: `connect`, `weld`, or equalities of tendons.
@@ -57,9 +58,9 @@ def mjcf_text(mechanism: Mechanism | AbstractDrawing) -> str:
     Raises:
         SceneError: MJCF has no equivalent for an element, or a joint of the tree is open; the error lists all of them.
     """
-    mechanism = mechanism.mechanism() if isinstance(mechanism, AbstractDrawing) else mechanism
+    mechanism = mechanism.mechanism() if isinstance(mechanism, Drawing) else mechanism
     check_known(mechanism, mechanism.name)
-    return _Writer(jax.tree.map(np.asarray, mechanism)).text()
+    return _Writer(jax.tree.map(np.asarray, mechanism.without_origin)).text()
 
 
 class _Writer:

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeAlias
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Int, PyTree
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 # Values, or dimensions, values and attributes, as accepted by xarray.
 Labelled: TypeAlias = "np.ndarray | list[str] | tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]"
 FORMAT = "udkjax sweep 1"
+NUMBERS_OF = {"stabilization": {"alpha", "beta"}, "method": {"rank_tol", "branch_tol"}}  # numbers of settings that may be axes
 LABELS = {
     RESULT: Label((), "1", "result of the run"),
     END: Label((), "s", "time reached by the run"),
@@ -166,7 +168,10 @@ def _coordinate(dimension: Dimension, column: AxisColumn) -> dict[str, Labelled]
 
 
 def _attributes(plan: SweepPlan) -> dict[str, str | int | float]:
-    settings = {name: value if isinstance(value, str | int | float) else _shown(value) for name, value in plan.settings.items()}
+    settings = {
+        name: value if isinstance(value, str | int | float) else _shown(plan, name, value)
+        for name, value in plan.settings.items()
+    }
     return {
         "title": plan.mechanism.name,
         "format": FORMAT,
@@ -179,5 +184,21 @@ def _attributes(plan: SweepPlan) -> dict[str, str | int | float]:
     }
 
 
-def _shown(value: PyTree) -> str:
-    return "none" if value is None else " ".join(str(value).split())
+class _AxisName:
+    """The name of an axis, printed where a setting has a number that the axis replaces."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __repr__(self) -> str:
+        return f"axis {self.name}"
+
+
+def _shown(plan: SweepPlan, setting: str, value: PyTree) -> str:
+    """Return a setting as text, with the names of axes instead of the numbers that these replace."""
+    if value is None:
+        return "none"
+    for column in plan.columns:
+        for name in () if callable(column.of) else set(column.of) & NUMBERS_OF.get(setting, set()):
+            value = eqx.tree_at(lambda x, name=name: getattr(x, name), value, _AxisName(column.name), is_leaf=lambda x: x is None)
+    return " ".join(str(value).split())

@@ -12,7 +12,8 @@ from udkjax.positions.drive import Drive
 from udkjax.positions.kinematics import FULL_TURN, Kinematics, kinematics
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers
 from udkjax.scene.checks import SceneError
-from udkjax.scene.mechanism import AbstractDrawing, Mechanism
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.sources import AbstractDrawing
 
 NEARLY_REAL = 1e-4  # relative to the extent; singular ends are at best accurate to the square root of the rounding error
 

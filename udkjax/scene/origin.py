@@ -1,0 +1,22 @@
+"""The concrete mechanism behind one whose numbers are traced."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+
+class Origin:
+    """The concrete mechanism from which one with traced numbers was made. It is hashable, and compares by value."""
+
+    def __init__(self, mechanism: Any):
+        self.mechanism = mechanism
+        leaves, structure = jax.tree.flatten(mechanism)
+        self._key = structure, tuple(np.asarray(leaf).tobytes() for leaf in leaves)
+        self._hash = hash(self._key)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Origin) and self._key == other._key)
