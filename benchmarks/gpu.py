@@ -6,7 +6,9 @@ one it says so, and runs the threads of the kernels one after another on this pr
 
 import json
 import os
+import re
 import statistics
+import subprocess
 import time
 import traceback
 from collections.abc import Callable
@@ -21,6 +23,8 @@ import udkjax as udk
 from benchmarks.batch import SPREAD, angles, ours, states
 from benchmarks.emulation import calls_of, run_threads
 from benchmarks.scripts import solve
+from udkjax.native.gpu import target
+from udkjax.native.runs import RunStates
 
 END, OUTPUTS = 20.0, 101  # s; output times of runs with dense output
 TOLERANCES = (1e-6, 1e-9)
@@ -249,6 +253,36 @@ def script(report: Report):
     report.add("script", members=SCRIPT_LANES, ms=each * 1e3, a_second=SCRIPT_LANES / each)
 
 
+def assembled(name: str) -> dict[str, Any] | None:
+    """Compile the kernel of a mechanism's run; return what `ptxas` says of it. None without `ptxas`."""
+    assembler, mechanism = target.ptxas(), _scene(name)
+    if assembler is None:
+        return None
+    ts, gravity = np.linspace(0.0, SCENES.get(name, END) / 100, 2), np.asarray(mechanism.gravity)
+    known = udk.analyse(mechanism)
+
+    def one(share):
+        moved = mechanism.with_parameters({"gravity": jnp.asarray(gravity) * share})
+        return udk.simulate(moved, ts, rtol=1e-6, atol=1e-6, throw=False, analysis=known).q[-1]
+
+    (call,) = (x for x in calls_of(jax.vmap(one), np.array([0.9, 1.0])) if isinstance(x.operation, RunStates))
+    start = time.perf_counter()
+    code = target.ptx(call.kernel.text)
+    middle = time.perf_counter()
+    given = [assembler, "-arch=sm_90", "-O3", "-v", "-", "-o", os.devnull]
+    said = subprocess.run(given, input=code, capture_output=True, text=True, check=True).stderr
+    spilled = sum(int(x) for x in re.findall(r"(\d+) bytes spill loads", said))
+    return {
+        "scene": name,
+        "thread_bytes": 8 * call.kernel.code.size,
+        "registers": int((re.findall(r"Used (\d+) registers", said) or [0])[-1]),
+        "spilled_bytes": spilled,
+        "ptx_kb": len(code) // 1000,
+        "llvm_s": middle - start,
+        "ptxas_s": time.perf_counter() - middle,
+    }
+
+
 def emulated(smoke: bool) -> list[dict[str, Any]]:
     """Compare the threads of kernels, one after another on this processor, with the engine."""
     figures, mechanism = [], udk.library.parallelogram()
@@ -259,6 +293,10 @@ def emulated(smoke: bool) -> list[dict[str, Any]]:
             results = run_threads(call.kernel, call)
             same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(results, call.outputs, strict=True))
             figures.append({"name": "emulation", "operation": type(call.operation).__name__, "outputs": outputs, "equal": same})
+            print(figures[-1])
+    for name in () if smoke else ("parallelogram", *SCENES):
+        if (figure := assembled(name)) is not None:
+            figures.append({"name": "assembled"} | figure)
             print(figures[-1])
     return figures
 
