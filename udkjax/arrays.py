@@ -8,7 +8,9 @@ from typing import Any, TypeAlias, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import Numbers
@@ -32,7 +34,13 @@ def is_traced(tree: Any) -> bool:
 
 def is_within_jit() -> bool:
     """Return True while a program is traced, in which concrete numbers become constants."""
-    return isinstance(jax.device_put(0.0), Tracer)
+    return isinstance(_evaluated_p.bind(), Tracer)
+
+
+_evaluated_p = Primitive("is_evaluated")  # without inputs: nothing is put on a device to know whether it is evaluated or traced
+_evaluated_p.def_impl(lambda: np.True_)
+_evaluated_p.def_abstract_eval(lambda: ShapedArray((), np.dtype(bool)))
+mlir.register_lowering(_evaluated_p, mlir.lower_fun(lambda: jnp.asarray(True), multiple_results=False))
 
 
 def library_for(tree: Any) -> ModuleType:

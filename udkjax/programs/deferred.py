@@ -30,6 +30,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from udkjax.arrays import is_traced, is_within_jit
 from udkjax.devices import on_host
 from udkjax.programs.numpy_program import Meter, TooLongError, count_operations, numpy_program
 from udkjax.programs.varying_axes import varies
@@ -62,7 +63,7 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
         except _ClosesOverError:
             return by_jit(*args, **kwargs)
         # Binding would make JAX retrace a program with custom derivative rules, to remove them before evaluation.
-        is_concrete = not any(isinstance(x, Tracer) for x in (*leaves, jax.device_put(0.0)))
+        is_concrete = not (is_traced(leaves) or is_within_jit())
         results = (_evaluate if is_concrete else deferred_p.bind)(*leaves, call_jaxpr=program)
         return out.rebuild(results)
 
