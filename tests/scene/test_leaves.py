@@ -237,6 +237,14 @@ def test_derivatives_by_leaves(name):
             )
 
 
+def test_invalid_leaves_are_named_where_they_are_used():
+    """A step of an optimizer may make a mass negative, which nothing checks until then."""
+    negative = eqx.tree_at(lambda m: m.drawing.links["coupler"].mass, four_bar(), jnp.asarray(-1.0))
+    for use in (end, udk.dumps, udk.assemble):
+        with pytest.raises(udk.SceneError, match=r'coupler" \(\w+\[1\]\)\.mass: must be > 0, is -1\.0'):
+            use(negative)
+
+
 def test_constants_of_gears_follow_from_their_radii(tmp_path):
     """Whoever changes a radius as a leaf runs what a file with this radius runs."""
     mechanism = library.planetary_gear()

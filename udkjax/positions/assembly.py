@@ -183,6 +183,7 @@ def require_closed(mechanism: Mechanism, closure: Closure, t: NumberLike = 0.0, 
     closed = closure.is_closed
     if isinstance(closed, Tracer) or closed:
         return
+    mechanism.with_parameters({})  # numbers changed as leaves of a tree have not been checked: raises an error that names them
     names = [name for name, _ in analyse(mechanism).row_names]
     psi, psi_dot, rows = (np.asarray(x) for x in (closure.psi, closure.psi_dot, closure.scales.rows))
     q = np.asarray(mechanism.q0 if guess is None else guess.q).ravel()

@@ -92,6 +92,14 @@ def test_the_dataset_says_what_it_is(data, pendulum):
     assert "position_error" in data and "rank" not in data and "q" not in data
 
 
+def test_settings_name_the_axes_that_replace_their_numbers(pendulum):
+    axes = {"gain": udk.Axis([2.0, 5.0], of="alpha"), "rank_tol": [1e-8]}
+    plan = make_plan(pendulum, axes, TS, stabilization=udk.Baumgarte(7.0, 9.0), method=udk.SVD())
+    attributes = assemble(plan, []).attrs
+    assert attributes["setting_stabilization"] == "Baumgarte(alpha=axis gain, beta=9)"
+    assert attributes["setting_method"].startswith("SVD(rank_tol=axis rank_tol")
+
+
 def test_what_is_not_finished_is_marked(plan, finished):
     members, values = finished[0]
     part = assemble(plan, [(members[:4], {name: array[:4] for name, array in values.items()})])

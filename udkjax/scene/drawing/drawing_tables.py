@@ -49,6 +49,7 @@ def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneE
 def drawing_text(drawing: Drawing) -> str:
     """Return a drawing as the text of a TOML file, in the units in which it was drawn; raise a `SceneError` if that fails."""
     check_known(drawing, drawing.name)
+    drawing.with_groups(drawing.groups, drawing.gravity)  # numbers changed as leaves of a tree have not been checked
     units, groups = Units(dict(drawing.units)), drawing.groups
     problems = [
         problem
