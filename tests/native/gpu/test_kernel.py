@@ -21,6 +21,7 @@ from udkjax.native import primitive
 from udkjax.native.base import machine
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.gpu import launch, target
+from udkjax.native.gpu.driver import CudaError
 from udkjax.native.gpu.kernel import VECTOR, kernel_code
 
 emulation = pytest.importorskip("benchmarks.emulation", reason="not in a source tree")
@@ -250,3 +251,43 @@ def test_ptx_computes_what_the_engine_computes(name, tmp_path):
         ptx_as_c.compiled(target.ptx(code.text), folder)(record.ctypes.data, len(outputs[0]))
         for found, known in zip(outputs, call.outputs, strict=True):
             assert_array_equal(found, known)
+
+
+class Loading:
+    """A driver of some devices that loads kernels of some kinds."""
+
+    def __init__(self, capabilities, accepted=(b"\x7fELF", b"//\n/")):
+        self.capabilities, self.accepted, self.images = capabilities, accepted, []
+
+    def device_count(self):
+        return len(self.capabilities)
+
+    def attribute(self, which, ordinal):
+        return self.capabilities[ordinal][which == launch.MINOR]
+
+    def __call__(self, name, place, *given):
+        if name == "cuLibraryLoadData":
+            self.images.append(given[0][:4])
+            if given[0][:4] not in self.accepted:
+                raise CudaError("the provided PTX was compiled with an unsupported toolchain")
+        ADDRESS.from_address(place).value = 42
+
+
+@pytest.mark.parametrize(
+    ("driver", "images", "handle"),
+    [
+        (Loading([(9, 0)]), 1, 42),
+        (Loading([(9, 0)], accepted=(b"//\n/",)), 2, 42),  # `ptxas` is newer than the driver
+        (Loading([(9, 0)], accepted=()), 2, None),
+        (Loading([(9, 0), (8, 0)]), 1, 42),  # two kinds of cards: the driver assembles
+        (Loading([(6, 1)]), 0, None),
+    ],
+)
+def test_kernels_are_loaded_or_left_to_the_host(driver, images, handle):
+    call = next(x for x in emulation.calls_of(jax.vmap(RUNS["elementary functions"]), MASSES) if not x.operation.is_reverse)
+    if target.ptxas() is None:
+        images = min(images, 1)
+    assert launch.load_kernel(driver, call.kernel) == handle
+    assert len(driver.images) == images
+    if driver.device_count() > 1:
+        assert driver.images == [b"//\n/"]

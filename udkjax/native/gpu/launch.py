@@ -19,7 +19,7 @@ from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.text import text_of_module
 from udkjax.native.gpu import target
-from udkjax.native.gpu.driver import CudaDriver, CudaError, driver
+from udkjax.native.gpu.driver import CudaDriver, driver
 from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, PLATFORM, POP, PUSH, Words, stream_of
 from udkjax.native.gpu.kernel import NAME, KernelCode, kernel_code
 from udkjax.native.operations import Operation
@@ -100,16 +100,18 @@ def load_kernel(of: CudaDriver, code: KernelCode) -> int | None:
     if min(kinds) < target.OLDEST:
         return None
     library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
-    image = target.compile_kernel(code.text, min(kinds), is_assembled=len(kinds) == 1)
-    try:
-        of("cuLibraryLoadData", ctypes.addressof(library), image, 0, 0, 0, 0, 0, 0)
-    except CudaError:  # `ptxas` is newer than the driver
-        image = target.compile_kernel(code.text, min(kinds), is_assembled=False)
-        of("cuLibraryLoadData", ctypes.addressof(library), image, 0, 0, 0, 0, 0, 0)
-    except AttributeError:  # a driver of CUDA 11
-        return None
-    of("cuLibraryGetKernel", ctypes.addressof(kernel), library, NAME.encode())
-    return kernel.value
+    # If `ptxas` refuses the kernel, or is newer than the driver, the driver assembles it.
+    for is_assembled in (True, False) if len(kinds) == 1 else (False,):
+        try:
+            image = target.compile_kernel(code.text, min(kinds), is_assembled)
+            of("cuLibraryLoadData", ctypes.addressof(library), image, 0, 0, 0, 0, 0, 0)
+            of("cuLibraryGetKernel", ctypes.addressof(kernel), library, NAME.encode())
+        except AttributeError:  # a driver of CUDA 11
+            return None
+        except RuntimeError:
+            continue
+        return kernel.value
+    return None
 
 
 def _has_memory(of: CudaDriver, kernel: int) -> bool:
