@@ -16,6 +16,7 @@ from udkjax.equations.scene_arrays import SceneArrays, _evaluator, arrays_in_tim
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.expressions import loop_program
 from udkjax.pinv.rank_policy import RankPolicy
+from udkjax.programs.deferred import deferred
 
 
 class Ellipse(udk.Joint):
@@ -164,13 +165,15 @@ OWN_JOINTS = ["revolute of two", "to ground", "slot of two", "rack of two", "ell
 def definitions(mech, states):
     """The same, of the residuals of the elements by JAX's own derivatives."""
 
+    @deferred  # NumPy evaluates JAX's program sooner than XLA compiles it
     def at(state):
         t, q, v = state
         found = {name: getattr(constraints, name)(mech, t, q) for name in ("psi", "psi_q")}
         found |= {name: getattr(constraints, name)(mech, t, q, v) for name in ("psi_dot", "gamma")}
         return found | {"force": loads.force(mech, t, q, v)}
 
-    return jax.jit(lambda *states: jax.lax.map(at, states))(*states)
+    found = [at(state) for state in zip(*states, strict=True)]
+    return {name: np.stack([each[name] for each in found]) for name in found[0]}
 
 
 @pytest.mark.parametrize("term", ["psi", "psi_dot", "psi_q", "gamma", "force"])

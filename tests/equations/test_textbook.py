@@ -3,7 +3,6 @@
 Every type of joint, driver and force element is held against it in test_scene_programs.py.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.pinv.rank_policy import RankPolicy
+from udkjax.programs.deferred import deferred
 
 SVD = udk.SVD(1e-9)
 T0 = jnp.array(0.3)
@@ -40,7 +40,7 @@ def moved(request):
     return mech, q, v
 
 
-@eqx.filter_jit
+@deferred
 def _textbook(mech, t, q, v, method, baumgarte, w):
     names = {"psi": constraints.psi(mech, t, q), "psi_q": constraints.psi_q(mech, t, q)}
     names |= {"psi_dot": constraints.psi_dot(mech, t, q, v), "gamma": constraints.gamma(mech, t, q, v)}
@@ -81,7 +81,7 @@ def test_rates_are_derivatives_along_a_motion(moved):
     """Psi_dot and gamma against differences of Psi along q + v s + a s^2 / 2: Psi_ddot = Psi_q a - gamma."""
     mech, q, v = moved
     a = jnp.cos(jnp.arange(q.size))
-    psi = jax.jit(lambda s: constraints.psi(mech, T0 + s, q + v * s + a * s**2 / 2))
+    psi = deferred(lambda s: constraints.psi(mech, T0 + s, q + v * s + a * s**2 / 2))
     x, h = textbook(mech, q, v), 1e-3
     samples = np.array([psi(k * h) for k in range(-3, 4)])
     close_to(np.array([-1, 9, -45, 0, 45, -9, 1]) @ samples / (60 * h), x["psi_dot"], 1e-9)
@@ -92,7 +92,7 @@ def test_the_power_balance(moved):
     """d(T + V)/dt along a motion that the constraints allow: the power of stated loads, of drivers, and of V itself in time."""
     mech, q, v = moved
 
-    @jax.jit
+    @deferred
     def balance(q, v):
         A = constraints.psi_q(mech, T0, q)
         v = v - uk.pseudoinverse(SVD, A) @ constraints.psi_dot(mech, T0, q, v)
@@ -118,7 +118,7 @@ def test_a_duplicated_constraint_changes_nothing(closed):
     close_to(again["a"], once["a"], 1e-11)
     close_to(again["psi_q"].T @ again["lambda"], once["psi_q"].T @ once["lambda"], 1e-11)
     off = q + 1e-4 * jnp.cos(jnp.arange(q.size))
-    project = jax.jit(lambda m: jnp.concatenate(uk.project(m, 0.0, off, v, SVD, steps=4)))
+    project = deferred(lambda m: jnp.concatenate(uk.project(m, 0.0, off, v, SVD, steps=4)))
     projected, alone = (project(m.without_origin) for m in (twice, mech))
     close_to(projected, alone, 1e-7)  # where redundant rows disagree, copies count twice
 
@@ -148,11 +148,11 @@ def test_weights_change_no_solution_of_consistent_rows_and_zero_leaves_one_out()
 def test_projection_returns_to_the_manifold_and_leaves_what_is_tangent_to_it(name):
     mech = scene(name)
     q, v = (x.ravel() + 1e-4 * jnp.sin(1.0 + jnp.arange(x.size)) for x in (mech.q0, mech.v0))
-    q1, v1 = jax.jit(lambda q, v: uk.project(mech, T0, q, v, SVD, steps=8))(q, v)
-    psi, psi_dot = jax.jit(lambda q, v: (constraints.psi(mech, T0, q), constraints.psi_dot(mech, T0, q, v)))(q1, v1)
+    q1, v1 = deferred(lambda q, v: uk.project(mech, T0, q, v, SVD, steps=8))(q, v)
+    psi, psi_dot = deferred(lambda q, v: (constraints.psi(mech, T0, q), constraints.psi_dot(mech, T0, q, v)))(q1, v1)
     assert np.abs(psi).max() < 1e-13 and np.abs(psi_dot).max() < 1e-13
-    tangent = jax.jit(lambda change: uk.tangent_part(mech, T0, q1, change, SVD))
-    part, psi_q = tangent(q), jax.jit(lambda q: constraints.psi_q(mech, T0, q))(q1)
+    tangent = deferred(lambda change: uk.tangent_part(mech, T0, q1, change, SVD))
+    part, psi_q = tangent(q), deferred(lambda q: constraints.psi_q(mech, T0, q))(q1)
     assert_allclose(psi_q @ part, 0.0, atol=1e-12)
     assert_allclose(tangent(part), part, atol=1e-12)
     assert_allclose(part @ (loads.mass(mech) * (q - part)), 0.0, atol=1e-12)  # in the metric of M the rest is orthogonal
@@ -161,7 +161,7 @@ def test_projection_returns_to_the_manifold_and_leaves_what_is_tangent_to_it(nam
 def test_coordinates_may_be_flat_or_by_body():
     mech = udk.library.slider_crank()
 
-    @jax.jit
+    @deferred
     def evaluate(q, v):
         of_q = [f(mech, T0, q) for f in (constraints.psi, constraints.psi_q)]
         return of_q + [f(mech, T0, q, v) for f in (constraints.psi_dot, constraints.gamma, loads.force, loads.potential_energy)]
@@ -212,7 +212,7 @@ def test_every_pseudoinverse_gives_what_singular_values_give(name, key):
     v = mech.v0.ravel() + 0.03 * jnp.sin(jnp.arange(mech.v0.size))
     analysis, q = udk.analyse(mech), udk.assemble(mech, T0).q.ravel()
 
-    @jax.jit
+    @deferred
     def both(m, q, v):
         q, v = uk.project(m, T0, q, v, udk.SVD(1e-6), steps=3)
         given = m, T0, q, v, udk.SVD(1e-6), None, analysis.scales.weights
