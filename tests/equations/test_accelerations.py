@@ -3,7 +3,6 @@
 from functools import partial
 from types import SimpleNamespace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ import udkjax as udk
 from tests.choices import fast
 from tests.textbook import terms
 from udkjax.equations import constraints, loads, prepare
+from udkjax.programs.deferred import deferred
 
 CLASSES = (udk.Auto, udk.SVD, udk.Varga, udk.Greville, udk.Householder, udk.GramSchmidt, udk.Elimination)
 METHODS = {cls.__name__: cls() for cls in CLASSES}
@@ -22,7 +22,7 @@ METHODS = {cls.__name__: cls() for cls in CLASSES}
 # --- the paper's linkage
 
 
-@eqx.filter_jit
+@deferred
 def along(mechanism, q, v, method):
     return jax.vmap(lambda q, v: udk.accelerations(mechanism, 0.0, q, v, method, multipliers=True))(q, v)
 
@@ -162,7 +162,7 @@ def test_projection_is_the_smallest_change(nearby, name):
     mech, qs, vs = nearby(name)
     equations, t = prepare(mech), jnp.array(0.0)
 
-    @jax.jit
+    @deferred
     def project(q, v):
         q, v = equations.project(t, q, v)
         return q, v, *equations.violation(t, q, v), constraints.psi_q(mech, t, q)
@@ -181,7 +181,7 @@ def test_the_tangential_part_is_what_projection_leaves(nearby):
     mech, (q, *_), (v, *_) = nearby("parallelogram")
     dq, dv = 1e-7 * np.random.default_rng(3).standard_normal((2, len(q)))
 
-    @eqx.filter_jit
+    @deferred
     def parts(mech, q, v, dq, dv):
         equations, t = prepare(mech), 0.0
         q, v = equations.project(t, *equations.project(t, q, v))
@@ -205,7 +205,7 @@ def test_bodies_without_constraints_fall_freely():
     mech = udk.Mechanism(bodies, forces=forces)
     assert udk.analyse(mech).redundant_rows == ()
 
-    @jax.jit
+    @deferred
     def by_all(q, v):
         solved = [udk.accelerations(mech, 0.0, q, v, method, multipliers=True) for method in METHODS.values()]
         return solved, loads.force(mech, 0.0, q.ravel(), v.ravel())
@@ -244,7 +244,7 @@ def test_rows_left_out_that_become_independent_count_again(linkage):
 
 
 def test_also_when_numbers_are_traced(linkage):
-    @jax.jit
+    @deferred
     def pair(length):
         mech = changed(linkage, length)
         state = udk.assemble(mech)
@@ -290,5 +290,5 @@ def test_derivatives_of_accelerations(linkage, placed):
         return jnp.stack(jax.grad(function, (0, 1))(*at)), jnp.array(jax.hessian(function, (0, 1))(*at))
 
     at = (jnp.array(-0.8), jnp.array(2.0))
-    for found, known in zip(*(jax.jit(partial(derivatives, f))(*at) for f in (angular, exact)), strict=True):
+    for found, known in zip(*(deferred(partial(derivatives, f))(*at) for f in (angular, exact)), strict=True):
         assert_allclose(found, known, atol=1e-9)

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations import equations_of
+from udkjax.programs.deferred import deferred
 
 LU = udk.Augmented()
 ROBUST = {
@@ -34,7 +35,7 @@ def mechanism(name):
     return getattr(udk.library, name)()
 
 
-@eqx.filter_jit  # all of them in one program, which evaluates what they share once
+@deferred  # all of them in one program, which evaluates what they share once
 def all_of(mech, t, q, v, formulations, baumgarte=None):
     """Accelerations by the Udwadia-Kalaba equation, and by each of the formulations."""
     solve = lambda f: equations_of(mech, udk.SVD(), baumgarte, f).accelerations(t, q, v)  # noqa: E731
@@ -143,7 +144,7 @@ def test_plain_LU_divides_by_rounding_errors(linkage, placed):
     """Rank 23 of 24: what LU takes for a pivot is a rounding error, and so is what it makes of the multipliers."""
     q, v = (x.ravel() for x in placed(-0.8, 1.3))
 
-    @jax.jit
+    @deferred
     def factorized(q, v):
         M, _, A, _ = equations_of(linkage, udk.SVD()).matrices(T0, q, v)
         matrix = jnp.block([[M, A.T], [A, jnp.zeros((12, 12))]])
@@ -160,7 +161,7 @@ def test_and_by_nothing_where_a_joint_is_given_twice():
     single = mechanism("compound_pendulum")
     double = udk.Mechanism(single.bodies, {"pin": single.joints["pin"], "again": single.joints["pin"]})
     q, v = single.q0.ravel(), jnp.array([0.3, 0.1, 0.0])
-    v = jax.jit(lambda q, v: equations_of(single, udk.SVD()).project(T0, q, v)[1])(q, v)
+    v = deferred(lambda q, v: equations_of(single, udk.SVD()).project(T0, q, v)[1])(q, v)
     reference, found = all_of(double, T0, q, v, ALL)
     assert not np.any(np.isfinite(found.pop("Augmented")))
     agree(reference, found)
@@ -194,7 +195,7 @@ def test_derivatives(name, closed):
     direction = jnp.asarray(np.random.default_rng(2).standard_normal(len(x)))
     weights = jnp.cos(jnp.arange(6.0))
 
-    @jax.jit
+    @deferred
     def taylor(s):
         slope = lambda s: jax.jvp(lambda s: f(x + s * direction), (s,), (jnp.ones(()),))  # noqa: E731
         return jax.jvp(slope, (s,), (jnp.ones(()),))
@@ -202,7 +203,7 @@ def test_derivatives(name, closed):
     ((_, forward), (_, second)), ahead, behind = (taylor(jnp.array(s)) for s in (0.0, h, -h))
     for found, a, b in zip((forward, second), ahead[0], behind[0], strict=True):
         assert_allclose(found, (a - b) / (2 * h), rtol=0, atol=1e-6 * float(jnp.abs(found).max()))
-    assert_allclose(jax.jit(jax.grad(lambda x: weights @ f(x)))(x) @ direction, weights @ forward, rtol=1e-9)
+    assert_allclose(deferred(jax.grad(lambda x: weights @ f(x)))(x) @ direction, weights @ forward, rtol=1e-9)
 
 
 # --- completion of a partitioned state
@@ -211,12 +212,12 @@ def test_derivatives(name, closed):
 def partitioned(mechanism, t, q, v):
     """The equations with the partition that is chosen at a state, and which coordinates are independent."""
     equations = equations_of(mechanism, None, None, udk.CoordinatePartitioning())
-    held = eqx.filter_jit(lambda e, t, q, v: e.fix_partition(t, q, v))(equations, t, q, v)
+    held = deferred(lambda e, t, q, v: e.fix_partition(t, q, v))(equations, t, q, v)
     assert held.independent is not None
     return held, held.independent
 
 
-@eqx.filter_jit
+@deferred
 def project_state(equations, q, v):
     return equations.project(T0, q, v)
 
@@ -237,7 +238,7 @@ def test_a_guess_too_far_away_is_not_a_number(linkage, placed):
     q, v = (x.ravel() for x in placed(-0.8, 1.3))
     held, independent = partitioned(linkage, T0, q, v)
     off = jnp.where(independent, 0.0, 0.4 * jnp.cos(jnp.arange(12.0)))
-    rates = eqx.filter_jit(lambda e, q, v: jnp.concatenate(e.rates(T0, q, v)))
+    rates = deferred(lambda e, q, v: jnp.concatenate(e.rates(T0, q, v)))
     assert np.isnan(rates(held, q + off, v)).any()
     assert np.isfinite(rates(held, q + 0.1 * off, v)).all()
 
@@ -249,7 +250,7 @@ def test_completion_has_derivatives(linkage, placed):
     y = pose(angle)
     held, independent = partitioned(linkage, T0, *jnp.split(y, 2))
     project = lambda y: jnp.concatenate(held.project(T0, *jnp.split(y, 2)))  # noqa: E731
-    jacobian, backward = jax.jit(lambda y: (jax.jacfwd(project)(y), jax.jacrev(project)(y)))(y)
+    jacobian, backward = deferred(lambda y: (jax.jacfwd(project)(y), jax.jacrev(project)(y)))(y)
     along = jax.jvp(pose, (angle,), (jnp.ones(()),))[1]
     assert_allclose(jacobian @ along, along, atol=1e-11)
     dependent = jnp.tile(~independent, 2)

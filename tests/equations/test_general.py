@@ -13,6 +13,7 @@ from scipy.special import fresnel
 
 import udkjax as udk
 from udkjax.equations.quantities import equations_of
+from udkjax.programs.deferred import deferred
 
 G = 9.81
 METHODS = udk.Auto(), udk.Greville(), udk.Elimination()
@@ -49,7 +50,7 @@ def test_redundancy():
     (q, v), triple = BALL_START, Ball(BALL.weight, BALL.radius, 3).system()
     pull = 1.5**2 - G * q[2]  # towards the centre, per mass; lambda = weight pull / (2 radius)
 
-    @jax.jit
+    @deferred
     def by_each(q, v):
         return [udk.accelerations(s, 0.0, q, v, m, multipliers=True) for m in METHODS for s in (BALL.system(), triple)]
 
@@ -204,7 +205,7 @@ def test_a_mass_matrix_that_is_not_diagonal():
     u = jnp.ones(2)
     plain = double(False)
     expected = jnp.linalg.solve(plain.mass(q) + 1e-3 * jnp.outer(u, u), plain.force(0.0, q, v))
-    by_both = jax.jit(lambda q, v: [udk.accelerations(double(True), 0.0, q, v, method) for method in (udk.Auto(), udk.Varga())])
+    by_both = deferred(lambda q, v: [udk.accelerations(double(True), 0.0, q, v, method) for method in (udk.Auto(), udk.Varga())])
     for a in by_both(jnp.append(q, q.sum()), jnp.append(v, v.sum())):
         assert_allclose(a, jnp.append(expected, expected.sum()), atol=1e-11)
     assert_allclose(udk.accelerations(plain, 0.0, q, v), jnp.linalg.solve(plain.mass(q), plain.force(0.0, q, v)), atol=1e-13)

@@ -13,6 +13,7 @@ import udkjax as udk
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.native.derivatives.record import STORED
 from udkjax.native.primitive import generate
+from udkjax.programs.deferred import deferred
 
 TORQUE, FORCE = np.array([1.0, 2.0, -1.0, 0.5]), np.array([[1.0, 0.0], [-2.0, 0.5], [3.0, 0.0]])
 NAMES = ("force.motor.value", "force.push.vector")
@@ -92,9 +93,9 @@ def loss():
 
 
 def test_derivatives_by_the_samples_forward_and_in_reverse(loss):
-    gradient = jax.jit(jax.grad(loss, (0, 1)))
+    gradient = deferred(jax.grad(loss, (0, 1)))
     _check_gradient(loss, gradient, 1e-4)
-    for a, b in zip(gradient(TORQUE, FORCE), jax.jit(jax.jacfwd(loss, (0, 1)))(TORQUE, FORCE), strict=True):
+    for a, b in zip(gradient(TORQUE, FORCE), deferred(jax.jacfwd(loss, (0, 1)))(TORQUE, FORCE), strict=True):
         assert_allclose(a, b, rtol=1e-10)
 
 
@@ -173,8 +174,8 @@ def test_steps_are_the_run_of_the_same_inputs():
     run = jax.jit(lambda a, b: udk.simulate(cart(udk.Held(a, dt), udk.Held(b, dt)), ts, analysis=udk.analyse(mechanism), **EXACT))
     found, expected = rollout(torque, force), run(torque, force)
     assert_allclose(found.q, expected.q[1:], rtol=0, atol=1e-11)
-    by_step = jax.jit(jax.grad(lambda *x: jnp.sum(rollout(*x).v[:, 1, 2] ** 2), (0, 1)))(torque, force)
-    by_run = jax.jit(jax.grad(lambda *x: jnp.sum(run(*x).v[1:, 1, 2] ** 2), (0, 1)))(torque, force)
+    by_step = deferred(jax.grad(lambda *x: jnp.sum(rollout(*x).v[:, 1, 2] ** 2), (0, 1)))(torque, force)
+    by_run = deferred(jax.grad(lambda *x: jnp.sum(run(*x).v[1:, 1, 2] ** 2), (0, 1)))(torque, force)
     jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-8, atol=1e-10), by_step, by_run)
     state = udk.assemble(mechanism)
     for k in range(2):  # outside of a trace, too

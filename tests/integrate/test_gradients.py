@@ -13,6 +13,7 @@ import pytest
 import udkjax as udk
 from udkjax import GROUND
 from udkjax.equations import prepare
+from udkjax.programs.deferred import deferred
 
 DATA = json.loads((Path(__file__).parents[1] / "data" / "seed_fivebar_parallelogram.json").read_text())
 EXACT = {name: float(value) for name, value in DATA["sensitivities_rest_minus50"]["2"].items()}
@@ -77,7 +78,7 @@ def accelerations(mechanism, method, p):
 def derivatives(f):
     """Values, the Jacobian by forward and by reverse mode, and the Hessian of a sum with weights."""
     total = lambda p: jnp.cos(jnp.arange(12.0)) @ f(p)  # noqa: E731
-    return jax.jit(jax.vmap(lambda p: (f(p), jax.jacfwd(f)(p), jax.jacrev(f)(p), jax.hessian(total)(p))))
+    return deferred(jax.vmap(lambda p: (f(p), jax.jacfwd(f)(p), jax.jacrev(f)(p), jax.hessian(total)(p))))
 
 
 ANGLES = np.linspace(-np.pi, np.pi, 401)  # with the singular configurations -pi, 0 and pi
@@ -127,7 +128,7 @@ def test_projection_has_derivatives(method):
     q, v, *_ = state(angle, length)
     along = jax.jvp(lambda a: jnp.concatenate(state(a, length)[:2]), (angle,), (jnp.ones(()),))[1]
 
-    @jax.jit
+    @deferred
     def evaluate(q, v):
         moved = jax.jvp(project, (q, v), tuple(jnp.split(along, 2)))
         return *moved, jax.jacfwd(project)(q, v), jax.jacrev(project)(q, v), equations.jacobian(0.0, q)
@@ -144,11 +145,11 @@ def test_projection_has_derivatives(method):
 @pytest.mark.parametrize("method", fast())
 def test_a_duplicated_joint_changes_no_acceleration_and_no_gradient(method):
     p = jnp.array([[-0.8, 1.2, 0.9], [2.1, 0.7, 1.1]])
-    f = lambda mechanism: jax.jit(  # noqa: E731
+    f = lambda mechanism: deferred(  # noqa: E731
         jax.vmap(lambda p: (accelerations(mechanism, method, p), jax.jacfwd(partial(accelerations, mechanism, method))(p)))
     )
     found = f(duplicated(LINKAGE, 3, ["A1", "B2"]))(p)
-    expected_ones = jax.jit(jax.vmap(lambda p: (closed_form(p), jax.jacfwd(closed_form)(p))))(p)
+    expected_ones = deferred(jax.vmap(lambda p: (closed_form(p), jax.jacfwd(closed_form)(p))))(p)
     for got, expected in zip(found, expected_ones, strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-10, atol=1e-10)
 
@@ -198,7 +199,7 @@ def test_a_duplicate_that_holds_a_body_on_the_ground_changes_nothing():
     welds = {f"weld{k}": udk.Weld((GROUND, "plate"), [[0.0, 0.0], [0.0, 0.0]]) for k in range(3)}
     mech = udk.Mechanism(body, welds)
     chosen = [METHODS[name] for name in ("Auto", "Varga", "Greville")]
-    by_each = jax.jit(lambda q, v: [udk.accelerations(mech, 0.0, q, v, method) for method in chosen])
+    by_each = deferred(lambda q, v: [udk.accelerations(mech, 0.0, q, v, method) for method in chosen])
     np.testing.assert_allclose(by_each(mech.q0, mech.v0), 0.0, atol=1e-12)
 
 

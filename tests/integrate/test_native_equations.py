@@ -18,6 +18,7 @@ from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import ConcreteRates, native_equations
 from udkjax.integrate.projection import Projection
 from udkjax.native.primitive import FEW
+from udkjax.programs.deferred import deferred
 
 METHODS = [udk.Auto(), udk.Elimination(), udk.SVD(), udk.Varga(), udk.Householder(), udk.GramSchmidt(), udk.Greville()]
 FORMULATIONS = [udk.NullSpaceQR(), udk.NullSpaceSVD(), udk.Augmented(udk.SVD())]
@@ -35,7 +36,7 @@ def both(mechanism, chosen, stabilization=Projection()):
     return native_equations(compiled, marks), compiled.textbook
 
 
-@eqx.filter_jit
+@deferred
 def terms(equations, t, q, v):
     """D and b with their rows weighted, a_F and M^(-1/2) by the textbook."""
     mechanism, w = equations.mechanism, equations.scales.weights
@@ -47,7 +48,7 @@ def terms(equations, t, q, v):
     )
 
 
-@eqx.filter_jit
+@deferred
 def evaluate(equations, t, q, v, dq, dv):
     return equations.accelerations(t, q, v), equations.tangent_part(t, q, v, dq, dv)
 

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.positions.channels import Quantity, channel_of, channels_of
+from udkjax.programs.deferred import deferred
 from udkjax.study.channel_values import measure
 
 OMEGA, STEP = 4.0, 1e-3
@@ -47,10 +48,10 @@ def crank():
         there = udk.library.slider_crank(OMEGA * t, OMEGA)
         return there.q0, there.v0
 
-    motion = Motion(jnp.asarray(TIMES), *jax.jit(jax.vmap(state))(TIMES))
+    motion = Motion(jnp.asarray(TIMES), *deferred(jax.vmap(state))(TIMES))
     spin = Quantity("spin", lambda mech, solution: mech.bodies["rod"].inertia * solution.v[:, 1, 2], "N m s")
     channels = (*(channel_of(mech, text) for text in [*channels_of(mech), *POINTS, *LOADS, *DISTANCES]), spin)
-    program = jax.jit(lambda mech, motion: measure(mech, motion, channels))
+    program = deferred(lambda mech, motion: measure(mech, motion, channels))
     values = np.asarray(program(mech, motion)).T
     return Measured(mech, motion, channels, dict(zip([c.name for c in channels], values, strict=True)), program)
 
@@ -216,7 +217,7 @@ def linkage():
         y, forward = jax.jvp(values, (x,), (e,))
         return y[0], *forward
 
-    return mech, channels, jax.jit(both)
+    return mech, channels, deferred(both)
 
 
 def test_derivatives_hold_where_constraints_are_redundant(linkage):
