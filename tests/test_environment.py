@@ -17,8 +17,8 @@ JAX_FIRST, UDKJAX_FIRST = "import jax, udkjax", "import udkjax, jax"
     ("order", "given", "dtype"),
     [
         (JAX_FIRST, {}, "float64"),
-        (UDKJAX_FIRST, {}, "float64"),
-        (JAX_FIRST, {"JAX_ENABLE_X64": "0"}, "float32"),
+        pytest.param(UDKJAX_FIRST, {}, "float64", marks=pytest.mark.slow),
+        pytest.param(JAX_FIRST, {"JAX_ENABLE_X64": "0"}, "float32", marks=pytest.mark.slow),
         (UDKJAX_FIRST, {"JAX_ENABLE_X64": "False"}, "float32"),
     ],
 )

@@ -88,7 +88,6 @@ def driven(forces):
 SPRING = {"spring": udk.Spring(["ground", "lower"], [[0.3, 0.5], [0.1, 0.0]], stiffness=40.0, length=0.2, damping=3.0)}
 
 
-@pytest.mark.slow
 def test_a_driver_and_force_elements(kkt, closed):
     """Against the KKT equations written down plainly."""
     mech = driven(SPRING)
@@ -168,7 +167,6 @@ def test_and_by_nothing_where_a_joint_is_given_twice():
     assert_allclose(reference, all_of(single, T0, q, v, {})[0], atol=1e-12)
 
 
-@pytest.mark.slow
 def test_in_line(linkage, placed):
     """All links in line, turning: the rank is 10, and the accelerations are still those of the parallelogram."""
     q, v = (x.ravel() for x in placed(0.0, 1.3))
@@ -180,7 +178,6 @@ def test_in_line(linkage, placed):
 # --- derivatives
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["CoordinatePartitioning", *but_slow("Augmented NullSpaceQR NullSpaceSVD")])
 def test_derivatives(name, closed):
     """With respect to time, state, masses and loads, forward and backward, against differences; and second ones."""

@@ -108,7 +108,6 @@ def test_the_power_balance(moved):
     assert_allclose(rate, power, rtol=0, atol=1e-9 * (1.0 + float(size)))
 
 
-@pytest.mark.slow
 def test_a_duplicated_constraint_changes_nothing(closed):
     """Neither accelerations, nor what projection does, nor what the joint and its copy do to the bodies together."""
     mech = udk.library.parallelogram()

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.programs.deferred import deferred
 
 # A rod that hangs from a slider: its body's first end is on a horizontal rail. Small, as derivatives take long to compile.
 ROD = {"rod": udk.Body(1.0, 0.1, [0.3, -0.4], -0.9)}
@@ -42,19 +43,18 @@ def differences(f, x, h=1e-4):
     ],
 )
 def test_states_change_by_times_as_by_differences(name, transform):
-    f = jax.jit(lambda x: states(ARMS[name], x))
+    f = deferred(lambda x: states(ARMS[name], x))
     wanted = differences(f, X)
     assert_allclose(transform(f)(X), wanted, rtol=1e-6, atol=1e-6 * np.abs(wanted).max())
 
 
-@pytest.mark.slow
 def test_second_derivatives_by_times_and_numbers():
     def f(x):
         found = states(ARMS["driven"].with_parameters({"body.rod.mass": x[2]}), x)
         return jnp.cos(jnp.arange(1.0, 1.0 + found.size)) @ found
 
     x = np.append(X, 1.3)
-    slope, second = jax.jit(jax.grad(f)), jax.jit(jax.jacfwd(jax.grad(f)))
+    slope, second = deferred(jax.grad(f)), deferred(jax.jacfwd(jax.grad(f)))
     wanted = differences(slope, x)
     assert_allclose(second(x), wanted, atol=1e-5 * np.abs(wanted).max())
 
@@ -70,7 +70,7 @@ def test_members_share_what_is_differentiated():
         return jax.vmap(run)(shares).sum()
 
     x = np.append(X, 1.3)
-    wanted = differences(jax.jit(f), x)
+    wanted = differences(deferred(f), x)
     for transform in (jax.grad(f), jax.jit(jax.grad(f))):
         assert_allclose(transform(x), wanted, rtol=1e-6)
 

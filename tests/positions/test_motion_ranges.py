@@ -46,6 +46,7 @@ def test_positions_that_are_not_reached_do_not_count():
     assert np.all(np.isfinite(found.transmission_angles["C"]))
 
 
+@pytest.mark.slow
 def test_a_slider_strokes_by_twice_its_crank():
     def stroke(r):
         mech = udk.library.slider_crank(0.3, 4.0, crank=r)

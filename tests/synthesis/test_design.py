@@ -288,6 +288,7 @@ def test_mistakes_are_named():
         udk.design("four_bar.toml", goal)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 def test_a_curve_that_wants_dead_points_has_designs_and_failures_say_why():
     """A heart's best four-bars pass dead points; what is found stays away from them, and its motion bears it out."""
     a = np.linspace(0.0, 2.0 * np.pi, 17)
