@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+from functools import partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,6 +18,7 @@ from tests.choices import fast
 from udkjax import library
 
 TS = np.array([0.0, 0.1])
+DRAWINGS = sorted((Path(__file__).parents[2] / "examples" / "drawings").glob("*.toml"))
 
 
 def workshop():
@@ -93,6 +96,7 @@ SCENES = {name: getattr(library, name) for name in library.__all__} | {
     "four-bar": four_bar,
     "changed four-bar": changed_four_bar,
     "geared pendulum": geared_pendulum,
+    **{file.stem: partial(udk.load, file) for file in DRAWINGS},
 }
 scenes = pytest.mark.parametrize("name", fast(["changed four-bar", "planetary_gear"], SCENES))
 
