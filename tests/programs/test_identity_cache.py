@@ -1,10 +1,20 @@
 """Results are cached by the identities of the objects from which they were computed."""
 
+import gc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from udkjax.programs import identity_cache
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity, cached_within_trace
+
+
+class Tree(eqx.Module):
+    x: jax.Array
 
 
 class Thing:
@@ -60,3 +70,31 @@ def test_the_oldest_make_room(counted, monkeypatch):
     assert len(calls) == 3
     function(two)
     assert len(calls) == 4
+
+
+def test_results_of_traced_trees_hold_within_their_trace():
+    """One computation for concrete numbers and one in each trace; a trace inside of another does not store what it computes."""
+    calls = []
+
+    @cached_within_trace
+    def doubled(tree):
+        calls.append(0)
+        return Tree(2 * tree.x)
+
+    tree = Tree(jnp.arange(3.0))
+    assert doubled(tree) is doubled(tree) and len(calls) == 1
+
+    @jax.jit
+    def outer(tree):
+        assert doubled(tree) is doubled(tree)
+        inner = jax.vmap(lambda y: doubled(tree).x.sum() + y)(tree.x)
+        other = Tree(tree.x + 1)
+        again = jax.vmap(lambda y: doubled(other).x.sum() * y)(tree.x)
+        return inner + again + doubled(other).x + doubled(tree).x
+
+    with jax.checking_leaks():
+        found = outer(tree)
+    assert_allclose(found, 6 + np.arange(3.0) + 12 * np.arange(3.0) + 2 * (np.arange(3.0) + 1) + 2 * np.arange(3.0))
+    del tree
+    gc.collect()
+    assert doubled(Tree(jnp.ones(3))).x[0] == 2
