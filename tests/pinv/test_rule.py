@@ -8,6 +8,7 @@ import pytest
 
 from tests.pinv.methods import entries
 from udkjax.pinv import SVD, Plus, Pseudoinverse, Varga
+from udkjax.programs.deferred import deferred
 
 rng = np.random.default_rng(7)
 SIZE = 12
@@ -86,7 +87,7 @@ def derivatives(method):
         lambda a: jax.jacrev(jax.jacrev(x, 1), 1)(a, jnp.zeros(2)),
         jax.grad(lambda a: jnp.sum(WEIGHTS * method(a))),
     ]
-    return jax.jit(jax.vmap(lambda a: [f(a) for f in functions]))
+    return deferred(jax.vmap(lambda a: [f(a) for f in functions]))
 
 
 @pytest.fixture(scope="session")
@@ -119,14 +120,14 @@ def test_forward_and_reverse_are_transposes(matrices):
         ct_a, ct_b = jax.vjp(f, a, B)[1](ct)
         return ct @ dx, jnp.sum(ct_a * da) + ct_b @ db
 
-    u, v = jax.jit(jax.vmap(product, (0, None, None, None)))(matrices, LEFT[0], DB[0], DB[1])
+    u, v = deferred(jax.vmap(product, (0, None, None, None)))(matrices, LEFT[0], DB[0], DB[1])
     np.testing.assert_allclose(u, v, rtol=1e-10)
 
 
 def test_second_derivatives_in_every_mode(matrices):
     x = solution(Varga(1e-9))
     modes = [(outer, inner) for outer in (jax.jacfwd, jax.jacrev) for inner in (jax.jacfwd, jax.jacrev)]
-    hessians = jax.jit(lambda a: [outer(inner(x, 1), 1)(a, jnp.zeros(2)) for outer, inner in modes])(matrices[0])
+    hessians = deferred(lambda a: [outer(inner(x, 1), 1)(a, jnp.zeros(2)) for outer, inner in modes])(matrices[0])
     for hessian in hessians[1:]:
         close(hessian[None], hessians[0][None], 1e-11)
 

@@ -90,6 +90,7 @@ def test_the_frequency_is_that_of_the_mode_at_rest():
     np.testing.assert_allclose(found[0, 2], -found[0, 0], rtol=1e-9)  # upside down it is unstable
 
 
+@pytest.mark.slow
 def test_the_torque_of_a_design_stays_below_what_is_given():
     lengths = {("O", "C"): (5.0, 20.0), ("O", "A"): (2.0, 20.0)}
     found = udk.design(
