@@ -23,8 +23,11 @@ def default_devices() -> list[Any]:
 
 def host_device() -> Any:
     """Return the CPU device if JAX computes on other devices by default; else None, as where `JAX_PLATFORMS` excludes the CPU."""
-    if default_devices()[0].platform == "cpu":
-        return None
+    return None if default_devices()[0].platform == "cpu" else cpu_device()
+
+
+def cpu_device() -> Any:
+    """Return the CPU device; None where `JAX_PLATFORMS` excludes it."""
     try:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError:

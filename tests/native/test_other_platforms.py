@@ -13,8 +13,9 @@ from jax.interpreters import mlir
 
 import udkjax as udk
 from udkjax.native import primitive
-from udkjax.native.base import host_function
+from udkjax.native.base import host_function, host_program
 from udkjax.native.base.host_function import call_seldom
+from udkjax.programs.deferred import deferred, deferred_p
 
 TS = np.array([0.0, 0.1, 0.2])
 PENDULUM, LINKAGE = udk.library.compound_pendulum(), udk.library.four_bar(np.pi / 3)
@@ -47,6 +48,11 @@ def rested(x):
     return udk.equilibrium(PENDULUM.with_parameters({"body.rod.mass": x})).q[0, 2]
 
 
+def turned(x):
+    mechanism = LINKAGE.with_parameters({"pin.D": LINKAGE.parameters()["pin.D"] * x})
+    return udk.kinematics(mechanism, "body.crank.angle", np.linspace(1.0, 1.2, 3)).q[-1, 1, 2]
+
+
 def _eigenvalues(x):
     return jnp.linalg.svd(x * jnp.eye(2), compute_uv=False)
 
@@ -64,8 +70,6 @@ PROGRAMS = {
     "closing": closed,
     "closing, forward mode": jax.jacfwd(closed),
     "closing, reverse mode": jax.grad(closed),
-    "kinematics": moved,
-    "equilibrium": rested,
     "rarely reached": lambda x: call_seldom(_eigenvalues, x),
 }
 
@@ -94,10 +98,42 @@ def test_the_host_computes_for_a_graphics_card(name):
     assert not name.startswith("run") or "stablehlo.while" not in card
 
 
-@pytest.mark.parametrize("name", ["run", "reverse mode", "closing", "rarely reached"])
+SOLVES = {  # with the numbers of calls: the scales, the assembly, and the solve; what follows it in reverse mode is linear
+    "kinematics": (moved, 3),
+    "kinematics, reverse mode": (jax.grad(turned), 3),
+    "equilibrium": (rested, 3),
+    "equilibrium, forward mode": (jax.jacfwd(rested), 3),
+    "equilibrium, reverse mode": (jax.grad(rested), 3),
+    "batch of equilibria": (lambda x: jax.vmap(rested)(x * jnp.arange(1.0, 4.0)), 3),
+    "modes": (lambda x: udk.modes(PENDULUM.with_parameters({"body.rod.mass": x})).omega2, 4),
+}
+FAST = {"kinematics", "equilibrium"}
+
+
+@pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in FAST)) for x in SOLVES])
+def test_a_solve_for_a_graphics_card_is_one_call(name):
+    """Without loops and factorizations on the card; on the CPU it is a part of the program."""
+    solve, calls = SOLVES[name]
+    traced = jax.jit(solve).trace(jnp.asarray(0.35))
+    cpu, card = (traced.lower(lowering_platforms=(platform,)).as_text() for platform in ("cpu", "cuda"))
+    assert "stablehlo.while" in cpu and "lapack" in cpu
+    assert "stablehlo.while" not in card and "cusolver" not in card
+    assert len(targets(card)) == calls and all(x.endswith("_copied") for x in targets(card))
+
+
+@pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
+def test_many_matrices_are_factorized_on_the_card():
+    values = jax.vmap(deferred(_eigenvalues))
+    for members, is_called in ((host_program.FEW_MATRICES, True), (host_program.FEW_MATRICES + 1, False)):
+        card = jax.jit(values).trace(jnp.ones(members)).lower(lowering_platforms=("cuda",)).as_text()
+        assert bool(targets(card)) == is_called and ("cusolver" in card) != is_called
+
+
+@pytest.mark.parametrize("name", ["run", "reverse mode", "closing", "rarely reached", "deferred"])
 def test_programs_are_exported_for_graphics_cards(name):
     """A program for both platforms runs here."""
-    program, x = jax.jit(PROGRAMS[name]), given(name)
+    program, x = jax.jit(deferred(_eigenvalues) if name == "deferred" else PROGRAMS[name]), given(name)
     names = targets(program.trace(x).lower(lowering_platforms=("cpu", "cuda")).as_text())
     assert {x.endswith("_copied") for x in names} == {True, False}
     checks = [jax.export.DisabledSafetyCheck.custom_call(x) for x in names]

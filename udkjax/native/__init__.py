@@ -21,7 +21,7 @@ How the code of a run is made, and where to look:
    the operations a JAX primitive with a batching rule. `udkjax.integrate` calls this primitive and defines its derivatives.
 8. wasm/ compiles the same text for pages.
 9. gpu/ serves programs that JAX compiles for a graphics card: `host_handler` calls the code of the host, and `launch` runs large
-   batches as kernels.
+   batches as kernels. base/`host_program` has the host run whole programs with loops.
 """
 
 from udkjax.lazy_names import lazy_names

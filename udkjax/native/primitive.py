@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from udkjax.equations.scales import evaluate_scales, scales_by_jax, scales_p
 from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.native.base import machine
+from udkjax.native.base import host_program, machine
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.base.loading import Code, load
@@ -335,3 +335,7 @@ for _platform in ("cpu", "cuda"):
     mlir.register_lowering(scales_p, mlir.lower_fun(_find_scales, multiple_results=False), platform=_platform)
 scales_p.def_impl(lambda numbers, programs: jax.device_put(_scales_of_batch(np.asarray(numbers), programs)))
 evaluate_as(scales_p, _scales_of_batch)
+
+# --- programs that users wait for, by the primitive of programs/deferred.py
+
+host_program.register()

@@ -4,7 +4,8 @@ XLA takes about two milliseconds to compile an operation, and NumPy two microsec
 faster without compilation. NumPy therefore evaluates a program until the evaluations have cost as much as compilation; from then
 on the compiled program runs, also on the host. The results agree to rounding.
 
-For JAX such a program is one operation, whose derivatives and batches are again deferred programs.
+For JAX such a program is one operation, whose derivatives and batches are again deferred programs. In programs of a graphics card
+the host runs it, if it has loops or factorizations (native/base/host_program.py).
 
 All means of avoiding repeated work in the package, and their uses:
 

@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.interpreters import mlir
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
 from udkjax.native import primitive
-from udkjax.native.base import ffi, host_function
+from udkjax.native.base import ffi, host_function, host_program
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.driver import CudaError
+from udkjax.programs.deferred import deferred, deferred_p
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")
 STREAM, CONTEXT, ERROR = 0x5EED, 0xC0DE, 700
@@ -116,6 +117,7 @@ def card(monkeypatch):
     monkeypatch.setattr(host_handler, "register", lambda name, handler: registered(f"{name}_{number}", handler))
     for p, module in ((primitive.native_p, primitive), (host_function.host_p, host_function)):
         mlir.register_lowering(p, mlir.lower_fun(module._lower_for_card), platform="cpu")
+    monkeypatch.setattr(host_program, "HOST", "none")
     jax.clear_caches()
     yield card
     for p, module in ((primitive.native_p, primitive), (host_function.host_p, host_function)):
@@ -297,3 +299,98 @@ def test_calls_of_several_threads_do_not_mix(card):
     with ThreadPoolExecutor(8) as pool:
         for x, found in zip(given, pool.map(run, given), strict=True):
             assert_array_equal(found, np.linalg.norm(x, axis=1))
+
+
+needs_deferred = pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
+FOUR = udk.library.four_bar(np.pi / 3)
+TABLE = jnp.array([2, 3, 5])
+
+
+@deferred
+def root(x, first=3, large=2**62 + 1):
+    """The square root by Newton's method, and other kinds of numbers."""
+
+    def step(state):
+        r, k = state
+        return 0.5 * (r + x / r), k + 1
+
+    r, k = jax.lax.while_loop(lambda state: jnp.abs(state[0] ** 2 - x) > 1e-12 * x, step, (x, jnp.asarray(0)))
+    values = jnp.linalg.svd(jnp.outer(TABLE, TABLE) * x, compute_uv=False)
+    return r, k, k > first, jnp.asarray(large) + k, r * 1j, jnp.asarray(k, np.int32), jnp.asarray(r, np.float32), values
+
+
+@deferred
+def singular_values(x):
+    return jnp.linalg.svd(jnp.array([[2.0, 1.0], [0.0, 1.0]]) * x + jnp.eye(2), compute_uv=False)
+
+
+def in_a_scan(xs):
+    def step(carry, x):
+        found = jax.lax.cond(x > 2.0, lambda: root(x)[0], lambda: -x)
+        return carry + found, found
+
+    return jax.lax.scan(step, 0.0, xs)
+
+
+SEVERAL = jnp.array([2.0, 3.0, 1.0])
+NESTED = {  # a function, its argument, and the number of its calls
+    "alone": (root, 2.0, 1),
+    "in a batch": (jax.vmap(root), SEVERAL, 1),
+    "in a loop and a branch": (in_a_scan, SEVERAL, 1),
+    "forward mode": (lambda x: jax.jvp(singular_values, (x,), (1.0,)), 2.0, 1),
+    "reverse mode": (jax.jacrev(singular_values), 2.0, 1),  # what follows the factorization is linear
+    "batch of gradients": (jax.vmap(jax.grad(lambda x: singular_values(x)[0])), SEVERAL, 1),
+}
+
+
+@needs_deferred
+@pytest.mark.parametrize("name", NESTED)
+def test_a_program_with_loops_or_factorizations_is_one_call(request, name):
+    function, x, calls = NESTED[name]
+    expected = [np.asarray(y) for y in jax.tree.leaves(jax.jit(function)(x))]
+    card = request.getfixturevalue("card")
+    found = jax.tree.leaves(jax.jit(function)(x))
+    assert [y.dtype for y in found] == [y.dtype for y in expected]
+    for y, known in zip(found, expected, strict=True):
+        assert_allclose(y, known, rtol=1e-14)
+    assert card.names.count("cuStreamGetCtx") == calls
+    assert card.names.count("cuMemcpyDtoHAsync_v2") == card.names.count("cuMemcpyHtoDAsync_v2") == calls
+
+
+@needs_deferred
+def test_such_a_program_is_compiled_once_and_runs_under_strict_settings(card, monkeypatch):
+    """It has NaN in places that the program around it discards."""
+
+    @deferred
+    def undefined(x):
+        return singular_values(x) / (x - x)
+
+    made, make = [], host_program.HostProgram._packed
+    monkeypatch.setattr(host_program.HostProgram, "_packed", lambda self, words: made.append(self) or make(self, words))
+    x = jnp.asarray(2.0)
+    programs = [jax.jit(f) for f in (lambda x: jnp.nan_to_num(undefined(x)), lambda x: jnp.where(x > 0, x, undefined(x)))]
+    for program in programs:
+        program(x)
+    assert len(set(made)) == len(made)
+    with jax.transfer_guard("disallow"), jax.debug_nans(True):
+        jax.block_until_ready([program(x) for program in programs])
+
+
+def rest(mass):
+    return udk.equilibrium(PENDULUM.with_parameters({"body.rod.mass": mass})).q[0]
+
+
+def moved(gravity):
+    mechanism = FOUR.with_parameters({"gravity": jnp.stack([0.0 * gravity, gravity])})
+    return udk.kinematics(mechanism, "body.crank.angle", np.linspace(1.0, 1.2, 3)).q[:, 1]
+
+
+@needs_deferred
+@pytest.mark.slow  # their programs take XLA seconds
+@pytest.mark.parametrize(("solve", "x", "calls"), [(rest, 2.0, 3), (moved, -9.81, 4)])
+def test_a_solve_is_one_call(request, solve, x, calls):
+    """The scales, the assembly, and the solve itself; within that of `kinematics` another, as all are copied here."""
+    expected = np.asarray(jax.jit(solve)(x))
+    card = request.getfixturevalue("card")
+    assert_allclose(jax.jit(solve)(x), expected, rtol=1e-12, atol=1e-12)
+    assert card.names.count("cuStreamGetCtx") == calls
