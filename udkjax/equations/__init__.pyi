@@ -19,6 +19,7 @@ from udkjax.equations.determinacy import Uniqueness as Uniqueness
 from udkjax.equations.differentiable_programs import DifferentiableProgram as DifferentiableProgram
 from udkjax.equations.element_programs import has_rheonomic_joints as has_rheonomic_joints
 from udkjax.equations.elements import has_pieces as has_pieces
+from udkjax.equations.elements import traced_loads as traced_loads
 from udkjax.equations.evaluate import force as force
 from udkjax.equations.evaluate import gamma as gamma
 from udkjax.equations.evaluate import kinetic_energy as kinetic_energy

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.annotations import NumericArray, TreeDef
-from udkjax.equations.structure import Element, ElementStructure, LeafShapes
+from udkjax.equations.structure import Element, ElementStructure, LeafShapes, element_structure
 from udkjax.expressions import Differential, Graph, Scalar, operations, trace
 from udkjax.expressions.differential import SparseRow
 from udkjax.scene.bodies import GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
@@ -102,6 +102,39 @@ def trace_force(
     numbers = [np.asarray(s, object) for s in (t, *q, *v)]
     (stored,) = energy(graph, leaves, numbers)
     return [as_scalar(s) for s in loads(graph, leaves, numbers)], as_scalar(stored)
+
+
+class TracedLoads:
+    """The loads of all force elements of one structure, as scalars of a graph; compared by identity.
+
+    Attributes:
+        kind: the structure.
+        graph: the graph.
+        inputs: the numbers of the element, t, q and v of its bodies; groups "number", "time", "q" and "v".
+        velocities: v.
+        loads: the generalized loads, with those of its potential.
+    """
+
+    def __init__(self, kind: ElementStructure):
+        self.kind, self.graph = kind, Graph()
+        leaves = []
+        for k, (shape, dtype) in enumerate(kind.shapes):
+            array = np.empty(shape, object)
+            for place in np.ndindex(*shape):
+                array[place] = self.graph.input((k, place), "number", dtype)
+            leaves.append(array)
+        t = self.graph.input("t", "time")
+        q, self.velocities = ([self.graph.input(k, group) for k in range(3 * kind.body_count)] for group in "qv")
+        self.inputs = [*(s for array in leaves for s in array.flat), t, *q, *self.velocities]
+        self.loads, _ = trace_force(self.graph, kind, leaves, t, q, self.velocities)
+
+
+_traced_loads = lru_cache(maxsize=256)(TracedLoads)
+
+
+def traced_loads(element: ForceElement, frames: Sequence[str]) -> TracedLoads:
+    """Return the loads of a force element attached to `frames`, names of bodies or the ground, traced once for its structure."""
+    return _traced_loads(element_structure(element, frames))
 
 
 def has_pieces(element: Element) -> bool:

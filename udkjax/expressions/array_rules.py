@@ -14,8 +14,8 @@ from jax import lax
 from udkjax.expressions.graph import Graph, Scalar
 from udkjax.expressions.selection import apply, both, either, where
 
-Arrays = list[Any]  # arrays of Scalars, which type checkers know as arrays of arrays
-Rule = Callable[[Graph, Arrays, Any], list[np.ndarray] | None]
+ScalarArrays = list[Any]  # arrays of Scalars, which type checkers know as arrays of arrays
+ArrayRule = Callable[[Graph, ScalarArrays, Any], list[np.ndarray] | None]
 MOST_SORTED = 32  # elements of a sorted row; beyond, comparisons of all pairs are too many
 MOST_PLACES = 256  # places among which an unknown index may choose
 # Reductions by the binary operation of two elements.
@@ -47,7 +47,7 @@ def _rows(array: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     return array.transpose(*kept, *axes).reshape(*(array.shape[k] for k in kept), -1)
 
 
-def _reduce(primitive: Any, graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray] | None:
+def _reduce(primitive: Any, graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray] | None:
     rows = _rows(inputs[0], equation.params["axes"])
     if rows.shape[-1] == 0:
         return None
@@ -61,7 +61,7 @@ def _reduce(primitive: Any, graph: Graph, inputs: Arrays, equation: Any) -> list
     return [result]
 
 
-def _accumulate(primitive: Any, graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray]:
+def _accumulate(primitive: Any, graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray]:
     axis, is_reverse = equation.params["axis"], equation.params["reverse"]
     rows = np.moveaxis(inputs[0], axis, 0)
     rows = rows[::-1] if is_reverse else rows
@@ -72,7 +72,7 @@ def _accumulate(primitive: Any, graph: Graph, inputs: Arrays, equation: Any) -> 
     return [np.moveaxis(result[::-1] if is_reverse else result, 0, axis)]
 
 
-def _first_extreme(compare: Any, graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray]:
+def _first_extreme(compare: Any, graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray]:
     rows, dtype = _rows(inputs[0], equation.params["axes"]), np.dtype(equation.params["index_dtype"])
     result = np.empty(rows.shape[:-1], object)
     for place in np.ndindex(*result.shape):
@@ -112,7 +112,7 @@ def _precedes(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
     return either(less, both(same, _precedes(a[1:], b[1:])))
 
 
-def _sort(graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray] | None:
+def _sort(graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray] | None:
     axis, keys = equation.params["dimension"], equation.params["num_keys"]
     columns = [np.moveaxis(x, axis, 0).copy() for x in inputs]
     n = len(columns[0])
@@ -132,9 +132,9 @@ def _sort(graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray] | Non
     return [np.moveaxis(c, 0, axis) for c in columns]
 
 
-def _compare_totally(is_strict: bool, graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray]:
+def _compare_totally(is_strict: bool, graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray]:
     """Compare in the order of sorting, in which NaN comes last."""
-    arrays: Arrays = list(np.broadcast_arrays(*inputs))
+    arrays: ScalarArrays = list(np.broadcast_arrays(*inputs))
     a, b = arrays
     result = np.empty(a.shape, object)
     for place in np.ndindex(*result.shape):
@@ -168,7 +168,7 @@ def choose_branch(graph: Graph, index: Scalar, branches: Sequence[Callable[[], l
     return chosen
 
 
-def _polynomial(graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray]:
+def _polynomial(graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray]:
     arrays = np.broadcast_arrays(*inputs)
     result = np.empty(arrays[0].shape, object)
     for place in np.ndindex(*result.shape):
@@ -177,7 +177,7 @@ def _polynomial(graph: Graph, inputs: Arrays, equation: Any) -> list[np.ndarray]
     return [result]
 
 
-def select_unknown(select: Callable[[Arrays], np.ndarray], array: np.ndarray, indices: Arrays) -> np.ndarray | None:
+def select_unknown(select: Callable[[ScalarArrays], np.ndarray], array: np.ndarray, indices: ScalarArrays) -> np.ndarray | None:
     """Return the elements of an array at indices of which some are unknown, by `select` of known ones.
 
     Args:
@@ -209,7 +209,7 @@ def select_unknown(select: Callable[[Arrays], np.ndarray], array: np.ndarray, in
     return result
 
 
-RULES: dict[str, Rule] = {
+RULES: dict[str, ArrayRule] = {
     **{name: partial(_reduce, p) for name, p in _JOINED.items()},
     **{name: partial(_accumulate, p) for name, p in _CUMULATIVE.items()},
     "argmax": partial(_first_extreme, lax.gt_p),

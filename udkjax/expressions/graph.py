@@ -6,7 +6,7 @@ never emitted (scalar_program.py), so a caller may build more nodes than it need
 """
 
 import math
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -230,24 +230,25 @@ class Graph:
 
         for index in program.order:
             node = program.graph.nodes[index]
-            match node.kind:
-                case "constant":
-                    copies[index] = self.constant(node.detail, node.dtype)
-                case "add":
-                    copies[index] = copied(node.arguments[0]) + copied(node.arguments[1])
-                case "sub":
-                    copies[index] = copied(node.arguments[0]) - copied(node.arguments[1])
-                case "mul":
-                    copies[index] = self.multiply(copied(node.arguments[0]), copied(node.arguments[1]))
-                case "div":
-                    copies[index] = self.divide(copied(node.arguments[0]), copied(node.arguments[1]))
-                case "sqrt":
-                    copies[index] = self.sqrt(copied(node.arguments[0]))
-                case _:
-                    copies[index] = Scalar(
-                        self, self._operation(node.kind, tuple(map(copied, node.arguments)), node.detail, node.dtype)
-                    )
+            copies[index] = self.again(node, [copied(a) for a in node.arguments])
         return [copied(s) for s in program.outputs]
+
+    def again(self, node: Node, arguments: Sequence[Scalar]) -> Scalar:
+        """Add the operation of a node with other arguments."""
+        match node.kind:
+            case "constant":
+                return self.constant(node.detail, node.dtype)
+            case "add":
+                return self.add(*arguments)
+            case "sub":
+                return arguments[0] - arguments[1]
+            case "mul":
+                return self.multiply(*arguments)
+            case "div":
+                return self.divide(*arguments)
+            case "sqrt":
+                return self.sqrt(*arguments)
+        return Scalar(self, self._operation(node.kind, tuple(arguments), node.detail, node.dtype))
 
     def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
         depends = frozenset().union(*[self.nodes[a.index].depends for a in arguments])

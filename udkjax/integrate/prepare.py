@@ -53,6 +53,7 @@ class Choices(NamedTuple):
     meter: "diffrax.AbstractProgressMeter | None" = None
     max_steps: int = 100_000
     engine: str = "auto"
+    kinks: str = ""  # whether kinks of forces are located, and which are not; empty without any
 
     @property
     def of_mechanism(self) -> tuple[Any, ...]:
@@ -80,6 +81,7 @@ class Choices(NamedTuple):
             ("max_steps", str(self.max_steps)),
             ("first_step", "chosen" if self.dt0 is None else "given"),
             ("engine", f"diffrax: {why_not_native}" if why_not_native else "native"),
+            *([("kinks", self.kinks)] if self.kinks else []),
         )
 
 

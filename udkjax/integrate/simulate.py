@@ -154,7 +154,15 @@ def simulate(
         if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
-    if events is not None:
+    is_located = events is not None
+    if isinstance(mechanism, Mechanism) and mechanism.forces:
+        from udkjax.integrate.events.kinks import kinks_of
+
+        found = kinks_of(mechanism)
+        by_steps = "by an adjoint of diffrax's" if choices.adjoint else "with a progress meter" if choices.meter else ""
+        is_located = is_located or (found.are_held and not by_steps)
+        choices = choices._replace(kinks=found.remark(by_steps))
+    if is_located:
         if not isinstance(mechanism, Mechanism) or choices.adjoint is not None or choices.meter is not None:
             others = "an adjoint of diffrax's" if choices.adjoint else "progress"
             what = others if isinstance(mechanism, Mechanism) else "a ConstrainedSystem"
@@ -163,7 +171,7 @@ def simulate(
 
         assert analysis is not None  # a mechanism has one
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, choices, max_events)
-        if not _has_failed(solution) or not is_concrete or int(solution.stats["events"]):
+        if not _has_failed(solution) or not is_concrete or int(solution.stats.get("events", 0)):
             return _required(solution, throw)  # events may have changed what moved
         return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
 

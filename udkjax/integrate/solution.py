@@ -79,7 +79,7 @@ CAUSES = {
 }
 
 
-_ORDER = "steps rejected right_hand_sides projections events"  # order of counts in texts, since jit sorts the names
+_ORDER = "steps rejected right_hand_sides projections events kinks"  # order of counts in texts, since jit sorts the names
 
 
 class SimulationError(RuntimeError):
@@ -123,6 +123,9 @@ class Solution(PrintsTable):
     bodies: tuple[str, ...] = eqx.field(static=True)
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
     events: "Events | None" = None  # `Events` of a run with events
+    # The time (s) from which jumps and kinks of forces are not located, so that derivatives do not pass through them; infinite if
+    # all are located, None if there are none.
+    unlocated: Float[Array, ""] | None = None
     found_cause: Any = eqx.field(static=True, default=None, repr=False)  # `FoundCause` of a single run that failed
 
     @property

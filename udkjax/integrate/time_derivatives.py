@@ -28,16 +28,17 @@ from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_
 def run_of_times(run: Callable[[Problem], IntegratorOutput], problem: Problem) -> IntegratorOutput:
     """Return `run(problem)` with derivatives of q and v along `problem.ts`, which the function `run` does not have."""
     ts = stop_gradients(problem.ts)
-    move = partial(_move, replace(problem, ts=ts))
+    move = partial(moved, replace(problem, ts=ts))
     q, v = move(problem.ts[0], problem.q, problem.v, ts[0] - problem.ts[0])
     raw = run(replace(problem, ts=ts, q=q, v=v))
     qs, vs = jax.vmap(move)(ts, raw.q, raw.v, problem.ts - ts)
     return raw._replace(q=qs, v=vs)
 
 
-def _move(
+def moved(
     problem: Problem, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"], s: Float[Array, ""]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Return a state at t after a time s = 0: its value, with the derivatives of the motion."""
     problem_of, numbers = split_numbers(problem)
     # A state is batched wherever its changes are, since JAX requires that derivative rules return values with unchanged batching.
     zero = sum(map(zero_of, (s, t, *numbers)))

@@ -49,6 +49,11 @@ class Action(PrintsLine):
         return ""
 
     @property
+    def turn(self) -> tuple[int, float, float] | None:
+        """The side of a comparison that it turns, the factor and the shift (kinks.py); None if it turns none."""
+        return None
+
+    @property
     def removed(self) -> frozenset[str]:
         """The names of the constraints that the action removes."""
         return frozenset()

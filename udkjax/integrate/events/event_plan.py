@@ -7,11 +7,12 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.events.actions import Action
 from udkjax.integrate.events.conditions import sees_velocity
 from udkjax.integrate.events.event import Event
+from udkjax.integrate.events.kinks import MOST_KINKS
 from udkjax.integrate.events.phases import Phases, Tables
 
 
@@ -25,7 +26,33 @@ class EventPlan:
     actions: tuple[type[Action], ...]
     at_rest: tuple[str, ...]  # consequence of rest, for impacts
     max_steps: int
-    max_events: int
+    max_events: int  # without kinks
+    turns: tuple[tuple[int, float, float] | None, ...]  # the side that it turns, with factor and shift
+    side_count: int  # the number S of sides
+
+    @cached_property
+    def kinks(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the events that turn a side."""
+        return np.array([x is not None for x in self.turns], bool)
+
+    @cached_property
+    def side_of(self) -> Int[np.ndarray, "E"]:
+        """The side that an event turns; 0 for those that turn none."""
+        return np.array([0 if x is None else x[0] for x in self.turns], int)
+
+    @cached_property
+    def side_changes(self) -> Float[np.ndarray, "2 E S"]:
+        """The factor and the shift of each side at an event."""
+        changes = np.stack([np.ones((self.count, self.side_count)), np.zeros((self.count, self.side_count))])
+        for k, turn in enumerate(self.turns):
+            if turn is not None:
+                changes[:, k, turn[0]] = turn[1:]
+        return changes
+
+    @property
+    def room(self) -> int:
+        """The largest number of events with all kinks."""
+        return self.max_events + (MOST_KINKS if self.side_count else 0)
 
     @property
     def count(self) -> int:
@@ -115,4 +142,6 @@ def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_even
         at_rest=tuple(e.action.rest for e in events),
         max_steps=max_steps,
         max_events=max_events,
+        turns=tuple(e.action.turn for e in events),
+        side_count=sum(held.smooth.count for held in phases.held),
     )

@@ -20,6 +20,7 @@ from udkjax.integrate.events.condition_program import condition_numbers
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.event_plan import EventPlan, event_plan
 from udkjax.integrate.events.hybrid import Hybrid
+from udkjax.integrate.events.kinks import FREE, places_of_kinks
 from udkjax.integrate.events.loop import run_loop
 from udkjax.integrate.events.machine_system import MachinePlan, MachineSystem, MemberUnits
 from udkjax.integrate.events.phase_code import PhaseCode, phase_arrays, phase_plan
@@ -64,7 +65,7 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
     """Run a system with events by machine code, within a traced program; `conditions` are those of all events."""
     start = hybrid.first_state()
     problems = [hybrid.problem(k, hybrid.ts, start) for k in range(len(hybrid.plans))]
-    plan = machine_plan(hybrid.plan, hybrid.phases, [problem.compiled for problem in problems], conditions)
+    plan = machine_plan(hybrid.plan, hybrid.phases, hybrid.events, [problem.compiled for problem in problems], conditions)
     leaves, tree = jax.tree.flatten(hybrid)
     arrays = [jnp.asarray(x) for x in leaves if isinstance(x, jax.Array | np.ndarray)]
     others = tuple(None if isinstance(x, jax.Array | np.ndarray) else x for x in leaves)
@@ -98,21 +99,24 @@ class HostRun:
     def shapes(self, members: int) -> list[tuple[int, ...]]:
         """Return the shapes of the fields of `EventRun`, with a leading axis of members."""
         plan = self.plan.events
-        return [(members, *shape) for shape in shapes_of_run(plan, self.times, self.coordinates, plan.max_events)]
+        return [(members, *shape) for shape in shapes_of_run(plan, self.times, self.coordinates, plan.room)]
 
     def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
         B, plan = max(len(x) for x in inputs), self.plan
         numbers, further, phases = inputs[NUMBERS], list(inputs[SHARED:]), []
         joints = [np.full((B, len(joint.program.outputs)), np.nan) for joint in plan.added]
+        joints.append(np.full((B, plan.events.side_count), FREE))
         shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED])
         ts, q, v, code, units, _, restitution, inverse_mass, of_joints = shared
         for phase in plan.phases:
             phases.append(PhaseCode(phase, further[: phase.count], numbers, inverse_mass, B, joints))
             further = further[phase.count :]
-        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), restitution, inverse_mass, of_joints)
+        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), restitution, inverse_mass, of_joints, numbers)
         state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.zeros(B, int), joints)
+        joints[-1][:] = system.first_sides(state)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))
-        outputs = results(plan.events, runs, ts, np.full(runs.scale.shape, np.inf), np)
+        unresolved = np.where(plan.events.kinks, system.lost_kinks[:, None], np.inf)
+        outputs = results(plan.events, runs, ts, unresolved, np)
         for member in np.flatnonzero(system.unresolved):
             if self.plain is None:
                 outputs.code[member] = -1
@@ -122,18 +126,25 @@ class HostRun:
         return list(outputs)
 
 
-def machine_plan(plan: EventPlan, phases: Phases, compiled: Sequence[CompiledMechanism], conditions: Conditions) -> MachinePlan:
+def machine_plan(
+    plan: EventPlan, phases: Phases, events: Sequence[Event], compiled: Sequence[CompiledMechanism], conditions: Conditions
+) -> MachinePlan:
     """Return the common part of runs.
 
     Args:
         plan: the events and phases.
         phases: the phases.
+        events: all events.
         compiled: the mechanism of each phase.
         conditions: conditions of all events.
     """
     impacts, added = [int(k) for k in np.flatnonzero(plan.impacts)], [name for _, name in phases.added_by]
-    plans = [phase_plan(m, conditions, held, impacts, added) for m, held in zip(compiled, phases.tables.held, strict=True)]
-    return MachinePlan(plan, tuple(plans), added_joints(phases))
+    of_kinks = places_of_kinks(events, phases.held)
+    plans = [
+        phase_plan(m, conditions, held, impacts, added, phases.held, of_kinks.sides)
+        for m, held in zip(compiled, phases.tables.held, strict=True)
+    ]
+    return MachinePlan(plan, tuple(plans), added_joints(phases), tuple(zip(phases.held, of_kinks.elements, strict=True)))
 
 
 @cached_by_identity
@@ -141,7 +152,7 @@ def concrete_plan(phases: Phases, conditions: Conditions, max_steps: int, max_ev
     """Return the plan from all events, then the compiled mechanism of each phase; their numbers are concrete."""
     count = len(others) - len(phases.mechanisms)
     plan = event_plan(phases, others[:count], max_steps, max_events)
-    return machine_plan(plan, phases, others[count:], conditions)
+    return machine_plan(plan, phases, others[:count], others[count:], conditions)
 
 
 def event_arrays(

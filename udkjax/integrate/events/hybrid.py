@@ -22,15 +22,15 @@ from udkjax.integrate.events.condition_program import conditions_of
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import contact_rows
-from udkjax.integrate.events.phases import Phases
+from udkjax.integrate.events.kinks import renewed_sides, with_sides
+from udkjax.integrate.events.phases import Added, Phases
 from udkjax.integrate.events.runs import RunState
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.pinv import SVD, Pseudoinverse
-from udkjax.scene.joints import Joint
+from udkjax.transforms.gradients import stop_gradients
 
 T = TypeVar("T")
-Added = tuple[Joint, ...]  # the joints that events add, with their current numbers
 Condition = Callable[[Float[Array, ""], Float[Array, "n"], Float[Array, "n"]], Float[Array, "k"]]  # of t, q and v
 
 
@@ -40,6 +40,7 @@ class Hybrid(eqx.Module):
     phases: Phases
     events: tuple[Event, ...]
     ts: Float[Array, "T"]  # output times (s)
+    sides: Float[Array, "S"]  # of comparisons in forces, at the start
     q: Float[Array, "n"]  # initial positions
     v: Float[Array, "n"]  # initial velocities
     code: Int[Array, ""]  # a `Result` that is known before the run
@@ -87,7 +88,7 @@ class Hybrid(eqx.Module):
 
     def first_state(self) -> RunState:
         """Return the state in which the run begins."""
-        return RunState(self.ts[0], self.q, self.v, jnp.array(0), self.phases.first_added())
+        return RunState(self.ts[0], self.q, self.v, jnp.array(0), (*self.phases.first_added(), self.sides))
 
     def problem(self, phase: int, ts: Float[Array, "T"], start: RunState) -> Problem:
         """Return the problem to integrate from a state, in a phase given as a Python int."""
@@ -146,18 +147,27 @@ class Hybrid(eqx.Module):
 
     # --- conditions
 
-    def conditions(self, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "E"]:
-        """Return the conditions of all events."""
-        return conditions_of(self.events, self.names, t, q, v)
+    def conditions(self, added: Added) -> Condition:
+        """Return the conditions of all events as a function of t, q and v, for the sides that comparisons have."""
+        events = with_sides(self.events, added[-1], self.phases.held)
+        return lambda t, q, v: conditions_of(events, self.names, t, q, v)
 
-    def conditions_and_rates(self, t: Array, q: Array, v: Array) -> tuple[Float[Array, "E"], Float[Array, "E"]]:
-        """Return the conditions and their rates, which are right only if a condition depends on positions alone."""
-        return rate_along(self.conditions, t, q, v, jnp.zeros_like(v))
+    def conditions_and_rates(self, added: Added) -> Callable[..., tuple[Float[Array, "E"], Float[Array, "E"]]]:
+        """Return a function for the conditions and their rates, right only for conditions of positions alone."""
+        conditions = self.conditions(added)
+        return lambda t, q, v: rate_along(conditions, t, q, v, jnp.zeros_like(v))
+
+    def turned(self, at: RunState, k: Int[Array, ""]) -> Float[Array, "S"]:
+        """Return the sides after event k at a state."""
+        factor, shift = (jnp.asarray(x)[k] for x in self.plan.side_changes)
+        sides = at.joints[-1] * factor + shift
+        return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[0]._forces, at.t, at.q, at.v, sides))
 
     def values(self, at: RunState, is_free: bool = False) -> StateValues:
         """Return conditions and their derivatives in a state; with `is_free` (no contact at rest) also directions of impulses."""
         t, q, v, phase, added = at
-        by_t, by_q, by_v = jax.jacfwd(self.conditions, (0, 1, 2))(t, q, v)
+        conditions = self.conditions(added)
+        by_t, by_q, by_v = jax.jacfwd(conditions, (0, 1, 2))(t, q, v)
 
         def of_phase(p: int, t: Array, q: Array, v: Array, normals: Array, added: Added) -> tuple[Array, Array]:
             equations = self.textbook(p, added)
@@ -165,10 +175,24 @@ class Hybrid(eqx.Module):
             return equations.accelerations(t, q, v), directions
 
         a, directions = self.in_phase(phase, of_phase, t, q, v, by_q, added, is_free=is_free)
-        g, rate = rate_along(self.conditions, t, q, v, a)
-        rates = lambda t, q, v: self.conditions_and_rates(t, q, v)[1]  # noqa: E731
+        g, rate = rate_along(conditions, t, q, v, a)
+        rates = lambda t, q, v: self.conditions_and_rates(added)(t, q, v)[1]  # noqa: E731
         rate_2 = jnp.where(np.array(self.plan.by_velocity), 0.0, rate_along(rates, t, q, v, a)[1])
         return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions)
+
+    def second_rates(self, at: RunState) -> tuple[Float[Array, "n"], Float[Array, "E"]]:
+        """Return the rate of the accelerations along the motion, and the second rates of all conditions, at a state."""
+        t, q, v, phase, added = at
+        conditions = self.conditions(added)
+
+        def accelerations(t: Array, q: Array, v: Array) -> Array:
+            return self.in_phase(phase, lambda p, *x: self.textbook(p, added).accelerations(*x), t, q, v)
+
+        def rates(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
+            a = accelerations(t, q, v)
+            return a, rate_along(conditions, t, q, v, a)[1]
+
+        return jax.jvp(rates, (t, q, v), (jnp.ones(()), v, accelerations(t, q, v)))[1]
 
     def forces(self, at: RunState) -> Float[Array, "E"]:
         """Return the contact forces in a state, minus the multipliers of the contacts at rest; 1 for all other events."""

@@ -47,6 +47,8 @@ def apply_event(
     plan, xp = system.plan, system.xp
     releases, e = k >= plan.count, k % plan.count
     t, q, v, phase, joints = before
+    if plan.kinks.any():
+        joints = system.with_sides(members, joints, system.turned(members, k, before))
     after = xp.where(releases, phase, xp.asarray(plan.after)[phase, e])
     blocked, adds = xp.zeros_like(releases), ~releases & xp.asarray(plan.adds)[e]
     if plan.adds.any() and (xp is not np or adds.any()):

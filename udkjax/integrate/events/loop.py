@@ -13,6 +13,7 @@ from jaxtyping import Bool, Int
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, first_crossing, side_of_zero
 from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
+from udkjax.integrate.events.kinks import FREE, MOST_KINKS
 from udkjax.integrate.events.runs import AGAIN, BEGIN, RECORD, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues, System
 from udkjax.integrate.solution import Result
@@ -38,7 +39,7 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     values, state_values = condition_values(system, members, state)
     values = values._replace(scale=xp.maximum(values.scale, take(runs.scale, members)))  # scales never decrease
     size, is_current = xp.abs(values.h), np.arange(E) == event[:, None]
-    carried = take(runs.carried, members) & (size <= CLOSED * values.scale)
+    carried = take(runs.carried, members) & (size <= CLOSED * values.scale) | _unheld(system, members, state.joints)
     undefined, ends = ~xp.isfinite(values.h), state.t >= take(system.end, members)
     # A located condition keeps its side until its event happens; any other nonzero condition is on the side of its sign.
     known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale)
@@ -46,10 +47,10 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     code = xp.where(take(runs.totals, members)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
     unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
     if xp is not np or unknown.any():
-        begins = event == BEGIN
+        begins, falling = event == BEGIN, plan.impacts | plan.kinks
         is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
         # Contacts are approached from the allowed side: an impact whose condition is zero at the start and falls happens at once.
-        before = xp.where(begins[:, None], xp.where(plan.impacts & is_zero, 1, now), sides[:, :E])
+        before = xp.where(begins[:, None], xp.where(falling & is_zero, 1, now), sides[:, :E])
         watched = plan.watched(state.phase, carried, xp)[:, :E]
         watched = watched & ~((event == AGAIN)[:, None] & _settled(system, runs, members))
         crossing = first_crossing(plan.both_directions[:E], watched, before, now, xp)
@@ -107,7 +108,7 @@ def _jump(
     system: System, runs: MemberRuns, members: MemberIndices, values: ConditionValues, state_values: StateValues
 ) -> MemberRuns:
     """Apply the events of members, and record them with the contacts that take part."""
-    plan, xp, E, K = system.plan, system.xp, system.plan.count, system.plan.max_events
+    plan, xp, E, K = system.plan, system.xp, system.plan.count, system.plan.room
     k, before = take(runs.event, members), runs.state(members)
     sides, carried = take(runs.sides, members), take(runs.carried, members)
     releases, e = k >= E, k % E
@@ -115,7 +116,7 @@ def _jump(
     after, contacts, blocked = apply_event(system, members, k, before, values, state_values)
     code = xp.where(xp.asarray(plan.stops)[e] & ~releases, Result.event_stop, Result.successful)
     is_current = np.arange(2 * E) == e[:, None]
-    sides = xp.where(is_current, xp.where((xp.asarray(plan.impacts)[e] | releases)[:, None], 1, -sides), sides)
+    sides = xp.where(is_current, xp.where((xp.asarray(plan.impacts | plan.kinks)[e] | releases)[:, None], 1, -sides), sides)
     noted, others, closed = k[:, None], xp.zeros((len(k), 0), bool), xp.full(held.shape, OPEN)
     if contacts is not None:
         closed = contacts.closed
@@ -134,7 +135,14 @@ def _jump(
     count = take(runs.count, members)
     is_noted = xp.concatenate([xp.ones_like(others, shape=(len(k), 1)), others], axis=1)
     total = xp.sum(is_noted, axis=1)
-    is_full = count + total > K
+    is_kink = xp.asarray(plan.kinks)[e] & ~releases
+    kinks, turned = _kink_count(system, runs, members), system.sides(members, after.joints)
+    is_full = (count - kinks + total > plan.max_events) & ~is_kink
+    # So many kinks are a force that chatters: its comparisons are no longer held.
+    chatters = (is_kink & (kinks + 1 >= MOST_KINKS))[:, None]
+    turned = xp.where(chatters, FREE, turned)
+    after = after._replace(joints=system.with_sides(members, after.joints, turned))
+    carried = carried | _unheld(system, members, after.joints)
     code = xp.where(is_full, Result.event_limit, code)
     rows = xp.where(is_noted & ~is_full[:, None], count[:, None] + xp.cumsum(is_noted, axis=1) - 1, K)
     stays = (is_full | blocked)[:, None]
@@ -149,6 +157,7 @@ def _jump(
         after.phase[:, None],
         np.arange(noted.shape[1])[None] > 0,
         closed[:, None],
+        turned[:, None],
     )
     follows = _may_follow(
         system, values, plan.watched(after.phase, carried, xp)[:, :E], closed, is_current[:, :E] & ~acts[:, None]
@@ -165,6 +174,22 @@ def _jump(
         code=code,
         running=(code == Result.successful) & (follows | (before.t < take(system.end, members))),
     )._replace(joints=after.joints)
+
+
+def _kink_count(system: System, runs: MemberRuns, members: MemberIndices) -> Int[Any, "b"]:
+    """Return the number of kinks so far."""
+    plan, index = system.plan, take(runs.record[INDEX_FIELD], members)
+    if not plan.side_count:
+        return system.xp.zeros(len(index), int)
+    return system.xp.sum((index >= 0) & (index < plan.count) & system.xp.asarray(plan.kinks)[index % plan.count], axis=1)
+
+
+def _unheld(system: System, members: MemberIndices, joints: Any) -> Bool[Any, "b E"]:
+    """Return a mask of the kinks whose sides are not held."""
+    plan, sides = system.plan, system.sides(members, joints)
+    if not plan.side_count:
+        return system.xp.zeros((len(sides), plan.count), bool)
+    return ~system.xp.isfinite(sides)[:, plan.side_of] & plan.kinks
 
 
 def _may_follow(

@@ -14,6 +14,7 @@ from udkjax.integrate.events.added_joints import AddedJoint, evaluate_joint
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import Contacts
+from udkjax.integrate.events.kinks import FREE, HeldElement
 from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
@@ -31,6 +32,7 @@ class MachinePlan(NamedTuple):
     events: EventPlan
     phases: tuple[PhasePlan, ...]
     added: tuple[AddedJoint, ...]  # the joints that events add
+    held: tuple[tuple[HeldElement, tuple[int, ...]], ...]  # forces with held sides, each with the places of its event numbers
 
 
 class MemberUnits(NamedTuple):
@@ -54,6 +56,7 @@ class MachineSystem:
         restitution: of all events (B, E).
         inverse_mass: of all coordinates (B, n).
         joint_numbers: the numbers of joints that events add, except those that depend on the state (B, k).
+        event_numbers: the numbers of all events (1 or B, K).
     """
 
     xp = np
@@ -67,7 +70,10 @@ class MachineSystem:
         restitution: np.ndarray,
         inverse_mass: np.ndarray,
         joint_numbers: np.ndarray,
+        event_numbers: np.ndarray,
     ):
+        self._event_numbers, self._held = event_numbers, plan.held
+        self.lost_kinks = np.full(len(ts), np.inf)  # times (s) from which sides are no longer held
         self.plan, self._added, self._is_projected = plan.events, plan.added, [x.projected for x in plan.phases]
         self._phases, self.ts, self._units, self._restitution = phases, ts, units, restitution
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
@@ -110,13 +116,49 @@ class MachineSystem:
     def add_joints(self, members: MemberIndices, event: Int[np.ndarray, "b"], q: np.ndarray, joints: Any) -> Any:
         """Return the numbers of the joints that events have added, with those that `event` adds at q; -1: no event."""
         indices, start = self._all if members is None else members, 0
-        for joint, numbers in zip(self._added, joints, strict=True):
+        for joint, numbers in zip(self._added, joints[:-1], strict=True):
             count, new = len(joint.program.inputs) - q.shape[1], event == joint.event
             if new.any():
                 inputs = self._joint_numbers[indices[new], start : start + count]
                 numbers[indices[new]] = evaluate_joint(joint, q[new], inputs)
             start += count
         return joints
+
+    def sides(self, members: MemberIndices, joints: Any) -> Float[np.ndarray, "b S"]:
+        """Return the sides of comparisons of members."""
+        return take(joints[-1], members)
+
+    def with_sides(self, members: MemberIndices, joints: Any, sides: Float[np.ndarray, "b S"]) -> Any:
+        """Return the joints that events have added, with other sides of members; changed in place."""
+        joints[-1][self._all if members is None else members] = sides
+        return joints
+
+    def turned(self, members: MemberIndices, k: Int[np.ndarray, "b"], at: RunState) -> Float[np.ndarray, "b S"]:
+        """Return the sides of members after event k at their states."""
+        factor, shift = self.plan.side_changes
+        return self._renew(members, at, self.sides(members, at.joints) * factor[k] + shift[k])
+
+    def first_sides(self, at: RunState) -> Float[np.ndarray, "B S"]:
+        """Return the sides of all members at the start."""
+        return self._renew(None, at, np.full_like(at.joints[-1], FREE))
+
+    def _renew(self, members: MemberIndices, at: RunState, sides: np.ndarray) -> np.ndarray:
+        result = sides.copy()
+        for held, places in self._held:
+            numbers, q = (
+                take(self._event_numbers, members if len(self._event_numbers) > 1 else None),
+                at.q.reshape(len(at.t), -1, 3),
+            )
+            v = at.v.reshape(q.shape)
+            state = [x for y in (q, v) for b in held.bodies for x in y[:, b].T]
+            given = [
+                *np.broadcast_to(numbers[:, list(places)], (len(at.t), len(places))).T,
+                at.t,
+                *state,
+                *result[:, held.sides].T,
+            ]
+            result[:, held.sides] = np.stack(held.smooth.renewal.by_numpy(given), axis=1)
+        return result
 
     def when(self, mask: Bool[np.ndarray, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
         """Return the runs with a change of the masked members."""
@@ -188,7 +230,13 @@ class MachineSystem:
     ):
         """Store the results and ends of the runs that stop."""
         status, (n, fails) = stretch.info[:, STATUS], (runs.q.shape[1], ~known)
-        self.unresolved[members] |= (status == Status.UNRESOLVED) & ~drifts
+        unresolved = (status == Status.UNRESOLVED) & ~drifts
+        if self.plan.side_count:  # perhaps a force that chatters: the run goes on with its comparisons
+            chatters = unresolved & np.isfinite(runs.joints[-1][members]).all(1)
+            freed, unresolved = members[chatters], unresolved & ~chatters
+            runs.joints[-1][freed], self.lost_kinks[freed], runs.running[freed] = FREE, runs.t[freed], True
+            known, fails = known | chatters, fails & ~chatters
+        self.unresolved[members] |= unresolved
         code = np.where(status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
         code = np.where(status == Status.NOT_FINITE, Result.not_finite, code)
         code = np.where((status == Status.LOST) | drifts, Result.drift, code)

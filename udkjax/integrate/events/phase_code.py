@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import places_of_joints
+from udkjax.integrate.events.kinks import HeldElement, places_of_sides
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.native_engine import run_inputs
 from udkjax.integrate.problem import Problem
@@ -34,7 +35,9 @@ class PhasePlan(NamedTuple):
     marking: MarkRows | None  # marks independent rows; None if this is not needed
     projected: bool
     project: StateOperation | None  # projects to the joints that events add; None without any
-    joints: tuple[tuple[int, ...], ...]  # for each such joint the places of its numbers; empty if the phase lacks it
+    # For each such joint the places of its numbers, empty if the phase lacks it; then those of the sides of comparisons.
+    joints: tuple[tuple[int, ...], ...]
+    sides_of_events: tuple[tuple[int, int], ...]  # places of sides among the numbers of events, with the index of the side
 
     @property
     def count(self) -> int:
@@ -43,7 +46,13 @@ class PhasePlan(NamedTuple):
 
 
 def phase_plan(
-    compiled: CompiledMechanism, conditions: Conditions, held: Sequence[int], impacts: Sequence[int], added: Sequence[str]
+    compiled: CompiledMechanism,
+    conditions: Conditions,
+    held: Sequence[int],
+    impacts: Sequence[int],
+    added: Sequence[str],
+    forces: Sequence[HeldElement],
+    of_kinks: tuple[tuple[int, int], ...],
 ) -> PhasePlan:
     """Return the operations of a phase.
 
@@ -53,6 +62,8 @@ def phase_plan(
         held: for each event the row of Psi that holds its contact; -1: none.
         impacts: the events that are impacts.
         added: the names of joints that events add.
+        forces: the forces with held sides.
+        of_kinks: the places of sides among the numbers of events, each with the index of its side.
     """
     run = compiled.plan.operation
     assert run is not None  # checked by the caller
@@ -63,7 +74,13 @@ def phase_plan(
         marking = MarkRows(scene_programs(compiled.textbook.mechanism.at(0.0)).with_all_rows)
     project = run.accelerations.projection if added else None
     joints = places_of_joints(compiled.textbook.mechanism, added)
-    return PhasePlan(run.watching(replace(conditions, rows=rows)), states, marking, compiled.plan.projected, project, joints)
+    if forces:
+        joints = (*joints, places_of_sides(compiled.samples.stand_in(compiled.textbook.mechanism), forces))
+    else:
+        joints = (*joints, ())
+    return PhasePlan(
+        run.watching(replace(conditions, rows=rows)), states, marking, compiled.plan.projected, project, joints, of_kinks
+    )
 
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
@@ -138,6 +155,7 @@ class PhaseCode:
         numbers = self._with_marks(members, ts[:, 0], q, v)
         further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
         watch[:, : conditions.number_count] = _of(self._event_numbers, members)
+        self._put_sides(watch, members)
         inputs = numbers, ts, q, v, *further, watch
         qs, vs, violation, info, crossing = call_members(*inputs, operation=operation, times=ts.shape[1])
         last_side, n = Conditions.head + conditions.count, q.shape[1]
@@ -156,7 +174,11 @@ class PhaseCode:
             numbers[:, list(self.plan.run.sampled)] = _spread(_of(self._samples[0], members), b)[np.arange(b), row]
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
         inputs = numbers, np.stack([t, t], axis=1), q, v, *further
-        (results,) = call_members(*inputs, _of(self._numbers_of_states, members), operation=operation, times=2)
+        of_states = _of(self._numbers_of_states, members)
+        if self.plan.sides_of_events:
+            of_states = _spread(of_states, b).copy()
+            self._put_sides(of_states, members)
+        (results,) = call_members(*inputs, of_states, operation=operation, times=2)
         values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
         directions = np.zeros((b, conditions.own_count, n))
         if operation.impacts:
@@ -173,6 +195,11 @@ class PhaseCode:
         inputs = self._with_marks(members, t, q, v), np.stack([t, t], axis=1), q, v
         (results,) = call_members(*inputs, *further, operation=operation, times=2)
         return results[:, :n], results[:, n:]
+
+    def _put_sides(self, numbers: np.ndarray, members: Int[np.ndarray, "b"]):
+        """Put the sides of comparisons into the numbers of events."""
+        for place, side in self.plan.sides_of_events:
+            numbers[:, place] = self._joints[-1][members, side]
 
     def _numbers_of(self, members: Int[np.ndarray, "b"]) -> np.ndarray:
         """Return the numbers of members, with those of the joints that events have added."""

@@ -6,7 +6,7 @@ determine which phases can be reached. Each phase has its own equations and mach
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,12 +18,14 @@ from udkjax.arrays import number
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.events.conditions import Frames, frames_of
 from udkjax.integrate.events.event import Event
+from udkjax.integrate.events.kinks import HeldElement
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.origin import Origin
 from udkjax.wording import quote, suggestion
 
+Added = tuple[Any, ...]  # the joints that events add, with their current numbers, and the sides of comparisons
 MOST_PHASES = 32  # each is compiled
 
 
@@ -44,10 +46,14 @@ class Phases(eqx.Module):
     added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, without the numbers that depend on the state at the event
     added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # for each added joint its event and its name
     tables: Tables = eqx.field(static=True)
+    held: tuple[HeldElement, ...] = eqx.field(static=True, default=())  # the forces with held sides
 
-    def with_added(self, phase: int, joints: Sequence[Joint]) -> Mechanism:
-        """Return the mechanism of a phase, with the joints that events have added."""
-        mechanism = self.mechanisms[phase]
+    def with_added(self, phase: int, added: Added) -> Mechanism:
+        """Return the mechanism of a phase, with the joints that events have added and the sides of its comparisons."""
+        mechanism, (*joints, sides) = self.mechanisms[phase], added
+        for held in self.held:
+            at = lambda m, k=held.force: m._forces[k].sides  # noqa: E731
+            mechanism = eqx.tree_at(at, mechanism, sides[held.sides])
         for (_, name), joint in zip(self.added_by, joints, strict=True):
             if name in mechanism.joint_names:
                 index = mechanism.joint_names.index(name)
@@ -57,6 +63,15 @@ class Phases(eqx.Module):
     def first_added(self) -> tuple[Joint, ...]:
         """Return the joints that events add, as they would be at the initial guess."""
         return tuple(self.joint_at(k, self.mechanisms[0].q0.ravel()) for k in range(len(self.added)))
+
+    def with_kinks(self, mechanism: Mechanism, held: tuple[HeldElement, ...], count: int) -> "Phases":
+        """Return the phases with the forces of a mechanism some of which are held, and with events at `count` kinks."""
+        *transitions, rows = self.tables
+        stay = [[(*row, *[phase] * count) for phase, row in enumerate(table)] for table in transitions]
+        after, resting, freed = map(tuple, stay)
+        tables = Tables(after, resting, freed, tuple((*row, *[-1] * count) for row in rows))
+        found = replace(self, held=held, tables=tables)
+        return eqx.tree_at(lambda p: [m._forces for m in p.mechanisms], found, [mechanism._forces] * len(self.mechanisms))
 
     def joint_at(self, k: int, q: Array) -> Joint:
         """Return the k-th joint that events add, added at q."""

@@ -100,13 +100,26 @@ class PlainSystem:
 
     def add_joints(self, members: MemberIndices, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:
         """Return the joints that events have added, with the joint that `event` adds at q; -1: no event."""
-        phases = self.hybrid.phases
-        new = (phases.joint_at(i, q[0]) for i in range(len(joints)))
+        phases, sides = self.hybrid.phases, joints[-1]
+        new = (phases.joint_at(i, q[0]) for i in range(len(joints) - 1))
         is_new = (event[0] == by for by, _ in phases.added_by)
-        return tuple(
+        chosen = (
             jax.tree.map(lambda x, y, chosen=chosen: jnp.where(chosen, x, y), x, y)
-            for chosen, x, y in zip(is_new, new, joints, strict=True)
+            for chosen, x, y in zip(is_new, new, joints[:-1], strict=True)
         )
+        return (*chosen, sides)
+
+    def sides(self, members: MemberIndices, joints: Added) -> Float[Array, "1 S"]:
+        """Return the sides of comparisons."""
+        return joints[-1][None]
+
+    def with_sides(self, members: MemberIndices, joints: Added, sides: Float[Array, "1 S"]) -> Added:
+        """Return the joints that events have added, with other sides."""
+        return (*joints[:-1], sides[0])
+
+    def turned(self, members: MemberIndices, k: Int[Array, "1"], at: RunState) -> Float[Array, "1 S"]:
+        """Return the sides after event k."""
+        return self.hybrid.turned(without_member(at), k[0])[None]
 
     def when(self, mask: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
         """Return the run with a change if the mask is true, else unchanged."""
@@ -141,7 +154,7 @@ class PlainSystem:
         good = jnp.cumsum(~(is_extrapolated[:, 0] | (raw.reached & (np.arange(len(times)) < raw.lost)))) == 0
 
         at = jnp.searchsorted(times, nodes)
-        g, g_dot = jax.vmap(hybrid.conditions_and_rates)(nodes, q[at], v[at])
+        g, g_dot = jax.vmap(hybrid.conditions_and_rates(state.joints))(nodes, q[at], v[at])
         forces = jax.vmap(lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v)))(nodes, q[at], v[at])
         hit = detect(
             Nodes(nodes, jnp.concatenate([g, forces], axis=1), jnp.concatenate([g_dot, 0 * g_dot], axis=1), good[at]),

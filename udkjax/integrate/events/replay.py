@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.annotations import TreeDef
 from udkjax.integrate.events.crossings import ZERO_RATE
+from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.host_run import run_by_machine_code
 from udkjax.integrate.events.hybrid import Hybrid, rate_along
 from udkjax.integrate.events.jumps import apply_event
@@ -35,6 +36,11 @@ def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
     arrays, rest = eqx.partition(hybrid, eqx.is_inexact_array)
     xs, tree = jax.tree.flatten(arrays)
     return _run(FixedPart(rest, tree, conditions), xs)
+
+
+def hybrid_plan(fixed: "FixedPart") -> EventPlan:
+    """Return the plan of a system."""
+    return jax.tree.unflatten(fixed.tree, [None] * fixed.tree.num_leaves).plan
 
 
 class FixedPart(eqx.Module):
@@ -65,7 +71,8 @@ def _(primals, tangents):
     if jax.tree.unflatten(fixed.tree, has_tangent).ts:
         raise NotImplementedError("a run with events has no derivatives by its output times")
 
-    xs = [_differentiate_once(x) for x in xs]
+    if hybrid_plan(fixed).changes.any():
+        xs = [_differentiate_once(x) for x in xs]
 
     def replay_from(*active: Array) -> tuple[Array, ...]:
         return replay(fixed.combine(replaced(xs, has_tangent, active)), stop_gradients(found))
@@ -76,7 +83,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _differentiate_once(x: Array) -> Array:
-    """Return x, without second derivatives: the first ones are exact only at fixed event times, so theirs would be wrong."""
+    """Return x, without second derivatives: those of jumps of the velocities or the constraints are not computed."""
     return x
 
 
@@ -96,6 +103,39 @@ def _(primals, tangents):
 #
 # with the saltation matrix (Leine and Nijmeijer 2004, section 7.5). The code does not form this matrix: it computes y+ with a d
 # whose value is zero, but whose derivatives are not.
+
+
+# To second order d and the moved states have further terms, d^2/2 times second rates. Their values and first derivatives are
+# zero, so that second rates are computed only where second derivatives are asked for.
+
+
+@eqx.filter_custom_jvp
+def _second_order(d: Float[Array, ""], hybrid: Hybrid, at: RunState) -> tuple[Float[Array, "n"], Float[Array, "E"]]:
+    """Return d^2/2 times the second rates of velocities and of conditions, at d = 0."""
+    return jnp.zeros_like(at.v), jnp.zeros(hybrid.count)
+
+
+@_second_order.def_jvp
+def _(primals, tangents):
+    change, found = tangents[0], _second_order(*primals)
+    if change is None:
+        return found, (None, None)
+    return found, tuple(x * change for x in _first_order(*primals))
+
+
+@eqx.filter_custom_jvp
+def _first_order(d: Float[Array, ""], hybrid: Hybrid, at: RunState) -> tuple[Float[Array, "n"], Float[Array, "E"]]:
+    """Return d times the second rates, at d = 0."""
+    return jnp.zeros_like(at.v), jnp.zeros(hybrid.count)
+
+
+@_first_order.def_jvp
+def _(primals, tangents):
+    change, (_, hybrid, at) = tangents[0], primals
+    found = _first_order(*primals)
+    if change is None:
+        return found, (None, None)
+    return found, tuple(x * change for x in stop_gradients(hybrid.second_rates(at)))
 
 
 class PieceStart(NamedTuple):
@@ -206,17 +246,27 @@ def _apply_at_fixed_time(
     if system.plan.held.any():
         force = lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v))[k % E]  # noqa: E731
         h, rate = (jnp.where(k >= E, *x) for x in zip(rate_along(force, *state[:3], a), (h, rate), strict=True))
-    h, rate = h - stop_gradients(h), stop_gradients(rate)
+    h = h - stop_gradients(h)
     unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E]) * hybrid.rate
-    is_transversal = jnp.abs(rate) > ZERO_RATE * unit
+    is_transversal = jnp.abs(stop_gradients(rate)) > ZERO_RATE * unit
+    rate = jnp.where(is_transversal, rate, 1.0)
     # If its condition is stationary, an event at the same instant as the event before moves with that event.
-    d = jnp.where(is_transversal, -h / jnp.where(is_transversal, rate, 1.0), jnp.where(again, shift, 0.0))
-    before = with_member(state._replace(t=state.t + d, q=state.q + d * state.v, v=state.v + d * a))
+    d = jnp.where(is_transversal, -h / rate, jnp.where(again, shift, 0.0))
+    _, of_h = _second_order(d, hybrid, state)
+    d = d - jnp.where(is_transversal, of_h[k % E] / stop_gradients(rate), 0.0)
+    before = with_member(_moved(hybrid, state, d, a))
     after = apply_event(system, None, k[None], before, *condition_values(system, None, before), found.closed[j][None]).state
     after = without_member(after)._replace(phase=found.event_phase[j])
-    fixed = after._replace(t=state.t, q=after.q - d * after.v, v=after.v - d * hybrid.values(after).a)
+    after = after._replace(joints=(*after.joints[:-1], found.sides[j]))
+    fixed = _moved(hybrid, after, -d, hybrid.values(after).a)._replace(t=state.t)
     before = without_member(before)
     return fixed, d, (before.t, jnp.stack([before.q, after.q]), jnp.stack([before.v, after.v]))
+
+
+def _moved(hybrid: Hybrid, state: RunState, d: Float[Array, ""], a: Float[Array, "n"]) -> RunState:
+    """Return the state after a time d = 0, with derivatives of first and second order."""
+    of_v, _ = _second_order(d, hybrid, state)
+    return state._replace(t=state.t + d, q=state.q + d * (state.v + 0.5 * d * a), v=state.v + d * a + of_v)
 
 
 def _no_event(n: int, K: int) -> tuple[Array, Array, Array, Array]:

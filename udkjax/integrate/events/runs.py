@@ -21,7 +21,7 @@ MemberIndices = Int[np.ndarray, "b"] | None  # the indices of members; None: all
 
 
 class RunState(NamedTuple):
-    """The states of runs: time, coordinates, velocities, phase, and the joints that events have added."""
+    """The states of runs: time, coordinates, velocities, phase, and the joints that events have added with all sides."""
 
     t: Float[Any, "*m"]
     q: Float[Any, "*m n"]
@@ -43,6 +43,7 @@ class EventRun(NamedTuple):
     event_phase: Int[Any, "*m K"]  # phase after the event
     together: Bool[Any, "*m K"]  # whether it is simultaneous with the event before, as one event
     closed: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
+    sides: Float[Any, "*m K S"]  # the sides of comparisons after the event
     count: Int[Any, "*m"]
     unresolved: Float[Any, "*m E"]
     undefined: Bool[Any, "*m E"]
@@ -51,13 +52,22 @@ class EventRun(NamedTuple):
 
 
 EVENT_STATES = ("event_time", "event_q", "event_v")
-RECORD = (*EVENT_STATES, "event_index", "event_phase", "together", "closed")  # fields of `EventRun` with an entry for each event
+RECORD = (
+    *EVENT_STATES,
+    "event_index",
+    "event_phase",
+    "together",
+    "closed",
+    "sides",
+)  # fields of `EventRun` with an entry for each event
 
 
 def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
     """Return the shapes of the fields of a run of T output times and n coordinates, with room for `room` events."""
     E, K = plan.count, room
-    return EventRun((T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K,), (K,), (K, E), (), (E,), (E,), (), (4,))
+    return EventRun(
+        (T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K,), (K,), (K, E), (K, plan.side_count), (), (E,), (E,), (), (4,)
+    )
 
 
 class MemberRuns(NamedTuple):
@@ -117,8 +127,14 @@ def take(x: Any, members: MemberIndices) -> Any:
 def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], xp: ModuleType, window: Any = None) -> MemberRuns:
     """Return runs before their start, with the `Result` known so far."""
     (B, n), E = state.q.shape, plan.count
-    shapes = shapes_of_run(plan, T, n, plan.max_events + 1)._asdict()
-    values = dict.fromkeys(EVENT_STATES, np.inf) | {"event_index": -1, "event_phase": -1, "together": False, "closed": 0}
+    shapes = shapes_of_run(plan, T, n, plan.room + 1)._asdict()
+    values = dict.fromkeys(EVENT_STATES, np.inf) | {
+        "event_index": -1,
+        "event_phase": -1,
+        "together": False,
+        "closed": 0,
+        "sides": 0.0,
+    }
     no = xp.zeros((B, E), bool)
     return MemberRuns(
         *state,
@@ -140,7 +156,7 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
 
 def results(plan: EventPlan, runs: MemberRuns, ts: Float[Any, "B T"], unresolved: Float[Any, "B E"], xp: ModuleType) -> EventRun:
     """Return the results of finished runs; an output at the time of the last state is that state."""
-    last, record = (ts == runs.t[:, None])[..., None], (x[:, : plan.max_events] for x in runs.record)
+    last, record = (ts == runs.t[:, None])[..., None], (x[:, : plan.room] for x in runs.record)
     q, v = xp.where(last, runs.q[:, None], runs.qs), xp.where(last, runs.v[:, None], runs.vs)
     ends = runs.count, unresolved, runs.undefined, runs.code, runs.totals
     return EventRun._make([q, v, runs.t, *record, *ends])

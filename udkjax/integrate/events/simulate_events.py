@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from udkjax.arrays import is_traced, is_within_jit, number, put_arrays
 from udkjax.devices import computing_on_host, on_host
@@ -22,12 +23,15 @@ from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand
 from udkjax.integrate.events.event_plan import event_plan
 from udkjax.integrate.events.host_run import HostRun, concrete_plan, event_arrays
 from udkjax.integrate.events.hybrid import Hybrid
+from udkjax.integrate.events.kinks import FREE, MOST_KINKS, renewed_sides, with_held_forces
 from udkjax.integrate.events.phases import Phases, phases_of
 from udkjax.integrate.events.replay import run_events
-from udkjax.integrate.events.runs import EventRun
+from udkjax.integrate.events.runs import RECORD, EventRun
 from udkjax.integrate.prepare import Choices, prepare_run
+from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
+from udkjax.integrate.time_derivatives import moved
 from udkjax.native.watching.conditions import Conditions
 from udkjax.positions.assembly import Closure, State
 from udkjax.programs.deferred import deferred
@@ -39,22 +43,30 @@ from udkjax.wording import quote
 UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-9 T; crossings may be missed: {}"
 
 
+class Kinks(NamedTuple):
+    """The kinks of the forces in a run."""
+
+    count: Int[Array, ""]
+    unlocated: Float[Array, ""]  # the time from which they are not located (s); else infinite
+
+
 class Given(NamedTuple):
     """The arguments of a run: the phases of a mechanism, the events, the initial state and the choices."""
 
     phases: Phases
-    events: tuple[Event, ...]
+    events: tuple[Event, ...]  # the user's events, then the kinks of forces
     ts: Float[Array, "T"]
     state: State | None
     closure: Closure | None  # instead of the state
     choices: Choices
     max_events: int
     conditions: Conditions | None  # conditions of all events, for machine code; None if it cannot run them
+    moves: bool  # whether times may have derivatives, which only runs without events of the user have
 
 
 def simulate_events(
     mechanism: Mechanism,
-    events: ExpandsToEvents | Sequence[ExpandsToEvents],
+    events: ExpandsToEvents | Sequence[ExpandsToEvents] | None,
     analysis: Analysis,
     ts: Any,
     state: State | None,
@@ -66,7 +78,7 @@ def simulate_events(
 
     Args:
         mechanism: the scene.
-        events: one event or several, ready-made ones among them.
+        events: one event or several, ready-made ones among them; None: only the kinks of forces.
         analysis: its `Analysis`.
         ts: the output times (s).
         state: the initial state; None: the state of `closure`.
@@ -83,21 +95,23 @@ def simulate_events(
     if conditions is not None:
         listed = with_cached_functions(listed, conditions)
     ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
-    given = Given(phases, listed, ts, state, closure, choices, max_events, conditions)
+    moves = isinstance(ts, Tracer) and events is None
+    given = Given(phases, listed, ts, state, closure, choices, max_events, conditions, moves)
     found = _run_at_once(mechanism, given)
     if found is None:
         given = given._replace(ts=number(ts), choices=choices.arrays())
         found = (_run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run)(given)
     found, reasons = found
-    names = tuple(e.name for e in listed)
+    names = tuple(e.name for e in listed if e.action.turn is None)
     if is_within_jit() or is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
-        return solution(mechanism, names, given, found, reasons, None)
+        return solution(mechanism, names, given, *_without_kinks(found, names, given, jnp), reasons, None)
     found = jax.tree.map(np.asarray, found)  # JAX would compile a program for each operation
-    if np.isfinite(found.unresolved).any():
-        fast = [f"{quote(e.name)} from {t:.6g} s on" for e, t in zip(listed, found.unresolved, strict=True) if np.isfinite(t)]
+    if np.isfinite(found.unresolved[: len(names)]).any():
+        fast = [f"{quote(name)} from {t:.6g} s on" for name, t in zip(names, found.unresolved) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
-    return put_arrays(_solution(mechanism, names, given, found, reasons, int(found.count)))
+    found, kinks = _without_kinks(found, names, given, np)
+    return put_arrays(_solution(mechanism, names, given, found, kinks, reasons, int(found.count)))
 
 
 def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
@@ -123,31 +137,36 @@ def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[st
 Prepared = tuple[tuple[Event, ...], Phases]
 
 
-def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToEvents], analysis: Analysis) -> Prepared:
+def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToEvents] | None, analysis: Analysis) -> Prepared:
     """Return all events, with unique names, and the phases that they lead to; cached if all numbers are concrete."""
-    listed = tuple(events) if isinstance(events, Sequence) else (events,)
+    listed = events if events is None else tuple(events) if isinstance(events, Sequence) else (events,)
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, listed, analysis))):
         return _expand(mechanism, listed, analysis)
-    return _expand_concrete(mechanism, analysis, *listed)
+    return _expand_concrete(mechanism, analysis, listed is None, *(listed or ()))
 
 
 @cached_by_identity
-def _expand_concrete(mechanism: Mechanism, analysis: Analysis, *events: ExpandsToEvents) -> Prepared:
+def _expand_concrete(mechanism: Mechanism, analysis: Analysis, has_none: bool, *events: ExpandsToEvents) -> Prepared:
     with jax.ensure_compile_time_eval(), computing_on_host():
-        return _expand(mechanism, events, analysis)
+        return _expand(mechanism, None if has_none else events, analysis)
 
 
-def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents], analysis: Analysis) -> Prepared:
-    found = expand_events(events, mechanism)
-    return found, phases_of(mechanism, found, analysis)
+def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents] | None, analysis: Analysis) -> Prepared:
+    found = () if events is None else expand_events(events, mechanism)
+    phases, (smooth, held, kinks) = phases_of(mechanism, found, analysis), with_held_forces(mechanism)
+    return ((*found, *kinks), phases.with_kinks(smooth, held, len(kinks))) if held else (found, phases)
 
 
 def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     """Run; return the result, and for each phase why machine code cannot integrate it."""
-    phases, events, ts, state, closure, choices, max_events, conditions = given
+    phases, events, ts, state, closure, choices, max_events, conditions, moves = given
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     run = prepare_run(compiled[0], phases.analyses[0], ts, state, closure, choices)
-    problem, stabilization = run.problem, choices.stabilization
+    problem, stabilization, ts = run.problem, choices.stabilization, run.problem.ts
+    if moves:
+        fixed = replace(problem, ts=stop_gradients(ts))
+        q, v = moved(fixed, ts[0], problem.q, problem.v, fixed.ts[0] - ts[0])
+        problem = replace(fixed, q=q, v=v)
     code = jnp.where(run.is_closed, Result.successful, Result.could_not_assemble)
     if closure is None:
         y = jnp.concatenate([problem.q, problem.v])
@@ -157,6 +176,7 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     hybrid = Hybrid(
         phases=phases,
         events=events,
+        sides=_first_sides(phases, problem),
         ts=problem.ts,
         q=problem.q,
         v=problem.v,
@@ -176,7 +196,20 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
     )
     if not all(x.plan.is_native for x in compiled):
         conditions = None
-    return run_events(hybrid, conditions), tuple(x.plan.why_not_native for x in compiled)
+    found = run_events(hybrid, conditions)
+    if moves:
+        reached = jnp.isfinite(found.q[:, :1])
+        q, v = (jnp.where(reached, y, 0.0) for y in (found.q, found.v))
+        q, v = jax.vmap(partial(moved, problem))(problem.ts, q, v, ts - problem.ts)
+        found = found._replace(**{name: jnp.where(reached, y, jnp.inf) for name, y in (("q", q), ("v", v))})
+    return found, tuple(x.plan.why_not_native for x in compiled)
+
+
+def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
+    """Return the sides of all comparisons at the start."""
+    free = jnp.full(sum(held.smooth.count for held in phases.held), FREE)
+    at = problem.ts[0], problem.q, problem.v, free
+    return stop_gradients(renewed_sides(phases.held, phases.mechanisms[0]._forces, *at))
 
 
 _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
@@ -187,6 +220,7 @@ def _solution(
     names: tuple[str, ...],
     given: Given,
     found: EventRun,
+    kinks: Kinks | None,
     reasons: tuple[str, ...],
     count: int | None,
 ) -> Solution:
@@ -219,11 +253,13 @@ def _solution(
         "rejected": found.totals[0] - found.totals[1],
         "right_hand_sides": found.totals[2],
         "projections": found.totals[3],
-        "events": found.count,
+        **({"events": found.count} if names else {}),
+        **({} if kinks is None else {"kinks": kinks.count}),
     }
     why = next(filter(None, reasons), "")
     engine = f"diffrax: {why}" if all(reasons) else f"native, in some phases diffrax: {why}" if why else "native"
-    settings = dict(choices.settings(why)) | {"max_events": str(given.max_events), "engine": engine}
+    settings = dict(choices.settings(why)) | {"engine": engine}
+    settings |= {"max_events": str(given.max_events)} if names else {}
     with jax.debug_nans(False):  # NaN stands for outputs after the end of a run
         q, v = (xp.where(xp.isinf(x), xp.nan, x).reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
     return Solution(
@@ -237,8 +273,28 @@ def _solution(
         atol=choices.atol,
         bodies=mechanism.body_names,
         choices=tuple(settings.items()),
-        events=listing,
+        events=listing if names else None,
+        unlocated=None if kinks is None else kinks.unlocated,
     )
 
 
 _compiled_solution = deferred(_solution)
+
+
+def _without_kinks(found: EventRun, names: tuple[str, ...], given: Given, xp: Any) -> tuple[EventRun, Kinks | None]:
+    """Return a run with the events of the user alone, and its kinks; None without any."""
+    E, own = len(given.events), len(names)
+    if own == E:
+        return found, None
+    k = xp.arange(len(found.event_index))
+    is_event = k < found.count
+    is_kink = is_event & (found.event_index % E >= own)
+    order = xp.argsort(xp.where(is_event & ~is_kink, k, len(k)), stable=True)[: given.max_events]
+    index = found.event_index // E * own + found.event_index % E
+    per_event = {name: getattr(found, name)[order] for name in RECORD} | {"event_index": index[order]}
+    count, last = xp.sum(is_kink), found.unresolved[own:].min()
+    full = xp.where(count >= MOST_KINKS, xp.max(xp.where(is_kink, found.event_time, -xp.inf)), xp.inf)
+    run = found._replace(
+        **per_event, count=found.count - count, unresolved=found.unresolved[:own], undefined=found.undefined[:own]
+    )
+    return run, Kinks(count, xp.minimum(last, full))

@@ -63,6 +63,18 @@ class System(Protocol):
         """Advance members, at most to the next crossing, which becomes their `event`."""
         ...
 
+    def sides(self, members: MemberIndices, joints: Any) -> Float[Any, "b S"]:
+        """Return the sides of comparisons (kinks.py), the last of the joints."""
+        ...
+
+    def with_sides(self, members: MemberIndices, joints: Any, sides: Float[Any, "b S"]) -> Any:
+        """Return the joints that events have added, with other sides of members."""
+        ...
+
+    def turned(self, members: MemberIndices, k: Int[Any, "b"], at: RunState) -> Float[Any, "b S"]:
+        """Return the sides of members after event k at their states."""
+        ...
+
     def when(self, mask: Bool[Any, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
         """Return the runs with a change of the masked members."""
         ...

@@ -1,0 +1,196 @@
+"""Jumps and kinks of forces that the state decides are located, and derivatives of first and second order pass through them."""
+
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+import udkjax as udk
+
+
+class Of(udk.ForceElement):
+    """A force along x on a point of unit mass."""
+
+    k: Float[Array, ""]
+
+    def along(self, t, x, v):
+        raise NotImplementedError
+
+    def loads(self, t, *frames):
+        return [(self.along(t, frames[0].x, frames[0].vx), 0.0, 0.0)]
+
+
+class Brake(Of):
+    def along(self, t, x, v):
+        return jnp.where(x > 0.2, -self.k, 0.0)
+
+
+class Bumper(Of):
+    def along(self, t, x, v):
+        return -self.k * jnp.maximum(x - 0.2, 0.0)
+
+
+class Steps(Of):
+    def along(self, t, x, v):
+        return self.k * jnp.floor(x / 0.2)
+
+
+class Saw(Of):
+    def along(self, t, x, v):
+        return -self.k * ((x + 0.13) % 0.3)
+
+
+class DeadZone(Of):
+    def along(self, t, x, v):
+        return -self.k * jnp.sign(x - 0.1) * jnp.maximum(jnp.abs(x - 0.1) - 0.05, 0.0)
+
+
+class Saturated(Of):
+    def along(self, t, x, v):
+        return jnp.clip(-self.k * (x - 0.2) - 0.3 * v, -0.4, 0.4)
+
+
+class Wrapped(Of):
+    """A comparison of a wrapped angle: its side changes where the angle is wrapped, too."""
+
+    def along(self, t, x, v):
+        angle = (10 * x + jnp.pi) % (2 * jnp.pi) - jnp.pi
+        return -self.k * (jnp.where(angle > 0.5, angle - 0.5, 0.0) + 0.1 * angle)
+
+
+class ByTangent(Of):
+    def along(self, t, x, v):
+        return -self.k * jnp.arctan2(jnp.sin(10 * x), jnp.cos(10 * x))
+
+
+class LaterFurther(Of):
+    def along(self, t, x, v):
+        return -self.k * jax.lax.cond(t > 0.23 * x + 0.2, lambda: x, lambda: 0.0 * x)
+
+
+class Sign(Of):
+    def along(self, t, x, v):
+        return -self.k * jnp.sign(v)
+
+
+class Wall(udk.ForceElement):
+    k: Float[Array, ""]
+
+    def potential(self, t, *frames):
+        return 0.5 * self.k * jnp.maximum(frames[0].x - 0.2, 0.0) ** 2
+
+
+KINDS = (Brake, Bumper, Steps, Saw, DeadZone, Saturated, Wrapped, ByTangent, LaterFurther, Wall)
+P = np.array([1.0, 2.0])
+
+
+def point(kind, p):
+    zero = 0.0 * p[0]
+    body = udk.Body(1.0, 0.1, velocity=jnp.stack([p[0], zero]) if isinstance(p, jax.Array) else np.array([p[0], zero]))
+    return udk.Mechanism({"b": body}, forces={"f": kind(["b"], k=p[1])}, gravity=[0, 0])
+
+
+def run(kind, p, end=0.6, **options):
+    return udk.simulate(point(kind, p), [0.0, end], rtol=1e-12, atol=1e-12, **options)
+
+
+def place(kind, p, **options):
+    return run(kind, p, **options).q[-1, 0, 0]
+
+
+def braked(p):
+    return p[0] * 0.6 - 0.5 * p[1] * (0.6 - 0.2 / p[0]) ** 2
+
+
+def bumped(p):
+    return 0.2 + p[0] / jnp.sqrt(p[1]) * jnp.sin(jnp.sqrt(p[1]) * (0.6 - 0.2 / p[0]))
+
+
+@pytest.mark.parametrize(("kind", "exact"), [(Brake, braked), (Bumper, bumped)])
+def test_a_step_ends_at_a_jump_or_a_kink(kind, exact):
+    found = run(kind, P)
+    assert found.q[-1, 0, 0] == pytest.approx(float(exact(P)), abs=1e-14)
+    assert int(found.stats["kinks"]) == 1 and float(found.unlocated) == np.inf
+    assert found.settings["kinks"] == "located" and found.events is None
+
+
+@pytest.mark.slow
+def test_derivatives_pass_through_a_jump():
+    """Forward, by the first velocity, the size of the jump and the end."""
+    p = jnp.array([*P, 0.6])
+
+    def end(p):
+        return udk.simulate(point(Brake, p), jnp.stack([0.0 * p[2], p[2]]), rtol=1e-12, atol=1e-12).q[-1, 0, 0]
+
+    exact = jax.jacfwd(lambda p: p[0] * p[2] - 0.5 * p[1] * (p[2] - 0.2 / p[0]) ** 2)(p)
+    np.testing.assert_allclose(jax.jacfwd(end)(p), exact, rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["native", "diffrax"])
+def test_derivatives_of_both_engines_in_reverse(engine):
+    slope = jax.grad(lambda p: place(Brake, p, engine=engine))(jnp.asarray(P))
+    np.testing.assert_allclose(slope, jax.grad(braked)(jnp.asarray(P)), rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "exact"), [(Brake, braked), (Bumper, bumped)])
+def test_second_derivatives_pass_through_jumps_and_kinks(kind, exact):
+    found = jax.hessian(lambda p: place(kind, p))(jnp.asarray(P))
+    np.testing.assert_allclose(found, jax.hessian(exact)(jnp.asarray(P)), atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_derivatives_are_those_of_differences(kind):
+    h = 1e-5
+    differences = [(float(place(kind, P + h * e)) - float(place(kind, P - h * e))) / (2 * h) for e in np.eye(2)]
+    np.testing.assert_allclose(jax.jacfwd(lambda p: place(kind, p))(jnp.asarray(P)), differences, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_members_of_a_batch_have_kinks_of_their_own():
+    ps = jnp.stack([jnp.array([v, 2.0]) for v in (0.2, 0.5, 1.0, 1.5)])
+    found = jax.vmap(lambda p: (lambda s: (s.q[-1, 0, 0], s.stats["kinks"]))(run(Steps, p)))(ps)
+    singles = [run(Steps, np.asarray(p)) for p in ps]
+    np.testing.assert_allclose(found[0], [s.q[-1, 0, 0] for s in singles], atol=1e-13)
+    assert found[1].tolist() == [int(s.stats["kinks"]) for s in singles]
+
+
+def test_a_run_may_begin_at_a_kink():
+    class FromZero(Of):
+        def along(self, t, x, v):
+            return -self.k * jnp.maximum(x, 0.0)
+
+    assert place(FromZero, np.array([1.0, 4.0])) == pytest.approx(np.sin(1.2) / 2, abs=1e-13)
+    assert place(FromZero, np.array([-1.0, 4.0])) == pytest.approx(-0.6, abs=1e-13)
+
+
+def test_events_of_the_user_stay_apart_from_kinks():
+    late = udk.Event(lambda t, at: at["b"].x - 0.3, udk.Log(), name="late")
+    found = run(Brake, P, events=[late])
+    assert found.events.names[:1] == ("late",) and int(found.events.count) == 1
+    assert float(found.events.time[0]) == pytest.approx(0.2 + (1 - np.sqrt(0.6)) / 2, abs=1e-13)
+    assert int(found.stats["kinks"]) == 1
+
+
+def test_what_rests_where_its_force_jumps_is_told():
+    """Dry friction at rest changes its sign without end: after some of its jumps they are no longer located."""
+    found = run(Sign, np.array([0.3, 1.0]), throw=False)
+    assert float(found.unlocated) == pytest.approx(0.3, abs=1e-9)
+    assert not found.result.is_success
+
+
+def test_forces_whose_kinks_are_not_located_are_told():
+    import diffrax
+
+    found = run(Brake, P, adjoint=diffrax.DirectAdjoint())
+    assert found.settings["kinks"] == "not located by an adjoint of diffrax's" and found.unlocated is None
+
+
+def test_a_scene_without_kinks_has_none():
+    spring = udk.Spring(["ground", "b"], [[0, 0], [0, 0]], 1.0, damping=0.1, length=0.1)
+    found = udk.simulate(udk.Mechanism({"b": udk.Body(1.0, 0.1, position=[1.0, 0.0])}, forces={"s": spring}), [0.0, 0.1])
+    assert "kinks" not in found.settings and "kinks" not in found.stats and found.unlocated is None
