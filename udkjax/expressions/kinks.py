@@ -1,8 +1,8 @@
 """Places where an expression jumps or has a kink, and the smooth expressions between them.
 
-Comparisons, |x|, signs, maxima, rounding and remainders are smooth except where an argument g crosses zero or a whole number. Each
-such g has a *side*, a number: 1 or -1, the sign of g; or the whole number below it. With its sides held, an expression is smooth,
-and continues smoothly beyond the crossing. A side that is not finite leaves the operation as it was.
+Comparisons, |x|, signs, maxima, rounding and remainders are smooth except where an argument g crosses zero or a whole number.
+Each such g has a *side*, a number: 1 or -1, the sign of g; or the whole number below it. With its sides held, an expression is
+smooth, and continues smoothly beyond the crossing. A side that is not finite leaves the operation as it was.
 """
 
 from collections.abc import Collection, Sequence

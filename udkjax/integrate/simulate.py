@@ -154,7 +154,7 @@ def simulate(
         if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
-    is_located = events is not None
+    is_located, located = events is not None, None
     if isinstance(mechanism, Mechanism) and mechanism.forces:
         from udkjax.integrate.events.kinks import kinks_of
 
@@ -173,7 +173,9 @@ def simulate(
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, choices, max_events)
         if not _has_failed(solution) or not is_concrete or int(solution.stats.get("events", 0)):
             return _required(solution, throw)  # events may have changed what moved
-        return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
+        if events is not None:
+            return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
+        located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
 
     solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
@@ -182,7 +184,10 @@ def simulate(
         analysis = analyse(mechanism)  # with the numbers of the given analysis more rows were redundant
         solution, _, end = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
     if _has_failed(solution):
-        return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
+        found = solution if located is None else located
+        return _required(explained(found, mechanism, analysis, choices.drift_tol, solver, end), throw)
+    if located is not None:
+        return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
     return solution
 
 
