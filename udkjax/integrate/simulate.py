@@ -155,7 +155,7 @@ def simulate(
             require_closed(mechanism, closure, start)  # before anything runs
 
     is_located, located = events is not None, None
-    if isinstance(mechanism, Mechanism) and mechanism.forces:
+    if isinstance(mechanism, Mechanism) and any(force.may_have_kinks for force in mechanism.forces.values()):
         from udkjax.integrate.events.kinks import kinks_of
 
         found = kinks_of(mechanism)

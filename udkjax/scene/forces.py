@@ -37,8 +37,11 @@ class ForceElement(PrintsLine):
 
     bodies: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=BODY)
     n_bodies: ClassVar[int] = 2  # number of `bodies`, for types of the scene format
-    # False if comparisons of the state only guard against division by zero; otherwise steps end where they change.
-    has_kinks: ClassVar[bool] = True
+
+    @property
+    def may_have_kinks(self) -> bool:
+        """False for the types of this module, whose comparisons of the state only guard against division by zero."""
+        return type(self).__module__ != __name__
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
         """Return the potential energy V (J), or None; its generalized force is -dV/dq."""
@@ -78,8 +81,6 @@ class Spring(ForceElement):
         length: free length (m), not negative.
         damping: in N s/m, not negative; None: no damper.
     """
-
-    has_kinks = False
 
     points: Float[Array, "2 2"] = eqx.field(converter=given_number)
     stiffness: Float[Array, ""] = eqx.field(converter=given_number, metadata=NOT_NEGATIVE)

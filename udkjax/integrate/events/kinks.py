@@ -159,7 +159,7 @@ def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, "SmoothLoads", b
     sampled = {k for section, k, _ in mechanism.samples if section == "_forces"}
     rows = mechanism.without_samples._forces if sampled else mechanism._forces
     for k, (name, element) in enumerate(mechanism.forces.items()):
-        if element.has_kinks:
+        if element.may_have_kinks:
             traced = traced_loads(rows[k], attached_bodies(element, mechanism.joints))
             has_numbers = all(map(eqx.is_inexact_array, jax.tree.leaves(element)))
             yield name, smooth_loads(traced, len(element.breakpoints) > 0), k not in sampled and has_numbers
