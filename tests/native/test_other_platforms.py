@@ -57,6 +57,10 @@ def _eigenvalues(x):
     return jnp.linalg.svd(x * jnp.eye(2), compute_uv=False)
 
 
+def _root(x):
+    return jax.lax.while_loop(lambda r: r**2 > 1.1 * x, lambda r: 0.5 * (r + x / r), x)
+
+
 DENSE = [udk.SVD(), udk.Householder(), udk.Greville()]
 PROGRAMS = {
     "run": run,
@@ -105,6 +109,7 @@ SOLVES = {  # with the numbers of calls: the scales, the assembly, and the solve
     "equilibrium, forward mode": (jax.jacfwd(rested), 3),
     "equilibrium, reverse mode": (jax.grad(rested), 3),
     "batch of equilibria": (lambda x: jax.vmap(rested)(x * jnp.arange(1.0, 4.0)), 3),
+    "events, reverse mode": (jax.grad(bounced), 7),
     "modes": (lambda x: udk.modes(PENDULUM.with_parameters({"body.rod.mass": x})).omega2, 4),
 }
 FAST = {"kinematics", "equilibrium"}
@@ -123,11 +128,21 @@ def test_a_solve_for_a_graphics_card_is_one_call(name):
 
 
 @pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
-def test_many_matrices_are_factorized_on_the_card():
-    values = jax.vmap(deferred(_eigenvalues))
-    for members, is_called in ((host_program.FEW_MATRICES, True), (host_program.FEW_MATRICES + 1, False)):
-        card = jax.jit(values).trace(jnp.ones(members)).lower(lowering_platforms=("cuda",)).as_text()
-        assert bool(targets(card)) == is_called and ("cusolver" in card) != is_called
+@pytest.mark.parametrize(
+    ("solve", "most", "word"), [(_eigenvalues, host_program.FEW_MATRICES, "cusolver"), (_root, host_program.SMALL, "while")]
+)
+def test_large_batches_stay_on_the_card(solve, most, word):
+    """Batches of matrices, and of loops that all members take together."""
+    for members, is_called in ((most, True), (most + 1, False)):
+        card = jax.jit(jax.vmap(deferred(solve))).trace(jnp.ones(members)).lower(lowering_platforms=("cuda",)).as_text()
+        assert bool(targets(card)) == is_called and (word in card) != is_called
+
+
+@pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
+def test_batches_of_loops_one_after_another_do_not():
+    one_by_one = deferred(lambda xs: jax.lax.map(_root, xs))
+    card = jax.jit(one_by_one).trace(jnp.ones(host_program.SMALL + 1)).lower(lowering_platforms=("cuda",)).as_text()
+    assert len(targets(card)) == 1 and "while" not in card
 
 
 @pytest.mark.parametrize("name", ["run", "reverse mode", "closing", "rarely reached", "deferred"])

@@ -20,6 +20,7 @@ from udkjax.integrate.events.plain_system import PlainSystem, run_plain, with_me
 from udkjax.integrate.events.runs import EventRun, RunState
 from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import Conditions
+from udkjax.programs.deferred import deferred
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.traced_numbers import replaced, select
 
@@ -75,7 +76,7 @@ def _(primals, tangents):
         xs = [_differentiate_once(x) for x in xs]
 
     def replay_from(*active: Array) -> tuple[Array, ...]:
-        return replay(fixed.combine(replaced(xs, has_tangent, active)), stop_gradients(found))
+        return _replay(fixed, replaced(xs, has_tangent, active), stop_gradients(found))
 
     change = jax.jvp(replay_from, select(xs, has_tangent), select(tangents[1], has_tangent))[1]
     return found, EventRun._make([*change, *(None for _ in found[len(change) :])])
@@ -157,6 +158,11 @@ class PieceOutput(NamedTuple):
     event_time: Float[Array, ""]
     event_q: Float[Array, "2 n"]
     event_v: Float[Array, "2 n"]
+
+
+@deferred
+def _replay(fixed: FixedPart, xs: Sequence[Array], found: EventRun) -> tuple[Array, ...]:
+    return replay(fixed.combine(xs), found)
 
 
 def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:

@@ -1,9 +1,9 @@
 """Deferred programs (programs/deferred.py) in programs of other devices than the CPU: one call of the host.
 
 On a graphics card each operation of a program takes microseconds to begin, each step of a loop waits for the host, and each
-factorization of a small matrix takes a large part of a millisecond. A deferred program with loops, or with a few matrices to
-factorize, is therefore compiled for the CPU, when the program around it is lowered, and called as a function of the host
-(host_function.py). On the CPU it is a part of the program around it.
+factorization of a small matrix takes a large part of a millisecond. Deferred programs with loops over small arrays, or with a few
+matrices to factorize, are therefore compiled for the CPU, when the program around them is lowered, and called as functions of the
+host (host_function.py). On the CPU they are parts of the program around them.
 
 Derivatives and batches of deferred programs are deferred programs; they come here by themselves.
 """
@@ -26,9 +26,10 @@ from udkjax.native.base.host_function import call_host
 from udkjax.native.gpu import host_handler
 from udkjax.programs.deferred import deferred_p
 
-LOOPS = {"while"}
+LOOPS = {"scan", "while"}
 FACTORIZATIONS = {"cholesky", "eig", "eigh", "hessenberg", "householder_product", "lu", "qr", "geqrf", "geqp3", "schur", "svd"}
 HOST = "cpu"  # the platform for which a program is a part of the program around it
+SMALL = 2**14  # numbers: on fewer the host ends an operation before a card has begun it
 FEW_MATRICES = 64  # factorized one after another: some 10 us each on the host; a card takes half a millisecond for any number
 
 
@@ -80,19 +81,22 @@ def runs_on_host(program: Any) -> bool:
     )
 
 
-def _is_slow(program: Any) -> bool:
-    """Return True if the program has loops or factorizations of a few matrices."""
-    factorized = []
+def _is_slow(jaxpr: Any) -> bool:
+    """Return True if a program has loops over operations on small arrays, or factorizations of a few matrices."""
+    for equation in jaxpr.eqns:
+        name, inner = equation.primitive.name, list(jaxprs_in_params(equation.params))
+        if name in LOOPS and max(map(_largest, inner)) <= SMALL:
+            return True
+        if name in FACTORIZATIONS and math.prod(equation.invars[0].aval.shape[:-2]) <= FEW_MATRICES:
+            return True
+        if any(map(_is_slow, inner)):
+            return True
+    return False
 
-    def has_loop(jaxpr: Any) -> bool:
-        for equation in jaxpr.eqns:
-            if equation.primitive.name in LOOPS or any(map(has_loop, jaxprs_in_params(equation.params))):
-                return True
-            if equation.primitive.name in FACTORIZATIONS:
-                factorized.append(math.prod(equation.invars[0].aval.shape[:-2]))
-        return False
 
-    return has_loop(program) or 0 < max(factorized, default=0) <= FEW_MATRICES
+def _largest(jaxpr: Any) -> int:
+    """Return the size of the largest result of an operation."""
+    return max((getattr(v.aval, "size", 0) for equation in jaxpr.eqns for v in equation.outvars), default=0)
 
 
 # --- arrays of any kind as words of 64 bits
