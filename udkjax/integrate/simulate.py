@@ -103,7 +103,9 @@ def simulate(
             actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to rounding, independently of
             `ts`, and the run restarts after each; contacts that act on one another are hit together. Both engines support
             events, also in batches, where each member has its own. Such runs have first derivatives, forward and reverse,
-            which include the changes of event times (saltation), but no derivatives by `ts`.
+            which include the changes of event times (saltation), but no derivatives by `ts`; with `Log` and `Stop` alone also
+            second ones. Jumps and kinks of forces of one's own (`where`, `max`, `abs`, `floor` of the state) are located in the
+            same way, without being listed: `Solution.unlocated` is the time from which they are not.
         max_events: the largest number of events.
 
     Returns:
