@@ -95,6 +95,27 @@ def test_threads_compute_what_the_engine_computes(name):
     assert served
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(udk.library.__all__))
+def test_threads_run_every_mechanism_of_the_library(name):
+    """Runs with outputs and with a derivative, of members under different gravity."""
+    make = getattr(udk.library, name)
+    mechanism = make(3) if name == "n_four_bar" else make()
+    known, gravity = udk.analyse(mechanism), jnp.array([0.0, -9.81])
+    end = 1e-3 if name == "andrews_squeezer" else 0.2
+
+    def run(x):
+        moved = mechanism.with_parameters({"gravity": gravity * x})
+        return udk.simulate(moved, np.linspace(0.0, end, 4), rtol=1e-7, atol=1e-7, throw=False, analysis=known).q
+
+    for f in (run, with_tangent(run)):
+        calls = [x for x in emulation.calls_of(jax.vmap(f), np.array([0.8, 1.0, 1.1])) if not x.operation.is_reverse]
+        assert any("Run" in type(x.operation).__name__ for x in calls)
+        for call in calls:
+            for found, known_output in zip(emulation.run_threads(call.kernel, call), call.outputs, strict=True):
+                assert_array_equal(found, known_output)
+
+
 def test_operations_without_a_kernel_are_refused():
     calls = emulation.calls_of(jax.vmap(jax.grad(lambda x: RUNS["tangent"](x)[0].sum())), MASSES)
     (name, *_) = (type(x.operation).__name__ for x in calls if x.operation.is_reverse)
