@@ -25,7 +25,7 @@ LOST = 0.1  # rad: a run whose angles are this wrong has lost the motion
 
 
 def table(end: float = 20.0, out: Path | None = None, progress: Any = None) -> Any:
-    """Return the table as a dataset over method, tol and stabilization."""
+    """Return the table as a dataset over pseudoinverse, tol and stabilization."""
     mech = udk.library.parallelogram()
     state = udk.assemble(mech)
     ts = np.linspace(0.0, end, 401)
@@ -61,7 +61,7 @@ def main() -> None:
         print(f"{'method':12} {'tol':>6} {'NSTEPS':>7} {'NFUNC':>8} {'violation':>10} {'angle off by':>12} {'rank':>6}  ended")
         for tol in data.tol.values[::-1]:
             for method in data.method.values:
-                run = data.isel(stabilization=number).sel({"method": method, "tol": tol})
+                run = data.isel(stabilization=number).sel(pseudoinverse=method, tol=tol)
                 rank = run["rank"].values[run["rank"].values >= 0]
                 ended = names[int(run.result)] + (", lost" if run.angle_error > LOST else "")
                 print(

@@ -63,7 +63,7 @@ def study(smoke: bool) -> xarray.Dataset:
     of_methods = sweep({"method": methods, "tol": tol, "threshold": threshold}, stabilization=free)
     # The rows are chosen when the mechanism is built: one threshold stands for all.
     rows = sweep({"tol": tol}, method=udk.Elimination(), stabilization=free)
-    maps = {name: of_methods.isel(method=k, drop=True) for k, name in enumerate(list(METHODS)[: len(methods)])}
+    maps = {name: of_methods.isel(pseudoinverse=k, drop=True) for k, name in enumerate(list(METHODS)[: len(methods)])}
     if not smoke:
         maps["SVD, projected"] = sweep({"tol": tol, "threshold": threshold}, method=svd)
     maps["11 rows"] = rows.expand_dims(threshold=list(thresholds), axis=1)

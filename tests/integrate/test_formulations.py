@@ -182,20 +182,13 @@ def test_twenty_seconds(formulation, angle, rate):
     assert jnp.abs(udk.violation(mech, sol)).max() < 1e-12
 
 
-@pytest.mark.slow
 @starts
-def test_plain_LU_gets_stuck_where_it_begins(angle, rate):
-    """The pivot of the redundant row is a rounding error, zero or not, so steps shrink to nothing in the first instants.
-
-    Rounding decides: of starts that differ by it, one in twelve gets farther where no branches meet, to where it drifts or to the
-    end, and says so. None is wrong without a word.
-    """
+def test_plain_LU_ends_where_it_begins(angle, rate):
+    """The pivot of the redundant row is a rounding error, zero or not, at all starts that differ by rounding."""
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)
     random, q = np.random.default_rng(0), np.asarray(mech.q0)
     q = q + np.spacing(np.abs(q)) * random.choice([-1, 0, 1], (24, *q.shape))
     choices = {"rtol": 1e-9, "atol": 1e-9, "formulation": udk.Augmented(), "max_steps": 5000, "throw": False}
     sols = jax.jit(jax.vmap(lambda q: udk.simulate(mech, LONG, udk.State(q, mech.v0), **choices)))(q)
-    stuck = np.isin(sols.code, (udk.Result.step_limit, udk.Result.step_too_small, udk.Result.not_finite)) & (sols.time < 0.2)
-    assert stuck.mean() >= (0.75 if angle == -50 else 1.0)
-    for k in np.flatnonzero(sols.code == udk.Result.successful):
-        assert np.abs(exact(mech, jax.tree.map(lambda x, k=k: x[k], sols)) - sols.q[k]).max() < 2e-6
+    assert np.all(sols.code == udk.Result.not_finite) and not np.any(sols.time)
+    assert not np.any(sols.stats["steps"]) and not np.any(sols.stats["accepted"])

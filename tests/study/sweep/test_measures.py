@@ -85,7 +85,7 @@ def test_measures_by_name_are_what_one_would_compute():
         rtol=1e-5,
         atol=1e-5,
         progress=False,
-    ).isel(method=0)
+    ).isel(pseudoinverse=0)
     for k, stabilization in enumerate(axes["stabilization"]):
         # In lanes, as members of the sweep: a single run rounds otherwise. A step's length follows from the error estimate of the
         # step before, a small difference of rounded numbers, so that steps end 4e-9 earlier or later; where the interpolated

@@ -18,14 +18,14 @@ def test_it_has_all_runs_and_each_is_what_it_is_alone(tmp_path):
     example: Any = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
     data = example.table(0.5, tmp_path, progress=False)
-    assert {dim: data.sizes[dim] for dim in ("method", "tol", "stabilization", "time")} == {
-        "method": 5,
+    assert {dim: data.sizes[dim] for dim in ("pseudoinverse", "tol", "stabilization", "time")} == {
+        "pseudoinverse": 5,
         "tol": 3,
         "stabilization": 2,
         "time": 401,
     }
     assert (data.result == 0).all() and (data["rank"] == 11).all()
-    assert (data.angle_error.max(("method", "stabilization")) < 10 * data.tol).all()
+    assert (data.angle_error.max(("pseudoinverse", "stabilization")) < 10 * data.tol).all()
     mech, ts = udk.library.parallelogram(), np.linspace(0.0, 0.5, 401)
     for gains, method, tol in ((0, 4, 1e-6), (1, 0, 1e-8)):
         alone = udk.simulate(

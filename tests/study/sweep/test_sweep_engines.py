@@ -180,6 +180,6 @@ def test_methods_gains_tolerances_and_thresholds_are_one_program(compilations):
     assert np.all(data.result == 0)
     for k, method in enumerate(methods):
         alone = udk.simulate(linkage, ts, None, 1e-9, 1e-9, replace(method, rank_tol=1e-2), udk.Baumgarte(5.0, 5.0))
-        member = data.isel({"method": k, "gain": 1, "tol": 1, "threshold": 1})
+        member = data.isel({"pseudoinverse": k, "gain": 1, "tol": 1, "threshold": 1})
         assert_allclose(member.q_end, alone.q[-1], rtol=0, atol=1e-9)
         assert int(member.steps) == int(alone.stats["steps"])

@@ -1,18 +1,27 @@
-"""D^(-1) of a square matrix by LU with partial pivoting; NaN or dominated by rounding if D is singular."""
+"""D^(-1) of a square matrix by LU with partial pivoting; dominated by rounding if D is singular, or NaN if this is checked."""
 
 from dataclasses import dataclass
 
-from udkjax.native.base.ir import Value
+import numpy as np
+
+from udkjax.native.base.ir import Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import reversed_each
 
 
 @dataclass(frozen=True)
 class LUCode(DenseMethod):
-    """P D = L U: rows of `upper` are the pivot rows when chosen; row k of `lower` holds the multipliers of step k."""
+    """P D = L U: rows of `upper` are the pivot rows when chosen; row k of `lower` holds the multipliers of step k.
+
+    If `refuses_singular`, a pivot that is a rounding error of the other entries in its column of U counts as zero, and the
+    solution is NaN: see `udkjax.equations.formulations.solve_regular`.
+    """
+
+    refuses_singular: bool = False
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
-        return {
+        largest = {"largest": (1, m)} if self.refuses_singular else {}
+        return largest | {
             "upper": (m, n),
             "lower": (m, m),
             "inverse": (1, m),
@@ -26,6 +35,8 @@ class LUCode(DenseMethod):
         in_register = max(d.vector // f.width, 1)  # columns
         with f.each(d.m) as i:
             unused.put(i, d.wide(1.0))
+        if self.refuses_singular:
+            d.row("largest").clear()
         with f.each(d.m) as k:
             best, pivot = f.variable(-1.0), f.variable(0.0)
             with f.each(d.m) as i:
@@ -36,7 +47,7 @@ class LUCode(DenseMethod):
             upper, lower = d.row("upper", k), d.row("lower", k)
             d.gather("D", d.whole(pivot.value), upper)
             inverse = 1.0 / upper.entry(k)
-            d.row("inverse").put(k, inverse)
+            d.row("inverse").put(k, self._unless_singular(d, k, best.value, inverse) if self.refuses_singular else inverse)
             d.row("order").put(k, pivot.value)
             with f.each(d.m) as i:
                 row = d.row("D", i)
@@ -48,6 +59,16 @@ class LUCode(DenseMethod):
                     wide = d.spread(-factor)
                     with f.each(row.registers, f.arithmetic("div", k, in_register)) as r:
                         row[r] = f.fma(wide, upper[r], row[r])
+
+    def _unless_singular(self, d: DenseMatrices, k: Value, size: Value, inverse: Value) -> Value:
+        """Return the inverse of pivot k, or NaN; `largest` holds the largest entries of the columns of U so far."""
+        f, upper, largest = d.f, d.row("upper", k), d.row("largest")
+
+        def include(r: Operand):
+            largest[r] = f.max(f.abs(upper[r]), largest[r])
+
+        d.over_registers(largest.registers, include)
+        return f.select(size > largest.entry(k) * (d.m * float(np.finfo(float).eps)), inverse, float("nan"))
 
     def solve(self, d: DenseMatrices):
         f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")

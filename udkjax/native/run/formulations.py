@@ -242,7 +242,7 @@ def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
         return NullSpaceCode(isinstance(formulation, NullSpaceSVD))
     if not isinstance(formulation, Augmented):
         return None
-    method = LUCode(relative=True) if formulation.method is None else dense_method(formulation.method)
+    method = LUCode(relative=True, refuses_singular=True) if formulation.method is None else dense_method(formulation.method)
     return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one method number
 
 

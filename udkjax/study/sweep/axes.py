@@ -8,7 +8,7 @@ among which machine code selects by number.
 
 import abc
 import warnings
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, Protocol, TypeAlias, cast
@@ -140,11 +140,12 @@ class Dimension:
     columns: tuple[AxisColumn, ...]
 
 
-def labels_of(setting: str, choices: Sequence[AxisChoice]) -> tuple[str, ...]:
-    """Return readable, unique names of choices: the types, with numbers if types are equal."""
+def labels_of(setting: str, choices: Sequence[AxisChoice], replaced: Collection[str] = ()) -> tuple[str, ...]:
+    """Return readable, unique names of choices: the types, with numbers, except `replaced` ones, if types are equal."""
     plain = [_short_label(setting, choice) for choice in choices]
     names = [
-        name if plain.count(name) == 1 else _label_with_numbers(name, choice) for name, choice in zip(plain, choices, strict=True)
+        name if plain.count(name) == 1 else _label_with_numbers(name, choice, replaced)
+        for name, choice in zip(plain, choices, strict=True)
     ]
     return tuple(name if name not in names[:k] else f"{name} #{names[:k].count(name) + 1}" for k, name in enumerate(names))
 
@@ -155,9 +156,10 @@ def _short_label(setting: str, choice: AxisChoice) -> str:
     return choice.name if isinstance(choice, Mechanism) else str(choice) if isinstance(choice, int) else type(choice).__name__
 
 
-def _label_with_numbers(name: str, choice: AxisChoice) -> str:
-    """Return the name of a choice with its scalar fields."""
-    numbers = {key: value for key, value in getattr(choice, "__dict__", {}).items() if eqx.is_array(value) and value.ndim == 0}
+def _label_with_numbers(name: str, choice: AxisChoice, replaced: Collection[str]) -> str:
+    """Return the name of a choice with its scalar fields, except those that other axes replace."""
+    fields = {key: value for key, value in getattr(choice, "__dict__", {}).items() if key not in replaced}
+    numbers = {key: value for key, value in fields.items() if eqx.is_array(value) and value.ndim == 0}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name
 
 

@@ -13,10 +13,11 @@ from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.units import units_of
 from udkjax.study.sweep.axes import AxisColumn, Dimension
-from udkjax.study.sweep.dimensions import SweepError
+from udkjax.study.sweep.dimensions import NUMBERS_OF, RENAMED, SweepError
 from udkjax.study.sweep.groups import END, RESULT, STEPS, group_run
 from udkjax.study.sweep.measures import Label, guess_label
 from udkjax.study.sweep.plan import Group, StoredVariable, SweepPlan
+from udkjax.wording import quote, suggestion
 
 if TYPE_CHECKING:
     import xarray
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 # Values, or dimensions, values and attributes, as accepted by xarray.
 Labelled: TypeAlias = "np.ndarray | list[str] | tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]"
 FORMAT = "udkjax sweep 1"
-NUMBERS_OF = {"stabilization": {"alpha", "beta"}, "method": {"rank_tol", "branch_tol"}}  # numbers of settings that may be axes
 LABELS = {
     RESULT: Label((), "1", "result of the run"),
     END: Label((), "s", "time reached by the run"),
@@ -48,7 +48,7 @@ def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
                 f"derivative of {variable} by {by}",
             )
         else:
-            label = labels.get(name) or guess_label(name, info.shape, len(plan.ts), bodies)
+            label = labels.get(name) or guess_label(name, info.shape, len(plan.ts), bodies, plan.units.get(name, ""))
         variables[name] = StoredVariable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
     return variables
 
@@ -75,6 +75,9 @@ def variables_of(plan: SweepPlan) -> Mapping[str, StoredVariable]:
             longest = map(max, other.shape, variable.shape)
             shape = tuple(len(plan.bodies) if d == "body" else size for d, size in zip(variable.dims, longest, strict=True))
             found[name] = StoredVariable(other.dims, shape, other.dtype, other.units, other.long_name)
+    own = found.keys() - LABELS.keys() - {name for measure in plan.measures for name in measure.labels}
+    if unknown := [name for name in plan.units if name not in own]:
+        raise SweepError([f"units: no measure of your own stores {quote(name)}{suggestion(name, own)}" for name in unknown])
     return found
 
 
@@ -103,6 +106,9 @@ def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Map
         for name, v in variables.items()
     }
     data = xarray.Dataset(found, coords=_coordinates(plan))
+    for setting, dimension in RENAMED.items():
+        if data.sizes.keys() >= {dimension} and setting in data.coords:
+            data = data.set_xindex(setting)  # allows data.sel({"method": "SVD"})
     data[RESULT].attrs |= {
         "flag_values": np.array([NOT_COMPUTED, *Result], np.int8),
         "flag_meanings": " ".join(["not_computed", *(result.name for result in Result)]),
@@ -162,7 +168,8 @@ def _coordinate(dimension: Dimension, column: AxisColumn) -> dict[str, Labelled]
         attributes["of"] = ", ".join(column.of)
     values = column.coordinate
     if values.ndim == 1:
-        return {column.name: (dimension.name, values, attributes)}
+        names = {dimension.name, column.name} if dimension.name == RENAMED.get(column.name) else {column.name}
+        return dict.fromkeys(names, (dimension.name, values, attributes))
     dims = (dimension.name, *(f"{column.name}_{k}" for k in range(1, values.ndim)))
     return {dimension.name: np.arange(dimension.size), f"{column.name}_value": (dims, values, attributes)}
 
@@ -199,6 +206,6 @@ def _shown(plan: SweepPlan, setting: str, value: PyTree) -> str:
     if value is None:
         return "none"
     for column in plan.columns:
-        for name in () if callable(column.of) else set(column.of) & NUMBERS_OF.get(setting, set()):
+        for name in () if callable(column.of) else set(column.of) & set(NUMBERS_OF.get(setting, ())):
             value = eqx.tree_at(lambda x, name=name: getattr(x, name), value, _AxisName(column.name), is_leaf=lambda x: x is None)
     return " ".join(str(value).split())

@@ -2,13 +2,13 @@
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
-from types import UnionType
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, TypeAlias, cast
 
 import jax
 import numpy as np
 
-from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.simulate import simulate
 from udkjax.pinv import Auto
 from udkjax.positions.assembly import State
@@ -34,8 +34,13 @@ from udkjax.wording import abbreviate, quote, suggestion
 
 Settings: TypeAlias = Mapping[str, Any]  # further arguments of `simulate`
 MEMBER = "member"  # the dimension of a design
+NUMBERS_OF = {"stabilization": ("alpha", "beta"), "method": ("rank_tol", "branch_tol")}  # numbers of settings that may be axes
+_SETTING_OF_NUMBER = {name: setting for setting, names in NUMBERS_OF.items() for name in names}
 # Dimensions and variables of the dataset, whose names a dimension of the sweep cannot have.
 TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
+# Arguments of `sel`, `isel` and `interp` of xarray: `data.sel(method="SVD")` would not select anything, without an error.
+XARRAY_ARGUMENTS = ("method", "tolerance", "drop", "indexers", "missing_dims", "coords", "assume_sorted", "kwargs")
+RENAMED = {"method": "pseudoinverse"}  # dimensions of settings whose names xarray has taken
 
 
 class SweepError(Mistakes):
@@ -47,6 +52,21 @@ class SweepError(Mistakes):
     """
 
     subject = "sweep"
+
+
+@contextmanager
+def refuse_untraceable(subject: str) -> Iterator[None]:
+    """Raise a `SweepError` with the cure if JAX cannot trace a user's function, which `subject` names."""
+    try:
+        yield
+    except (
+        jax.errors.TracerArrayConversionError,
+        jax.errors.TracerIntegerConversionError,
+        jax.errors.ConcretizationTypeError,
+        jax.errors.NonConcreteBooleanIndexError,
+    ):
+        cure = "write it in jax.numpy, without numpy, float() or `if` on computed values: members are computed in a batch"
+        raise SweepError([f"{subject}: {cure}"]) from None
 
 
 def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepDesign | None = None) -> tuple[Dimension, ...]:
@@ -77,14 +97,28 @@ def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepD
             problems.append(
                 f"axis {quote(name)}: the dataset has a dimension or variable of this name; choose another, with of=..."
             )
+        dimension = RENAMED.get(name, name) if [column.of for column in columns] == [(name,)] else name
+        if dimension in XARRAY_ARGUMENTS:
+            problems.append(
+                f"axis {quote(name)}: data.sel({name}=...) of xarray has another meaning; choose another name, with of=..."
+            )
+        if dimension != name and dimension in axes:
+            problems.append(f"axis {quote(dimension)}: the dimension of {quote(name)} has this name; choose another, with of=...")
         if columns:
-            dimensions.append(Dimension(name, len(columns[0].values), columns))
+            dimensions.append(Dimension(dimension, len(columns[0].values), columns))
     problems += _clashes(dimensions)
     if not axes:
         problems.append("axes: a sweep needs at least one")
     if problems:
         raise SweepError(problems)
-    return tuple(dimensions)
+    replaced = {target for d in dimensions for column in d.columns if not callable(column.of) for target in column.of}
+    return tuple(replace(d, columns=tuple(_relabelled(column, replaced) for column in d.columns)) for d in dimensions)
+
+
+def _relabelled(column: AxisColumn, replaced: set[str]) -> AxisColumn:
+    """Return an axis whose labels do not show the numbers that other axes replace."""
+    numbers = replaced & set(NUMBERS_OF.get(column.setting, ())) if column.is_choice else set()
+    return replace(column, labels=labels_of(column.setting, column.choices, numbers)) if numbers else column
 
 
 def _is_range(given: "Axis | Values") -> bool:
@@ -115,7 +149,8 @@ def _column(
     if not callable(of) and any(target in CHOICES for target in of):
         return _choices(name, of, values, problems)
     numbers = _numbers(values)
-    if numbers is None or not np.all(np.isfinite(numbers)):
+    may_be_nan = not callable(of) and all(target in _SETTING_OF_NUMBER for target in of)  # for members that do not use it
+    if numbers is None or not np.all(np.isfinite(numbers) | (may_be_nan & np.isnan(numbers))):
         problems.append(f"axis {quote(name)}: must be finite numbers, one entry per value, is {abbreviate(values)}")
         return None
     if not callable(of):
@@ -179,8 +214,8 @@ def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.nda
     for target in of:
         if target in NUMBERS and numbers.ndim != 1:
             yield f"axis {quote(name)}: {target} is a number, so its values are a list of numbers, not of shape {numbers.shape}"
-        elif target in NUMBERS and np.min(numbers) < 0:
-            yield f"axis {quote(name)}: {target} must not be negative, is {np.min(numbers):g}"
+        elif target in NUMBERS and np.any(numbers < 0):
+            yield f"axis {quote(name)}: {target} must not be negative, is {np.nanmin(numbers):g}"
 
 
 def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
@@ -198,7 +233,7 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
 
 
 def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
-    """Return the mistakes in axes of settings: invalid values, settings given twice, and gains that the choices do not have."""
+    """Return the mistakes in axes of settings: invalid values, settings given twice, and numbers that no member uses."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
@@ -208,15 +243,24 @@ def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settin
             wrong = argument_problems(simulate, {"mechanism": mechanism, target: value})
             problems += [f"axis {quote(column.name)}: {text}" for text in wrong]
 
-    def all_are(setting: str, kind: type | UnionType, wanted: str, cure: str) -> Iterator[str]:
-        choices = targets[setting].values if setting in targets else (settings.get(setting),)
-        if wanted in targets and not all(isinstance(choice, kind) for choice in choices):
-            yield f"axis {quote(targets[wanted].name)}: {wanted} belongs to {cure}, which not all members have"
-
-    for gain in ("alpha", "beta"):
-        problems += all_are("stabilization", Baumgarte, gain, "stabilization=Baumgarte()")
-    problems += all_are("method", Auto | type(None), "branch_tol", "method=Auto()")
+    for wanted in [target for target in targets if target in _SETTING_OF_NUMBER]:
+        setting, column = _SETTING_OF_NUMBER[wanted], targets[wanted]
+        choices = targets[setting].choices if setting in targets else (settings.get(setting),)
+        is_used = np.array([uses_number(setting, choice, wanted) for choice in choices])
+        if not is_used.any():
+            owner = "stabilization=Baumgarte()" if setting == "stabilization" else "method=Auto()"
+            problems.append(f"axis {quote(column.name)}: {wanted} belongs to {owner}, which no member has")
+            continue
+        is_zipped = any({wanted, setting} <= {t for c in d.columns if not callable(c.of) for t in c.of} for d in dimensions)
+        if np.any(np.isnan(column.numbers) & (is_used if is_zipped else True)):
+            cure = "NaN is for members without it" if is_zipped else "Zipped with the choices, it may be NaN for those without it"
+            problems.append(f"axis {quote(column.name)}: {wanted} must be finite numbers; {cure}")
     return problems
+
+
+def uses_number(setting: str, choice: AxisChoice, name: str) -> bool:
+    """Return True if a choice of a setting has this number, as `Baumgarte` has gains and `Auto`, the default, a `branch_tol`."""
+    return hasattr(Auto() if setting == "method" and choice is None else choice, name)
 
 
 def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:

@@ -14,7 +14,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result, versions
 from udkjax.study.members import concurrent_chunks
-from udkjax.study.sweep.groups import RESULT, GroupRun, group_run
+from udkjax.study.sweep.groups import RESULT, STEPS, GroupRun, group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 from udkjax.threads import thread_count
 
@@ -43,7 +43,9 @@ def run(plan: SweepPlan, chunk: Chunk) -> Done:
         for rows, which in other_redundant_rows(group, chunk.members, stored[RESULT]).items():
             for name, values in group_run(plan, chunk.group, rows).compute(chunk.members[which]).items():
                 stored[name][which] = values
-    return chunk, stored, time.perf_counter() - begun
+    seconds, steps = time.perf_counter() - begun, stored[STEPS].astype(float)
+    share = steps / steps.sum() if steps.any() else np.full(len(steps), 1 / len(steps))
+    return chunk, stored | dict.fromkeys(group.seconds, seconds * share), seconds
 
 
 def other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:

@@ -26,7 +26,10 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import NUMBERS
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Outputs, Program
 from udkjax.study.quantities import parameter_value
+from udkjax.study.sweep.dimensions import NUMBERS_OF, refuse_untraceable, uses_number
+from udkjax.study.sweep.measures import SECONDS
 from udkjax.study.sweep.plan import SweepPlan, stack_choices
+from udkjax.wording import quote
 
 RESULT, END, STEPS = "result", "end_time", "steps"  # variables stored for every member
 LANE_WIDTH = 8  # number of members in the widest vector unit; the size of a piece is a multiple of it
@@ -69,6 +72,7 @@ class GroupRun:
         group = plan.groups[index]
         self.plan, self.members = plan, group.members
         self.names = tuple(plan.derivatives)
+        self.seconds = tuple(name for measure in plan.measures if measure.name == SECONDS for name in measure.labels)
         self.numbers = tuple(column for column in plan.columns if not column.is_choice)
         fixed: dict[str, PyTree] = {"mechanism": plan.mechanism, **plan.settings}
         fixed |= {name: number(value) for name, value in plan.settings.items() if name in NUMBERS and value is not None}
@@ -130,7 +134,8 @@ class GroupRun:
         for column in self.numbers:
             x = own.axes[column.name] + shift.get(column.name, 0.0)
             if callable(column.of):
-                mechanism, values = column.of(mechanism.with_parameters(values), x), {}
+                with refuse_untraceable(f"axis {quote(column.name)}"):
+                    mechanism, values = column.of(mechanism.with_parameters(values), x), {}
                 if not isinstance(mechanism, Mechanism):
                     raise TypeError(
                         f"axis {column.name!r}: its function must return a Mechanism, not a {type(mechanism).__name__}"
@@ -155,12 +160,11 @@ class GroupRun:
         if "t1" in numbers:
             fractions = (ts - ts[0]) / (ts[-1] - ts[0])
             ts = ts[0] + (numbers.pop("t1") - ts[0]) * fractions
-        for gain in ("alpha", "beta"):
-            if gain in numbers:
-                values["stabilization"] = _with(values["stabilization"], gain, numbers.pop(gain))
-        for tol in ("rank_tol", "branch_tol"):
-            if tol in numbers:
-                values["method"] = _with(values.get("method") or Auto(), tol, numbers.pop(tol))
+        for setting, names in NUMBERS_OF.items():
+            for name in names:
+                if name in numbers and uses_number(setting, choice := values.get(setting), name):
+                    values[setting] = _with(Auto() if choice is None else choice, name, numbers[name])
+                numbers.pop(name, None)
         return values | numbers | {"ts": ts}
 
     def __call__(self, shared: Shared, own: Own, shifts: Array) -> Outputs:
@@ -195,7 +199,7 @@ class GroupRun:
 
     def _names_of_slopes(self, slopes: Mapping[str, object]) -> dict[str, tuple[str, int]]:
         """Return, for each derivative, its variable and the index of the name to differentiate by."""
-        return {f"d_{of}_d_{by}": (of, k) for of in slopes if of != END for k, by in enumerate(self.names)}
+        return {f"d_{of}_d_{by}": (of, k) for of in slopes if of not in (END, *self.seconds) for k, by in enumerate(self.names)}
 
     def _closure(self, shared: Shared, own: Own, mechanism: Mechanism) -> Closure | None:
         if shared.closure is not None or not self.assembled:

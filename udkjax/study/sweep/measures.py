@@ -19,7 +19,7 @@ from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.positions.channels import Channel, channel_of
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure as evaluate_channels
-from udkjax.study.sweep.dimensions import SweepError
+from udkjax.study.sweep.dimensions import refuse_untraceable
 from udkjax.wording import quote, suggestion
 
 UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, NumberLike]])
@@ -28,6 +28,7 @@ MeasureChoice = TypeAliasType("MeasureChoice", OneMeasure | Sequence[OneMeasure]
 # Coordinates (T, bodies, 3) to compare runs with, or a function of (mechanism, ts) that returns them.
 Reference = TypeAliasType("Reference", Solution | Numbers | Callable[[Mechanism, Array], Numbers] | None)
 
+SECONDS = "seconds"  # name of the measure whose values are written after a chunk has been computed
 RANK_NOT_REACHED = -1  # rank at output times that a run did not reach
 
 
@@ -81,14 +82,14 @@ class Measure:
 NAMELESS = "lambda"  # name of an anonymous function
 
 
-def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int) -> Label:
+def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int, units: str = "") -> Label:
     """Label the result of a user-defined function by its shape."""
     dims = [f"{name}_{k}" for k in range(len(shape))]
     if shape[-2:] == (bodies, 3):
         dims[-2:] = "body", "coordinate"
     if shape and shape[0] == outputs and dims[0] != "body":
         dims[0] = "time"
-    return Label(tuple(dims), "", "")
+    return Label(tuple(dims), units, "")
 
 
 def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mechanism: Mechanism) -> tuple[Measure, ...]:
@@ -138,11 +139,8 @@ def _evaluate_channel(channel: Channel, run: MeasuredRun) -> dict[str, Array]:
 
 def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array]:
     """Call a user-defined function; the measure's name, if any, is the name of a single array, or a prefix of several names."""
-    try:
+    with refuse_untraceable(f"measure {quote(name)}"):
         outputs = function(run.mechanism, run.solution)
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
-        cure = "write it in jax.numpy, without numpy, float() or `if` on computed values: members are computed in a batch"
-        raise SweepError([f"measure {quote(name)}: {cure}"]) from None
     if isinstance(outputs, Mapping):
         front = "" if name == NAMELESS else f"{name}_"
         return {f"{front}{key}": jnp.asarray(value) for key, value in outputs.items()}
@@ -221,7 +219,8 @@ def _energy_drift(run: MeasuredRun) -> dict[str, Array]:
     angle_error=Label((), "rad", "largest error of an angle"),
 )
 def _error(run: MeasuredRun) -> dict[str, Array]:
-    reference = run.reference(run.mechanism, run.solution.ts) if callable(run.reference) else run.reference
+    with refuse_untraceable("reference"):
+        reference = run.reference(run.mechanism, run.solution.ts) if callable(run.reference) else run.reference
     error = run.solution.q - jnp.asarray(getattr(reference, "q", reference))
     return {"position_error": _largest(error[..., :2]), "angle_error": _largest(error[..., 2])}
 
@@ -236,6 +235,11 @@ def _error(run: MeasuredRun) -> dict[str, Array]:
 )
 def _counts(run: MeasuredRun) -> dict[str, Array]:
     return {name: run.solution.stats[name] for name in MEASURES["counts"].labels}
+
+
+@_named(SECONDS, along=False, seconds=Label((), "s", "computing time: the member's share, by steps, of that of its chunk"))
+def _seconds(run: MeasuredRun) -> dict[str, Array]:
+    return {SECONDS: jnp.array(jnp.nan)}  # measured outside the program
 
 
 @_named("rank", rank=Label(("time",), "1", "rank of D by the method's own rule; -1: not reached"))

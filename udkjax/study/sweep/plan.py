@@ -4,6 +4,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -67,6 +68,7 @@ class SweepPlan:
     measures: tuple[Measure, ...]
     derivatives: tuple[str, ...] = ()
     design: SweepDesign | None = None
+    units: Mapping[str, str] = field(default_factory=dict)  # of variables of user-defined measures
     token: str = field(default_factory=lambda: uuid.uuid4().hex)  # equal in all copies, which therefore share compiled code
 
     def __hash__(self) -> int:
@@ -162,6 +164,7 @@ def make_plan(
     design: SweepDesign | None = None,
     reference: Reference = None,
     derivatives: Sequence[str] = (),
+    units: Mapping[str, str] = MappingProxyType({}),
     **settings: Any,
 ) -> SweepPlan:
     """Make the plan of a sweep; arguments as for `udkjax.sweep`.
@@ -198,7 +201,7 @@ def make_plan(
     if problems:
         raise SweepError(problems)
     stored = ts if any(measure.along for measure in measures) else ts[[0, -1]]
-    return SweepPlan(mechanism, dimensions, stored, settings, measures, tuple(derivatives), design)
+    return SweepPlan(mechanism, dimensions, stored, settings, measures, tuple(derivatives), design, dict(units))
 
 
 def _number_structures(values: Sequence[AxisChoice]) -> np.ndarray:

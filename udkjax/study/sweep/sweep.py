@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import AxisValues, SweepDesign
 from udkjax.study.sweep.chunks import MEMORY, compute_members
-from udkjax.study.sweep.dataset import assemble
+from udkjax.study.sweep.dataset import assemble, variables_of
 from udkjax.study.sweep.executors import Executor, compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
 from udkjax.study.sweep.groups import RESULT
@@ -42,6 +43,7 @@ def sweep(
     design: SweepDesign | None = None,
     reference: Reference = None,
     derivatives: Sequence[str] = (),
+    units: Mapping[str, str] = MappingProxyType({}),
     engine: Engine = "auto",
     client: "distributed.Client | None" = None,
     out: str | os.PathLike[str] | None = None,
@@ -59,18 +61,22 @@ def sweep(
             `drift_tol`, `dt0`, `method`, `solver`, `stabilization`, `formulation`, `max_steps`, `state`), of an attribute of
             settings (`alpha` and `beta` of Baumgarte's stabilization, `rank_tol` and `branch_tol` of the method), `t1`, to which
             the output times are stretched, or `mechanism`, to compare mechanisms. `Axis(values, of=...)` allows another name of
-            an axis and may tie several quantities; `Zipped({...})` varies axes together.
+            an axis and may tie several quantities; `Zipped({...})` varies axes together. Numbers of
+            settings apply to the members that have them: "alpha" and "beta" to those with Baumgarte's stabilization. Zipped with
+            the choices, they may be NaN for the others.
         ts: output times (T,), s.
         measure: measures to store for each member; nothing else is stored. A measure is a name: "final" (q and v at the end),
             "states" (at all `ts`), "violation" (the largest, m or rad), "energy_drift" (J), "error" (the largest error of a
-            position and of an angle, against `reference`), "counts", "rank" (of D at all `ts`), or a channel, such as "pin.C.x"
-            (at all `ts`). It may also be a function of (mechanism, solution), in jax.numpy, that returns an array or a dict of
-            arrays. Several measures are given in a list, or a dict by name.
+            position and of an angle, against `reference`), "counts", "seconds" (computing time), "rank" (of D at all `ts`), or a
+            channel, such as "pin.C.x" (at all `ts`). Members are computed together: "seconds" is the time of a chunk, shared
+            among its members in proportion to their steps. A measure may also be a function of (mechanism, solution), in
+            jax.numpy, that returns an array or a dict of arrays. Several measures are given in a list, or a dict by name.
         design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are then ranges (low, high) or frozen
             distributions of scipy.stats, and all of them lie along the dimension "member".
         reference: for the measure "error": a Solution, coordinates (T, bodies, 3), or a function of (mechanism, ts).
         derivatives: names of parameters and axes: the dataset also has the derivatives of all stored variables by each of them,
             as `d_<variable>_d_<name>`, in forward mode.
+        units: units of the variables that functions store, by name, such as {"height": "m"}.
         engine: "dask": on the workers of a `client`; "devices": in this process; "auto": on a client if one is given.
         client: a client of dask.distributed; by default the most recent one.
         out: a folder for finished chunks; if the same sweep is run again, it continues from these.
@@ -80,8 +86,10 @@ def sweep(
         settings: further arguments of `simulate`, for all members.
 
     Returns:
-        A dataset along the axes. `result` is the result of each member, a number that its attributes explain. The
-        variables of failed members are NaN; no exception is raised for them.
+        A dataset along the axes. The dimension of an axis "method" is called "pseudoinverse", since `data.sel(method=...)` of
+        xarray does not select by it: write data.sel(pseudoinverse="SVD"), or data.sel({"method": "SVD"}). `result` is the result
+        of each member, a number that its attributes explain. The variables of failed members are NaN; no exception is raised for
+        them.
 
     Raises:
         SweepError: lists every mistake in the arguments.
@@ -89,7 +97,9 @@ def sweep(
         ClusterError: there is no client, or its workers cannot compute the sweep.
     """
     require("xarray")
-    plan = make_plan(mechanism, axes, ts, measure, design=design, reference=reference, derivatives=derivatives, **settings)
+    studied = {"design": design, "reference": reference, "derivatives": derivatives, "units": units}
+    plan = make_plan(mechanism, axes, ts, measure, **studied, **settings)
+    variables_of(plan)  # traces every program, and finds mistakes before anything is computed or stored
     compute = _engine(engine, client)
     with open_store(out, fingerprint(plan) if out is not None else {}) as store:
         done, codes = read_variable(store, RESULT)
