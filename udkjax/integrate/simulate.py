@@ -31,6 +31,7 @@ from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
 from udkjax.pinv import Pseudoinverse
 from udkjax.positions.assembly import AssemblyWarning, Closure, State, require_closed
 from udkjax.programs.deferred import deferred
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
@@ -157,7 +158,7 @@ def simulate(
             require_closed(mechanism, closure, start)  # before anything runs
 
     is_located, located = events is not None, None
-    if isinstance(mechanism, Mechanism) and any(force.may_have_kinks for force in mechanism.forces.values()):
+    if isinstance(mechanism, Mechanism) and _may_have_kinks(mechanism):
         from udkjax.integrate.events.kinks import kinks_of
 
         found = kinks_of(mechanism)
@@ -191,6 +192,11 @@ def simulate(
     if located is not None:
         return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
     return solution
+
+
+@cached_by_identity
+def _may_have_kinks(mechanism: Mechanism) -> bool:
+    return any(force.may_have_kinks for force in mechanism.forces.values())
 
 
 def _has_failed(solution: Solution) -> bool:
