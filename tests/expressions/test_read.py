@@ -34,6 +34,7 @@ FUNCTIONS = {
     "roots": lambda x, y: jnp.sqrt(1.0 + x * x) + lax.rsqrt(1.0 + y * y) + jnp.cbrt(y),
     "shapes": lambda x, y: jnp.concatenate([x[None], y.reshape(1, 3)], 0).T[::-1, 1:].ravel() * jnp.repeat(x[1:2], 3),
     "broadcasting": lambda x, y: x[:, None] * y[None, :] + jnp.ones((3, 1)),
+    "axes of length one": lambda x, y: jnp.where(lax.ge_p.bind(x[None, :1], y[None]), x, y),
     "constant indices": lambda x, y: x[jnp.array([2, 0, 0])] * y[np.array([1, 1, 2])],
     "known places": lambda x, y: x.at[1].set(y[0]).at[jnp.array([2, 0])].set(y[1:]),
     "a known slice": lambda x, y: lax.dynamic_update_slice(jnp.outer(x, x), y[None, 1:], (1, 0)),

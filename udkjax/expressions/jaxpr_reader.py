@@ -121,7 +121,7 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return [_elementwise(partial(_ARITHMETIC[name], **parameters), shape, inputs)]
     if name == "convert_element_type" and all(s.node.dtype == dtype for s in inputs[0].flat):
         return inputs
-    if name in _ELEMENTWISE and all(i.shape in ((), shape) for i in inputs):
+    if name in _ELEMENTWISE and np.broadcast_shapes(*(i.shape for i in inputs)) == shape:  # JAX repeats axes of length one
         return [_elementwise(partial(_apply, graph, equation, dtype), shape, inputs)]
     if name == "reduce_sum" and np.issubdtype(dtype, np.floating):
         zero: Any = graph.constant(0.0, dtype)
