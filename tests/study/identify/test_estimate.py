@@ -51,7 +51,9 @@ def estimate() -> Estimate:
     channels = [SimpleNamespace(name=f"y{k}", units="rad") for k in range(8)]
     index = np.array([[0, t, c] for t in range(5) for c in range(8)])
     problem: Any = SimpleNamespace(
-        unknowns=SimpleNamespace(guess=np.array([1.0, 2.0, 3.0, 4.0])),
+        unknowns=SimpleNamespace(
+            guess=np.array([1.0, 2.0, 3.0, 4.0]), kinds=["bounded"] * 4, low=np.zeros(4), high=np.full(4, 4.5)
+        ),
         all_names=(*names, "start: angle"),
         all_units=("kg", "kg", "m", "1", "rad"),
         channels=channels,
@@ -122,7 +124,7 @@ def test_the_text_says_how_the_fit_ended_and_what_the_noise_was(estimate):
         "estimated noise: " + ", ".join(f"y{k} 0.02 rad" for k in range(1, 7)) + " and y7 0.02 rad",
         "the fit has not converged: these are the best values found",
         "a & b",
-        "d is at one of its bounds",
+        "d is at its bound, 4.5; from below it is known to 2.5",
     ]
 
 

@@ -45,6 +45,14 @@ class Row(NamedTuple):
     note: str
 
 
+def _starting_at(mechanism: Mechanism, state: State) -> Mechanism:
+    """Return the mechanism with another initial guess."""
+    q, v = np.asarray(state.q), np.asarray(state.v)
+    fields = {"position": q[:, :2], "angle": q[:, 2], "velocity": v[:, :2], "angular_velocity": v[:, 2]}
+    names = mechanism.body_names
+    return mechanism.with_parameters({f"body.{body}.{name}": x[k] for k, body in enumerate(names) for name, x in fields.items()})
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
     """Identified values of parameters with their uncertainty. `print` shows a table.
@@ -53,7 +61,8 @@ class Estimate:
         names: names of the P parameters; `units` are their units.
         values: identified values, in these units.
         uncertainty: standard errors, correlations, and undetermined directions.
-        at_bounds: parameters that are at one of their bounds.
+        at_bounds: parameters that are at one of their bounds, or at zero if they cannot be negative; their standard errors are
+            for changes away from the bound.
         initial_state_values: correction and standard error of each unknown of an initial state.
         predicted, residuals, noise: for each record, by channel, at its times (T,): predicted values; measured minus predicted;
             and standard deviations, given or estimated.
@@ -93,9 +102,16 @@ class Estimate:
     loss: Loss
 
     @cached_property
-    def mechanism(self) -> Mechanism:
-        """The mechanism with the identified values."""
+    def _with_values(self) -> Mechanism:
         return apply_values(self.problem.mechanism, self.problem.unknowns.targets, jnp.asarray(self.values))
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """The mechanism with the identified values; its initial guess is the initial state of the first record."""
+        start = self.problem.records[0].start
+        if start.estimate == "nothing" and start.state is None:
+            return self._with_values
+        return _starting_at(self._with_values, self.initial_states[0])
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -110,7 +126,7 @@ class Estimate:
     @cached_property
     def initial_states(self) -> tuple[State, ...]:
         """The closed initial states of the records."""
-        return self.problem.first_states(self.mechanism, self.z)
+        return self.problem.first_states(self._with_values, self.z)
 
     @property
     def success(self) -> bool:
@@ -123,12 +139,20 @@ class Estimate:
         prefixes = label_prefixes(self.problem.records)
         lines = [] if self.converged else ["the fit has not converged: these are the best values found"]
         lines += self.uncertainty.messages
-        lines += [f"{name} is at one of its bounds" for name in self.at_bounds]
+        lines += [self._bound_sentence(self.names.index(name)) for name in self.at_bounds]
         lines += outlier_sentences(self.problem, self.outliers, self.loss is not squares)
         lines += [found.text(prefixes[k] + channel) for (k, channel), found in self.whiteness.items() if not found.white]
         if self.guesses > 1 and self.agreeing == 1 and not all(found.white for found in self.whiteness.values()):
             lines.append(f"only one of {self.guesses} first guesses led to this fit: there may be a better minimum")
         return "\n".join(lines) or "the records determine every parameter"
+
+    def _bound_sentence(self, k: int) -> str:
+        unknowns, error = self.problem.unknowns, self.uncertainty.standard_errors[k]
+        low, high = (0.0, np.inf) if unknowns.kinds[k] == "positive" else (unknowns.low[k], unknowns.high[k])
+        unit = "" if self.units[k] in ("", "1") else f" {self.units[k]}"
+        is_low = self.values[k] - low <= high - self.values[k]
+        known = f"; from {'above' if is_low else 'below'} it is known to {error:.2g}{unit}"
+        return f"{self.names[k]} is at its bound, {low if is_low else high:g}{known if np.isfinite(error) else ''}"
 
     def profile(self, name: str, level: float = CONFIDENCE) -> ProfileLikelihood:
         """Compute the profile likelihood of a parameter: its confidence interval without a linear model.

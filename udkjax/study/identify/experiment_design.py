@@ -20,11 +20,12 @@ from udkjax.printing import PrintedTable, prints_table
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, build_problem
+from udkjax.study.identify.fit_problem import FitProblem, build_problem
 from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import MEDIUM_TOL, TolerancePair
 from udkjax.study.identify.records import ChannelKey, IdentificationError, Noise, Record, Start
 from udkjax.study.identify.uncertainty import SMALLEST_PART
+from udkjax.study.identify.unknowns import INVISIBLE_RATIO
 from udkjax.wording import suggestion
 
 Criterion = Literal["D", "A", "E"]

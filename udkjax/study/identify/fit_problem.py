@@ -31,10 +31,6 @@ from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_stat
 from udkjax.wording import suggestion
 
 STILL_DEVIATION = 1e-12  # standard deviation below which a channel is constant, relative to its largest number
-# Singular values below this, relative to the largest of a Jacobian, belong to directions that measurements do not determine. A
-# change that does not affect the equations of motion has 1e-16, at any tolerance; derivatives integrated at 1e-7 have errors of
-# 1e-8.
-INVISIBLE_RATIO = 1e-8
 RESIDUALS_PER_UNKNOWN = 3.0  # least number in the first fitted part of a record, and in a piece; fewer would fit the noise
 # Arguments of `simulate` that `identify` sets itself.
 DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress", "analysis")

@@ -23,6 +23,7 @@ from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem,
 from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, CostHistory, Fit
 from udkjax.study.identify.optimizer import Minimizer, huber, robust
 from udkjax.study.identify.prediction import TolerancePair
+from udkjax.study.identify.unknowns import Unknowns
 from udkjax.study.noise import noise_of_differences
 
 GUESS_SPREAD = 1.0  # standard deviation of an unknown around its guess; a factor of e for positive parameters
@@ -52,6 +53,11 @@ class RegularizedProblem:
     problem: FitProblem
     guess: Float[np.ndarray, "K"]
     noise: Float[np.ndarray, "R"]
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """The parameters."""
+        return self.problem.unknowns
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian, as `FitProblem.evaluate` does, with outliers weighted by Huber's loss."""

@@ -13,7 +13,7 @@ from udkjax.progress import ProgressOption, report_progress
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, FitProblem, Residuals, Strategy, build_problem
+from udkjax.study.identify.fit_problem import FitProblem, Residuals, Strategy, build_problem
 from udkjax.study.identify.least_squares import CostHistory, Fit
 from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
 from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
@@ -23,6 +23,7 @@ from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
+from udkjax.study.identify.unknowns import INVISIBLE_RATIO
 from udkjax.study.noise import Whiteness, whiteness_of
 
 MOST_REWEIGHTINGS = 2  # number of further fits, each weighted by the residuals of the previous one
@@ -188,6 +189,11 @@ def _estimate_of(
         (*unknowns.kinds, *["free"] * (problem.K - P)),
     )
     J, r = weighted.J[0][inliers], weighted.r[0][inliers]
+    if (stuck := unknowns.stuck_at_bounds(z, r, J)).any():
+        # dr/dz vanishes at a bound; dr/dx, from within, does not.
+        scale = np.append(unknowns.range_scale, problem.state_sizes)
+        J = J * np.where(stuck, scale / values.dx_dz, 1.0)
+        values = values._replace(dx_dz=np.where(stuck, scale, values.dx_dz))
     uncertainty = estimate_uncertainty(J, r, values, groups[inliers], P, len(problem.priors))
     scale = np.append(uncertainty.noise, 1.0)[groups]
     projection = np.zeros((len(inliers), uncertainty.projection.shape[1]))
@@ -216,7 +222,7 @@ def _estimate_of(
         units=unknowns.units,
         values=x,
         uncertainty=uncertainty,
-        at_bounds=unknowns.at_bounds(x),
+        at_bounds=tuple(name for k, name in enumerate(unknowns.names) if stuck[k] or name in unknowns.at_bounds(x)),
         initial_state_values=dict(zip(names, zip(states.tolist(), uncertainty.state_errors.tolist(), strict=True), strict=False)),
         predicted=problem.by_record(problem.y[problem.present] - residual),
         residuals=problem.by_record(residual),

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import lstsq
 
-from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
-from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN
+from udkjax.study.identify.fit_problem import Residuals
+from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN, INVISIBLE_RATIO
 
 # Gauss-Newton steps (largest change of a dimensionless unknown) at which a fit has converged: for a part of the records; with
 # loose integration; with costs exact to the square of the step; and for the final fit, where smaller steps have no visible
@@ -31,6 +31,7 @@ MOST_REFUSED_STEPS = 8  # number of successive rejected steps after which a fit 
 ROUNDING = 4 * float(np.finfo(float).eps)  # steps below this, relative to the unknowns, are rounding errors
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
+Stuck: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # `Unknowns.stuck_at_bounds`
 ReportStep: TypeAlias = Callable[[str], None]  # called with a message after each step
 CostHistory: TypeAlias = list[tuple[float, float]]  # cost after each step, and largest change of an unknown in the next step
 
@@ -50,11 +51,16 @@ def minimize_squares(
     steps: int = STEPS,
     step_tol: float = EXACT_STEP,
     report: ReportStep = lambda text: None,
+    stuck: Stuck | None = None,
 ) -> Fit:
-    """Minimize r.r / 2 from a first guess, until the (dimensionless) Gauss-Newton step is at most `step_tol`."""
+    """Minimize r.r / 2 from a first guess, until the (dimensionless) Gauss-Newton step is at most `step_tol`.
+
+    Unknowns that are `stuck` at a bound keep their values.
+    """
     from scipy.optimize import least_squares
 
     fit = _TrustRegionFit(evaluate, z, step_tol, report)
+    fit.stuck = stuck
     # `Descent` ends a fit by all conditions except the number of steps.
     choices: dict[str, Any] = {"jac": fit.jacobian, "ftol": None, "gtol": None, "xtol": ROUNDING, "max_nfev": steps}
     with suppress(StopIteration):
@@ -84,8 +90,13 @@ class Descent:
 
 
 class _TrustRegionFit(Descent):
-    """Residuals and Jacobians at changes of a guess, as callbacks of SciPy."""
+    """Residuals and Jacobians at changes of a guess, as callbacks of SciPy.
 
+    K further residuals, which are zero, hold the unknowns that are stuck at a bound: SciPy would lengthen its steps if columns
+    of the Jacobian were zero.
+    """
+
+    stuck: Stuck | None = None
     refused = 0  # number of trials since the last improvement
 
     def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R"]:
@@ -96,25 +107,29 @@ class _TrustRegionFit(Descent):
         cost = float(0.5 * r @ r) if ok else np.inf
         if cost < self.end.cost:
             self.end, self.refused = self.end._replace(z=z, cost=cost), 0
-            return r
+            return np.append(r, np.zeros(len(z)))
         self.refused += 1
         is_finest = self.size <= FINE_STEP and self.refused >= 2  # further improvements are rounding errors
         if not self.end.history or is_finest or self.refused >= MOST_REFUSED_STEPS:
             self.stop(is_finest)
-        return r if ok else np.full_like(r, np.inf)
+        return np.append(r if ok else np.full_like(r, np.inf), np.zeros(len(z)))
 
     def jacobian(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R K"]:
         """Return the Jacobian of the latest residuals."""
-        J = self.found.J[0]
+        J, held = self.found.J[0], np.zeros(len(change))
+        if self.stuck is not None and (stuck := self.stuck(self.guess + change, self.found.r[0], J)).any():
+            J, held = np.where(stuck, 0.0, J), np.where(stuck, np.linalg.norm(J, axis=0).max() or 1.0, 0.0)
         size, cosine = gauss_newton(self.found.r[0], J)
         self.record(size)
         if cosine <= ORTHOGONAL_COSINE:
             self.stop(True)
-        return J
+        return np.concatenate([J, np.diag(held)])
 
 
 def gauss_newton(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[float, float]:
     """Return the largest entry of the Gauss-Newton step in determined directions, and the cosine between r and the range of J."""
+    if not J.any():
+        return 0.0, 0.0  # every unknown is at a bound
     step, _, rank, _ = lstsq(J, r, cond=INVISIBLE_RATIO, lapack_driver="gelsy")
     if not rank:
         return np.inf, np.inf

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.extras import OptionalImport
-from udkjax.study.identify.fit_problem import INVISIBLE_RATIO, Residuals
+from udkjax.study.identify.fit_problem import Residuals
 from udkjax.study.identify.least_squares import (
     EXACT_STEP,
     FINE_STEP,
@@ -25,6 +25,7 @@ from udkjax.study.identify.least_squares import (
 )
 from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.identify.records import IdentificationError
+from udkjax.study.identify.unknowns import INVISIBLE_RATIO, Unknowns
 
 if TYPE_CHECKING:  # imported only when needed, since this takes a second
     import optax
@@ -120,6 +121,11 @@ ROBUST = {"huber": huber, "soft_l1": soft_l1}
 class Evaluated(Protocol):
     """An object with residuals and a Jacobian: a `FitProblem`, or a wrapper of one."""
 
+    @property
+    def unknowns(self) -> Unknowns:
+        """The parameters, which are the first of the unknowns z."""
+        ...
+
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
         """Compute residuals and their Jacobian: see `FitProblem.evaluate`."""
         ...
@@ -151,7 +157,7 @@ class Minimizer:
         evaluate = weighted_residuals(problem, tol, self.loss, horizon)
         if self.method is not None:
             return minimize_by_gradient(self.method, evaluate, z, step_tol=step_tol, report=self.report)
-        return minimize_squares(evaluate, z, steps, step_tol, self.report)
+        return minimize_squares(evaluate, z, steps, step_tol, self.report, problem.unknowns.stuck_at_bounds)
 
     def with_label(self, label: str) -> "Minimizer":
         """Return the same minimizer with reports that begin with a label."""

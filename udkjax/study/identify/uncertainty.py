@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from scipy.special import chdtr, chdtrc
 
 from udkjax.pinv.row_spaces import echelon, null_space
-from udkjax.study.identify.fit_problem import INVISIBLE_RATIO
+from udkjax.study.identify.unknowns import INVISIBLE_RATIO
 from udkjax.study.noise import SIGNIFICANCE
 from udkjax.wording import join_names
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import qr
 from scipy.special import expit, logit
 
@@ -27,6 +27,13 @@ from udkjax.study.quantities import Setter, parameter_value
 from udkjax.wording import quote
 
 Transform = Literal["positive", "bounded", "free"]
+# Largest change of the residuals on the rest of the way to a bound, in standard deviations of their noise, at which a parameter
+# is at the bound; and least way of z from the first guess.
+BOUND_EFFECT, LEAST_WAY = 1e-2, 1.0
+# Singular values below this, relative to the largest of a Jacobian, belong to directions that measurements do not determine. A
+# change that does not affect the equations of motion has 1e-16, at any tolerance; derivatives integrated at 1e-7 have errors of
+# 1e-8.
+INVISIBLE_RATIO = 1e-8
 BOUND_DISTANCE = 1e-3  # distance from a bound, relative to the range, at which a value is at the bound
 FARTHEST_UNKNOWN = 20.0  # largest |z|; for a positive parameter, about the first guess times 5e8
 # Distance of other guesses from the first: a factor for positive parameters, a fraction of the scale for others.
@@ -107,6 +114,28 @@ class Unknowns:
     def _by_kind(self, positive: np.ndarray, bounded: np.ndarray, free: np.ndarray) -> np.ndarray:
         kinds = np.array(self.kinds)
         return np.select([kinds == "positive", kinds == "bounded"], [positive, bounded], free)
+
+    def stuck_at_bounds(
+        self, z: Float[np.ndarray, "K"], r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]
+    ) -> Bool[np.ndarray, "K"]:
+        """Return which unknowns a fit pushes towards a bound, zero for positive parameters, without a visible effect.
+
+        dr/dz vanishes at a bound, where z is infinite. The rest of the way to the bound changes the residuals by about dr/dz: if
+        this is at most `BOUND_EFFECT` of the noise, or not visible at all, the parameter is as good as at the bound.
+        """
+        P = len(self.names)
+        size, slope = np.linalg.norm(J, axis=0), (J.T @ r)[:P]
+        kinds, noise = np.array(self.kinds), np.linalg.norm(r) / np.sqrt(max(len(r), 1))
+        outwards = np.select([kinds == "positive", kinds == "bounded"], [-1.0, np.sign(z[:P])], 0.0)
+        is_near = (size[:P] <= BOUND_EFFECT * noise) & (slope * outwards < 0.0) | (
+            size[:P] <= INVISIBLE_RATIO * size.max(initial=0.0)
+        )
+        return np.append(is_near & (z[:P] * outwards > LEAST_WAY), np.zeros(len(z) - P, dtype=bool))
+
+    @property
+    def range_scale(self) -> Float[np.ndarray, "P"]:
+        """The scale of each parameter, also at a bound: its first guess if it is positive, its range if it is bounded."""
+        return self._by_kind(self.guess, self.high - self.low, self.scale)
 
     def at_bounds(self, x: Float[np.ndarray, "P"]) -> tuple[str, ...]:
         """Return the names of the parameters that are at one of their bounds."""
