@@ -23,7 +23,7 @@ def loaded(*functions: Function, globals: Sequence[str] = ()) -> Callable[..., N
     last = functions[-1]
     library = machine.Library([machine.compile_module(text_of_module(functions, globals))], [last.name])
     kinds = {POINTER: ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
-    run = machine.function(library[last.name], *(kinds[x.base] for name, x in last.given.items() if name != "shared"))
+    run = machine.function(library[last.name], *(kinds[x.base] for name, x in last.given.items() if name != "block_memory"))
 
     def call(*arguments: Any, _alive: Any = library):
         assert all(a.flags.c_contiguous for a in arguments if isinstance(a, np.ndarray))

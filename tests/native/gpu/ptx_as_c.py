@@ -108,7 +108,7 @@ def instruction(text: str) -> str:
     if name == "cvta.to.local.u64":
         return f"{to} = in_stack({x[0]});"
     if name == "cvta.to.shared.u64":
-        return f"{to} = in_block({x[0]}, shared, sizeof(shared));"
+        return f"{to} = in_block({x[0]}, block_memory, sizeof(block_memory));"
     if name == "cvt.s64.s32" or name.startswith("mul.wide.s32"):
         return f"{to} = (u)((s)(int32_t){') * (s)(int32_t)('.join(x)});"
     if name.startswith("mul.wide.u32"):

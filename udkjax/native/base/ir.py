@@ -61,7 +61,7 @@ class Function:
         self._count, self.declared = 0, set()
         self.evaluated: dict[str, Function] = {}  # functions called by `evaluate`; the same module has to define them
         self.given = {n: Value(self, f"%{n}", base) for base, n in arguments}
-        self.given["shared"] = Value(self, "%shared", POINTER)  # memory of the block, in a thread of a GPU
+        self.given["block_memory"] = Value(self, "%block_memory", POINTER)  # memory of the block, in a thread of a GPU
 
     # --- text
 
@@ -95,11 +95,11 @@ class Function:
                 names[n] = f"{n}.given"
                 casts.append(f"%{n}.local = addrspacecast ptr %{n}.given to ptr addrspace({LOCAL_SPACE})")
                 casts.append(f"%{n} = addrspacecast ptr addrspace({LOCAL_SPACE}) %{n}.local to ptr")
-        if any("ptr %shared" in line for line in self._lines):
+        if any("ptr %block_memory" in line for line in self._lines):
             casts.append(
-                f"%shared = addrspacecast ptr addrspace({SHARED_SPACE}) @shared to ptr"
+                f"%block_memory = addrspacecast ptr addrspace({SHARED_SPACE}) @block_memory to ptr"
                 if local
-                else "%shared = getelementptr i8, ptr @shared, i64 0"
+                else "%block_memory = getelementptr i8, ptr @block_memory, i64 0"
             )
         arguments = ", ".join(f"{base}{' noalias' if base == POINTER else ''} %{names[n]}" for base, n in self._arguments)
         end = "ret void" if self.returns == "void" else None

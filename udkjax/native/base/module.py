@@ -204,9 +204,9 @@ class Module(Running):
             pointer, index = at[x][0], at[x][1] + k
             is_shared = self.shares_constants and (x, pointer) == ("constants", "work")
             is_shared = is_shared and index != self.drop_tol_place  # a run changes this threshold
-            return ("shared", k) if is_shared else (pointer, index)
+            return ("block_memory", k) if is_shared else (pointer, index)
 
-        lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers} | {"shared": 1}
+        lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers} | {"block_memory": 1}
         inputs, outputs = find(program.inputs), find(program.outputs)
         self.functions.append(
             write(

@@ -51,7 +51,7 @@ def write_enter(module: Module):
     with f.each(module.constants) as i:
         module.put_lane_entry(f, "constants", lane, f.load(constants, i), i)
         if module.shares_constants:  # all threads write the same
-            f.store(f.load(constants, i), f.given["shared"], i)
+            f.store(f.load(constants, i), f.given["block_memory"], i)
     if module.falls_back and not module.unrolled:
         count = len(module.code.constants)
         all_constants, tol = Value(f, f.reserve(DOUBLE, count), POINTER), module.lane_entry(f, "fallback_tol", lane)

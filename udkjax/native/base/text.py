@@ -60,7 +60,7 @@ def text_of_module(
 def external_functions(declarations: str) -> frozenset[str]:
     """Return the names of functions outside a module, from its text or its declarations; instructions are not functions.
 
-    In the engine's modules only functions of memory management are external (`malloc`, `free`, `realloc`). Whoever compiles a
+    In the engine's modules only functions of memory management are external (malloc, free, realloc). Whoever compiles a
     module for a target without a C library must supply them, or refuse the module.
     """
     declared = re.findall(r"^declare [^@\n]*@([\w.]+)", declarations, re.MULTILINE)

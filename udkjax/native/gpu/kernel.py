@@ -63,7 +63,7 @@ class KernelCode(NamedTuple):
     def functions_text(self, local: Collection[str]) -> str:
         """Return LLVM's text of the functions; `local` are the names of arguments that point to a thread's own memory."""
         space = f"addrspace({SHARED_SPACE}) " if local else ""
-        shared_memory = f"@shared = internal {space}global [{max(self.constants, 1)} x double] undef, align 16"
+        shared_memory = f"@block_memory = internal {space}global [{max(self.constants, 1)} x double] undef, align 16"
         return text_of_module(self.code.functions, [shared_memory, *self.code.globals], local=local, shared=self.code.shared)
 
 
