@@ -128,6 +128,18 @@ class ScenePrograms:
         return program(solver.acceleration_system, solve)
 
     @cached_property
+    def accelerations_and_drift(self) -> LoopProgram:
+        """Compute a, psi of all rows, and distance; set safe."""
+        drift = [*self._terms.row_terms("psi", "psi"), self._solver.elimination.distance()]
+        return program(self.accelerations.parts, drift)
+
+    @cached_property
+    def drift(self) -> LoopProgram:
+        """Compute psi of all rows, and distance."""
+        distance = [*self._solver.factorize_dropping, self._solver.elimination.distance()]
+        return program(self._solver.position_terms("psi_q"), distance, self._terms.row_terms("psi", "psi"))
+
+    @cached_property
     def multipliers(self) -> LoopProgram:
         """Compute multipliers, the lambda of all rows, and a; set safe."""
         return program(self.accelerations.parts, self._terms.multipliers(0))

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.integrate.constrained import Constrained
+from udkjax.integrate.drift import DriftController
 from udkjax.integrate.native_equations import equations_for_diffrax
 from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -30,6 +31,8 @@ def integrate_by_diffrax(
     equations = equations_for_diffrax(problem)
     if problem.compiled.plan.projected:  # as machine code does, whose derivatives are combined with those of this engine
         y0 = project(equations, ts[0], y0)
+    measures_drift = equations.constrained and not problem.compiled.plan.projected
+    controller = CountingController(_controller(problem))
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
         Constrained(problem.compiled.plan.solver or diffrax.Dopri8(), problem.compiled.plan.projected),
@@ -39,7 +42,7 @@ def integrate_by_diffrax(
         y0=y0,
         args=equations,
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)], controller_state=True),
-        stepsize_controller=CountingController(_controller(problem)),
+        stepsize_controller=DriftController(controller, problem.drift_tol) if measures_drift else controller,
         adjoint=adjoint or diffrax.RecursiveCheckpointAdjoint(),
         max_steps=int(np.asarray(problem.max_steps)),  # the loops of diffrax need a concrete number
         progress_meter=meter or diffrax.NoProgressMeter(),
@@ -57,7 +60,11 @@ def integrate_by_diffrax(
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, Status.STEP_LIMIT, Status.STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, Status.DONE, status)
     status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
-    count = evaluations(run.controller_state)
+    controller_state: Any = run.controller_state
+    if measures_drift:
+        controller_state, drifted = controller_state.inner, controller_state.status
+        status = jnp.where(drifted == Status.RUNNING, status, drifted)
+    count = evaluations(controller_state)
     right_hand_sides = jnp.where(count == NOT_COUNTED, NOT_COUNTED, count + (problem.h is None))  # one chooses the step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)

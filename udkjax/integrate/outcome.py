@@ -1,7 +1,7 @@
 """The end of a run and its cost, from the solver's own statistics."""
 
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,13 +40,22 @@ def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: 
     return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))
 
 
+def failure(status: Any, xp: ModuleType = jnp) -> Any:
+    """Return the `Result` of a run that has ended early, by its `Status`."""
+    code = xp.where(status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
+    for status_of, result in (
+        (Status.NOT_FINITE, Result.not_finite),
+        (Status.LOST, Result.drift),
+        (Status.SINGULAR, Result.singular),
+    ):
+        code = xp.where(status == status_of, result, code)
+    return code
+
+
 def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
     """Return the `Result` and its time (s): that of the first output with drift, or the last time of the integrator."""
     raw = run.raw
-    code = xp.where(raw.status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
-    code = xp.where(raw.status == Status.NOT_FINITE, Result.not_finite, code)
-    code = xp.where(raw.status == Status.LOST, Result.drift, code)
-    code = xp.where(raw.status == Status.DONE, Result.successful, code)
+    code = xp.where(raw.status == Status.DONE, Result.successful, failure(raw.status, xp))
     is_lost = xp.isfinite(raw.lost)
     code = xp.where(is_lost, xp.where(raw.lost == 0, Result.initial_state_open, Result.drift), code)
     code = xp.where(run.missed, Result.drift, code)

@@ -41,6 +41,7 @@ class Result(PrintsWords):
     invalid_argument = 11
     initial_state_open = 12
     undefined_condition = 13
+    singular = 14
 
     @property
     def is_success(self) -> bool:
@@ -75,6 +76,8 @@ CAUSES = {
     Result.invalid_argument: "an argument of this run cannot be used: output times that do not increase, a state that is not "
     "finite, a tolerance or first step that is not positive, or a number of the scene or of an event that cannot be: one that is "
     "not finite, a mass that is not positive, knots that do not increase, a lower limit above the upper one",
+    Result.singular: "the run, which is not projected, met a singular configuration with its constraints too far open: it may "
+    "have lost its energy, or gone on along another branch; use `Projection()`",
     Result.undefined_condition: "the condition of an event is not a number: look at what it divides by, or takes the root of",
 }
 

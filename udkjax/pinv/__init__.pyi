@@ -1,6 +1,7 @@
 """The door of `pinv`: the names that floors above import, each from the module that it is in."""
 
 from udkjax import pinv as pinv
+from udkjax.pinv.auto import NEAREST as NEAREST
 from udkjax.pinv.auto import Auto as Auto
 from udkjax.pinv.elimination import Elimination as Elimination
 from udkjax.pinv.elimination import default_rank_tol as default_rank_tol

@@ -10,6 +10,7 @@ from udkjax.pinv.svd import SVD, SVDFactors
 # by its reciprocal: with 1e-6, ten digits remain. Singular configurations are crossed equally well with 1e-5 and with 1e-7; the
 # larger the value, the more often singular values are needed.
 BRANCH_TOL = 1e-6
+NEAREST = BRANCH_TOL**0.5  # the distance from dependence below which elimination is not used
 
 
 class Auto(Dense):

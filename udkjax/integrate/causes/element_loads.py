@@ -28,8 +28,18 @@ class ElementLoads(NamedTuple):
     stiffness: np.ndarray  # (states, elements), 1/s
 
 
-def element_loads(mechanism: Mechanism, length: float, states: Sequence[TimedState]) -> ElementLoads:
-    """Evaluate the loads of each force element at several states."""
+def element_loads(
+    mechanism: Mechanism, length: float, states: Sequence[TimedState], mobility: np.ndarray | None = None
+) -> ElementLoads:
+    """Evaluate the loads of each force element at several states.
+
+    Args:
+        mechanism: the mechanism.
+        length: the characteristic length (m).
+        states: the states.
+        mobility: the projection onto the motions that the constraints allow, in the mass metric (n, n): rates are those of
+            these motions. None: those of each element's bodies alone.
+    """
     names, count = mechanism.force_names, len(mechanism.forces)
     ts, qs, vs = (np.stack([np.asarray(s[k], float) for s in states]) for k in range(3))
     shape = len(states), count
@@ -45,7 +55,14 @@ def element_loads(mechanism: Mechanism, length: float, states: Sequence[TimedSta
         sqrt_mass = np.sqrt(moving)
         for rates, matrix, power in ((stiffness, by_q, 0.5), (damping, by_v, 1.0)):
             scaled = np.nan_to_num(matrix / sqrt_mass[:, :, None] / sqrt_mass[:, None, :], posinf=0.0, neginf=0.0)
-            rates[:, kind.members] = np.linalg.norm(scaled, 2, axis=(-2, -1)) ** power if moving.shape[1] else 0.0
+            if not moving.shape[1]:
+                continue
+            if mobility is not None:
+                places = (3 * kind.bodies.T[:, :, None] + np.arange(3)).reshape(len(kind.members), -1)
+                scaled = scaled @ mobility[places[:, :, None], places[:, None, :]]
+                rates[:, kind.members] = np.abs(np.linalg.eigvals(scaled)).max(-1) ** power
+                continue
+            rates[:, kind.members] = np.linalg.norm(scaled, 2, axis=(-2, -1)) ** power
     return ElementLoads(tuple(names), size, jump, damping, stiffness)
 
 

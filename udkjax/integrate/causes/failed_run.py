@@ -30,10 +30,15 @@ class FailedRun:
     rtol: float
     atol: float
     drift_tol: float
-    is_projected: bool
+    stabilization: str  # Projection, Baumgarte or NoneType
     is_explicit: bool  # whether the solver is explicit
     drops_rows: bool  # whether the method leaves out rows that are redundant by the analysis
     formulation: str
+
+    @property
+    def is_projected(self) -> bool:
+        """True if states are projected."""
+        return self.stabilization == "Projection"
 
     @cached_property
     def rows(self) -> PositionRows:
@@ -67,6 +72,17 @@ class FailedRun:
         """Return the left singular vectors and the singular values of D, with rows of length one."""
         D = self.rows.dense(self.rows.at(t, q)[2])
         return np.linalg.svd(D, full_matrices=False)[:2] if np.all(np.isfinite(D)) else (D, np.full(len(D), np.nan))
+
+    def mobility(self, t: float, q: np.ndarray) -> np.ndarray | None:
+        """Return the projection onto the motions that the constraints allow, in the mass metric; None if not finite."""
+        D = self.rows.dense(self.rows.at(t, q)[2]) if self.rows.count else np.zeros((0, len(q)))
+        if not np.all(np.isfinite(D)):
+            return None
+        mass = np.ravel([[b.mass, b.mass, b.inertia] for b in self.mechanism.bodies.values()]).astype(float)
+        D = D / self.rows.metric / np.sqrt(mass / mass.max())
+        _, sigma, right = np.linalg.svd(D / np.linalg.norm(D, axis=1, keepdims=True), full_matrices=False)
+        span = right[: self.analysis.rank] if self.analysis.rank is not None else right[sigma > 0]
+        return np.eye(len(q)) - span.T @ span
 
     def open_rows(self, t: float, q: np.ndarray) -> str:
         """Name the open constraints at a position, the largest residual first, each with its residual (m, rad)."""

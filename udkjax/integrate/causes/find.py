@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.equations.analysis import Analysis
-from udkjax.integrate.causes.element_loads import ElementLoads, element_loads
+from udkjax.integrate.causes.element_loads import ElementLoads, TimedState, element_loads
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.integrate.causes.reach import explain_reach
 from udkjax.integrate.solution import Result, Solution
@@ -20,6 +20,7 @@ NEARBY = 1e-9  # fraction of the span: a load changes much within this time only
 # evaluated them in a rejected step up to ten times as long as the last.
 AHEAD = (0.0, *np.geomspace(1e-6, 0.1, 80))
 JUMP = 1e-3  # least relative change of a load over `NEARBY` at a jump; smooth loads change a million times less
+PARTS = 8  # of the way between two states; half of the change within one part is a jump, a smooth load has two eighths at most
 GROWN = 1e6  # ratio of a load to its earlier value above which it grows without bound
 NEAR_REACH = 1e-2  # fraction of the span by which a run may end before a dead point
 STIFF = 0.1  # least rate times step; explicit methods of any order lose stability between 1 and 10
@@ -74,6 +75,8 @@ def find_cause(run: FailedRun) -> str | None:
             return f"the initial state is open (m, rad): {text}; `assemble` closes it, and so does a run without an initial state"
         case Result.drift:
             return _explain_drift(run)
+        case Result.singular:
+            return _explain_singular(run)
         case Result.not_finite:
             return _explain_not_finite(run)
         case Result.step_too_small:
@@ -92,7 +95,8 @@ def _explain_open_guess(run: FailedRun) -> str | None:
 
 def _explain_drift(run: FailedRun) -> str | None:
     k = int(np.argmin(np.abs(run.ts - run.time)))
-    q, left_out = run.q[k], sorted({run.rows.names[i][0] for i in run.analysis.redundant_rows or ()})
+    q = run.q[k] if run.end is None or np.isfinite(run.q[k]).all() else run.end[1]
+    left_out = sorted({run.rows.names[i][0] for i in run.analysis.redundant_rows or ()})
     text = run.open_rows(run.time, q)
     anew = "analyse the mechanism with its present numbers, or use method=SVD()"
     if not text:
@@ -103,12 +107,33 @@ def _explain_drift(run: FailedRun) -> str | None:
     size = float(np.max(np.abs(run.psi(run.time, q)) / run.row_scales))
     open_by = f"open (m, rad): {text}, {size:.2g} of the scene's scales, more than drift_tol={run.drift_tol:g}"
     if not run.is_projected:
-        return f"{open_by}; nothing returns the states to the constraints: stabilize them, by Projection()"
+        return f"{open_by}; {_nothing_projects(run)}"
     if run.drops_rows and any(f'"{name}"' in text for name in left_out):
         return f"{open_by}; rows of {', '.join(left_out)} are left out as redundant, but are independent: {anew}"
     if run.rows.close(run.time, q) is None:
         return f"{open_by}; no position nearby satisfies the constraints"
     return f"{open_by}; a position nearby satisfies them: {_near_singular(run) or 'loosen drift_tol, or tighten rtol and atol'}"
+
+
+def _explain_singular(run: FailedRun) -> str:
+    """Describe the singular configuration that an unprojected run met, and how far its constraints were open there."""
+    t, q, _ = run.states[0]
+    size = float(np.max(np.abs(run.psi(t, q)) / run.row_scales))
+    place = _nearest_singular(run)
+    return (
+        f"near a singular configuration{'' if place is None else f' of {place[0]}'} the constraints are open by {size:.1g} of "
+        "the scene's scales: the run may change its branch or lose its energy there (the bound is drift_tol times the square of "
+        f"the distance from it); {_nothing_projects(run)}"
+    )
+
+
+def _nothing_projects(run: FailedRun) -> str:
+    if run.stabilization == "Baumgarte":
+        return (
+            "Baumgarte() only damps the violation, more slowly with smaller gains, and nothing returns the states to the "
+            "constraints: use Projection(), or larger gains"
+        )
+    return "nothing returns the states to the constraints: stabilize them, by Projection()"
 
 
 def _explain_not_finite(run: FailedRun) -> str | None:
@@ -165,7 +190,8 @@ def _violent_load(run: FailedRun) -> str:
     unit = np.tile([float(scales.length), float(scales.length), 1.0], len(q) // 3)
     turn = 1e-6 * max(speed, float(scales.rate)) * unit
     earlier, later = ((t + sign * NEARBY * span, q + sign * NEARBY * span * v, v) for sign in (-1, 1))
-    loads = _loads(run, [earlier, (t, q, v), later, (t, q, v - turn), (t, q, v + turn), *run.states[1:][::-1][:2]])
+    slower, faster = (t, q, v - turn), (t, q, v + turn)
+    loads = _loads(run, [earlier, (t, q, v), later, slower, faster, *run.states[1:][::-1][:2]])
     size, names = np.nan_to_num(loads.size, nan=0.0, posinf=1e300), loads.names
     before, now = size[5:].max(0, initial=0.0), size[1]
     slow = max(float(scales.rate), 1 / span) ** 2
@@ -174,8 +200,7 @@ def _violent_load(run: FailedRun) -> str:
             return f'force "{name}" grows without bound: here it is {now[k] / max(before[k], slow):.1g} times what it was'
     largest = size.max(0)
     # A load may jump with time, or with velocity.
-    time_jump = np.abs(loads.jump[2])
-    speed_jump = np.abs(_loads(run, [(t, q, v - turn), (t, q, v + turn)]).jump[1])
+    time_jump, speed_jump = _jumps(run, earlier, later), _jumps(run, slower, faster)
     for k, name in enumerate(names):
         if time_jump[k] > JUMP * max(largest[k], slow):
             return f'force "{name}" jumps at {t:.6g} s: give its `breakpoints`, smooth it, or make the jump an event'
@@ -184,12 +209,26 @@ def _violent_load(run: FailedRun) -> str:
     return ""
 
 
+def _jumps(run: FailedRun, first: TimedState, last: TimedState) -> np.ndarray:
+    """Return the change of each element's load between two neighbouring states if it is a jump, else zero.
+
+    A jump changes the load within one of several parts of the way; a smooth load, however steep, in all of them.
+    """
+    shares = np.linspace(0.0, 1.0, PARTS + 1)
+    states = [
+        (first[0] + x * (last[0] - first[0]), *((1 - x) * a + x * b for a, b in zip(first[1:], last[1:], strict=True)))
+        for x in shares
+    ]
+    changes = _loads(run, states).jump
+    return np.where(np.diff(changes, axis=0).max(0) > 0.5 * changes[-1], changes[-1], 0.0)
+
+
 def _stiff(run: FailedRun) -> str:
     """Name the force element that keeps the steps of an explicit solver short."""
     t, q, v = run.states[0]
     if not run.is_explicit or run.steps < 1 or not t > run.ts[0]:
         return ""
-    loads = _loads(run, [(t, q, v)])
+    loads = _loads(run, [(t, q, v)], run.mobility(t, q))
     step = (t - float(run.ts[0])) / run.steps
     if not loads.names:
         return ""
@@ -212,18 +251,22 @@ def _reach_at_end(run: FailedRun) -> str:
 
 def _near_singular(run: FailedRun) -> str:
     """Describe the singular configuration near which the run ended, with its joints."""
+    place = _nearest_singular(run)
+    if place is None or not place[1] < SINGULAR:
+        return ""
+    return f"the state is near a singular configuration of {place[0]} (smallest singular value {place[1]:.1g} of the largest)"
+
+
+def _nearest_singular(run: FailedRun) -> tuple[str, float] | None:
+    """Return the joints whose rows are closest to dependence at the end, and the smallest singular value over the largest."""
     t, q, _ = run.states[0]
     rank = run.analysis.rank
     if rank is None or not rank:
-        return ""
+        return None
     u, sigma = run.decomposed(t, q)
-    if not sigma[rank - 1] < SINGULAR * sigma[0]:
-        return ""
     involved = np.abs(u[:, rank - 1]) > 0.1 * np.abs(u[:, rank - 1]).max()
     names = list(dict.fromkeys(name for (name, _), is_involved in zip(run.rows.names, involved, strict=True) if is_involved))
-    share = sigma[rank - 1] / sigma[0]
-    listed = ", ".join(names[:MOST_NAMED])
-    return f"the state is near a singular configuration of {listed} (smallest singular value {share:.1g} of the largest)"
+    return ", ".join(names[:MOST_NAMED]), float(sigma[rank - 1] / sigma[0])
 
 
 def _rank(run: FailedRun) -> int:
@@ -232,8 +275,8 @@ def _rank(run: FailedRun) -> int:
     return int(np.sum(sigma > SINGULAR * sigma[0]))
 
 
-def _loads(run: FailedRun, states: list) -> ElementLoads:
-    return element_loads(run.mechanism, float(run.analysis.scales.length), states)
+def _loads(run: FailedRun, states: list, mobility: np.ndarray | None = None) -> ElementLoads:
+    return element_loads(run.mechanism, float(run.analysis.scales.length), states, mobility)
 
 
 def explained(
@@ -269,7 +312,7 @@ def explained(
         rtol=float(solution.rtol),
         atol=float(solution.atol),
         drift_tol=float(drift_tol),
-        is_projected=settings["stabilization"] == "Projection",
+        stabilization=settings["stabilization"],
         is_explicit=is_explicit(solver) or settings["solver"] == "Adams",  # the corrector of Adams is applied once, not solved
         drops_rows=settings["method"] in ("Auto", "Elimination"),
         formulation=settings["formulation"],

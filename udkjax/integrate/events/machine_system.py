@@ -18,6 +18,7 @@ from udkjax.integrate.events.kinks import FREE, HeldElement
 from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
+from udkjax.integrate.outcome import failure
 from udkjax.integrate.solution import Result
 from udkjax.native.base.steps import Status
 from udkjax.native.runs import RunStates
@@ -237,9 +238,7 @@ class MachineSystem:
             runs.joints[-1][freed], self.lost_kinks[freed], runs.running[freed] = FREE, runs.t[freed], True
             known, fails = known | chatters, fails & ~chatters
         self.unresolved[members] |= unresolved
-        code = np.where(status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
-        code = np.where(status == Status.NOT_FINITE, Result.not_finite, code)
-        code = np.where((status == Status.LOST) | drifts, Result.drift, code)
+        code = np.where(drifts, Result.drift, failure(status, np))
         last = stretch.info[fails, TIME], stretch.info[fails, INFO : INFO + n], stretch.info[fails, INFO + n :]
         runs.code[members[fails]] = code[fails]
         runs.t[members[fails]], runs.q[members[fails]], runs.v[members[fails]] = last

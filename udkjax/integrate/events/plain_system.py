@@ -23,6 +23,7 @@ from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.loop import run_loop
 from udkjax.integrate.events.runs import Change, EventRun, MemberIndices, MemberRuns, RunState, results, runs_before
 from udkjax.integrate.events.system import StateValues
+from udkjax.integrate.outcome import failure
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
 from udkjax.native.base.steps import SMALLEST_STEP, Status
@@ -217,6 +218,4 @@ class PlainSystem:
 
 
 def _failure(raw: IntegratorOutput) -> Int[Array, ""]:
-    code = jnp.where(raw.status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
-    code = jnp.where(raw.status == Status.NOT_FINITE, Result.not_finite, code)
-    return jnp.where((raw.status == Status.DONE) | (raw.status == Status.LOST), Result.drift, code)
+    return jnp.where(raw.status == Status.DONE, Result.drift, failure(raw.status))

@@ -104,6 +104,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "retries": "number of successive attempts that were shortened because of a pivot",
     "distance": "distance from singular configurations: root of the smallest pivot relative to its diagonal entry",
     **{f"distance{k}": "distance of the previous accepted states; distance2 is the latest" for k in range(POINTS - 1)},
+    "farthest": "largest distance of an accepted state of a run that is not projected",
     "tolerance": "tolerance of the fastest velocity, in its unit",
     "rank": "rank of D found by the fallback",
     "wanted": "whether a rank-revealing method is requested",

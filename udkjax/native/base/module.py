@@ -51,6 +51,7 @@ class Module(Running):
         self.is_dense = plan.pseudoinverse is not None and m > 0
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
+        self.measures_drift = plan.steps and m > 0 and not plan.projected
         self.pieces = code.piece_count if plan.breaks else 0
         self.programs = {name: getattr(code, name) for name in self.program_names()}
         self.unrolled = Unrolled(code, list(self.programs), differentiated, active, self.mode) if plan.unrolled else None
@@ -146,6 +147,8 @@ class Module(Running):
             names += self.solving
         if self.is_formulated and not self.is_dense:
             names.append("dense_accelerations")
+        if self.measures_drift:
+            names.append("drift" if self.takes_dense_rows else "accelerations_and_drift")
         if self.falls_back and self.plan.unrolled:
             names.append("rows_and_loads")
         return names
@@ -176,7 +179,7 @@ class Module(Running):
 
     def write_programs(self):
         for name in self.programs:
-            out = {"a": ("out", 0)} if name == "accelerations" else {}
+            out = {"a": ("out", 0)} if name.startswith("accelerations") else {}
             self.write_program(name, self.arrays | out)
         self.write_prologue("prologue", self.unrolled)
 

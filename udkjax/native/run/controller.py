@@ -33,6 +33,7 @@ from udkjax.native.base.steps import (
     Status,
 )
 from udkjax.native.run.manifold import largest_violation, velocity_tolerance
+from udkjax.pinv.auto import NEAREST
 
 
 def write_decide(module: Module):
@@ -67,7 +68,8 @@ def write_decide(module: Module):
     code = where(stepping & failed & begin & ~accept, where(code.is_(float(Status.RUNNING)), Status.STEP_TOO_SMALL, code), code)
     code = where(accept & (s.last > 0.5), Status.DONE, code)
     lost = _accept_step(module, f, s, accept)
-    code = where((lost > 0.5) & code.is_(float(Status.RUNNING)), Status.LOST, code)
+    goes_on = code.is_(float(Status.RUNNING)) | (code.is_(float(Status.DONE)) & lost.is_(float(Status.SINGULAR)))
+    code = where((lost > 0.0) & goes_on, lost, code)
     s.where(accept & stepped, rate=rate)
     if module.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
@@ -118,7 +120,7 @@ def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Valu
 
 
 def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
-    """Make the end of a step the latest point; return one in lanes whose new point is off the constraint manifold."""
+    """Make the end of a step the latest point; return the status of lanes whose new point ends their run, else zero."""
     lost = f.variable(0.0)
     with f.if_(f.any_of(accept)):
         with f.if_(f.any_of(accept & module.interpolates(f, s))):
@@ -134,11 +136,28 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
         if module.m and module.plan.projected:
             module.invoke(f, "psi")
             is_lost = accept & (largest_violation(module, f) > LOST_TOL)
-            lost.value = f.select(is_lost, f.const(1.0, DOUBLE, f.width), 0.0)
+            lost.value = f.select(is_lost, f.const(Status.LOST, DOUBLE, f.width), 0.0)
+        if module.measures_drift:
+            lost.value = _judge_drift(module, f, s, accept)
         if module.m:
             s.where(accept, tolerance=velocity_tolerance(module, f, s, "point3 v"))
         module.record_step(f, s, accept)
     return lost.value
+
+
+def _judge_drift(module: Module, f: Function, s: Lane, accept: Value) -> Value:
+    """Return `LOST` or `SINGULAR` in lanes whose new point, which is not projected, has drifted too far, else zero.
+
+    Where the distance from singular configurations is d, a violation x of Psi moves the state by x / d and turns its velocity by
+    x / d^2: near the intersection of two branches, the curves of constant Psi are hyperbolas, and lead from one branch to the
+    other. Therefore the bound of x is `drift_tol` times d^2, with d relative to the largest distance of the run. A distance
+    below `NEAREST` counts as `NEAREST`.
+    """
+    s.where(accept, farthest=f.max(s.farthest, s.distance))
+    nearness = f.max(s.distance, NEAREST) / f.max(s.farthest, NEAREST)
+    violated, status = largest_violation(module, f), lambda code: f.const(float(code), DOUBLE, f.width)
+    is_turned = accept & (violated > s.drift_tol * (nearness * nearness))
+    return f.select(is_turned, f.select(violated > s.drift_tol, status(Status.LOST), status(Status.SINGULAR)), 0.0)
 
 
 def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value) -> Value:

@@ -38,7 +38,7 @@ def write_attempt(module: Module):
     stage_state(module, f, s, stages)
     setattr(s, "state t", s.t1)
     if not module.plan.projected:
-        module.accelerate(f, "result a")
+        module.accelerate_and_measure(f)
         check_pivots(module, f, s, "result a")
         with f.each(module.rowcount) as r:
             module.put(f, "result v", r, module.vector(f, "state v", r))

@@ -52,6 +52,15 @@ class Trajectory(Module):
     def accelerate(self, f: Function, to: str):
         self.invoke(f, FORMULATE if self.formulated else "accelerations", to)
 
+    def accelerate_and_measure(self, f: Function):
+        """Compute the accelerations `result a` at the end of a step that is not projected, with its `psi` and `distance`."""
+        if self.measures_drift and not self.takes_dense_rows:
+            self.invoke(f, "accelerations_and_drift", "result a")
+            return
+        self.accelerate(f, "result a")
+        if self.measures_drift:
+            self.invoke(f, "drift")
+
     def accelerate_end(self, f: Function):
         if self.formulated:
             self.copy(f, "state v", "saved v")

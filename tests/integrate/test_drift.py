@@ -1,0 +1,138 @@
+"""Runs that are not projected end where their drift is too large for the singular configuration that they meet."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax import Result
+from udkjax.native import primitive
+from udkjax.native.run import controller
+
+TS = np.linspace(0.0, 5.0, 26)
+TIGHT = {"rtol": 1e-8, "atol": 1e-8, "throw": False}
+SWING = np.deg2rad(45.0)  # the parallelogram is flat at zero, four times in these five seconds
+
+
+def swing(angle=SWING):
+    return udk.library.parallelogram(angle)
+
+
+def kite(angle=0.8, scale=1.0):
+    return udk.library.four_bar(angle, 4.0, (scale, 2 * scale, 2 * scale), scale, gravity=9.81 * scale)
+
+
+def equal_crank(angle=0.8, speed=6.0):
+    return udk.library.slider_crank(angle, speed, driven=False, crank=0.8, rod=0.8)
+
+
+def reference(mech):
+    return udk.simulate(mech, TS, rtol=1e-11, atol=1e-11).q
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("stabilization", "method"),
+    [
+        (None, udk.SVD(1e-4)),
+        (None, udk.Auto()),
+        (udk.Baumgarte(2.0, 2.0), udk.SVD(1e-4)),  # its energy falls from 24 J to less than zero, with Psi below 3e-4
+        (udk.Baumgarte(2.0, 2.0), udk.Auto()),
+    ],
+)
+def test_a_drifting_run_ends_at_a_singular_configuration(stabilization, method, engine):
+    solution = udk.simulate(swing(), TS, method=method, stabilization=stabilization, engine=engine, **TIGHT)
+    assert solution.result == Result.singular and not solution.result.is_success
+    kept = float(solution.time) > TS
+    assert not np.isfinite(solution.q[~kept]).any()
+    energy = np.asarray(udk.energy(swing(), solution).total)[kept]
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-3)
+    assert "near a singular configuration of" in solution.cause and "Projection()" in solution.cause
+    gains = "larger gains" in solution.cause
+    assert gains == (stabilization is not None)
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gain", [10.0, pytest.param(100.0, marks=pytest.mark.slow)])
+def test_a_run_that_is_stabilized_well_passes(gain, engine):
+    solution = udk.simulate(swing(), TS, stabilization=udk.Baumgarte(gain, gain), engine=engine, **TIGHT)
+    assert solution.result == Result.successful and np.abs(solution.q - reference(swing())).max() < 1e-6
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e3])
+def test_the_length_of_a_mechanism_does_not_matter(scale):
+    mech, ended = kite(scale=scale), 0
+    for method in (udk.SVD(1e-4), udk.Auto()):
+        for stabilization in (None, udk.Baumgarte(2.0, 2.0), udk.Baumgarte(30.0, 30.0)):
+            s = udk.simulate(mech, TS, method=method, stabilization=stabilization, **TIGHT)
+            ended += s.result == Result.singular
+            assert not s.result.is_success or np.abs(s.q[:, :, 2] - reference(mech)[:, :, 2]).max() < 1e-3
+    assert 2 <= ended < 6
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
+    """Of the nearest distance, and of the bound."""
+    runs = [
+        (swing(), None, udk.SVD(1e-4)),
+        (swing(), udk.Baumgarte(2.0, 2.0), udk.Auto()),
+        (equal_crank(), None, udk.Auto()),
+        (udk.library.four_bar(1.0, 3.0), None, udk.Auto()),
+        (udk.library.peaucellier(0.5, 0.3), udk.Baumgarte(10.0, 10.0), udk.Auto()),
+    ]
+    ts = [TS] * 4 + [np.linspace(0.0, 0.5, 6)]
+
+    def verdicts(**choices):
+        return [
+            int(udk.simulate(m, t, method=method, stabilization=x, **TIGHT, **choices).code)
+            for (m, x, method), t in zip(runs, ts, strict=True)
+        ]
+
+    before = verdicts()
+    assert before == [Result.singular] * 3 + [Result.successful] * 2
+    assert verdicts(drift_tol=1e-3 * factor) == before
+    monkeypatch.setattr(controller, "NEAREST", controller.NEAREST * factor)
+    primitive.generate.cache_clear()
+    primitive.machine_code.cache_clear()
+    assert verdicts() == before
+    primitive.generate.cache_clear()
+    primitive.machine_code.cache_clear()
+
+
+def test_each_member_of_a_batch_has_its_own_end_and_derivatives_as_other_failed_runs():
+    angles, ts = jnp.array([SWING, 0.9]), np.linspace(0.0, 3.0, 4)
+
+    def angle_at(a, k, **choices):
+        return udk.simulate(udk.library.parallelogram(a), ts, **choices, **TIGHT).q[k, 0, 2]
+
+    def code(a, alpha):
+        mech = udk.library.parallelogram(a)
+        return udk.simulate(mech, ts, stabilization=udk.Baumgarte(alpha, alpha), **TIGHT).code
+
+    codes = jax.vmap(code)(jnp.array([SWING, SWING, 0.9]), jnp.array([2.0, 30.0, 30.0]))
+    assert codes.tolist() == [Result.singular, Result.successful, Result.successful]
+    for k in (1, -1):
+        forward = jax.vmap(lambda a, k=k: jax.jvp(lambda a: angle_at(a, k, stabilization=None), (a,), (1.0,))[1])(angles)
+        reverse = jax.vmap(jax.grad(lambda a, k=k: angle_at(a, k, stabilization=None)))(angles)
+        limited = jax.vmap(jax.grad(lambda a, k=k: angle_at(a, k, max_steps=30)))(angles)
+        np.testing.assert_allclose(forward, reverse, rtol=1e-5)
+        np.testing.assert_allclose(limited, reverse, rtol=1e-5)
+        assert np.all(np.asarray(reverse) != 0.0) == (k == 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [swing, equal_crank, kite])
+def test_no_run_is_successful_and_wrong(make):
+    refused = right = 0
+    for angle in np.linspace(0.4, 1.1, 4):
+        mech = make(angle)
+        exact = reference(mech)
+        for method in (udk.SVD(1e-4), udk.Auto(), udk.SVD(), udk.Householder(), udk.Elimination()):
+            for stabilization in (None, *(udk.Baumgarte(x, x) for x in (2.0, 10.0, 30.0, 100.0))):
+                s = udk.simulate(mech, TS, method=method, stabilization=stabilization, max_steps=3000, **TIGHT)
+                if s.result.is_success:
+                    right += 1
+                    assert np.abs(s.q[-1, :, 2] - exact[-1, :, 2]).max() < 1e-2, (angle, method, stabilization)
+                refused += int(s.result == Result.singular)
+    assert right > 20 and refused > 5
