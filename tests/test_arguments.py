@@ -159,6 +159,13 @@ def test_choices_of_a_wrong_type_are_refused(name, wrong, text):
     assert text in message(udk.simulate, MECH, TS, **{name: wrong})
 
 
+def test_a_solver_without_an_error_estimate_is_refused_with_the_cure():
+    for choices in ({}, {"dt0": 1e-3}):
+        assert "Euler does not estimate them; give a solver such as" in message(
+            udk.simulate, MECH, TS, solver=diffrax.Euler(), **choices
+        )
+
+
 def test_thresholds_and_gains_of_no_use_are_refused():
     wrongs: list[Any] = [[1e-3, 1e-4], -1.0, np.nan]
     for wrong in wrongs:

@@ -1,6 +1,7 @@
 """Checks of scenes from files and from Python; they find all mistakes, not only the first."""
 
 import dataclasses
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Any, Literal, NamedTuple, get_args, get_origin
@@ -81,12 +82,11 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
     owner: dict[tuple[str, str], SceneEntry] = {}
     for entry in entries:
         space = "joint" if entry.section == "driver" else entry.section
-        if not isinstance(entry.name, str) or not entry.name:
-            mistake = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
-            problems.append(f"{entry.where}.name: {mistake}")
+        if mistake := name_mistake(entry.name):
+            problems.append(f"{entry.section}[{entry.index}].name: {mistake}")
         elif entry.section == "body" and entry.name == GROUND:
             problems.append(f'{entry.where}.name: "{GROUND}" is the fixed frame; choose another name')
-        elif (first := owner.setdefault((space, entry.name), entry)) is not entry:
+        elif (first := owner.setdefault((space, str(entry.name)), entry)) is not entry:
             problems.append(f"{entry.where}.name: taken by {first.section}[{first.index}]; names must be unique")
         if entry.cls is None:
             problems.append(entry.problem)
@@ -94,6 +94,19 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
         else:
             problems.extend(check_table(entry.where, entry.cls, entry.table, known))
     return problems
+
+
+def name_mistake(name: object) -> str:
+    """Return why messages, tables and commands cannot show the name of an element, with the cure; empty if they can."""
+    if not isinstance(name, str) or not name:
+        return "missing" if name is None else f"must be a non-empty string, is {abbreviate(name)}"
+    shown = "".join(c for c in name if unicodedata.category(c) not in ("Cc", "Cs", "Zl", "Zp")).strip()
+    if shown == name:
+        return ""
+    what = "blanks at its ends" if shown == name.strip() else "line breaks or control characters"
+    return (
+        f"must not have {what}, is {name!r}; write {quote(shown)}" if shown else f"must not be blank, is {name!r}; choose a name"
+    )
 
 
 def traced_numbers_are_valid(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:

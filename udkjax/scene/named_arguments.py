@@ -111,6 +111,15 @@ def _of_diffrax(kind: str, example: str) -> ArgumentCheck:
     return check
 
 
+def _check_solver(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a solver that estimates its errors, since these decide the steps."""
+    _of_diffrax("AbstractSolver", "diffrax.Tsit5()")(name, value, given)
+    if not isinstance(value, sys.modules["diffrax"].AbstractAdaptiveSolver):
+        kind = type(value).__name__
+        cure = f"give a solver such as diffrax.Tsit5(), or diffrax.HalfSolver(diffrax.{kind}()), which estimates them"
+        raise ArgumentError(f"{name}: steps are chosen by errors, also with dt0, and {kind} does not estimate them; {cure}")
+
+
 def _of_kind(condition: str, is_valid: Callable[[Any], bool]) -> ArgumentCheck:
     """Return a check that an argument satisfies `is_valid`; `condition` describes valid arguments in messages."""
 
@@ -220,6 +229,6 @@ CHECKS: dict[str, ArgumentCheck] = {
     "compliances": _require_mapping,
     "point": _require_point,
     "bodies": _of_kind("be the name of a body, or a list of names", lambda x: isinstance(x, str) or _are_names(x)),
-    "solver": _of_diffrax("AbstractSolver", "diffrax.Tsit5()"),
+    "solver": _check_solver,
     "adjoint": _of_diffrax("AbstractAdjoint", "diffrax.ForwardMode()"),
 }

@@ -8,7 +8,7 @@ import numpy as np
 from udkjax.annotations import TomlTable
 from udkjax.arrays import by_numpy, is_traced
 from udkjax.scene.bodies import GROUND, Body, Frame
-from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes
+from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes, name_mistake
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
@@ -90,8 +90,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
 def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, group: dict[str, Any], problems: list[str]) -> None:
     """Add an element to its group, or its mistakes to the problems."""
     path = entry.where if entry.section != "pin" else where("pin", entry.index, str(entry.name))
-    if not isinstance(entry.name, str) or not entry.name:
-        mistake = "missing" if entry.name is None else f"must be a non-empty string, is {abbreviate(entry.name)}"
+    if mistake := name_mistake(entry.name):
         problems.append(f"{path}.name: {mistake}")
     elif entry.name in group:
         problems.append(f"{path}.name: taken by another {entry.section}; names must be unique")
