@@ -113,6 +113,8 @@ class Solution(PrintsTable):
         rtol: relative tolerance of the run.
         atol: absolute tolerance of the run.
         bodies: the names of the bodies, in the order of q and v.
+        unlocated: time (s) from which jumps and kinks of forces are not located, so that derivatives do not pass through them;
+            infinite if all are located, None if there are none.
     """
 
     ts: Float[Array, "T"]
@@ -126,8 +128,6 @@ class Solution(PrintsTable):
     bodies: tuple[str, ...] = eqx.field(static=True)
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
     events: "Events | None" = None  # `Events` of a run with events
-    # The time (s) from which jumps and kinks of forces are not located, so that derivatives do not pass through them; infinite if
-    # all are located, None if there are none.
     unlocated: Float[Array, ""] | None = None
     found_cause: Any = eqx.field(static=True, default=None, repr=False)  # `FoundCause` of a single run that failed
 
