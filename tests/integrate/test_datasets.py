@@ -3,6 +3,7 @@
 import json
 
 import jax
+import numpy as np
 import xarray
 from numpy.testing import assert_allclose
 
@@ -40,3 +41,10 @@ def test_a_file_that_anyone_can_read(pendulum, motion, tmp_path):
     with xarray.open_dataset(tmp_path / "run.nc", engine="h5netcdf") as data:
         found = float(data.q.sel(body="rod", coordinate="x")[-1]), data.attrs["result"], data.attrs["stats_steps"]
     assert found == (float(motion.q[-1, 0, 0]), "successful", int(motion.stats["steps"]))
+
+
+def test_a_system_of_ones_own_has_a_dataset():
+    ball = udk.ConstrainedSystem(mass=lambda q: np.eye(2), force=lambda t, q, v: -q)
+    data = udk.simulate(ball, [0.0, 1.0], udk.State(np.array([1.0, 0.0]), np.zeros(2))).to_xarray(ball)  # pyright: ignore[reportArgumentType]
+    assert data.q.dims == ("time", "coordinate") and dict(data.sizes) == {"time": 2, "coordinate": 2}
+    assert_allclose(data.q[-1, 0], np.cos(1.0), rtol=0, atol=1e-7)

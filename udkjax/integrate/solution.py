@@ -183,20 +183,27 @@ class Solution(PrintsTable):
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
         """Return an xarray Dataset: q and v over time, body and coordinate, units, versions, settings, result and statistics.
 
+        The q and v of a `ConstrainedSystem` are over time and coordinate, without units.
+
         If `mechanism` is given, the dataset also has its numbers (the attribute `parameters`, as JSON), its text (`scene`, as
         TOML) and the efforts of its drivers (`effort` over time and driver): torques (N m) and forces (N), by `udkjax.efforts`.
         """
         with OptionalImport():
             import xarray
 
-        dims = ("time", "body", "coordinate")
+        mechanism = mechanism if isinstance(mechanism, Mechanism) else None  # a system has no numbers or text of a scene
+        if self.bodies:
+            dims, coords = ("time", "body", "coordinate"), {"body": list(self.bodies), "coordinate": list(COORDINATES)}
+        else:
+            dims, coords = ("time", "coordinate"), {"coordinate": np.arange(np.shape(self.q)[-1])}
         data = xarray.Dataset(
-            {"q": (dims, np.asarray(self.q)), "v": (dims, np.asarray(self.v))},
-            coords={"time": np.asarray(self.ts), "body": list(self.bodies), "coordinate": list(COORDINATES)},
+            {"q": (dims, np.asarray(self.q)), "v": (dims, np.asarray(self.v))}, {"time": np.asarray(self.ts), **coords}
         )
         data["time"].attrs = {"units": "s"}
-        data["q"].attrs = {"long_name": "coordinates: centre of mass and angle", "units": "m, m, rad"}
-        data["v"].attrs = {"long_name": "velocities", "units": "m/s, m/s, rad/s"}
+        data["q"].attrs, data["v"].attrs = {"long_name": "coordinates"}, {"long_name": "velocities"}
+        if self.bodies:
+            data["q"].attrs = {"long_name": "coordinates: centre of mass and angle", "units": "m, m, rad"}
+            data["v"].attrs |= {"units": "m/s, m/s, rad/s"}
         data.attrs = {
             "title": mechanism.name if mechanism is not None else "",
             "result": self.result.name,
