@@ -289,5 +289,9 @@ class Module(Running):
         """Compute the accelerations at `state`."""
         self.invoke(f, "accelerations", to)
 
+    def accelerate_and_measure(self, f: Function):
+        """Compute the accelerations at the end of a step that is not projected, `result a`."""
+        self.accelerate(f, "result a")
+
     def accelerate_end(self, f: Function):
         """Hook: called with `state q`, `result v` and their accelerations `result a` at the end of a step."""
