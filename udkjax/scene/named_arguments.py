@@ -142,6 +142,10 @@ _require_mapping = _of_kind(
     "map names to numbers, such as {name: number}",
     lambda x: isinstance(x, Mapping) and all(isinstance(name, str) for name in x),
 )
+_require_units = _of_kind(
+    'map names to units, such as {name: "m"}',
+    lambda x: isinstance(x, Mapping) and all(isinstance(text, str) for pair in x.items() for text in pair),
+)
 
 
 def _is_coordinate(x: Any) -> bool:
@@ -217,6 +221,7 @@ CHECKS: dict[str, ArgumentCheck] = {
     "seed": partial(require_count, least=0),
     "values": require_finite,
     "axes": _require_mapping,
+    "units": _require_units,
     "rate": require_finite,
     "acceleration": require_finite,
     "value": require_number,

@@ -64,10 +64,10 @@ def animation(slider_crank, run):
 def hostile():
     """A mechanism whose texts are markup and script."""
     names = [
-        "</script><script>window.hit=1</script>",
+        "</script><script>window.hit=1</script>\u2028a",
         "<img src=x onerror='window.hit=2'>",
         '"><b onmouseover=window.hit=3>',
-        "a\u2028b",
+        "a&amp;'b'",
     ]
     body = udk.Body(1.0, 0.1, (0.5, 0.0))
     joint = udk.Revolute(("ground", names[1]), [(0.0, 0.0), (-0.5, 0.0)])
