@@ -101,9 +101,14 @@ class Wind(udk.ForceElement):
         return [(self.strength * along, jnp.arcsinh(v.x) - jnp.power(1.0 + v.y**2, 0.3), jnp.cbrt(v.x) * jnp.sinh(v.y))]
 
 
+def stone_in_wind() -> udk.Mechanism:
+    """A body under this force."""
+    return udk.Mechanism({"stone": udk.Body(1.0, 0.01)}, forces={"wind": Wind(["stone"], strength=jnp.asarray(0.1))})
+
+
 def functions(report: Report):
     """Compare all bits of runs under a force with elementary functions."""
-    stone = udk.Mechanism({"stone": udk.Body(1.0, 0.01)}, forces={"wind": Wind(["stone"], strength=jnp.asarray(0.1))})
+    stone = stone_in_wind()
 
     def one(x):
         moved = stone.with_parameters({"force.wind.strength": x})

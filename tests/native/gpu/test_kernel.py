@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.interpreters import mlir
-from jaxtyping import Array, Float
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
@@ -25,6 +24,7 @@ from udkjax.native.gpu.driver import CudaError
 from udkjax.native.gpu.kernel import VECTOR, kernel_code
 
 emulation = pytest.importorskip("benchmarks.emulation", reason="not in a source tree")
+gpu = pytest.importorskip("benchmarks.gpu")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")
 
 LINKAGE, FOUR_BAR, PENDULUM = udk.library.parallelogram(), udk.library.four_bar(), udk.library.compound_pendulum()
@@ -51,18 +51,7 @@ def with_second(f):
     return lambda x: jax.jvp(jax.jacfwd(f), (x,), (1.0,))
 
 
-class Wind(udk.ForceElement):
-    """A force with elementary functions."""
-
-    strength: Float[Array, ""]
-
-    def loads(self, t, *frames):
-        v = frames[0].velocity((0.0, 0.0))
-        along = jnp.tanh(v.x) + jnp.arctan2(v.y, 1.0 + v.x**2) + jnp.exp(-(v.x**2)) + jnp.log1p(v.y**2)
-        return [(self.strength * along, jnp.arcsinh(v.x) - jnp.power(1.0 + v.y**2, 0.3), jnp.cbrt(v.x) * jnp.sinh(v.y))]
-
-
-STONE = udk.Mechanism({"stone": udk.Body(1.0, 0.01)}, forces={"wind": Wind(["stone"], strength=jnp.asarray(0.1))})
+STONE = gpu.stone_in_wind()
 
 RUNS = {
     "redundant": last(LINKAGE, "body.coupler.mass"),

@@ -8,8 +8,9 @@ import hashlib
 import itertools
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -144,8 +145,24 @@ def compile_module(text: str, level: int = LEVEL) -> bytes:
     return object_code(text, _target_machine(level), _llvm().get_default_triple(), () if level == QUICK else PASSES)
 
 
+@cache
+def llvm_for_all_targets() -> Any:
+    """Return LLVM with the compilers of all its targets, not only of this processor."""
+    llvm = _llvm()
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    return llvm
+
+
 def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[str] = PASSES) -> bytes:
     """Compile a module to object code in a separate context, so that threads can compile in parallel."""
+    with optimized(text, machine, triple, optimizations) as module:
+        return _emit(machine, module)
+
+
+@contextmanager
+def optimized(text: str, machine: Any, triple: str, optimizations: Sequence[str]) -> Iterator[Any]:
+    """Parse a module for a target, and run passes of optimization on it."""
     llvm = _llvm()
     with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
         module.triple = triple
@@ -154,7 +171,7 @@ def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[st
         for name in optimizations:
             getattr(passes, f"add_{name}_pass")()
         passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
-        return _emit(machine, module)
+        yield module
 
 
 def _emit(machine: Any, module: Any) -> bytes:

@@ -33,7 +33,7 @@ from udkjax.native.base.ffi import (
     word,
 )
 from udkjax.native.base.ir import BOOL, INT, POINTER, Function, Value, Variable
-from udkjax.native.base.text import text_of_module
+from udkjax.native.base.text import ALLOCATION, text_of_module
 from udkjax.native.gpu.driver import CudaDriver, driver
 from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, GIVEN, PLATFORM, POP, PUSH, Words, stream_of
 from udkjax.threads import cores
@@ -47,10 +47,7 @@ ALIGNMENT = 64  # of arrays, in bytes; as many precede the pinned memory, whose 
 PINNED_BYTES = 2**20
 PORTABLE = 1  # CU_MEMHOSTALLOC_PORTABLE: for all devices
 FAILED = b"copying between the graphics card and the host failed: "
-LIBC = (
-    *("declare ptr @malloc(i64)", "declare void @free(ptr)"),
-    *("declare i32 @pthread_create(ptr, ptr, ptr, ptr)", "declare i32 @pthread_detach(i64)"),
-)
+LIBC = (*ALLOCATION, "declare i32 @pthread_create(ptr, ptr, ptr, ptr)", "declare i32 @pthread_detach(i64)")
 
 
 def register(name: str, handler: int) -> str:

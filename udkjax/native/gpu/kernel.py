@@ -6,7 +6,8 @@ of a multiprocessor then run the same functions at about the same time, which it
 """
 
 from collections.abc import Collection
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 from udkjax.native.base.ir import SHARED_SPACE
 from udkjax.native.base.memory import Memory, ThreadCode
@@ -16,7 +17,9 @@ from udkjax.native.base.text import external_functions, text_of_module, with_eva
 from udkjax.native.operations import Operation
 
 NAME = "run_members"  # of the kernel
-VECTOR = 2  # coordinates whose numbers are read together: a thread waits for memory most of the time
+# Coordinates whose numbers are read together, as a thread waits for memory most of the time. The paper's linkage is slower with 4
+# or 6.
+VECTOR = 2
 # The arguments of functions that point to the memory of a thread, or into it.
 LOCAL = ("work", "out", "tangent", "stored", "accelerations", "projection")
 # A barrier that also asks whether the condition holds in any thread of the block.
@@ -47,14 +50,15 @@ define ptx_kernel void @{NAME}(ptr byval([FIELDS x i64]) align 8 %call) {{
 """
 
 
-class KernelCode(NamedTuple):
+@dataclass(frozen=True)
+class KernelCode:
     """The code of a kernel, with the module whose call record it takes."""
 
     module: Memory
     code: ThreadCode
     constants: int  # in the shared memory of a block
 
-    @property
+    @cached_property
     def text(self) -> str:
         """LLVM's text of the kernel."""
         kernel = KERNEL.replace("FIELDS", str(len(self.module.call_fields))).replace("SIZE", str(self.code.size))

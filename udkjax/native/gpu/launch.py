@@ -25,10 +25,10 @@ from udkjax.native.gpu.kernel import NAME, KernelCode, kernel_code
 from udkjax.native.operations import Operation
 from udkjax.threads import thread_count
 
-# A kernel takes as long, however small the batch, as a core of the host takes for this number of members; measured on an H100.
+# A kernel takes about as long, however small the batch, as a core of the host for this number of members; measured on an H100.
 # Batches of fewer members for each core run on the host, unless `UDKJAX_KERNEL_MEMBERS` sets the smallest batch.
 MEMBERS_OF_CORE = 128
-BLOCK = 128  # threads of a block
+BLOCK = 128  # threads of a block; of 64, 128 and 256 the fastest for the paper's linkage on an H100
 MOST_MEMORY = 2**16  # bytes of a thread; the driver reserves them for each of the 270,000 threads that an H100 can hold
 LAUNCH, KERNEL = "cuLaunchKernel", "kernel"
 TARGET = "udkjax_kernel_"  # prefix of the names of FFI targets
@@ -153,8 +153,7 @@ def _launch(code: KernelCode) -> Function:
     with f.if_(answer.value.is_(0) & (members > 0)):
         answer.value = WORDS.drive(f, PUSH, f.load(place, base=POINTER))
         with f.if_(answer.value.is_(0)):
-            one: tuple[Any, ...] = ("i32 1", "i32 1")
-            sizes = (f"i32 {grid.name}", *one, f"i32 {BLOCK}", *one, "i32 0")
+            sizes = f"i32 {grid.name}", "i32 1", "i32 1", f"i32 {BLOCK}", "i32 1", "i32 1", "i32 0"
             answer.value = WORDS.drive(f, LAUNCH, WORDS.load(f, KERNEL), *sizes, stream, parameters, "ptr null")
             WORDS.drive(f, POP, place)
     with f.if_(answer.value.is_not(0)):

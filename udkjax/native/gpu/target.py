@@ -8,7 +8,6 @@ import tempfile
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from udkjax.native.base import code_cache, machine
 
@@ -43,15 +42,9 @@ def compile_kernel(text: str, capability: tuple[int, int], is_assembled: bool = 
 
 def ptx(text: str, capability: tuple[int, int] = NEWEST) -> str:
     """Compile to PTX."""
-    llvm = _llvm()
+    llvm = machine.llvm_for_all_targets()
     compiler = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=_name(capability), features=PTX, opt=LEVEL)
-    with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
-        module.triple, module.data_layout = TRIPLE, str(compiler.target_data)
-        module.verify()
-        passes = llvm.create_new_module_pass_manager()
-        for name in PASSES:
-            getattr(passes, f"add_{name}_pass")()
-        passes.run(module, llvm.create_pass_builder(compiler, llvm.create_pipeline_tuning_options(speed_level=LEVEL)))
+    with machine.optimized(text, compiler, TRIPLE, PASSES) as module:
         return compiler.emit_assembly(module)
 
 
@@ -74,16 +67,11 @@ def assemble(code: str, capability: tuple[int, int], assembler: str) -> bytes:
 @cache
 def ptxas() -> str | None:
     """Return the path of NVIDIA's assembler: of a wheel (JAX brings it), of an installed CUDA, or on the path; else None."""
-    folders = []
-    for name in ("nvidia.cu13", "nvidia.cuda_nvcc"):
-        try:
-            spec = find_spec(name)
-        except ModuleNotFoundError:
-            continue
-        folders += [Path(x) / "bin" for x in (spec.submodule_search_locations or ()) if spec] if spec else []
-    folders += [Path(home) / "bin" for home in (os.environ.get("CUDA_HOME"), "/usr/local/cuda") if home]
+    spec, homes = find_spec("nvidia"), [os.environ.get("CUDA_HOME"), "/usr/local/cuda"]
+    for wheels in spec.submodule_search_locations or () if spec else ():
+        homes = [f"{wheels}/cu13", f"{wheels}/cuda_nvcc", *homes]
     name = "ptxas.exe" if sys.platform == "win32" else "ptxas"
-    found = next((str(folder / name) for folder in folders if (folder / name).is_file()), None)
+    found = next((str(Path(home, "bin", name)) for home in homes if home and Path(home, "bin", name).is_file()), None)
     return found or shutil.which(name)
 
 
@@ -92,12 +80,3 @@ def _version(assembler: str | None) -> str:
     if assembler is None:
         return ""
     return subprocess.run([assembler, "--version"], capture_output=True, text=True, check=True).stdout
-
-
-@cache
-def _llvm() -> Any:
-    import llvmlite.binding as llvm
-
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    return llvm

@@ -4,8 +4,7 @@ LLVM's text is the same: the call record of `run` has fields of 8 bytes, of whic
 rounded separately. The functions of memory management (malloc, free) are imports.
 """
 
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from udkjax.native.base import code_cache, machine
 from udkjax.native.base.memory import Memory
@@ -47,17 +46,8 @@ def compile_wasm(text: str, exports: tuple[str, ...]) -> LinkedModule:
     key = machine.digest("\0".join((TRIPLE, FEATURES, text)))
     code = code_cache.read(key)
     if code is None:
-        target = _llvm().Target.from_triple(TRIPLE)
+        target = machine.llvm_for_all_targets().Target.from_triple(TRIPLE)
         options = {"cpu": "generic", "features": FEATURES, "opt": machine.LEVEL, "reloc": "static", "codemodel": "small"}
         code = machine.object_code(text, target.create_target_machine(**options), TRIPLE)
         code_cache.write(key, code)
     return link(code, exports)
-
-
-@cache
-def _llvm() -> Any:
-    import llvmlite.binding as llvm
-
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    return llvm
