@@ -84,6 +84,21 @@ def test_threads_compute_what_the_engine_computes(name):
     assert served
 
 
+def test_constants_that_all_members_share_are_in_the_memory_of_the_block(tmp_path):
+    """Members that differ by their starts alone: the threads, and where there is a C compiler, LLVM's PTX for them."""
+    run = gpu.ours(LINKAGE, np.linspace(0.0, 0.5, 4))
+    (call,) = emulation.calls_of(run, gpu.states(gpu.angles(-45.0, 5)), 1e-7)
+    assert call.kernel.constants > 0 and "@block_memory" in call.kernel.text
+    found = [emulation.run_threads(call.kernel, call)]
+    if shutil.which("cc") and platform.machine() == "x86_64":
+        found.append([np.full(x.shape, np.nan) for x in call.outputs])
+        record = emulation.call_record(call.kernel, call, [x.ctypes.data for x in (*call.inputs, *found[1])])
+        ptx_as_c.compiled(target.ptx(call.kernel.text), tmp_path)(record.ctypes.data, 5)
+    for outputs in found:
+        for x, known in zip(outputs, call.outputs, strict=True):
+            assert_array_equal(x, known)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(udk.library.__all__))
 def test_threads_run_every_mechanism_of_the_library(name):
