@@ -1,6 +1,7 @@
 """Four-bars that were designed for a straight line, the letter D and a walking foot.
 
-A drawing gives the links and their joints, and a goal file the targets of a point. `udk.design` finds the pins; the foot moves.
+A drawing gives the links and their joints, and a goal file gives the targets of a point. `udk.design` finds the positions of the
+pins. The player shows the walking foot.
 """
 
 from pathlib import Path

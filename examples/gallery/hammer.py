@@ -1,7 +1,7 @@
 """A hammer falls on its anvil, rebounds and comes to rest: each blow is an event, also in the live page.
 
-A spring drives the hammer, and its head hits a contact of restitution 0.6. Blows are ticks on the timeline; they become weaker
-and weaker until the hammer is at rest.
+A spring drives the hammer, and its head hits a contact with a restitution of 0.6. Each blow is a tick on the timeline. The blows
+become weaker and weaker until the hammer is at rest.
 """
 
 import numpy as np

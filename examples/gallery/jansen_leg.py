@@ -1,6 +1,6 @@
 """Theo Jansen's leg in a batch: how the path of its foot depends on the length of its crank.
 
-The seven links are sized by Jansen's "eleven holy numbers". The legs of a batch are computed together.
+The seven links are sized by Jansen's "eleven holy numbers". One call computes the legs for all crank lengths.
 """
 
 import jax

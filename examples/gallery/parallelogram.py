@@ -1,6 +1,6 @@
 """The paper's linkage, live: one constraint is redundant as long as its three links are equal and parallel.
 
-Change the length of one link, and the linkage cannot move: the page says so, or that the loops do not close.
+If you change the length of one link, the linkage cannot move, or its loops do not close; the page says which.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Peaucellier's linkage of 1864 turns a rotation into an exact straight line.
 
-Its far corner D moves on x = (arm^2 - side^2) / (2 crank), to rounding.
+Its far corner D moves on x = (arm^2 - side^2) / (2 crank), to machine precision.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A planetary gear with three planets where one would do: its carrier turns at sun / (sun + ring) of the sun's speed."""
+"""A planetary gear with three planets, two of them redundant: its carrier turns at sun / (sun + ring) of the sun's speed."""
 
 import numpy as np
 
