@@ -94,8 +94,8 @@ def test_scales_by_arrays_of_jax_and_by_machine_code_are_those_of_numpy(make):
     """Scenes with drivers, gears and force elements; JAX operations are for other devices."""
     mechanism = make()
     programs, numbers = scene_programs(mechanism), np.array([*numbers_as_vector(mechanism.numbers), 0.0, 0.0])
-    known = scales.evaluate_scales(numbers, programs)
-    assert_allclose(jax.jit(scales.scales_by_jax, static_argnums=1)(numbers, programs), known, rtol=1e-14)
+    known = scales.scales_p.by_numpy(numbers, programs)
+    assert_allclose(jax.jit(scales.scales_p.by_jax, static_argnums=1)(numbers, programs), known, rtol=1e-14)
     assert_scales(jax.jit(lambda whole: udk.analyse(whole).scales)(mechanism), mechanism)
 
 
@@ -170,9 +170,9 @@ def test_what_drivers_cannot_reach_is_given_up_soon(monkeypatch, large):
 
 MODULES = position_closure, position_rows, dense_rows, redundancy, scale_program, sparse_rows
 DENSE = [
-    "CLOSED_TOL",
-    "ROUNDING_UNITS",
-    "LONGEST_STEP",
+    "CLOSURE.tol",
+    "CLOSURE.rounding",
+    "CLOSURE.longest_step",
     "DEPENDENT_TOL",
     "CLEAR_TOL",
     "NEGLIGIBLE_SHARE",
@@ -205,10 +205,13 @@ def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name
     """As many rows are redundant, and what closed closes, to rounding."""
     scenes = {kind: getattr(udk.library, kind)() for kind in ("parallelogram", "planetary_gear")}
     expected = {kind: udk.analyse(mechanism).redundant for kind, mechanism in scenes.items()}
+    name, _, field = name.partition(".")
     homes = [module for module in MODULES if hasattr(module, name)]
     assert homes
     for module in homes:
-        monkeypatch.setattr(module, name, factor * getattr(module, name))
+        value = getattr(module, name)
+        changed = value._replace(**{field: factor * getattr(value, field)}) if field else factor * value
+        monkeypatch.setattr(module, name, changed)
     choose = redundancy.kinematic_rows
     monkeypatch.setattr(redundancy, "kinematic_rows", lambda mechanism: choose(mechanism, large))
     for kind, mechanism in scenes.items():

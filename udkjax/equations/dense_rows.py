@@ -11,7 +11,7 @@ import numpy as np
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
 from udkjax.equations.loads import mass_of
-from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
+from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.position_rows import PositionRows
 from udkjax.equations.scales import Scales, concrete_scales
 from udkjax.equations.scene_arrays import arrays_in_time
@@ -121,7 +121,7 @@ class DenseRows(DenseTerms):
             return q, v, *self.violation(t, q, v), 0
         q = close_position(self, t, q, np)
         plus = self.plus(t, q)
-        for _ in range(VELOCITIES):
+        for _ in range(CLOSURE.velocities):
             v = v - self.metric * (plus @ (self.scales.weights * self.geometry(t, q, v)[1]))
         return q, v, *self.violation(t, q, v), plus.rank
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.annotations import NumericArray
 from udkjax.arrays import ArrayLibrary
 from udkjax.equations.constraints import BodyArray, bodies, vector
-from udkjax.equations.structure import ElementKind, evaluate_by_kind, numbers_as_vector
+from udkjax.equations.structure import ElementKind, Result, evaluate_by_kind, numbers_as_vector
 from udkjax.programs.deferred import traced_once
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
@@ -83,7 +83,7 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyAr
         V (J).
     """
     gravity = jnp.tile(jnp.append(mechanism.gravity, 0.0), len(mechanism.body_names))
-    potentials = _evaluate_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
+    potentials = evaluate_forces(lambda e, *frames: e.potential(t, *frames), mechanism, q, v)
     return sum((jnp.sum(V) for _, V in potentials if V is not None), -(mass(mechanism) * gravity) @ vector(q))
 
 
@@ -98,13 +98,29 @@ def element_loads(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray
         return None if result is None else jnp.stack([vector(list(load)) for load in result])
 
     total = jnp.zeros((len(mechanism.body_names), 3))
-    for kind, values in _evaluate_forces(loads, mechanism, q, v):
+    for kind, values in evaluate_forces(loads, mechanism, q, v):
         if values is not None:
             total = total.at[kind.bodies.T].add(values[:, ~np.array(kind.structure.ground)])
     return total.ravel()
 
 
-def _evaluate_forces(
-    function: Callable[..., Array | None], mechanism: Mechanism, q: BodyArray, v: BodyArray
-) -> list[tuple[ElementKind, Array | None]]:
+def loads_on_frames(element: ForceElement, t: ArrayLike, *frames: Frame) -> Float[Array, "frames 3"]:
+    """Return all loads of a force element on its frames (N, N m), those of its potential included."""
+    time = jnp.asarray(t, jnp.result_type(float))
+
+    def potential(places: Float[Array, "frames 3"]) -> Array:
+        turned = zip(frames, places, strict=True)
+        moved = [f._replace(x=x, y=y, angle=a, cos=jnp.cos(a), sin=jnp.sin(a)) for f, (x, y, a) in turned]
+        value = element.potential(time, *moved)
+        return jnp.zeros(()) if value is None else jnp.sum(jnp.asarray(value))
+
+    total = -jax.grad(potential)(jnp.stack([vector(list(frame[:3])) for frame in frames]))
+    stated = element.loads(time, *frames)
+    return total if stated is None else total + jnp.stack([vector(list(load)) for load in stated])
+
+
+def evaluate_forces(
+    function: Callable[..., Result], mechanism: Mechanism, q: BodyArray, v: BodyArray
+) -> list[tuple[ElementKind, Result]]:
+    """Evaluate `function(element, *frames)` for the force elements of each kind together; see `evaluate_by_kind`."""
     return evaluate_by_kind(function, mechanism, [*mechanism.forces.values()], bodies(q), bodies(v))

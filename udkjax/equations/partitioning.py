@@ -18,7 +18,7 @@ from udkjax.annotations import Time, Vector
 from udkjax.arrays import number_called
 from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
-from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 
@@ -76,7 +76,7 @@ class PartitionedSystem(WrappedSystem):
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
         # A solution farther from the predicted state might be another assembly mode; NaN makes the integrator shorten the step.
-        is_near = self.equations.size(closed - q) <= LONGEST_STEP
+        is_near = self.equations.size(closed - q) <= CLOSURE.longest_step
         return jnp.where(is_near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:

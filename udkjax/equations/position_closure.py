@@ -7,29 +7,41 @@ a step, to stay on the branch of the guess, and is halved until the residual fal
 are closed by NumPy, without compilation; traced numbers take the same steps in JAX.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import ArrayLike
 
 from udkjax.annotations import AnyArray, Time
 from udkjax.arrays import ArrayLibrary
-from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.scales import Scales
 from udkjax.programs.control_flow import control_flow
 
-# Largest Psi, in units of the scene's scales, at which a position counts as closed. Rounding errors are about 1e-15; in a scene
-# that cannot be closed, Psi is as large as the errors of its lengths.
-CLOSED_TOL = 1e-9
-ROUNDING_UNITS = 32.0  # times eps and the largest coordinate: smaller residuals are rounding errors
-LONGEST_STEP = 0.3  # largest change of a coordinate in one step, in rad or characteristic lengths, to stay on the branch
-CLOSURE_ITERATIONS = 40  # maximum number of Gauss-Newton steps; five or six are usual: convergence is quadratic
-PACE_STEPS = 4  # steps over which the rate of convergence is measured: see `try_to_close`
-VELOCITIES = 2  # corrections of v: the second removes the rounding errors of the first
-STEP_HALVINGS = 12  # maximum for one step: if 2^-12 of a step does not lower the residual, the position cannot be closed
+
+class ClosingRule(NamedTuple):
+    """When a position counts as closed, and how it is approached.
+
+    Rounding errors of Psi are about 1e-15 in units of the scene's scales; in a scene that cannot be closed, Psi is as large as
+    the errors of its lengths. `tol` lies between the two.
+    """
+
+    tol: float = 1e-9  # largest Psi, in units of the scene's scales, at which a position counts as closed
+    rounding: float = 32.0  # times eps and the largest coordinate: smaller residuals are rounding errors
+    longest_step: float = 0.3  # largest change of a coordinate in one step, in rad or characteristic lengths: keeps the branch
+    steps: int = 40  # maximum number of Gauss-Newton steps; five or six are usual: convergence is quadratic
+    pace_steps: int = 4  # steps over which the rate of convergence is measured: see `try_to_close`
+    velocities: int = 2  # corrections of v: the second removes the rounding errors of the first
+    halvings: int = 12  # maximum for one step: if 2^-12 of a step does not lower the residual, the position cannot be closed
+
+    def shortening(self, size: AnyArray, xp: ArrayLibrary) -> AnyArray:
+        """Return the factor that makes a step of this size as long as `longest_step`; 1 for a shorter one."""
+        too_long = size > self.longest_step
+        return xp.where(too_long, self.longest_step / xp.where(too_long, size, 1.0), 1.0)
+
+
+CLOSURE = ClosingRule()
 
 Assembly = tuple[AnyArray, AnyArray, AnyArray, AnyArray, ArrayLike]  # q, v, Psi, Psi_dot and the rank of D
 
@@ -53,21 +65,21 @@ class Rows(Protocol[AnyArray]):
 
 def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """Return the residual that rounding of the coordinates causes."""
-    return ROUNDING_UNITS * float(jnp.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
+    return CLOSURE.rounding * float(jnp.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
 
 
 def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return whether Psi and Psi_dot are within `CLOSED_TOL` in units of the scene's scales, or at rounding level."""
-    open_by = xp.maximum(CLOSED_TOL, rounding(scales, q, xp))
+    """Return whether Psi and Psi_dot are within `CLOSURE.tol` in units of the scene's scales, or at rounding level."""
+    open_by = xp.maximum(CLOSURE.tol, rounding(scales, q, xp))
     rate = xp.maximum(scales.rate, scales.size(v, xp))
     return (scales.violation(psi, xp) <= open_by) & (scales.violation(psi_dot, xp) <= open_by * rate)
 
 
 def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return a Gauss-Newton step, shortened so that no coordinate changes by more than `LONGEST_STEP`."""
+    """Return a Gauss-Newton step, shortened so that no coordinate changes by more than `CLOSURE.longest_step`."""
     step = rows.correction(t, q)
     longest = rows.scales.size(step, xp)
-    return step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
+    return step * CLOSURE.shortening(longest, xp)
 
 
 def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
@@ -78,11 +90,11 @@ def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = j
 
     def is_worse(trial: tuple[AnyArray, Any]) -> ArrayLike:
         scale, k = trial
-        return (k < STEP_HALVINGS) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
+        return (k < CLOSURE.halvings) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
 
     halve = lambda trial: (0.5 * trial[0], trial[1] + 1)  # noqa: E731
     scale, k = control_flow(xp).while_loop(is_worse, halve, (xp.ones(()), 0))
-    improves = (k < STEP_HALVINGS) & (size > rounding(rows.scales, current, xp))
+    improves = (k < CLOSURE.halvings) & (size > rounding(rows.scales, current, xp))
     return xp.where(improves, q + scale * step, q), improves
 
 
@@ -91,7 +103,7 @@ def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary 
 
     def goes_on(state: tuple[AnyArray, Any, int]) -> ArrayLike:
         _, improves, k = state
-        return improves & (k < CLOSURE_ITERATIONS)
+        return improves & (k < CLOSURE.steps)
 
     def body(state: tuple[AnyArray, Any, int]) -> tuple[AnyArray, Any, int]:
         q, _, k = state
@@ -107,42 +119,15 @@ def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
     more slowly.
     """
     sizes, improves = [float(np.linalg.norm(rows.residual(t, q)))], True
-    while improves and len(sizes) <= CLOSURE_ITERATIONS:
+    while improves and len(sizes) <= CLOSURE.steps:
         q, improves = damped_step(rows, t, q, np)
         sizes.append(float(np.linalg.norm(rows.residual(t, q))))
-        if len(sizes) > PACE_STEPS:
-            fall = (sizes[-1 - PACE_STEPS] - sizes[-1]) / PACE_STEPS
-            improves &= sizes[-1] <= fall * (CLOSURE_ITERATIONS + 1 - len(sizes))
+        if len(sizes) > CLOSURE.pace_steps:
+            fall = (sizes[-1 - CLOSURE.pace_steps] - sizes[-1]) / CLOSURE.pace_steps
+            improves &= sizes[-1] <= fall * (CLOSURE.steps + 1 - len(sizes))
     return q
 
 
 def driver_time_step(scales: Scales) -> float:
     """Return the time (s) between positions of the random motion, in which drivers move about as far as the other coordinates."""
-    return LONGEST_STEP / float(scales.rate) if scales.rate > 0.0 else 0.0
-
-
-class TracedRows(NamedTuple):
-    """The `Rows` of a mechanism with traced numbers, by its equations of motion."""
-
-    equations: MechanismSystem
-
-    @property
-    def scales(self) -> Scales:
-        return self.equations.scales
-
-    def residual(self, t: Time, q: Array) -> Array:
-        return self.equations.violation(t, q, q)[0] / self.scales.rows
-
-    def correction(self, t: Time, q: Array) -> Array:
-        plus, psi, root = self.equations.linearized_position(t, q)
-        return -root * (plus @ psi)
-
-    def assemble(self, close: Callable[["TracedRows", Time, Array], Array], t: Time, q: Array, v: Array) -> Assembly[Array]:
-        """Return q closed by `close`, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
-        if not self.equations.constrained:
-            return q, v, *self.equations.violation(t, q, v), 0
-        q, rank = close(self, t, q), 0
-        for _ in range(VELOCITIES):
-            plus, residual, root = self.equations.linearized_velocity(t, q, v)
-            v, rank = v - root * (plus @ residual), plus.rank
-        return q, v, *self.equations.violation(t, q, v), rank
+    return CLOSURE.longest_step / float(scales.rate) if scales.rate > 0.0 else 0.0

@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from udkjax.annotations import Time
-from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scales import Scales
 
 POSITION_SAMPLES = 24  # positions of the random motion, if the first one has dependent rows
@@ -111,11 +111,11 @@ class PositionRows(ABC, Generic[Position]):
             heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(self.size) / np.sqrt(self.size)
             heading = last.tangent_part(heading)  # keep the direction, so that the motion covers the range
             step = self.metric * heading
-            moved = last.q + LONGEST_STEP * step / max(self.scales.size(step, np), 1e-300)
+            moved = last.q + CLOSURE.longest_step * step / max(self.scales.size(step, np), 1e-300)
             position = self.close(time_step * (k + 1), moved, give_up=True)
             if position is None or not position.is_clear or not np.any(heading):  # stuck: jump
                 heading, jump = random.standard_normal(self.size), random.uniform(-1.0, 1.0, self.size)
-                position = self.close(time_step * (k + 1), first.q + LONGEST_STEP * self.metric * jump, give_up=True)
+                position = self.close(time_step * (k + 1), first.q + CLOSURE.longest_step * self.metric * jump, give_up=True)
             failures = 0 if position is not None else failures + 1
             positions.extend([] if position is None else [position])
         positions = [p for p in positions if p.is_clear]
@@ -130,8 +130,8 @@ class PositionRows(ABC, Generic[Position]):
             return ()
         chosen = []
         for members, subsets in self.split_rows(positions):
-            generic = [subset for subset in subsets if subset.smallest > GENERIC_TOL] or subsets
-            chosen += members[list(choose_dispensable([subset.null_space for subset in generic]))].tolist()
+            null_spaces = [subset.null_space for subset in self.generic(subsets)]
+            chosen += members[list(self.dispensable(null_spaces))].tolist()
         return tuple(sorted(chosen))
 
     def owners_of_row(self, t: Time, q: np.ndarray, name: str) -> set[str] | None:
@@ -143,18 +143,23 @@ class PositionRows(ABC, Generic[Position]):
             return None
         return set(owners[owners != name][np.abs(shares) > NEGLIGIBLE_SHARE])
 
+    @staticmethod
+    def generic(positions: Sequence[Any]) -> Sequence[Any]:
+        """Return the positions that are far from singular, by their `smallest` singular values; all if none is."""
+        return [position for position in positions if position.smallest > GENERIC_TOL] or positions
 
-def choose_dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
-    """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as possible for every N.
+    @staticmethod
+    def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
+        """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as possible for every N.
 
-    Greedy: take the row whose smallest length over all N is largest; then project the direction of that row out of each N. Among
-    equal rows the last is chosen, so that a copy is left out and its original stays.
-    """
-    chosen: list[int] = []
-    while null_spaces[0].shape[1]:
-        length = np.min([np.linalg.norm(N, axis=1) for N in null_spaces], axis=0)
-        length[chosen] = -1.0
-        row = int(np.flatnonzero(length >= 0.999 * length.max())[-1])
-        chosen.append(row)
-        null_spaces = [N @ np.linalg.svd(N[row : row + 1])[2][1:].T for N in null_spaces]
-    return tuple(sorted(chosen))
+        Greedy: take the row whose smallest length over all N is largest; then project the direction of that row out of each N.
+        Among equal rows the last is chosen, so that a copy is left out and its original stays.
+        """
+        chosen: list[int] = []
+        while null_spaces[0].shape[1]:
+            length = np.min([np.linalg.norm(N, axis=1) for N in null_spaces], axis=0)
+            length[chosen] = -1.0
+            row = int(np.flatnonzero(length >= 0.999 * length.max())[-1])
+            chosen.append(row)
+            null_spaces = [N @ np.linalg.svd(N[row : row + 1])[2][1:].T for N in null_spaces]
+        return tuple(sorted(chosen))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_rows import NEGLIGIBLE_SHARE, PositionRows
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
@@ -45,8 +45,18 @@ def generic_position(mechanism: Mechanism) -> np.ndarray | None:
         return None
     step = rows.metric * start.tangent_part(random)
     size = rows.scales.size(step, np)
-    moved = rows.close(0.0, start.q + LONGEST_STEP * step / size) if size > 0 else None
+    moved = rows.close(0.0, start.q + CLOSURE.longest_step * step / size) if size > 0 else None
     return start.q if moved is None else moved.q
+
+
+def holders_of_driver(mechanism: Mechanism, name: str) -> set[str] | None:
+    """Return the constraints that hold the coordinate of a driver, in a generic position of the joints alone.
+
+    These are the constraints on whose rows of Psi_q the row of the driver depends; None if the joints and the other drivers leave
+    it free, or the joints cannot be closed. All numbers are concrete.
+    """
+    q = generic_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
+    return None if q is None else kinematic_rows(mechanism).owners_of_row(0.0, q, name)
 
 
 def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionRows:

@@ -107,26 +107,28 @@ def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
 # --- the scales as one JAX operation on vectors of numbers (..., numbers), which native lowers to machine code
 
 
-def evaluate_scales(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
-    """Return the array `scales` for each vector of `numbers`, by NumPy."""
-    results = [_evaluate(programs, x, np) for x in numbers.reshape(-1, numbers.shape[-1])]
-    return np.array(results, numbers.dtype).reshape(*numbers.shape[:-1], -1)
+class ScalesPrimitive(Primitive):
+    """The array `scales` for vectors of numbers."""
 
+    def by_numpy(self, numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
+        """Return the array `scales` for each vector of `numbers`, by NumPy."""
+        results = [_evaluate(programs, x, np) for x in numbers.reshape(-1, numbers.shape[-1])]
+        return np.array(results, numbers.dtype).reshape(*numbers.shape[:-1], -1)
 
-def scales_by_jax(numbers: Array, programs: ScenePrograms) -> Array:
-    """Return the array `scales` for each vector of `numbers`, by JAX."""
-    return jnp.vectorize(lambda x: _evaluate(programs, x, jnp), signature="(n)->(m)")(numbers)
+    def by_jax(self, numbers: Array, programs: ScenePrograms) -> Array:
+        """Return the array `scales` for each vector of `numbers`, by JAX."""
+        return jnp.vectorize(lambda x: _evaluate(programs, x, jnp), signature="(n)->(m)")(numbers)
 
 
 def _batch(inputs: Any, axes: Any, programs: ScenePrograms) -> tuple[Any, int]:
     return scales_p.bind(jnp.moveaxis(inputs[0], axes[0], 0), programs=programs), 0
 
 
-scales_p = Primitive("scales")
-scales_p.def_impl(lambda numbers, programs: jax.device_put(evaluate_scales(np.asarray(numbers), programs)))
+scales_p = ScalesPrimitive("scales")
+scales_p.def_impl(lambda numbers, programs: jax.device_put(scales_p.by_numpy(np.asarray(numbers), programs)))
 scales_p.def_abstract_eval(
     lambda numbers, programs: result_type((*numbers.shape[:-1], programs.scale_count), [numbers], numbers.dtype)
 )
 batching.primitive_batchers[scales_p] = _batch
-mlir.register_lowering(scales_p, mlir.lower_fun(scales_by_jax, multiple_results=False))
-evaluate_as(scales_p, evaluate_scales)
+mlir.register_lowering(scales_p, mlir.lower_fun(scales_p.by_jax, multiple_results=False))
+evaluate_as(scales_p, scales_p.by_numpy)

@@ -20,7 +20,7 @@ from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
 from udkjax.equations.dense_rows import CLEAR_TOL, RowTerms
 from udkjax.equations.loads import mass_of
-from udkjax.equations.position_closure import VELOCITIES, Assembly, close_position, driver_time_step, is_closed, try_to_close
+from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.position_rows import NEGLIGIBLE_SHARE, PositionRows
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.scales import concrete_scales
@@ -164,7 +164,7 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
         if not np.all(np.isfinite(D.data)):
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
-        for _ in range(VELOCITIES + 1):  # the damped first correction is not exact
+        for _ in range(CLOSURE.velocities + 1):  # the damped first correction is not exact
             v = v + self._solve(D, self.geometry(t, q, v)[1] / length)
         return q, v, psi, self.geometry(t, q, v)[1], rank
 

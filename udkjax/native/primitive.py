@@ -16,7 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.equations.scales import evaluate_scales, scales_by_jax, scales_p
+from udkjax.equations.scales import scales_p
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base import host_program, machine
 from udkjax.native.base.ffi import handler
@@ -318,7 +318,7 @@ def _scale_inputs(numbers: Any) -> list[Any]:
 
 def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:
     if numbers.dtype != np.float64 or unsupported(programs):
-        return scales_by_jax(numbers, programs)
+        return scales_p.by_jax(numbers, programs)
     (scales,) = native_p.bind(*_scale_inputs(numbers), operation=FindScales(programs), times=1)
     return scales.reshape(*numbers.shape[:-1], -1)
 
@@ -326,7 +326,7 @@ def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:
 def _scales_of_batch(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
     """Evaluate the primitive of scales outside compiled programs; for a few vectors by NumPy, without compilation."""
     if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or unsupported(programs):
-        return evaluate_scales(numbers, programs)
+        return scales_p.by_numpy(numbers, programs)
     (scales,) = call_members(*_scale_inputs(np.asarray(numbers, float)), operation=FindScales(programs), times=1)
     return scales.reshape(*numbers.shape[:-1], -1)
 

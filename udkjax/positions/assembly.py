@@ -87,7 +87,7 @@ class Closure(NamedTuple):
     psi_dot: Float[Array, "m"]
     rank: Int[Array, ""]
     scales: Scales
-    is_closed: Bool[Array, ""]  # whether the residuals are within `CLOSED_TOL` of the scene's scales, or rounding
+    is_closed: Bool[Array, ""]  # whether the residuals are within `CLOSURE.tol` of the scene's scales, or rounding
 
 
 @checked

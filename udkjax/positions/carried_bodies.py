@@ -15,7 +15,7 @@ from udkjax.annotations import NumberLike
 from udkjax.arrays import library_for
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.positions.coordinates import Coordinate, element_of
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
@@ -113,4 +113,4 @@ def _is_carried(mechanism: Mechanism, part: set[int], carrier: int) -> bool:
     moved[indices, :2] = q[indices, :2] @ np.array([[c, s], [-s, c]]) + length * np.array([dx, dy])
     moved[indices, 2] += turn
     change = (rows.psi(0.0, moved.ravel()) - rows.psi(0.0, q.ravel())) / rows.scales.rows
-    return bool(np.all(np.abs(change[mask]) <= CLOSED_TOL))
+    return bool(np.all(np.abs(change[mask]) <= CLOSURE.tol))

@@ -1,15 +1,18 @@
 """Closure of a mechanism as a function of its numbers, by machine code or JAX, with derivatives of any order."""
 
 import operator
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.annotations import Number
+from udkjax.annotations import Number, Time
+from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.position_closure import CLOSURE_ITERATIONS, Assembly, TracedRows, close_position, damped_step
+from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, damped_step
 from udkjax.equations.scales import Scales
 from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
@@ -39,6 +42,33 @@ def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
         return mechanism
     motions = lambda x: [driver.motion for driver in x.drivers.values()]  # noqa: E731
     return eqx.tree_at(motions, mechanism, [MotionFrom(motion, t) for motion in motions(mechanism)])
+
+
+class TracedRows(NamedTuple):
+    """The `Rows` of a mechanism with traced numbers, by its equations of motion."""
+
+    equations: MechanismSystem
+
+    @property
+    def scales(self) -> Scales:
+        return self.equations.scales
+
+    def residual(self, t: Time, q: Array) -> Array:
+        return self.equations.violation(t, q, q)[0] / self.scales.rows
+
+    def correction(self, t: Time, q: Array) -> Array:
+        plus, psi, root = self.equations.linearized_position(t, q)
+        return -root * (plus @ psi)
+
+    def assemble(self, close: Callable[["TracedRows", Time, Array], Array], t: Time, q: Array, v: Array) -> Assembly[Array]:
+        """Return q closed by `close`, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
+        if not self.equations.constrained:
+            return q, v, *self.equations.violation(t, q, v), 0
+        q, rank = close(self, t, q), 0
+        for _ in range(CLOSURE.velocities):
+            plus, residual, root = self.equations.linearized_velocity(t, q, v)
+            v, rank = v - root * (plus @ residual), plus.rank
+        return q, v, *self.equations.violation(t, q, v), rank
 
 
 def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
@@ -148,7 +178,7 @@ def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
         following, better = damped_step(rows, t, q)
         return jnp.where(better, following, q + rows.correction(t, q)), None
 
-    return jax.lax.scan(body, q, None, length=CLOSURE_ITERATIONS)[0]
+    return jax.lax.scan(body, q, None, length=CLOSURE.steps)[0]
 
 
 @_close_position.defjvp

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.arrays import ArrayLibrary
-from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.native.base.host_function import call_seldom
 from udkjax.positions.crossing import CLOSE_DISTANCE, LOST_RANK, NEAR_LOSS, Crossing, find_crossing, find_toggle
@@ -231,7 +231,7 @@ def _advance(
     rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
     near = xp.linalg.norm(corrected - predicted) <= PREDICTION_TOL * eta + rounding
     # A residual remains in directions that E^+ truncates; it is of second order in the step, and corrected in the next step.
-    closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(corrected) <= CLOSED_TOL))
+    closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(corrected) <= CLOSURE.tol))
     good = near & (tangent @ tau >= LARGEST_BEND) & closed
     good = good & ~(lands & (eta > CLOSE_DISTANCE) & (clearance < NEAR_LOSS))  # the tangent leads across only from nearby
     good = good & ((side == state.side) | (eta <= CLOSE_DISTANCE))  # else the point is on a neighbouring branch

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
-from udkjax.equations.position_closure import ROUNDING_UNITS
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.svd import SVDFactors
@@ -56,7 +56,7 @@ class AbstractCurve(ABC):
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
         """Return True if the residual is rounding."""
         xp = self.by.xp
-        return self.violation(X) <= ROUNDING_UNITS * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
+        return self.violation(X) <= CLOSURE.rounding * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
 
     def violation(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
         """Return the largest row of |Psi|, each relative to its scale."""

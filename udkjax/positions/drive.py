@@ -20,7 +20,7 @@ from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
-from udkjax.equations.redundancy import generic_position, kinematic_rows
+from udkjax.equations.redundancy import holders_of_driver
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.coordinates import Coordinate, constant_motion, named_element, value_of
 from udkjax.scene.checks import SceneError
@@ -107,7 +107,7 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
     driver_text = driver if isinstance(driver, str) else f"the {element.coordinate} of {' and '.join(element.bodies)}"
     if concrete.is_concrete and analysis.redundant_rows != ():
         with jax.ensure_compile_time_eval():  # concrete even while something else is traced
-            require_free(concrete, with_drivers(concrete, {}), name, driver_text, names)
+            require_free(concrete, name, driver_text, names)
     _require_determinate(driven, analysis, driver_text)
     row = next(k for k, (owner, _) in enumerate(analysis.row_names) if owner == name)
     rows = analysis.scales.rows
@@ -221,14 +221,13 @@ def suggested_coordinate(mechanism: Mechanism) -> str:
     return (free or [f"body.{mechanism.body_names[0]}.angle"])[0]
 
 
-def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:
+def require_free(driven: Mechanism, name: str, driver: str, names: Mapping[str, str]) -> None:
     """Raise an error if the joints and the other drivers hold the coordinate of a driver.
 
     The coordinate is held if its row of Psi_q depends on their rows in a generic configuration.
 
     Args:
         driven: the mechanism with the driver; its numbers are concrete.
-        bare: the mechanism without drivers.
         name: name of the driver in the mechanism.
         driver: the name of the driver in the message.
         names: names of other drivers in the message, if not their own.
@@ -236,8 +235,7 @@ def require_free(driven: Mechanism, bare: Mechanism, name: str, driver: str, nam
     Raises:
         SceneError: the coordinate is held; the message names the drivers that hold it.
     """
-    q = generic_position(bare)
-    involved = None if q is None else kinematic_rows(driven).owners_of_row(0.0, q, name)
+    involved = holders_of_driver(driven, name)
     if involved is None:
         return
     holding = [names.get(other, f"driver {quote(other)}") for other in driven.driver_names if other in involved]

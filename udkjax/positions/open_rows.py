@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.redundancy import kinematic_rows
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
@@ -50,10 +50,10 @@ def explain_open(
         psi_dot: residual Psi_dot (m,), in m/s or rad/s.
         scales: scales of the rows.
     """
-    is_open = bool(np.max(np.abs(psi) / scales) > CLOSED_TOL) or not np.all(np.isfinite(psi))
+    is_open = bool(np.max(np.abs(psi) / scales) > CLOSURE.tol) or not np.all(np.isfinite(psi))
     residual = psi if is_open else psi_dot
     sizes = np.nan_to_num(np.abs(residual) / scales, nan=np.inf)
-    text = name_open_rows(names, residual, scales, CLOSED_TOL * float(min(sizes.max(), 1e300)))
+    text = name_open_rows(names, residual, scales, CLOSURE.tol * float(min(sizes.max(), 1e300)))
     if not is_open:
         drivers = [name for name in dict.fromkeys(names) if name in mechanism.drivers and f'"{name}"' in text]
         who = f"driver{'s' * (len(drivers) > 1)} {' and '.join(map(_quote, drivers))} ask{'s' * (len(drivers) < 2)} for"
@@ -74,7 +74,7 @@ def explain_open(
     demands = []
     for name, driver in mechanism.drivers.items():
         off = float(left[list(names).index(name)])
-        if abs(off) > CLOSED_TOL * float(scales[list(names).index(name)]):
+        if abs(off) > CLOSURE.tol * float(scales[list(names).index(name)]):
             value, unit = float(driver.motion(t)), "rad" if driver.coordinate == "angle" else "m"
             demands.append(f'driver "{name}" asks for {value:.6g} {unit} at {t:.6g} s, and is at {value + off:.6g} {unit}')
     return f"{cause}Without drivers it closes: {'; '.join(demands)}. Change the drivers' motion, or bring the guess closer to it."

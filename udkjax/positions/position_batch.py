@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
-from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_programs import PositionPrograms, TracedModel, trace_model
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.closing.positions import PositionCode
@@ -105,7 +105,7 @@ class PositionBatch:
         require_finite("values", s)
         if s.ndim not in (1, 2) or (s.ndim == 2 and len(s) != len(x)):
             raise ValueError(f"values must have the shape (T,), or ({len(x)}, T) for {len(x)} members, not {s.shape}")
-        found = self._code(x, s, self._unit, longest=LONGEST_STEP * float(self._driven.unit), threads=threads)
+        found = self._code(x, s, self._unit, longest=CLOSURE.longest_step * float(self._driven.unit), threads=threads)
         return self._arrange(*found)
 
     def _table(self) -> PrintedTable:

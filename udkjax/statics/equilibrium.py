@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.annotations import NumberLike
 from udkjax.arrays import library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.position_closure import LONGEST_STEP, STEP_HALVINGS
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.positions.assembly import State, close
 from udkjax.positions.branches import distinct_positions, random_positions
 from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
@@ -228,7 +228,7 @@ def _settle(
         q, current, k, _ = state
         step = current.directions @ _towards_rest(current, scale, stable, curve)
         longest = xp.max(xp.abs(step / curve.units[:-1]))
-        step = step * xp.where(longest > LONGEST_STEP, LONGEST_STEP / xp.where(longest > LONGEST_STEP, longest, 1.0), 1.0)
+        step = step * CLOSURE.shortening(longest, xp)
         size = xp.linalg.norm(current.force)
 
         def trial(state: Trial) -> Trial:
@@ -242,7 +242,7 @@ def _settle(
             return 0.5 * share, j + 1, closed & better, new, trial
 
         def worse(state: Trial) -> Bool[Array, ""]:
-            return (state[1] < STEP_HALVINGS) & ~state[2]
+            return (state[1] < CLOSURE.halvings) & ~state[2]
 
         first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, current
         _, _, better, new, new_linearization = by.while_loop(worse, trial, first)

@@ -13,11 +13,7 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Time
 from udkjax.equations import loads
-from udkjax.equations.constraints import bodies
 from udkjax.equations.scales import Scales
-from udkjax.equations.structure import evaluate_by_kind
-from udkjax.scene.bodies import Frame
-from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -39,22 +35,7 @@ def load_scale(mechanism: Mechanism, scales: Scales, t: Time, q: Float[Array, "n
 
 def load_sizes(mechanism: Mechanism, t: Time, q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
     """Return the sum of the absolute loads on each coordinate (N, N m), of gravity and of each force element."""
-    time = jnp.asarray(t, jnp.result_type(float))
-
-    def sizes(element: ForceElement, *frames: Frame) -> Float[Array, "frames 3"]:
-        def potential(places: Float[Array, "frames 3"]) -> Array:
-            moved = [
-                f._replace(x=x, y=y, angle=a, cos=jnp.cos(a), sin=jnp.sin(a)) for f, (x, y, a) in zip(frames, places, strict=True)
-            ]
-            values = element.potential(time, *moved)
-            return jnp.zeros(()) if values is None else jnp.asarray(values)
-
-        total = -jax.grad(potential)(jnp.stack([jnp.stack([jnp.asarray(x, float) for x in f[:3]]) for f in frames]))
-        explicit = element.loads(time, *frames)
-        return jnp.abs(total if explicit is None else total + jnp.asarray([[jnp.asarray(x) for x in load] for load in explicit]))
-
     total = jnp.abs(loads.mass(mechanism).reshape(-1, 3) * jnp.append(mechanism.gravity, 0.0))
-    elements = [*mechanism.forces.values()]
-    for kind, values in evaluate_by_kind(sizes, mechanism, elements, bodies(q), bodies(v)):
-        total = total.at[kind.bodies.T].add(values[:, ~np.array(kind.structure.ground)])
+    for kind, values in loads.evaluate_forces(lambda e, *frames: loads.loads_on_frames(e, t, *frames), mechanism, q, v):
+        total = total.at[kind.bodies.T].add(jnp.abs(values[:, ~np.array(kind.structure.ground)]))
     return total.ravel()

@@ -17,8 +17,6 @@ from jaxtyping import Array, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import analyse
-from udkjax.equations.constraints import bodies
-from udkjax.equations.structure import evaluate_by_kind
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -141,8 +139,7 @@ def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[A
             return total
         return total + jax.grad(lambda t: jnp.asarray(element.potential(t, *frames), t.dtype))(t)
 
-    elements = [*mechanism.forces.values()]
-    by_element = jnp.zeros(len(elements))
-    for kind, powers in evaluate_by_kind(power, mechanism, elements, bodies(q), bodies(v)):
+    by_element = jnp.zeros(len(mechanism.forces))
+    for kind, powers in loads.evaluate_forces(power, mechanism, q, v):
         by_element = by_element.at[kind.members].set(powers)
     return by_element

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_programs import trace_model
 from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.positions.drive import Drive, drive
@@ -206,7 +206,7 @@ class DesignProblem:
     @property
     def longest(self) -> float:
         """The longest step of the driver's value."""
-        return LONGEST_STEP * float(self.driven.unit)
+        return CLOSURE.longest_step * float(self.driven.unit)
 
     def march(self, x: np.ndarray, s: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions (M, J, n) at values (M, J), in order from the drawn position, and whether all exist (M,)."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.motion_measures import MotionModel
-from udkjax.equations.position_closure import LONGEST_STEP
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_programs import trace_model
 from udkjax.positions.drive import Drive, Driven
 from udkjax.positions.free_numbers import FreeNumbers, position_model
@@ -64,7 +64,7 @@ class CompiledTerm:
         goal.check(mechanism, driven, free.names)
         self.goal, self._unit, self._span = goal, unit, span
         self._unit_of_residuals = scale / np.sqrt(goal.samples)
-        self._longest = LONGEST_STEP * float(driven.unit)
+        self._longest = CLOSURE.longest_step * float(driven.unit)
         turning = span is None
         base = position_model(free, driver, lambda *_: jnp.zeros(0), None if turning else origin, shifted and not turning)
         speed = goal.speed if goal.speed is not None else _speed(mechanism, driven.name)

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.constraints import vector
-from udkjax.equations.structure import evaluate_by_kind
+from udkjax.equations import loads
 from udkjax.programs.deferred import deferred
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
@@ -45,11 +44,11 @@ def element_loads(
     shape = len(states), count
     size, jump, damping, stiffness = (np.zeros(shape) for _ in range(4))
     for kind, (load, by_q, by_v) in _evaluate(mechanism.without_origin, ts, qs, vs) if count else ():
-        loads, by_q, by_v = (np.asarray(x) for x in (load, by_q, by_v))  # (states, elements, 3k), (.., 3k, 3k)
+        load, by_q, by_v = (np.asarray(x) for x in (load, by_q, by_v))  # (states, elements, 3k), (.., 3k, 3k)
         body = np.array([[b.mass, b.mass, b.inertia] for b in mechanism.bodies.values()], float)
         moving = body[kind.bodies.T].reshape(len(kind.members), -1)  # (elements, 3k)
         unit = np.tile([length, length, 1.0], moving.shape[1] // 3)
-        a = loads / moving / unit
+        a = load / moving / unit
         size[:, kind.members] = np.abs(a).max(-1, initial=0.0)
         jump[:, kind.members] = np.abs(a - a[:1]).max(-1, initial=0.0)
         sqrt_mass = np.sqrt(moving)
@@ -71,7 +70,7 @@ def _evaluate(mechanism: Mechanism, ts: np.ndarray, qs: np.ndarray, vs: np.ndarr
     kinds: list = []
 
     def at(t: Array, q: Array, v: Array) -> list:
-        found = evaluate_by_kind(lambda e, *frames: _load(e, t, frames), mechanism, [*mechanism.forces.values()], q, v)
+        found = loads.evaluate_forces(lambda e, *frames: _load(e, t, frames), mechanism, q, v)
         kinds[:] = [kind for kind, _ in found]
         return [x for _, x in found]
 
@@ -90,14 +89,7 @@ def _load(element: ForceElement, t: Array, frames: Sequence[Frame]) -> tuple[Arr
         return moved_frames
 
     def load(q: Array, v: Array) -> Array:
-        total = jnp.zeros(len(q))
-        found = element.loads(t, *placed(q, v))
-        if found is not None:
-            total = total + jnp.concatenate([jnp.zeros(0), *(vector(list(found[k])) for k in moving)])
-        potential = lambda q: element.potential(t, *placed(q, v))  # noqa: E731
-        if jax.eval_shape(potential, q) is not None:
-            total = total - jax.grad(lambda q: jnp.sum(jnp.asarray(potential(q))))(q)
-        return total
+        return loads.loads_on_frames(element, t, *placed(q, v))[np.array(moving, int)].ravel()
 
     q = jnp.concatenate([jnp.zeros(0), *(jnp.stack(frames[k][:3]) for k in moving)])
     v = jnp.concatenate([jnp.zeros(0), *(jnp.stack(frames[k][5:]) for k in moving)])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.redundancy import generic_position, kinematic_rows
+from udkjax.equations.redundancy import holders_of_driver
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver
@@ -44,7 +44,7 @@ def explain_reach(run: FailedRun, until: float) -> str:
     names = [name for name in mechanism.driver_names if name in reach.owners]
     if not names:
         return ""
-    opposed = _opposed(mechanism, names)
+    opposed = holders_of_driver(mechanism, names[-1]) is not None
     demands = " and ".join(f'driver "{name}" asks for {_value(mechanism.drivers[name], until)}' for name in names)
     where = f"at {until:.6g} s"
     if opposed and len(names) > 1:
@@ -104,12 +104,6 @@ def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozens
     demand = N @ (N.T @ ((rows.at(until, q)[0] - psi) / length))
     involved = np.abs(demand) > INVOLVED_SHARE * np.abs(demand).max(initial=0.0)
     return frozenset(name for (name, _), is_involved in zip(rows.names, involved, strict=True) if is_involved)
-
-
-def _opposed(mechanism: Mechanism, names: list[str]) -> bool:
-    """Return True if the rows of drivers depend on the others in a generic configuration, too."""
-    q = generic_position(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
-    return q is not None and kinematic_rows(mechanism).owners_of_row(0.0, q, names[-1]) is not None
 
 
 def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:

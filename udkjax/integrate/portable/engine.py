@@ -11,7 +11,7 @@ import numpy as np
 
 from udkjax.annotations import JsonObject
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.position_closure import CLOSED_TOL, ROUNDING_UNITS
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events.event import ExpandsToEvents
@@ -233,7 +233,7 @@ def _close(mechanism: Mechanism) -> JsonObject:
 def _closing(analysis: Analysis) -> JsonObject:
     """Return the inputs of closing."""
     length, tol = float(analysis.scales.length), float(analysis.scales.rank_tol)
-    return {"thresholds": [tol**2, 0.0], "settings": [length, tol], "tol": CLOSED_TOL, "rounding": ROUNDING_UNITS}
+    return {"thresholds": [tol**2, 0.0], "settings": [length, tol], "tol": CLOSURE.tol, "rounding": CLOSURE.rounding}
 
 
 def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: JsonObject) -> JsonObject:

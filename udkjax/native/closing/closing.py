@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSURE_ITERATIONS, LONGEST_STEP, ROUNDING_UNITS, STEP_HALVINGS, VELOCITIES
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
@@ -79,7 +79,7 @@ class Closing(Module):
             for name in "qv":
                 self.put_entry(f, f"state {name}", i, self.entry(f, f"point3 {name}", i))
         better, steps = f.variable(1.0), f.variable(0, INT)
-        with f.while_(lambda: (better.value > 0.5) & (steps.value < CLOSURE_ITERATIONS)):
+        with f.while_(lambda: (better.value > 0.5) & (steps.value < CLOSURE.steps)):
             steps.value = steps.value + 1
             before = size()
             largest, longest = f.variable(1.0), f.variable(0.0)
@@ -87,15 +87,17 @@ class Closing(Module):
                 q = self.entry(f, "state q", i)
                 largest.value = f.max(f.abs(q) * self.entry(f, "inverse unit", i), largest.value)
                 self.put_entry(f, "corrected q", i, q)
-            better.value = f.select(before > largest.value * (ROUNDING_UNITS * np.finfo(float).eps), f.const(1.0), 0.0)
+            better.value = f.select(before > largest.value * (CLOSURE.rounding * np.finfo(float).eps), f.const(1.0), 0.0)
             with f.if_(better.value > 0.5):
                 self._correct(f, "q")
                 with f.each(n) as i:
                     step = f.abs(self.entry(f, "state dq", i)) * self.entry(f, "inverse unit", i)
                     longest.value = f.max(step, longest.value)
-                scale = f.variable(f.select(longest.value > LONGEST_STEP, LONGEST_STEP / longest.value, f.const(1.0)))
+                scale = f.variable(
+                    f.select(longest.value > CLOSURE.longest_step, CLOSURE.longest_step / longest.value, f.const(1.0))
+                )
                 halvings, better.value = f.variable(0, INT), 0.0
-                with f.while_(lambda: (better.value < 0.5) & (halvings.value < STEP_HALVINGS)):
+                with f.while_(lambda: (better.value < 0.5) & (halvings.value < CLOSURE.halvings)):
                     move(scale.value)
                     better.value = f.select(size() < before, f.const(1.0), 0.0)
                     scale.value = scale.value * 0.5
@@ -104,11 +106,11 @@ class Closing(Module):
                     move(f.const(0.0))
                 with f.if_(better.value > 0.5):
                     step_scale = scale.value * 2.0
-                    limited = f.select(longest.value > LONGEST_STEP, f.const(1.0), 0.0)
+                    limited = f.select(longest.value > CLOSURE.longest_step, f.const(1.0), 0.0)
                     self._at_previous_state(f, "q", lambda: self._record_correction(f, "q", step_scale, limited))
         for _ in range(self.further):
             self._record_correction(f, "q", f.const(1.0), f.const(0.0))
-        for _ in range(VELOCITIES):
+        for _ in range(CLOSURE.velocities):
             self._record_correction(f, "v", f.const(1.0), f.const(0.0))
             self._correct(f, "v")
             with f.each(n) as i:

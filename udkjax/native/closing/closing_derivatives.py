@@ -9,7 +9,7 @@ tangents.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from udkjax.equations.position_closure import CLOSURE_ITERATIONS, VELOCITIES
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.expressions.loop_derivative import FORWARD, REVERSE, TWICE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
@@ -169,7 +169,7 @@ class ClosingReverse(ClosingDerivative):
 
     def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
-        n, capacity, p = self.n, CLOSURE_ITERATIONS + 1 + VELOCITIES, self.places
+        n, capacity, p = self.n, CLOSURE.steps + 1 + CLOSURE.velocities, self.places
         self.row = 3 + 2 * n  # length of a row of the record: index of the quantity, scale, whether limited, q and v before
         p.add("record", capacity * self.row)
         p.add("records")

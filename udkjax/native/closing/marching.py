@@ -11,7 +11,7 @@ side changes where branches meet, and differs on another branch nearby.
 
 import numpy as np
 
-from udkjax.equations.position_closure import ROUNDING_UNITS
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
@@ -139,7 +139,7 @@ class Marching(Module):
         old_length2, new_length2 = old_square.value + per_unit, new_square.value + per_unit
         is_straight = product.value + per_unit > f.intrinsic("sqrt", old_length2 * new_length2) * STRAIGHT
         is_near = deviation.value < f.abs(h) * f.intrinsic("sqrt", old_length2) * SLACK + largest.value * (64 * eps)
-        is_closed = ~(violated > largest.value * (ROUNDING_UNITS * eps)) & f.is_finite(violated)
+        is_closed = ~(violated > largest.value * (CLOSURE.rounding * eps)) & f.is_finite(violated)
         is_smooth = (is_straight & is_near) | (f.repeat(begins, f.width) if f.width > 1 else begins)
         return is_closed & (s.distance > DISTANT) & is_smooth
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_programs import PositionPrograms
 from udkjax.native.base import machine
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value, Variable
@@ -182,7 +182,7 @@ class _Text:
                 self._put(f, "q", f.select(succeeds, self._load(f, "new", i), self._load(f, "q", i)), i)
             last = f.select(continues.value > 0.5, f.select(succeeds, size.value, np.nan), self._load(f, "end"))
             self._put(f, "end", last)
-            is_open = (size.value >= LAST_STEP) | (self._load(f, "violation") > CLOSED_TOL**2)
+            is_open = (size.value >= LAST_STEP) | (self._load(f, "violation") > CLOSURE.tol**2)
             continues.value = f.select(succeeds & is_open, f.const(1.0, DOUBLE, self.width), 0.0)
             rounds.value = rounds.value + 1
         self._put(f, "end", f.select(continues.value > 0.5, np.nan, self._load(f, "end")))

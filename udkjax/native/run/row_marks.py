@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSED_TOL
+from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
@@ -83,7 +83,7 @@ class RowMarks(Module):
         active = s.active > 0.5
         iterate_newton(self, f, s, active, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
         self.invoke(f, "psi")
-        is_closed = largest_violation(self, f) < CLOSED_TOL
+        is_closed = largest_violation(self, f) < CLOSURE.tol
         distance = self.largest(f, self._distance(f))
         is_closed = is_closed & ((distance > STAYS * STEP) | ~f.like(is_free, BOOL, width))
         self.invoke(f, "independent_rows")

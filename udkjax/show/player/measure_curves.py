@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from udkjax.equations import determinacy
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.evaluate import singular_values
 from udkjax.equations.quantities import efforts, energy, violation
 from udkjax.equations.reactions import reactions, unique_reactions
 from udkjax.programs.deferred import deferred
@@ -95,7 +94,7 @@ def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
 
 @deferred
 def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Float[Array, "T k"]:
-    return jax.vmap(lambda t, q: singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
+    return jax.vmap(lambda t, q: determinacy.singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
 def _violation(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:

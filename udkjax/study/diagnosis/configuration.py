@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.position_closure import LONGEST_STEP, close_position, is_closed
+from udkjax.equations.position_closure import CLOSURE, close_position, is_closed
 from udkjax.equations.position_rows import PositionRows
 from udkjax.equations.redundancy import kinematic_rows
 from udkjax.scene.mechanism import Mechanism
@@ -124,7 +124,7 @@ class RankedPositions:
             heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(len(heading)) / np.sqrt(len(heading))
             allowed = last.right @ (last.right.T @ heading)
             size = np.linalg.norm(allowed)
-            t += self.rows.driver_time_step * NEIGHBOUR_STEP / LONGEST_STEP
+            t += self.rows.driver_time_step * NEIGHBOUR_STEP / CLOSURE.longest_step
             direction = allowed / size if size > 0.0 else allowed
             moved = self.displace(last, direction, NEIGHBOUR_STEP, t) or self.displace(last, direction, NEIGHBOUR_STEP, last.t)
             if moved is None or self.distance(moved, last) < SMALLEST_MOVE * NEIGHBOUR_STEP:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from udkjax.equations import determinacy
-from udkjax.equations.position_rows import choose_dispensable
+from udkjax.equations.position_rows import PositionRows
 from udkjax.positions.assembly import State, close, require_closed
 from udkjax.positions.channels import StateHistory
 from udkjax.scene.arguments import checked
@@ -104,7 +104,7 @@ def _dependencies(
     if here.rank == best.rank:
         return permanent, []
     # Combinations of rows that vanish here, without those that vanish everywhere: one row is excluded for each of the latter.
-    spared = choose_dispensable([best.left])
+    spared = PositionRows.dispensable([best.left])
     N = here.left
     for row in spared:
         if np.linalg.norm(N[row]) > determinacy.UNIQUE_TOL:

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.position_rows import GENERIC_TOL, PositionRows
+from udkjax.equations.position_rows import PositionRows
 from udkjax.equations.redundancy import kinematic_rows
 from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
@@ -39,7 +39,7 @@ DEPENDENT_PART = 1e-6
 DIFFERENCE_STEP = 1e-5  # step of the central differences, relative to a parameter's value
 # Step after which a mechanism must close again, relative to a parameter's size (its value, or less if that changes a row by more
 # than the row's size). A loop that opens to second order does so by 1e-4 of the size, ten million times the tolerance of
-# closing (`position_closure.CLOSED_TOL`).
+# closing (`position_closure.CLOSURE.tol`).
 CLOSING_STEP = 1e-2
 SMALL_VALUE = 1e-5  # values below this count as zero, relative to the size by effect; coordinates can be so small
 MOST_POSITIONS = 4  # number of positions that are closed again
@@ -140,7 +140,7 @@ class RedundantLoops:
         if not self.redundant:
             return
         self._drivers = mechanism.driver_names
-        self._positions = [p for p in positions if p.smallest > GENERIC_TOL] or positions
+        self._positions = rows.generic(positions)
         self._names = [name for name, _ in rows.names]
         self._redundant_rows = list(rows.redundant(positions))
         self._measure(rows, steps, _length(original))
