@@ -1,1 +1,1 @@
-"""Studies: one script a claim, from the claim to its figure. `python -m experiments NAME`. See README.md."""
+"""Studies: one script for each claim, with its data and figure. `python -m experiments NAME`. See README.md."""

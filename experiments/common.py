@@ -1,12 +1,12 @@
-"""Running of studies: compute, write the data with everything needed to repeat them, draw the figure from the file alone.
+"""Run studies: compute, write the data with everything needed to repeat them, and draw the figure from the file alone.
 
-A study is one module whose docstring gives the claim and its reasons. It has
+A study is one module. Its docstring gives the claim and its reasons. It has
 
     study(smoke) -> xarray.Dataset     compute; a small version if `smoke`; `described` adds the attributes
-    holds(data) -> {part: bool}        the claim in parts, each compared with the data, also of the small run
+    holds(data) -> {part: bool}        the claim in parts, each compared with the data, also of a small run
     headline(data) -> str              the claim in figures, in one line; the README quotes it
-    figure(data) -> Figure             from the data alone
-    page(data) -> str                  a page of its own, NAME.md, if it has one
+    figure(data) -> Figure             drawn from the data alone
+    page(data) -> str                  a page of its own, NAME.md, if the study has one
 """
 
 import inspect

@@ -1,19 +1,18 @@
-"""Every integrator has the order that it claims, also when its steps are projected; between the steps some have less.
+"""Every integrator has its theoretical order, also with projection; at outputs between steps, some have a lower order.
 
-Measured with steps of equal size on the paper's linkage, released at -45 degrees: by how much q is wrong after 2 s, against the
-exact solution (a method of order p errs like h^p). A multistep method begins with order one, so the steps grow to their size
-from a millionth of it, by a tenth each. An Adams method of order k predicts with k points and corrects with k + 1, and so
-converges like h^(k+1); a backward differentiation formula of order k like h^k. At k = 12 there is no such law to be seen:
-predicted and corrected once, the method is unstable until its steps are so small that it is exact up to rounding. (With a
-variable order the program itself finds that.)
+The error of q after 2 s is measured against the exact solution, with steps of equal size, on the paper's linkage, released at
+-45 degrees. The error of a method of order p is proportional to h^p. A multistep method begins with order one, so its first
+step is a millionth of h, and each step is a tenth longer than the one before until it reaches h. An Adams method of order k
+predicts with k points and corrects with k + 1, and therefore converges like h^(k+1); a backward differentiation formula of
+order k converges like h^k. At k = 12 no such law is visible: with one prediction and one correction, the method is unstable
+until its steps are so small that it is exact up to rounding. (With variable order, the program itself finds this.)
 
-Projection after each step moves the state by no more than the step's own error, O(h^(p+1)), along directions in which there is
-nothing to lose: Psi = 0 and Psi_dot = 0 hold for the exact solution. So it cannot lower the order (E. Hairer, C. Lubich, G.
-Wanner, Geometric Numerical Integration, 2006, theorem IV.4.1). Where the error falls to rounding within a decade of steps, at
-orders above eight, terms of higher order still have a part in it, and the slope comes out steeper. Output times lie between the
-steps; there a result is as good as the polynomial that the method offers. Dopri8's is of order 5, Dopri5's and Tsit5's of order
-4, Verner65's of order 4: the error between the steps falls like h^6 and h^5 whatever the order of the steps, and at fine steps
-it is what one sees.
+Projection after each step moves the state by no more than the error of the step, O(h^(p+1)), towards Psi = 0 and Psi_dot = 0,
+which the exact solution satisfies. It therefore cannot lower the order (E. Hairer, C. Lubich, G. Wanner, Geometric Numerical
+Integration, 2006, theorem IV.4.1). At orders above eight, the error falls to the rounding level within a decade of step sizes;
+terms of higher order still contribute there, and the measured slope is steeper. Output times lie between steps, where a result
+is as accurate as the interpolating polynomial of the method: Dopri8's has order 5, Dopri5's and Tsit5's order 4, Verner65's
+order 4. The error between steps falls like h^6 and h^5 whatever the order of the steps, and dominates at small steps.
 """
 
 from collections.abc import Callable
@@ -111,7 +110,7 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
 def headline(data: xarray.Dataset) -> str:
     ends, between = orders(data, "error"), orders(data, "between")
     listed = ", ".join(f"{name.replace(', k = ', ' ')} {p:.1f}" for name, p in ends.items() if name != UNSTABLE)
-    return f"orders measured: {listed}; at outputs between the steps Dopri8 has {between['Dopri8']:.1f}"
+    return f"measured orders: {listed}; Dopri8 at outputs between steps {between['Dopri8']:.1f}"
 
 
 def figure(data: xarray.Dataset) -> Figure:

@@ -1,17 +1,18 @@
-"""A start off the constraints by delta: projection forgets it at once, gains in time; without either it stays or grows.
+"""If a start violates the constraints by delta, projection removes this at once, gains in time; otherwise it stays or grows.
 
-The paper's linkage starts at -45 degrees, at rest, with its loops opened by delta, or their rates wrong by delta: moved by
-M^(-1/2) D^+ w, w random, which is orthogonal in the mass metric to what the mechanism can do, so that the start it stands for,
-the nearest one that is closed, is the same. A run is held against the exact motion from there. Of Psi'' = 0 alone remains
+The paper's linkage starts at -45 degrees, at rest, with its loops open by delta or their rates wrong by delta. The state is
+moved by M^(-1/2) D^+ w with a random w, which is orthogonal, in the mass metric, to the motions that the mechanism can make.
+The nearest closed state is therefore still the original one, and errors are measured against the exact motion from there. If
+only Psi'' = 0 is enforced, the violation evolves as follows:
 
     chosen rows:            Psi = Psi_0 + t Psi_dot_0: an opening stays, a wrong rate opens the loops like t. (The row left out
-                            follows from the others with factors that depend on the position; its error is a few times as large);
-    truncated pseudoinverse: the drift of redundant constraints, a bead on a rotating wire, which grows by 1.77 /s, until
-                            the twelfth singular value that it makes counts as one: then the run is lost;
-    Baumgarte, alpha = beta: Psi = (Psi_0 + (Psi_dot_0 + alpha Psi_0) t) e^(-alpha t): closed after a few 1/alpha. But on the way
-                            the feedback has moved the mechanism along its manifold, too, by O(delta), and that stays;
-    projection:             closed after the first step, by the smallest change in the mass metric: this is the state the start
-                            stands for, but for the motion during that one step, O(h delta).
+                            follows from the others with factors that depend on the position; its error is a few times as large.)
+    truncated pseudoinverse: redundant constraints drift like a bead on a rotating wire, at 1.77 /s, until the twelfth singular
+                            value, which is due to the drift, exceeds the rank threshold: then the run is lost.
+    Baumgarte, alpha = beta: Psi = (Psi_0 + (Psi_dot_0 + alpha Psi_0) t) e^(-alpha t): closed after a few 1/alpha. Meanwhile,
+                            however, the feedback also moves the mechanism along its manifold by O(delta), and this error stays.
+    projection:             closed after the first step, by the smallest change in the mass metric. The result is the nearest
+                            closed state, except for the motion during this one step, O(h delta).
 """
 
 from types import SimpleNamespace
@@ -149,7 +150,7 @@ def headline(data: xarray.Dataset) -> str:
         }
         told = ["lost" if np.isinf(e) else f"{p:.0e} / {e:.0e}" for p, e in zip(worst["violation"], worst["error"])]
         listed.append(f"{name}: {told[0]} and {told[1]}")
-    return "|Psi| / error of q after 10 s, start open by 1e-6 m and by 1e-6 m/s: " + "; ".join(listed)
+    return "violation / error of q after 10 s, with starts that are open by 1e-6 m and by 1e-6 m/s: " + "; ".join(listed)
 
 
 def figure(data: xarray.Dataset) -> Figure:

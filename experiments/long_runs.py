@@ -1,23 +1,23 @@
-"""Over a thousand periods energy drifts like t and phase is lost like t^2; Adams loses least for what it costs.
+"""Over a thousand periods the energy error grows like t and the phase error like t^2; Adams methods lose least for their cost.
 
-Both systems are pendulums in disguise, phi'' = -w^2 sin(phi) with the energy J (phi'^2 / 2 - w^2 cos(phi)): the IFToMM
+Both systems are equivalent to a pendulum, phi'' = -w^2 sin(phi), with the energy J (phi'^2 / 2 - w^2 cos(phi)): the IFToMM
 benchmark A01 (a point mass on a rod, 2000 s) and the paper's linkage (phi = theta + 90 degrees, J = 3.05 kg m^2, 1000 periods).
 In action and angle variables the motion is E = const, psi' = Omega(E), with Omega = pi w / (2 K(k^2)), and psi follows from a
-state by an elliptic integral. So the error of a run splits without any fit into one of energy and one of phase.
+state by an elliptic integral. The error of a run therefore splits, without any fit, into an energy error and a phase error.
 
-The local error of an integrator is the same from period to period, as long as the orbit is: a method that is not symmetric
-(none of these is, with an adaptive step) gains or loses a fixed energy each period, so dE ~ t, and
+The local error of an integrator is the same in each period as long as the orbit is the same. A method that is not symmetric
+(with an adaptive step, none of these is) gains or loses a fixed energy in each period, so dE ~ t, and
 
-    dpsi = c t + Omega'(E) int dE dt:        a part ~ t, and one ~ t^2, which wins (Hairer, Lubich, Wanner, 2006, section X.3).
+    dpsi = c t + Omega'(E) int dE dt,        one part ~ t, and one ~ t^2, which dominates (Hairer, Lubich, Wanner, 2006, X.3).
 
 An Adams method changes its order and its steps irregularly, so that gains and losses nearly cancel from period to period: its
-energy may wander for long before it drifts.
+energy may fluctuate for a long time before it drifts.
 
-Projection returns states to the constraint manifold, on which E is free: it does not conserve it. But without it the loops
-open, and the reactions do work on that, dE/dt = -lambda^T Psi_dot, which exceeds the errors of the steps themselves. What
-the energy of a short run shows may be something else again: results at output times come from the polynomial between the steps.
-With Dopri8, whose steps are long and of order 8, and whose polynomial is of order 5, and with Verner65, whose polynomial is of
-order 4, they are worse than the ends of the steps.
+Projection returns states to the constraint manifold, on which E is free: it does not conserve E. Without projection, however,
+the loops open, and the reactions do work, dE/dt = -lambda^T Psi_dot, which exceeds the errors of the steps themselves. The
+energy of a short run may show something else: results at output times come from the polynomial between the steps. With Dopri8,
+whose steps are long and of order 8 but whose polynomial is of order 5, and with Verner65, whose polynomial is of order 4, these
+results are less accurate than the ends of the steps.
 """
 
 import json
@@ -270,9 +270,9 @@ def headline(data: xarray.Dataset) -> str:
         for name, one in ((name, ends.sel(solver=name)) for name in data.solver.values if name in ("Dopri8", "Adams"))
     )
     return (
-        f"median exponents: energy {np.median(energy):.2f}, phase {np.median(phase):.2f}; the energy's error makes "
-        f"{np.median(part):.0%} of the phase's; A01 at {tol:.0e} after {float(ends.time.max()):.0f} s: {told}; linkage, "
-        f"20 s, 1e-9, Dopri8: energy wrong by {float(budget.at_step_ends):.1e} J at step ends, "
+        f"median exponents: energy {np.median(energy):.2f}, phase {np.median(phase):.2f}; the energy error explains "
+        f"{np.median(part):.0%} of the phase error; A01 at {tol:.0e} after {float(ends.time.max()):.0f} s: {told}; energy error "
+        f"of the linkage, 20 s, 1e-9, Dopri8: {float(budget.at_step_ends):.1e} J at step ends, "
         f"{float(budget.at_outputs):.1e} J at outputs"
     )
 

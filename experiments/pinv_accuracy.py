@@ -1,22 +1,23 @@
-"""Orthogonal pseudoinverses err by eps cond(A), Greville and elimination by eps cond(A)^2.
+"""The errors of orthogonal pseudoinverses are about eps cond(A), those of Greville and elimination about eps cond(A)^2.
 
-Two families whose pseudoinverses are known exactly for every e, in rational arithmetic, and 27 single matrices:
+The matrices are two families whose pseudoinverses are known exactly for every e, in rational arithmetic, and 27 single
+matrices:
 
-    gap       12 x 12, rank 11: ten singular values 1, one e, one 0. The collection's two members give all others, since both
+    gap       12 x 12, rank 11: ten singular values 1, one e, one 0. Two members of the collection give all others, since both
               A = A_0 + e B and A^+ = P_0 + C / e are straight lines.
     Lauchli   6 x 5, rank 5: a row of ones over e I. A^+ = (I - 11^T / (5 + e^2)) / e^2 A^T (Lauchli, Numer. Math. 3 (1961) 226).
 
-An orthogonal factorization is exact for a matrix next to A, at a distance of eps |A|, and A^+ is wrong by cond(A) times that
-relative distance (Wedin, BIT 13 (1973) 217): as much as rounding the entries of A costs alone, so that no method can do better.
-With pivoting modified Gram-Schmidt belongs to them even if it orthogonalizes once: the columns of Q lose their orthogonality by
-eps cond, no more than is lost anyhow. Elimination works on A A^T, whose condition is cond(A)^2. Greville's recursion multiplies
-P = A_k^+, wrong by eps cond |P|, with the next row: c, the part of the row that is new, is wrong by eps cond too, and where c is
-as short as 1 / cond this enters relative to c. Lauchli's matrices are ill-conditioned by the size of their rows alone, which
-costs an orthogonal factorization nothing.
+An orthogonal factorization is exact for a matrix at a distance of eps |A| from A, and the relative error of A^+ is cond(A)
+times this relative distance (Wedin, BIT 13 (1973) 217). Rounding the entries of A alone costs as much, so no method can do
+better. With pivoting, modified Gram-Schmidt is as accurate even if it orthogonalizes once: the columns of Q lose their
+orthogonality by eps cond, which is no more than the error that exists anyway. Elimination works on A A^T, whose condition is
+cond(A)^2. Greville's recursion multiplies P = A_k^+, whose error is eps cond |P|, by the next row: c, the new part of the row,
+then has an error of eps cond, too, which is large relative to c if c is as short as 1 / cond. Lauchli's matrices are
+ill-conditioned only because of the sizes of their rows, which do not affect an orthogonal factorization.
 
-A threshold decides the rank. `between` lies in the geometric middle between the smallest singular value that counts, 1 / cond,
-and what rounding leaves of a zero: eps, with Greville eps cond, with elimination the root of eps. That much is known of a test
-matrix only. `default` is what the method takes by itself.
+A threshold decides the rank. `between` is the geometric mean of the smallest singular value that counts, 1 / cond, and the
+value that rounding leaves of a zero: eps, with Greville eps cond, with elimination the root of eps. Both values are known for
+test matrices only. `default` is the default threshold of the method.
 """
 
 import json

@@ -1,16 +1,18 @@
-"""In float32 errors are larger by the ratio of the units of rounding, 5e8; to cross singularities it takes wider thresholds.
+"""In float32 errors are larger by the ratio of the rounding units, 5e8; to cross singularities, float32 needs wider thresholds.
 
-The same programs, in a process with `JAX_ENABLE_X64=0`, and in one without. Of the pseudoinverses the orthogonal
-ones stay at eps cond; the default thresholds follow eps, and so does the condition from which a method loses the rank. A run of
-the paper's linkage, 20 s with projection, follows its tolerance until rounding takes over: each of n steps leaves some eps |y|,
-and a smaller tolerance takes more steps, which makes it no better; from about 10 eps on the steps fall to nothing.
+The same programs run in one process with `JAX_ENABLE_X64=0` and in one without. The errors of the orthogonal pseudoinverses
+stay at eps cond. The default thresholds are proportional to eps, and so is the inverse of the condition number at which a
+method loses the rank. A run of the paper's linkage, 20 s with projection, follows its tolerance until rounding takes over: each
+of n steps adds about eps |y|, and a smaller tolerance takes more steps, which does not help; below a tolerance of about 10 eps,
+steps shrink to zero.
 
-From +60 degrees the linkage crosses singular configurations. A direction whose singular value s is kept brings an error of eps
-/ s into the accelerations, elimination with a pivot p one of eps / p; where that is more than the tolerance, the controller
-sees jumps that no step is small enough for. So the threshold of the rank, and the pivot at which `Auto` turns to singular
-values, have to be above eps / tol. The defaults, 1e-4 and 1e-6, leave room for 2e-10 in float64; at smaller tolerances steps are
-placed around the configuration, and cost no more than with wider thresholds. In float32 they leave room for no tolerance at all:
-runs are lost, or, where the tolerance is loose, come out far off. There 1e-2 and 1e-3 let runs cross.
+From +60 degrees the linkage crosses singular configurations. If a direction with the singular value s is kept, accelerations
+have an error of eps / s, with elimination and a pivot p an error of eps / p. If this error exceeds the tolerance, the
+controller sees jumps that no step is small enough for. The rank threshold, and the pivot at which `Auto` switches to singular
+values, therefore have to be above eps / tol. In float64 the defaults, 1e-4 and 1e-6, allow tolerances down to 2e-10; at smaller
+tolerances, steps are placed around the configuration, and cost no more than with wider thresholds. In float32 the defaults
+allow no tolerance at all: runs are lost or, if the tolerance is loose, end far from the solution. With 1e-2 and 1e-3, runs in
+float32 cross.
 """
 
 import os

@@ -1,15 +1,15 @@
-"""The identities of mechanics hold for all random mechanisms, and every malformed input gets an answer.
+"""The identities of mechanics hold for all random mechanisms, and every malformed input is answered with an error message.
 
-Claim: of random mechanisms, with loops, redundant copies, joints that others imply, all types of joints, drivers and forces, from
-a micrometre to a kilometre, the terms of the equations are those of an independent implementation (reference_equations.py), all
-methods, formulations and engines agree, and accelerations do not depend on names, orders, axes, units or copies of constraints.
-Power is balanced, a is nearest to a_F in the metric of M, impulses are reciprocal, impacts neither pull nor give energy, and
-derivatives are limits of differences. Scene files, arguments and command lines that are wrong neither hang nor abort a process.
-They are to end in a documented error that names the place, without a traceback and without part of a file: those that do not are
-faults, which the page lists.
+Claim: random mechanisms have loops, redundant copies of joints, joints implied by others, all types of joints, drivers and
+forces, and sizes from a micrometre to a kilometre. For all of them, the terms of the equations agree with an independent
+implementation (reference_equations.py), all methods, formulations and engines agree, and accelerations do not depend on names,
+orders, axes, units or copies of constraints. Power is balanced, a is nearest to a_F in the metric of M, impulses are
+reciprocal, impacts neither pull nor add energy, and derivatives are limits of differences. Wrong scene files, arguments and
+command lines neither hang nor abort a process. Each has to end in a documented error that names the place, without a traceback
+and without writing part of a file; any other result is a fault, which the page lists.
 
-Most properties take no compilation: the scalar programs of a structure are run by NumPy on many mechanisms at once. Runs compile,
-and so there are fewer of them. The page properties.md lists what was found. A longer run, or one more:
+Most properties need no compilation: NumPy runs the scalar programs of a structure on many mechanisms at once. Runs are
+compiled, and so there are fewer of them. The page properties.md lists the results. For a longer run, or an additional one:
 
     python -m experiments properties --set mechanisms=20000 --set seed=1 --set minutes=60
     python -m experiments properties --set mechanisms=0 --set runs=0 --set first=88000 --set add=1     # more input
@@ -31,7 +31,7 @@ from experiments.parts.fuzz import KINDS, Fault, cases_of, run, verdict
 from experiments.parts.tally import Found, Tally
 
 PROPERTIES = state_properties.PROPERTIES | run_properties.PROPERTIES | contact_properties.PROPERTIES
-MARGINS = 50.0, 10_000.0  # tolerance over worst error: below it a tolerance is nearly met, above it says little
+MARGINS = 50.0, 10_000.0  # tolerance over worst error: below the first it is nearly exceeded, above the second it tests little
 MEMBERS = 100  # mechanisms of each structure
 LISTED, SHOWN = 100, 60  # faults that the data list, and kinds of faults that the page lists
 
@@ -52,17 +52,17 @@ def study(
     """Check all properties.
 
     Args:
-        smoke: Whether to do it in small.
-        mechanisms: How many mechanisms, at states.
-        files: How many scene files that are wrong.
-        arguments: How many calls with wrong arguments.
-        commands: How many wrong command lines.
-        runs: How many structures to integrate; every other one by diffrax, too, every third with derivatives.
-        contacts: How many plates and wheels to throw, of each of four kinds.
-        seed: Of everything.
+        smoke: Whether to run a small version.
+        mechanisms: Number of mechanisms whose equations are checked at single states.
+        files: Number of malformed scene files.
+        arguments: Number of calls with wrong arguments.
+        commands: Number of wrong command lines.
+        runs: Number of structures to integrate; every other one also by diffrax, every third with derivatives.
+        contacts: Number of plates and wheels to throw, of each of four kinds.
+        seed: Seed of all random numbers.
         first: The number of the first structure and of the first input.
-        minutes: When to stop, if it is not done.
-        add: Whether to add to the data that are there.
+        minutes: Time limit.
+        add: Whether to add the results to the existing data.
     """
     if smoke:
         mechanisms, files, arguments, commands, runs, contacts, minutes = 20, 30, 10, 0, 0, 0, 5.0
@@ -120,7 +120,7 @@ def _dataset(tally: Tally, count: dict[str, int], done: dict[str, int], faults: 
 
 
 def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
-    """Return what two runs found together; what the older one did not look for, it found in no case."""
+    """Return the combined results of two runs; properties that the older one did not check have no cases in it."""
     at = dict(zip(old.property.values, json.loads(old.worst_at), strict=True))
     old = (
         old.assign_coords(property=old.property.astype(object))
@@ -146,7 +146,7 @@ def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
 
 
 def holds(data: xarray.Dataset) -> dict[str, bool]:
-    """Return whether each property holds, of those that the run came to, and whether no input hangs or aborts a process."""
+    """Return whether each property that the run checked holds, and whether no input hangs or aborts a process."""
     found = {
         name: bool(worst <= PROPERTIES[name].tolerance)
         for name, cases, worst in zip(data.property.values, data.cases.values, data.worst.values, strict=True)
@@ -168,7 +168,7 @@ def _margins(data: xarray.Dataset) -> np.ndarray:
 
 
 def headline(data: xarray.Dataset) -> str:
-    """Return how much was tried, and how near to its tolerance any property came."""
+    """Return the numbers of cases, and the smallest margin between an error and its tolerance."""
     margins = _margins(data)[data.cases.values > 0]
     tried = f"{int(data.mechanisms.sum())} random mechanisms, {int(data.cases.sum())} comparisons in {len(margins)} properties"
     smallest = f"smallest margin {margins.min(initial=np.inf):.2g}"
@@ -190,22 +190,23 @@ def figure(data: xarray.Dataset) -> Figure:
 
 
 def page(data: xarray.Dataset) -> str:
-    """Return properties.md: what was found of each property, and each fault that stands."""
+    """Return properties.md: the result for each property, and each remaining fault."""
     at, margins = json.loads(data.worst_at), _margins(data)
     sets = dict(zip(data.set.values, map(int, data.mechanisms.values), strict=True))
     kinds = zip(data.kind.values, map(int, data.inputs.values), map(int, data.faults.values), strict=True)
     versions = ", ".join(f"{key[8:]} {data.attrs[key]}" for key in sorted(data.attrs) if key.startswith("version_"))
     lines = [
-        "# Properties, of random mechanisms and of input that nobody means",
+        "# Properties of random mechanisms and malformed input",
         "",
         f"Written by `python -m experiments properties` (seed {data.attrs['seed']}, {data.attrs['seconds']:.0f} s; {versions}).",
         "",
-        f"{sets['mechanisms']:,} mechanisms at states, by programs that NumPy runs, and {sets['large']} large ones by loops; "
-        f"{sets['runs']} integrated by machine code, a part of them by diffrax and with derivatives; {sets['contacts']} thrown "
-        "onto a floor and other bodies. A case is drawn again by the call next to its error: "
-        "`random_scene(seed, structure, numbers)` of experiments/parts/random_scenes.py. Margin: tolerance over worst error; `!` "
-        "where it is under 50, `?` where it is over 10,000. Errors are relative, in the scene's own units; where the condition "
-        f"number of the rows exceeds {state_properties.ORDINARY:g}, they are over what it makes of rounding.",
+        f"The equations of {sets['mechanisms']:,} mechanisms are evaluated by NumPy at single states, those of "
+        f"{sets['large']} large mechanisms by loops. {sets['runs']} mechanisms are integrated by machine code, a part of them "
+        f"also by diffrax and with derivatives; {sets['contacts']} bodies are thrown onto a floor and onto other bodies. The "
+        "call next to an error reproduces the case: `random_scene(seed, structure, numbers)` of "
+        "experiments/parts/random_scenes.py. The margin is the tolerance divided by the worst error, marked `!` below 50 and "
+        "`?` above 10,000. Errors are relative, in the scene's own units; if the condition number of the rows exceeds "
+        f"{state_properties.ORDINARY:g}, they are also divided by its amplification of rounding.",
         "",
         "| Property | Claim | Cases | Worst error | Tolerance | Margin | Because | Worst at |",
         "|---|---|---|---|---|---|---|---|",
@@ -225,7 +226,7 @@ def page(data: xarray.Dataset) -> str:
     faults = [Fault(*f) for f in json.loads(data.listed)]
     example = {f.signature: f for f in reversed(faults)}
     if faults:
-        lines += ["", "Faults, each again by `python -m experiments.parts.fuzz KIND SEED CASE`:", ""]
+        lines += ["", "Faults; `python -m experiments.parts.fuzz KIND SEED CASE` reproduces one:", ""]
         lines += ["| Times | Kind, seed, case | About | Wrong | Text |", "|---|---|---|---|---|"]
     for signature, times in Counter(f.signature for f in faults).most_common(SHOWN):
         f = example[signature]

@@ -1,6 +1,6 @@
-"""Masses may spread over twelve decades, lengths over six, with a rank threshold of 1e-8; at 1e-4 a ratio of 1e8 is too much.
+"""With a rank threshold of 1e-8, masses may spread over twelve decades, lengths over six; with 1e-4, a ratio of 1e8 is too much.
 
-Four families, each with exact accelerations, the linkage with an exact motion too:
+Four families have exact accelerations, and the linkage also has an exact motion:
 
     masses     the paper's linkage with links of 10^(-s/2), 1 and 10^(s/2) kg: one degree of freedom, J theta'' = -g w cos(theta);
     pendulum   two uniform rods in a chain, the lower one 10^s times as heavy, s = -12 ... 12: two equations in two angles, whose
@@ -8,18 +8,20 @@ Four families, each with exact accelerations, the linkage with an exact motion t
     lengths    the linkage with links of 10^(-3) to 10^3 m under a coupler with pins 1 m apart;
     rods       the two rods with lengths in a ratio of 10^(-6) to 10^6.
 
-D = Psi_q M^(-1/2) has columns of the size of m^(-1/2), so its singular values spread like the roots of the masses. What is
-truncated relative to the largest, at 1e-4, lets the pins between heavy bodies go once masses spread over 1e8: the accelerations
-are wrong altogether. At 1e-8 and less everything is kept; what is redundant leaves 1e-16, so there is room. `Auto` eliminates,
-and is right on the linkage with any masses. But where a light rod carries one 1e8 times as heavy its rows are nearly dependent,
-in the mass metric, and it turns to singular values, truncated at 1e-4: wrong altogether as well; with 1e-8 it is right. So the
-default of the equations of motion is 1e-4 up to a ratio of 100, and less, by the root of the ratio, beyond.
+D = Psi_q M^(-1/2) has columns of the size of m^(-1/2), so its singular values spread like the roots of the masses. Truncation
+at 1e-4 of the largest ignores the pins between heavy bodies once masses spread over 1e8, and the accelerations are completely
+wrong. At 1e-8 and less, all independent rows are kept; redundant rows leave singular values of 1e-16, so there is room between.
+`Auto` uses elimination, and is accurate on the linkage with any masses. If a light rod carries one 1e8 times as heavy, however,
+its rows are nearly dependent in the mass metric, and `Auto` switches to singular values: truncated at 1e-4, the result is
+completely wrong as well; with 1e-8 it is accurate. The default of the equations of motion is therefore 1e-4 up to a mass ratio
+of 100, and smaller beyond, in proportion to the root of the ratio.
 
-What is left are rounding errors. Elimination loses eps m2 / m1 where the body m1 carries m2, the square of the condition of D,
-and nothing where it is the other way round. Orthogonal methods err by eps relative to M^(1/2) a, which the heavy body rules: a
-light one that hangs on it may be wrong by up to eps m1 / m2. Gram-Schmidt with pivoting combines columns with columns only, so
-that their size does not matter: it is exact to rounding for all masses. The linkage's errors grow as (length / pin distance)^2,
-the condition of the coupler's rotation, by every method; the rods' lengths cost nothing.
+The remaining errors are due to rounding. Where the body m1 carries m2, elimination has an error of eps m2 / m1, the square of
+the condition of D, and no such error in the opposite case. Orthogonal methods have an error of eps relative to M^(1/2) a, which
+the heavy body dominates: a light body that hangs on it may have an error of up to eps m1 / m2. Gram-Schmidt with pivoting
+combines columns only with columns, so that their sizes do not matter: it is exact to machine precision for all masses. With
+every method, the linkage's errors grow as (length / pin distance)^2, the condition of the coupler's rotation; the lengths of
+the rods have no effect.
 """
 
 import dataclasses
@@ -253,7 +255,7 @@ def headline(data: xarray.Dataset) -> str:
     told = {f: ", ".join(largest(f, m, 1e-8) for m in methods) for f in ("masses", "pendulum")}
     return (
         f"largest relative error of an acceleration, threshold 1e-8: linkage, masses over 12 decades: {told['masses']}; two "
-        f"rods, ratio 1e-12 to 1e12: {told['pendulum']}; with 1e-4: {largest('masses', 'SVD', 1e-4)} on the linkage"
+        f"rods, ratio 1e-12 to 1e12: {told['pendulum']}; threshold 1e-4: {largest('masses', 'SVD', 1e-4)} on the linkage"
     )
 
 

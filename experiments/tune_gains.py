@@ -1,26 +1,27 @@
-"""Gains can be tuned by gradient where steps are equal; where steps are controlled that advantage is lost: any few per second do.
+"""Gains can be tuned by gradient if steps are equal; with adaptive steps, any gains of a few per second do as well.
 
-What to minimize: the mean square of Psi where the steps of a run end, by the logarithms of alpha and beta. Not of a run at a
-tolerance: its violation jumps from one pair of gains to the next, and its derivative is taken with the steps held, which leaves
-out what gains do to steps. From 2 to 20 /s the drift falls, or stays, as steps shorten; with the steps held it seems to grow as
-the third power of the gains, or the sixth of large ones. So runs are by as many equal steps of Dopri8 as the tolerance asks for
-with gains of 5. That bounds the cost: the number of right-hand sides is given, and gains too large for the step, alpha h or
-beta h of the order of one, show as drift. It is smooth, and a sum of squares, which
-`minimize_squares` of udkjax.study.identify minimizes.
+The function to minimize is the mean square of Psi at the ends of the steps of a run, in terms of the logarithms of alpha and
+beta. Runs with adaptive steps are not suitable: their violation jumps from one pair of gains to the next, and its derivative is
+taken with the step sizes held constant, which ignores the effect of the gains on the steps. From 2 to 20 /s the drift falls or
+stays the same, as steps become shorter; with the steps held, it seems to grow as the third power of the gains, or the sixth
+power of large gains. Runs therefore take as many equal steps of Dopri8 as the tolerance requires with gains of 5. This bounds
+the cost: the number of right-hand sides is given, and gains too large for the step, with alpha h or beta h of the order of one,
+show as drift. The function is smooth, and a sum of squares, which `minimize_squares` of udkjax.study.identify minimizes.
 
-Where to start: from a closed start at rest the parallelogram's motion does not excite what redundancy lets grow. The gains that
-are least then do for 4 s of motion, but not for long: by theory (see gains.py) drift grows with them. So starts are open by a
-hundredth of the tolerance, which is about what controlled steps leave.
+From a closed start at rest, the parallelogram's motion does not excite the unstable drift of the redundant constraints. The
+smallest gains would then do for 4 s of motion, but not for long: by theory (see gains.py) drift grows with them. Starts are
+therefore open by a hundredth of the tolerance, which is about the violation that adaptive steps leave.
 
-At outputs between the steps interpolation errs by more than the drift; so that of runs at a tolerance is read off at the ends of
-four runs of different length.
+At outputs between the steps, interpolation has larger errors than the drift. The drift of runs with adaptive steps is therefore
+measured at the ends of four runs of different lengths.
 
-Claim, for two linkages and tolerances of 1e-6 to 1e-10: four guesses come to the same gains, between 0.5 and 10 /s, in some ten
-gradients each, of which one takes as long as three runs. By equal steps they drift less than any equal gains of a grid of nine,
-but not by a factor of two; at the steps of another tolerance, 1.3 times as much as what is tuned there, at most. At a tolerance
-they take no more right-hand sides than gains of 5, and drift up to five times as much as the best (which is also the luckiest) of
-the grid that takes no more, seldom less: which it is changes with every change of where the steps end. Equal steps are not what
-controlled ones are: the four-bar, whose steps differ in size, drifts a hundred times less with these.
+Claim, for two linkages and tolerances of 1e-6 to 1e-10: four guesses lead to the same gains, between 0.5 and 10 /s, in about
+ten gradients each, of which one takes as long as three runs. With equal steps, the tuned gains drift less than any equal gains
+of a grid of nine, but not by a factor of two; with the steps of another tolerance, they drift at most 1.3 times as much as
+gains tuned for these steps. With adaptive steps, they take no more right-hand sides than gains of 5, and drift up to five times
+as much as the best (which is also the luckiest) gains of the grid that take no more, and seldom less; which gains are best
+changes whenever the ends of the steps change. Equal steps differ from adaptive ones: the four-bar, whose steps differ in size,
+drifts a hundred times less with adaptive steps.
 """
 
 from typing import Any
@@ -212,9 +213,9 @@ def headline(data: xarray.Dataset) -> str:
     tolerances, first = ", ".join(f"{tol:.0e}" for tol in data.tol.values), data.scene.values[0]
     few, many = float(data.evaluations.min()), float(data.evaluations.max())
     return (
-        f"alpha and beta for {tolerances}, {gains}; in {few:.0f} to {many:.0f} gradients; drift, of that of the best equal "
-        f"gains: {best} by equal steps, {run} at a tolerance; right-hand sides, of those of gains of 5: {cost}; drift of "
-        f"the {first} goes like the gain to the power of {true[0]:.1f}, with the steps held {held[0]:.1f}"
+        f"alpha and beta for {tolerances}, {gains}; in {few:.0f} to {many:.0f} gradients; drift relative to the best equal "
+        f"gains: {best} with equal steps, {run} with adaptive steps; right-hand sides relative to gains of 5: {cost}; drift of "
+        f"the {first} scales as the gain to the power of {true[0]:.1f}, by derivatives with held steps {held[0]:.1f}"
     )
 
 

@@ -1,21 +1,23 @@
-"""Drift of redundant constraints grows like the distance of a bead on a rotating wire.
+"""The drift of redundant constraints grows like the distance of a bead on a rotating wire.
 
-A pseudoinverse truncated at the rank r of a closed mechanism enforces P (Psi'' + 2 alpha Psi' + beta^2 Psi) = 0, P the projector
-onto the range of the constraint Jacobian, I - P = Q that onto its left null space. Where loops are slightly open, Psi = Psi_q dq
-lies in that range: Q Psi = 0, to first order, and stays there while the range turns. Differentiated, this gives the law
+A pseudoinverse truncated at the rank r of a closed mechanism enforces P (Psi'' + 2 alpha Psi' + beta^2 Psi) = 0, with P the
+projector onto the range of the constraint Jacobian, and Q = I - P the projector onto its left null space. If loops are slightly
+open, Psi = Psi_q dq is in this range: Q Psi = 0 to first order, and this remains true while the range turns. Differentiation
+gives the law
 
-    p = P Psi',        Psi' = p - Q' Psi,        p' = -Q' p + Q'^2 Psi - 2 alpha p - beta^2 Psi :
+    p = P Psi',        Psi' = p - Q' Psi,        p' = -Q' p + Q'^2 Psi - 2 alpha p - beta^2 Psi.
 
-seen from axes that turn with the range the drift obeys rho'' + 2 alpha rho' + (beta^2 - W) rho = 0, with W = P Q'^2 P the
-squared rates at which the left null space turns. In the paper's linkage that space is one direction, (e, -2e, e, -e, 2e, -e) of
-the links' axis e, so W is theta'^2, and the exact solution theta(t) makes it a scalar equation of Hill's kind,
+In axes that turn with the range, the drift obeys rho'' + 2 alpha rho' + (beta^2 - W) rho = 0, where W = P Q'^2 P contains the
+squared rates at which the left null space turns. In the paper's linkage this space has one direction, (e, -2e, e, -e, 2e, -e)
+with the axis e of the links. W is then theta'^2, and with the exact solution theta(t) the law is a scalar equation of Hill's
+type,
 
     rho'' + 2 alpha rho' + (beta^2 - theta'^2) rho = 0.
 
-Claim: the full nonlinear equations, started with a drift of 1e-9, let it grow at the Floquet exponent of this law, to five
-digits: for the linkage from five starts, with and without gains, and for a scissor lift, redundant by two rows whose left null
-space turns at two unequal rates, none of them constant. Gains alpha = beta = a shift the
-exponent by -a: a few per second are enough.
+Claim: in the full nonlinear equations, a drift of 1e-9 at the start grows at the Floquet exponent of this law, to five digits:
+for the linkage from five starts, with and without gains, and for a scissor lift with two redundant rows, whose left null space
+turns at two different rates, neither of them constant. Gains alpha = beta = a shift the exponent by -a: a few per second are
+enough.
 """
 
 from collections.abc import Callable
@@ -152,7 +154,7 @@ def headline(data: xarray.Dataset) -> str:
     """The worst deviation, and the rates from -45 and -50 degrees."""
     rates = ", ".join(f"{float(data.measured[k, 0]):.5f} /s ({name})" for k, name in enumerate(data.motion.values))
     worst = float(deviation(data).max())
-    return f"{int(data.measured.count())} growth rates off theory by at most {worst:.0e}; without gains {rates}"
+    return f"{int(data.measured.count())} growth rates differ from theory by at most {worst:.0e}; without gains: {rates}"
 
 
 def figure(data: xarray.Dataset) -> Figure:

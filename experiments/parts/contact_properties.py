@@ -17,10 +17,10 @@ from experiments.parts.tally import Property, Tally
 
 PROPERTIES = {
     "impact energy": Property(
-        "Energy never grows in an impact, or later", 1e-7, "runs at a tolerance of 1e-8, of the largest energy"
+        "Energy never grows, at an impact or later", 1e-7, "relative to the largest energy, in runs at a tolerance of 1e-8"
     ),
-    "impact pull": Property("No impulse of a contact pulls", 1e-7, "of the largest impulse, as above"),
-    "impact depth": Property("No contact is passed", 1e-6, "of the scene's length, as above"),
+    "impact pull": Property("No contact pulls", 1e-7, "relative to the largest impulse, as above"),
+    "impact depth": Property("No contact is penetrated", 1e-6, "relative to the scene's length, as above"),
 }
 
 

@@ -21,28 +21,28 @@ SPAN = 0.5  # of the scene's own time
 STEPS = 5e-4, 2.5e-4  # relative changes of the numbers, of differences
 PROPERTIES = {
     "engines": Property(
-        "Machine code and diffrax reach the same states at a tolerance of 1e-10", 1e-6, "what the motion makes of it"
+        "Machine code and diffrax reach the same states at a tolerance of 1e-10", 1e-6, "growth of errors along the motion"
     ),
     "batch": Property(
-        "A member of a batch is what it is alone", 1e-9, "at a tolerance of 1e-10, in whose last digits steps may differ"
+        "A run in a batch is the same as alone", 1e-9, "a tolerance of 1e-10, in whose last digits steps may differ"
     ),
-    "jit": Property("A run under jit is what it is outside", 1e-9, "as above"),
-    "energy of a run": Property("Without drivers and friction, energy is kept", 1e-7, "at a tolerance of 1e-10"),
+    "jit": Property("A run under jit is the same as outside", 1e-9, "as above"),
+    "energy of a run": Property("Without drivers and friction, energy is conserved", 1e-7, "a tolerance of 1e-10"),
     "CoordinatePartitioning": Property(
         "CoordinatePartitioning finds the accelerations of the reference",
         1e-10,
         "rounding, times the square of the condition number",
     ),
     "run by partitioning": Property(
-        "A run by CoordinatePartitioning reaches the states of machine code", 1e-6, "what the motion makes of 1e-10"
+        "A run by CoordinatePartitioning reaches the same states as machine code", 1e-6, "growth of errors along the motion"
     ),
     "power balance": Property(
-        "Powers add up to the rates of the energies, at all times", 1e-11, "rounding, and what velocities violate"
+        "Powers add up to the rates of the energies, at all times", 1e-11, "rounding, and the violation of the velocities"
     ),
     "work": Property(
-        "The work of drivers and loads is the change of the energies that are written by hand", 1e-8, "integrals of 33 powers"
+        "The work of drivers and loads is the change of energy, by formulas written by hand", 1e-8, "integrals of 33 powers"
     ),
-    "closure of a run": Property("All joints stay closed along a run", 1e-8, "two Newton steps after each step, to rounding"),
+    "closure of a run": Property("All joints stay closed along a run", 1e-8, "two Newton iterations after each step"),
     "forward derivative": Property(
         "jvp is the limit of central differences", 1e-4, "differences of runs at a tolerance of 1e-10"
     ),
@@ -88,7 +88,7 @@ def check_runs(tally: Tally, seed: int, structures: Iterable[int], members: int,
         native = jax.jit(jax.vmap(_runner(first, "native")))
         found = native(*batch)
         ended = np.asarray(found.code) == udk.Result.successful
-        tally.leave_out("a run ends early, by its own word", int(np.sum(~ended)))
+        tally.leave_out("a run that ends early and reports it", int(np.sum(~ended)))
         unit = np.array([[scene.length, scene.length, 1.0] for scene in scenes])[:, None, None, :]
         q = np.asarray(found.q) / unit
         size = np.maximum(1.0, np.max(abs(q), axis=(1, 2, 3)))
@@ -165,7 +165,7 @@ def _check_partitioning(
         return
     run = jax.jit(jax.vmap(_runner(first, "diffrax", formulation)))(*batch)
     both = ended & (np.asarray(run.code) == udk.Result.successful)
-    tally.leave_out("a run by partitioning ends early, by its own word", int(np.sum(ended & ~both)))
+    tally.leave_out("a run by partitioning that ends early and reports it", int(np.sum(ended & ~both)))
     for k in np.flatnonzero(both):
         tally.add("run by partitioning", np.max(abs(np.asarray(run.q)[k] / unit[k] - q[k])) / size[k], scenes[k].label)
 
@@ -181,7 +181,7 @@ def _check_power(tally: Tally, scene: RandomScene) -> None:
     x = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
     run = udk.simulate(mechanism, 0.5 * span * (x + 1), udk.State(*state_of(scene.table)), TOL, TOL, throw=False, max_steps=2000)
     if not run.result.is_success:
-        tally.leave_out("a run ends early, by its own word")
+        tally.leave_out("a run that ends early and reports it")
         return
     found = udk.power_balance(mechanism, run)
     tally.add("power balance", float(found.relative), scene.label)
@@ -191,7 +191,7 @@ def _check_power(tally: Tally, scene: RandomScene) -> None:
     energy = [0.5 * e.mass @ v.ravel() ** 2 + e.potential for e, v in ends]
     size = max(*map(abs, energy), span * np.max(abs(power)), scene.mass * (scene.length / scene.time) ** 2)
     if abs(fine - coarse) > 1e-9 * size:
-        tally.leave_out("powers that 33 times do not resolve")
+        tally.leave_out("powers that 33 times cannot resolve")
         return
     tally.add("work", abs(energy[1] - energy[0] - fine) / size, scene.label)
 

@@ -26,40 +26,38 @@ from udkjax.pinv.rank_policy import RankPolicy
 
 SAFE = 1e-12  # pivots relative to their rows above which elimination is trusted here: half of the digits
 GAP = 1e-6, 1e-11  # singular values of D relative to the largest: those that count, and those that do not; in between, neither
-ORDINARY = 30.0  # the condition number up to which a state is ordinary; beyond it errors may grow like its square
-ROUNDING = "rounding, of some hundred operations"
+ORDINARY = 30.0  # the condition number up to which errors are not scaled; beyond it they may grow like its square
+ROUNDING = "rounding in some hundred operations"
 CONDITION = "rounding, times the square of the condition number of the rows that are eliminated"
 PROPERTIES = {
-    "Psi": Property("Psi of the programs is that of an independent implementation", 1e-12, ROUNDING),
-    "Psi_q": Property("Psi_q, by rules for expressions, is that of Taylor series in NumPy", 1e-12, ROUNDING),
-    "Psi_dot": Property("Psi_dot is that of Taylor series", 1e-12, ROUNDING),
+    "Psi": Property("Psi agrees with an independent implementation", 1e-12, ROUNDING),
+    "Psi_q": Property("Psi_q, by rules for expressions, agrees with Taylor series in NumPy", 1e-12, ROUNDING),
+    "Psi_dot": Property("Psi_dot agrees with Taylor series", 1e-12, ROUNDING),
     "gamma": Property(
-        "gamma is that of Taylor series of second order", 1e-12, f"{ROUNDING}, and differences of squares of rates"
+        "gamma agrees with Taylor series of second order", 1e-12, f"{ROUNDING}, and differences of squares of rates"
     ),
-    "loads": Property("M^(-1) F is that of loads written by hand", 1e-12, ROUNDING),
-    "energy": Property("Kinetic and potential energy are those written by hand", 1e-12, ROUNDING),
-    "large scenes": Property(
-        "Psi, Psi_q, Psi_dot, gamma and loads of large scenes, by loops, are those of NumPy", 1e-11, ROUNDING
-    ),
-    "elimination": Property("Elimination finds the accelerations that singular values of all rows find", 1e-12, "as asked for"),
+    "loads": Property("M^(-1) F agrees with loads written by hand", 1e-12, ROUNDING),
+    "energy": Property("Kinetic and potential energy agree with formulas written by hand", 1e-12, ROUNDING),
+    "large scenes": Property("Psi, Psi_q, Psi_dot, gamma and loads of large scenes, by loops, agree with NumPy", 1e-11, ROUNDING),
+    "elimination": Property("Elimination finds the same accelerations as singular values of all rows", 1e-12, "required"),
     "constraints": Property("Accelerations satisfy Psi_q a = gamma", 1e-11, CONDITION),
     "Gauss": Property("a is nearest to a_F in the metric of M: N^T M (a - a_F) = 0 along all free motions N", 1e-11, CONDITION),
-    "power": Property("v^T (M a - F) = lambda^T Psi_t: the power of constraints is that of drivers", 1e-11, CONDITION),
-    "reciprocity": Property("An impulse at i moves j as one at j moves i, through all constraints", 1e-11, CONDITION),
+    "power": Property("v^T (M a - F) = lambda^T Psi_t: the power of constraints is the power of drivers", 1e-11, CONDITION),
+    "reciprocity": Property("An impulse at i moves j as an impulse at j moves i, through all constraints", 1e-11, CONDITION),
     "file": Property(
-        "A scene that is written and read has the same numbers, and accelerations to the bit", 0.5, "a count: of bits"
+        "A scene that is written and read has the same numbers and accelerations, bit for bit", 0.5, "a count of bits"
     ),
     "rigid motion": Property(
-        "A scene moved and turned as a whole, gravity too, has its accelerations turned",
+        "If a scene and its gravity are moved and turned as a whole, its accelerations turn with it",
         1e-9,
-        "rounding, of positions far from the origin",
+        "rounding of positions far from the origin",
     ),
-    "units": Property("A change of units of length, time and mass changes accelerations by them alone", 1e-11, CONDITION),
-    "names": Property("New names change nothing, to the bit", 0.5, "a count: of bits"),
+    "units": Property("Other units of length, time and mass only scale accelerations", 1e-11, CONDITION),
+    "names": Property("Other names change no bit of the result", 0.5, "a count of bits"),
     "order": Property("Bodies, joints and forces in another order have the same accelerations", 1e-11, CONDITION),
     "copies": Property("Constraints that are given k times change no acceleration", 1e-11, CONDITION),
     **{
-        name: Property(f"{name} finds the accelerations of the reference, whatever is redundant", tol, because)
+        name: Property(f"{name} finds the accelerations of the reference, with any redundancy", tol, because)
         for name, tol, because in (
             ("SVD", 1e-11, "rounding, times the condition number"),
             ("Varga", 1e-11, "rounding, times the condition number"),
@@ -555,7 +553,9 @@ def _check_structure(
 
     # Half of the mechanisms are turned and moved, the other half, or all that cannot be turned, get other units.
     can_turn, others, back = can_be_turned(scenes[0].table), [], []
-    tally.leave_out("tied to the axes or the origin of the ground: not turned", 0 if can_turn else len(both))
+    tally.leave_out(
+        "tied to the axes or the origin of the ground, so that the scene cannot be turned", 0 if can_turn else len(both)
+    )
     for k, scene in enumerate(scenes):
         if can_turn and k % 2 == 0:
             c, d = np.cos(turn := rng.uniform(-3.0, 3.0)), np.sin(turn)

@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike
 
 @dataclass(frozen=True)
 class Property:
-    """A claim that errors stay below a tolerance, each error in its own unit; `tolerance_because` says why that one."""
+    """A claim that errors, each in its own unit, stay below a tolerance; `tolerance_because` gives the reason for its value."""
 
     claim: str
     tolerance: float
@@ -28,13 +28,13 @@ class Found:
 
 @dataclass
 class Tally:
-    """The errors of all properties, and the cases that a property does not speak of, by the reason."""
+    """The errors of all properties, and the numbers of cases that were left out, by reason."""
 
     found: dict[str, Found] = field(default_factory=dict)
     left_out: dict[str, int] = field(default_factory=dict)
 
     def add(self, name: str, errors: ArrayLike | Sequence[float], at: str) -> None:
-        """Count one or several errors of a case; NaN is the worst of all."""
+        """Count one or several errors of a case; NaN counts as infinite."""
         found = self.found.setdefault(name, Found())
         for error in np.ravel(np.asarray(errors, float)):
             error = math.inf if math.isnan(error) else float(error)
@@ -43,11 +43,11 @@ class Tally:
                 found.worst, found.at = error, at
 
     def leave_out(self, reason: str, count: int = 1) -> None:
-        """Count cases that are no test of a property."""
+        """Count cases that cannot test a property."""
         self.left_out[reason] = self.left_out.get(reason, 0) + count
 
     def merge(self, other: "Tally") -> None:
-        """Add what another part of a run found."""
+        """Add the results of another part of a run."""
         for name, one in other.found.items():
             found = self.found.setdefault(name, Found())
             found.cases += one.cases
