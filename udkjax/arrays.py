@@ -2,9 +2,10 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from types import ModuleType
-from typing import Any, TypeAlias, TypeVar
+from types import MethodType, ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,6 +79,31 @@ def make_module(cls: type[Module], **fields: Any) -> Module:
     for name, value in fields.items():
         object.__setattr__(module, name, value)
     return module
+
+
+class QuickMethods(eqx.Module):
+    """A module whose methods are looked up in the same time however many numbers it has.
+
+    The methods are trees, as those of every Equinox module, but made without the check that visits all leaves each time.
+    """
+
+    if not TYPE_CHECKING:
+
+        def __getattribute__(self, name: str, /) -> Any:
+            found = object.__getattribute__(self, name)
+            if type(found) is MethodType and found.__self__ is self and not name.startswith("__"):
+                described = {key: getattr(found, key) for key in _DESCRIPTION if hasattr(found, key)}
+                return make_module(_METHOD, **described, __func__=found.__func__, __self__=self)
+            return found
+
+
+class _WithMethod(eqx.Module):
+    def method(self) -> None:
+        """Have the type of methods of Equinox modules, which is not public."""
+
+
+_METHOD: type[Any] = type(_WithMethod().method)
+_DESCRIPTION = tuple(vars(_WithMethod().method).keys() - {"__func__", "__self__"})  # as of `functools.wraps`
 
 
 def number(value: Numbers) -> Float[Array, "..."]:

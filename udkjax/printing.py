@@ -7,10 +7,11 @@ from html import escape
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
+
+from udkjax.arrays import QuickMethods
 
 MOST_ROWS = 14  # rows of a table as text, which fit on a screen with title and remarks; further rows are only counted
 MOST_HTML_ROWS = 30  # rows of a table in a notebook, which can be scrolled
@@ -184,14 +185,14 @@ def _literal(value: Any) -> str:
     return repr(value) if isinstance(value, str) else format_field(value) if not isinstance(value, tuple) else str(value)
 
 
-class PrintsLine(eqx.Module):
+class PrintsLine(QuickMethods):
     """A module that prints as a Python expression."""
 
     def __repr__(self) -> str:
         return one_line(self)
 
 
-class PrintsTable(eqx.Module):
+class PrintsTable(QuickMethods):
     """A module that prints as a table: `_table()` if all of its numbers have values, else `_shapes()`."""
 
     _units: ClassVar[Mapping[str, str]] = units()  # unit of each field

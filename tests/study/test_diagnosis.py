@@ -9,10 +9,13 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pytest import approx
 from scipy.optimize import brentq
+from scipy.sparse import csr_array
 
 import udkjax as udk
 from tests.scaling import scaled
+from udkjax.pinv.sparse_gram import SmallSingularValues
 from udkjax.scene import GROUND
 from udkjax.study.accuracy import pendulum
 from udkjax.study.diagnosis import fixes
@@ -314,19 +317,34 @@ def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
     assert len(built) == sum(len(r.fixes) for r in found.redundancies) + 1
 
 
-def test_positions_of_a_large_scene_are_closed_without_singular_vectors(monkeypatch):
-    """The walk to the next rank change takes hundreds of positions, and of each the singular values alone."""
+def test_positions_of_a_large_scene_are_closed_and_ranked_without_dense_decompositions(monkeypatch):
+    """The walk to the next rank change takes hundreds of positions, each kept; their Jacobians are sparse."""
     mech, decompose, found = udk.library.n_four_bar(20), np.linalg.svd, []
     positions = RankedPositions(mech, 1e-6)
     start = positions.at(0.0, np.ravel(udk.assemble(mech).q))
     direction = start.right[:, 0]
 
-    def counted(matrix, *given, compute_uv=True, **choices):
-        found.append(compute_uv)
-        return decompose(matrix, *given, compute_uv=compute_uv, **choices)
+    def counted(matrix, *given, **choices):
+        found.append(min(matrix.shape) > 10)
+        return decompose(matrix, *given, **choices)
 
     monkeypatch.setattr(np.linalg, "svd", counted)
     moved = positions.displace(start, direction, 0.1)
-    assert moved is not None and not found
-    assert moved.rank == start.rank and found == [False]
+    assert moved is not None and moved.rank == start.rank and not any(found)
     assert np.abs(positions.rows.residual(0.0, moved.q)).max() < 1e-12
+    assert moved.allowed(direction) == approx(moved.right @ (moved.right.T @ direction), abs=1e-12)
+    assert [moved.value(moved.rank), moved.largest] == approx(moved.sigma[[moved.rank - 1, 0]], abs=1e-14)
+
+
+@pytest.mark.parametrize("redundant", [0, 3, 40])
+def test_small_singular_values_of_a_sparse_matrix_are_those_of_the_dense_one(redundant):
+    random = np.random.default_rng(1)
+    A = random.standard_normal((60, 90)) * (random.uniform(size=(60, 90)) < 0.1)
+    A = np.concatenate([A, random.standard_normal((redundant, 60)) @ A])
+    small, sigma = SmallSingularValues(csr_array(A), 1e-9), np.linalg.svd(A)[1]
+    assert small.zero_count == redundant and small.largest == approx(sigma[0], rel=1e-11)
+    assert small.values[redundant] == approx(sigma[59], rel=1e-12)
+    assert small.left.T @ small.left == approx(np.eye(redundant), abs=1e-12)
+    assert np.abs(small.left.T @ A).max(initial=0.0) < 1e-12 * sigma[0]
+    x = random.standard_normal(90)
+    assert small.null_space_part(x) == approx(x - np.linalg.pinv(A, rcond=1e-9) @ (A @ x), abs=1e-9)

@@ -8,13 +8,12 @@ them form sets, of a few dozen rows in most scenes; each set is decided separate
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.sparse import coo_array, csc_array, csr_array, eye_array
+from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
@@ -26,15 +25,13 @@ from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.scales import concrete_scales
 from udkjax.pinv.elimination import default_rank_tol
 from udkjax.pinv.elimination_order import minimum_degree
+from udkjax.pinv.sparse_gram import SparseMatrix, factor_gram
 from udkjax.scene.mechanism import Mechanism
 
 # Largest pivot of a unit row, the square of a length, that counts as zero.
 DEPENDENT_PIVOT = default_rank_tol(np.dtype(float)) ** 2
 DAMPING = RANK_TOL**2  # added to D D^T in closing; counterpart of the truncation at `RANK_TOL` for small scenes
 NULL_SPACE_BATCH = 64  # number of columns of a null space solved for at a time, to limit the memory of the dense columns
-
-
-SparseMatrix: TypeAlias = Any  # SciPy's type stubs lack the shape
 
 
 class SparsePosition(NamedTuple):
@@ -63,7 +60,7 @@ class SparsePosition(NamedTuple):
 
     def tangent_part(self, heading: np.ndarray) -> np.ndarray:
         """Return the part of a displacement that the constraints allow."""
-        solve = splu(csc_array(self.D @ self.D.T + DAMPING * eye_array(self.D.shape[0])), **_SYMMETRIC).solve
+        solve = factor_gram(self.D, DAMPING).solve
         for _ in range(2):
             heading = heading - self.D.T @ solve(self.D @ heading)
         return heading
@@ -75,7 +72,7 @@ class SparsePosition(NamedTuple):
         if not count:
             return csc_array((rows, 0))
         independent = self.D[self.independent]
-        solve = splu(csc_array(independent @ independent.T), **_SYMMETRIC).solve
+        solve = factor_gram(independent).solve
         blocks = []
         for start in range(0, count, NULL_SPACE_BATCH):
             dependent = self.dependent[start : start + NULL_SPACE_BATCH]
@@ -86,9 +83,6 @@ class SparsePosition(NamedTuple):
             basis[np.abs(basis) < NEGLIGIBLE_SHARE] = 0.0
             blocks.append(coo_array(basis))
         return csc_array(_stack_columns(blocks, rows))
-
-
-_SYMMETRIC: dict[str, Any] = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}, "diag_pivot_thresh": 0.0}
 
 
 def _stack_columns(blocks: list[SparseMatrix], rows: int) -> SparseMatrix:
@@ -129,10 +123,11 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
         return matrix.toarray()
 
     def _normalize_rows(self, values: np.ndarray) -> tuple[SparseMatrix, np.ndarray]:
-        D = csr_array((values * self.metric[self.entries[1]], self.entries), shape=(self.count, self.size))
-        length = np.sqrt(D.multiply(D).sum(axis=1))
+        rows, columns = self.entries
+        values = values * self.metric[columns]
+        length = np.sqrt(np.bincount(rows, values**2, self.count))
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rounding errors are not scaled up
-        return csr_array(D.multiply(1 / length[:, None])), length
+        return csr_array((values / length[rows], self.entries), shape=(self.count, self.size)), length
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
         return self.psi(t, q) / self.scales.rows
@@ -145,8 +140,7 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
         """Return -W D^T (D D^T + damping)^(-1) residual."""
         if not np.all(np.isfinite(D.data)):
             return np.full(self.size, np.nan)
-        system = csc_array(D @ D.T + DAMPING * eye_array(self.count))
-        return -self.metric * (D.T @ splu(system, **_SYMMETRIC).solve(residual))
+        return -self.metric * (D.T @ factor_gram(D, DAMPING).solve(residual))
 
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> SparsePosition | None:
         q = try_to_close(self, t, q) if give_up else close_position(self, t, q, np)

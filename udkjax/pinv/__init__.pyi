@@ -25,6 +25,9 @@ from udkjax.pinv.rule import LeastSquaresSolution as LeastSquaresSolution
 from udkjax.pinv.rule import Plus as Plus
 from udkjax.pinv.rule import Pseudoinverse as Pseudoinverse
 from udkjax.pinv.rule import exceeds as exceeds
+from udkjax.pinv.sparse_gram import SmallSingularValues as SmallSingularValues
+from udkjax.pinv.sparse_gram import SparseMatrix as SparseMatrix
+from udkjax.pinv.sparse_gram import factor_gram as factor_gram
 from udkjax.pinv.svd import SVD as SVD
 from udkjax.pinv.svd import SVDFactors as SVDFactors
 from udkjax.pinv.varga import Varga as Varga

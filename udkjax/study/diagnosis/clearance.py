@@ -45,18 +45,17 @@ def clearance(positions: RankedPositions, at: Configuration, rank: int, walk: bo
     """Return the distance to the next configuration where the rank is below `rank`, the generic rank."""
     if not rank or at.rank < rank:
         return Clearance(0.0 if rank else 1.0, 0.0 if rank else np.inf, None, 0.0)
-    sigma = at.sigma[rank - 1]
-    slope = np.linalg.norm([_slope(positions, at, direction, rank) for direction in at.right.T]) if at.right.size else 0.0
+    sigma = at.value(rank)
+    slope = np.linalg.norm([_slope(positions, at, direction, rank) for direction in at.right.T]) if at.freedom else 0.0
     estimate = float(sigma / slope) if slope > SLOPE_STEP * sigma else np.inf
-    driven = at.right.shape[1] == 0 and positions.rows.driver_time_step > 0.0
-    nearest, searched = (None, 0.0) if not walk or not (at.right.shape[1] == 1 or driven) else _search(positions, at, rank)
-    return Clearance(float(sigma / at.sigma[0]), estimate, nearest, searched)
+    driven = at.freedom == 0 and positions.rows.driver_time_step > 0.0
+    nearest, searched = (None, 0.0) if not walk or not (at.freedom == 1 or driven) else _search(positions, at, rank)
+    return Clearance(sigma / at.largest, estimate, nearest, searched)
 
 
 def _slope(positions: RankedPositions, at: Configuration, direction: np.ndarray, rank: int) -> float:
-    step = SLOPE_STEP * positions.unit * direction
-    change = positions.at(at.t, at.q + step).J - positions.at(at.t, at.q - step).J
-    return float(at.u[:, rank - 1] @ change @ at.vt[rank - 1]) / (2 * SLOPE_STEP)
+    change = positions.change_along(at, SLOPE_STEP * direction)
+    return float(at.u[:, rank - 1] @ (change @ at.vt[rank - 1])) / (2 * SLOPE_STEP)
 
 
 def _search(positions: RankedPositions, start: Configuration, rank: int) -> tuple[RankChange | None, float]:
@@ -66,7 +65,7 @@ def _search(positions: RankedPositions, start: Configuration, rank: int) -> tupl
     path = [*reversed(back), start, *onward]
     distances = np.concatenate([[0.0], np.cumsum([positions.distance(a, b) for a, b in pairwise(path)])])
     distances -= distances[len(back)]
-    sigma = np.array([c.sigma[rank - 1] for c in path])
+    sigma = np.array([c.value(rank) for c in path])
     roots = [
         _root(positions, path, distances, sigma, k, rank)
         for k in range(1, len(path) - 1)
@@ -79,7 +78,7 @@ def _search(positions: RankedPositions, start: Configuration, rank: int) -> tupl
 def _walk(positions: RankedPositions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
     """Return closed positions along the path, past the first minimum of sigma, and True if they return to the start."""
     path, more = [start], WALK_STEPS
-    heading = side * start.right[:, 0] if start.right.shape[1] else np.zeros(len(start.q))
+    heading = side * start.right[:, 0] if start.freedom else np.zeros(len(start.q))
     while more:
         last, more = path[-1], more - 1
         tried = (_step(positions, last, heading, fraction * NEIGHBOUR_STEP, side) for fraction in (1.0, 0.7))
@@ -91,7 +90,7 @@ def _walk(positions: RankedPositions, start: Configuration, rank: int, side: flo
             heading = _onward([c.q / positions.unit for c in path[-3:]])
         if len(path) > 3 and positions.distance(start, moved, turns=False) < NEIGHBOUR_STEP:
             return path[1:], True
-        if len(path) > 2 and more > POINTS_PER_SIDE and _has_kink([c.sigma[rank - 1] for c in path[-3:]]):
+        if len(path) > 2 and more > POINTS_PER_SIDE and _has_kink([c.value(rank) for c in path[-3:]]):
             more = POINTS_PER_SIDE
     return path[1:], False
 

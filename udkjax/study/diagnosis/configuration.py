@@ -1,10 +1,12 @@
 """A closed position of a mechanism, its scaled Jacobian with null spaces, and nearby closed positions.
 
-All of this is NumPy on the scene's programs, without compilation. Rows and columns are scaled as in determinacy.py.
+All of this is NumPy on the scene's programs, without compilation. Rows and columns are scaled as in determinacy.py. In large
+scenes the Jacobian is sparse, and only its small singular values are computed.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +14,11 @@ from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSURE, close_position, is_closed
 from udkjax.equations.position_rows import PositionRows
 from udkjax.equations.redundancy import kinematic_rows
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.scene.mechanism import Mechanism
+
+if TYPE_CHECKING:
+    from udkjax.pinv.sparse_gram import SmallSingularValues
 
 NEIGHBOUR_STEP = 0.1  # step from one neighbour to the next, relative to the characteristic length, and rad
 N_NEIGHBOURS = 12
@@ -37,10 +43,19 @@ class Configuration:
         """The singular values, without the vectors, whose computation takes several times as long."""
         return singular_values(self.J)
 
-    @cached_property
+    @property
     def rank(self) -> int:
         """Number of nonzero singular values."""
         return count_rank(self.sigma, self._rank_tol)
+
+    def value(self, number: int) -> float:
+        """Return the `number`-th largest singular value, from one; `number` is at least the rank."""
+        return float(self.sigma[number - 1])
+
+    @property
+    def largest(self) -> float:
+        """The largest singular value."""
+        return float(self.sigma[0])
 
     @cached_property
     def _vectors(self) -> tuple[np.ndarray, np.ndarray]:
@@ -67,15 +82,70 @@ class Configuration:
         """Basis of the null space, (n, n - rank): displacements that the constraints allow to first order."""
         return self.vt[self.rank :].T
 
+    def allowed(self, displacement: np.ndarray) -> np.ndarray:
+        """Return the part of a displacement (n,) that the constraints allow."""
+        return self.right @ (self.right.T @ displacement)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The shape of J."""
+        return self.J.shape[0], self.J.shape[1]
+
+    @property
+    def freedom(self) -> int:
+        """Number of degrees of freedom, n - rank."""
+        return self.shape[1] - self.rank
+
     @property
     def redundancy(self) -> int:
         """Number of redundant rows."""
-        return len(self.J) - self.rank
+        return self.shape[0] - self.rank
 
     @property
     def smallest(self) -> float:
         """The smallest nonzero singular value, relative to the largest."""
-        return float(self.sigma[self.rank - 1] / self.sigma[0]) if self.rank else 1.0
+        return self.value(self.rank) / self.largest if self.rank else 1.0
+
+
+class LargeConfiguration(Configuration):
+    """A configuration of a large mechanism, whose Jacobian is sparse; a path of many of them takes little memory.
+
+    Args:
+        t: time (s).
+        q: coordinates (n,).
+        J: scaled Jacobian (m, n), in compressed sparse rows.
+        small: its small singular values.
+        rank_tol: singular values up to this fraction of the largest count as zero.
+    """
+
+    def __init__(self, t: float, q: np.ndarray, J: Any, small: "SmallSingularValues", rank_tol: float):
+        self.t, self.q, self.sparse, self._small, self._rank_tol = t, q, J, small, rank_tol
+
+    @cached_property
+    def J(self) -> np.ndarray:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.sparse.toarray()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.sparse.shape
+
+    @property
+    def rank(self) -> int:
+        return self.shape[0] - self._small.zero_count
+
+    def value(self, number: int) -> float:
+        return float(self._small.values[self.shape[0] - number])
+
+    @property
+    def largest(self) -> float:
+        return self._small.largest
+
+    @property
+    def left(self) -> np.ndarray:
+        return self._small.left
+
+    def allowed(self, displacement: np.ndarray) -> np.ndarray:
+        return self._small.null_space_part(displacement)
 
 
 class RankedPositions:
@@ -84,14 +154,44 @@ class RankedPositions:
     def __init__(self, mechanism: Mechanism, rank_tol: float):
         rows = self.rows = KinematicRows(mechanism)
         self.rank_tol, self._mechanism = rank_tol, mechanism
+        self._is_large = bool(rows.count) and not scene_programs(mechanism).is_small
+        self._vectors: np.ndarray | None = None  # of small singular values at the last position: the next ones are similar
         length = float(rows.scales.length)
         self.unit = np.tile([length, length, 1.0], rows.size // 3)
         self.row_unit = np.asarray(rows.scales.rows, float)
 
     def at(self, t: float, q: np.ndarray) -> Configuration:
         """Return the configuration at closed coordinates."""
-        J = self.rows.jacobian(t, q) * self.unit / self.row_unit[:, None]
-        return Configuration(t, q, J, self.rank_tol)
+        if not self._is_large:
+            return Configuration(t, q, self._dense_jacobian(t, q), self.rank_tol)
+        from udkjax.pinv.sparse_gram import SmallSingularValues  # imports SciPy, which small scenes do not need
+
+        J = self._sparse_jacobian(t, q)
+        small = SmallSingularValues(J, self.rank_tol, self._vectors)
+        self._vectors = small.vectors
+        return LargeConfiguration(t, q, J, small, self.rank_tol)
+
+    def change_along(self, at: Configuration, displacement: np.ndarray) -> Any:
+        """Return the change of J, by central differences, from minus to plus a displacement in scaled coordinates."""
+        jacobian = self._sparse_jacobian if self._is_large else self._dense_jacobian
+        step = self.unit * displacement
+        return jacobian(at.t, at.q + step) - jacobian(at.t, at.q - step)
+
+    def rank_of_rows(self, at: Configuration, rows: Sequence[int]) -> int:
+        """Return the rank of some of the rows of J."""
+        if len(rows) == at.shape[0]:
+            return at.rank
+        return count_rank(singular_values(at.J[rows]), self.rank_tol)
+
+    def _dense_jacobian(self, t: float, q: np.ndarray) -> np.ndarray:
+        return self.rows.jacobian(t, q) * self.unit / self.row_unit[:, None]
+
+    def _sparse_jacobian(self, t: float, q: np.ndarray) -> Any:
+        from scipy.sparse import csr_array
+
+        i, k = self.rows.entries
+        values = self.rows.geometry(t, q, 0.0 * q)[2] * self.unit[k] / self.row_unit[i]
+        return csr_array((values, (i, k)), shape=(self.rows.count, self.rows.size))
 
     @cached_property
     def _closing(self) -> PositionRows:
@@ -122,7 +222,7 @@ class RankedPositions:
         heading, t = random.standard_normal(len(start.q)), start.t
         for _ in range(N_NEIGHBOURS if self.rows.count else 0):
             heading = heading / np.linalg.norm(heading) + 0.3 * random.standard_normal(len(heading)) / np.sqrt(len(heading))
-            allowed = last.right @ (last.right.T @ heading)
+            allowed = last.allowed(heading)
             size = np.linalg.norm(allowed)
             t += self.rows.driver_time_step * NEIGHBOUR_STEP / CLOSURE.longest_step
             direction = allowed / size if size > 0.0 else allowed

@@ -10,7 +10,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import clearance
-from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions, count_rank, singular_values
+from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
 from udkjax.study.diagnosis.diagnosis import Diagnosis
 from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fixes_of
@@ -68,7 +68,7 @@ def diagnose(
     generic = [c for c in [current, *neighbours] if c.rank == generic_rank]
     owners = [name for name, _ in rows.names]
     permanent, momentary = _dependencies(mechanism, current, generic, owners)
-    if not neighbours and current.right.size:  # moves to first order only: rows are dependent here
+    if not neighbours and current.freedom:  # moves to first order only: rows are dependent here
         permanent, momentary = [], [*permanent, *momentary]
     redundancies = _with_fixes(mechanism, positions, generic if fixes else [], permanent)
     redundancies += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
@@ -81,7 +81,7 @@ def diagnose(
         rows=rows.count,
         rank=current.rank,
         ordinary_rank=generic_rank,
-        joint_rank=count_rank(singular_values(current.J[of_joints]), rank_tol),
+        joint_rank=positions.rank_of_rows(current, of_joints),
         joint_rows=len(of_joints),
         can_move=bool(neighbours),
         redundancies=tuple(redundancies),

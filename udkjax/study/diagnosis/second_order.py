@@ -37,18 +37,18 @@ class Branch(NamedTuple):
 
 def branches(mechanism: Mechanism, positions: RankedPositions, at: Configuration) -> list[Branch]:
     """Return the branches that meet at a configuration; if it is not singular, the directions of its motion."""
-    A, N, V = quadratic_forms(mechanism, positions, at), at.left, at.right
-    if not V.shape[1]:
+    if not at.freedom:
         return []
-    found = zeros_of(A) if N.shape[1] else [Zeros(np.eye(V.shape[1]), V.shape[1])]
+    A, V = quadratic_forms(mechanism, positions, at), at.right
+    found = zeros_of(A) if at.redundancy else [Zeros(np.eye(V.shape[1]), V.shape[1])]
     return [_follow(positions, at, V @ zeros.space, zeros.dimension) for zeros in found]
 
 
 def quadratic_forms(mechanism: Mechanism, positions: RankedPositions, at: Configuration) -> np.ndarray:
     """Return the forms A (k, d, d) of the second-order condition: N^T of the second derivative of scaled Psi along V."""
+    if not at.redundancy or not at.freedom:
+        return np.zeros((at.redundancy, at.freedom, at.freedom))
     N, V = at.left, at.right
-    if not N.shape[1] or not V.shape[1]:
-        return np.zeros((N.shape[1], V.shape[1], V.shape[1]))
     unit, weights = positions.unit[:, None] * V, N / positions.row_unit[:, None]
     return np.asarray(_hessian(mechanism.without_origin, np.asarray(at.t), at.q, unit, weights))
 
