@@ -113,3 +113,9 @@ def test_traced_numbers_are_refused():
 
     with pytest.raises(ValueError, match="concrete numbers"):
         jax.jit(ask)(1.0)
+
+
+def test_the_text_of_a_large_mechanism_fits_on_a_page_and_says_what_it_leaves_out():
+    text = str(udk.explain(udk.library.chain(30)))
+    assert len(text) < 30_000
+    assert "and 48 rows and 72 columns more, in the fields of the explanation" in text

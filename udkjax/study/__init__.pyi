@@ -9,6 +9,7 @@ from udkjax.study.channel_values import path as path
 from udkjax.study.choices import choice as choice
 from udkjax.study.diagnosis import Diagnosis as Diagnosis
 from udkjax.study.diagnosis import diagnose as diagnose
+from udkjax.study.diagnosis.configuration import RankedPositions as RankedPositions
 from udkjax.study.diagnosis.fixes import Fix as Fix
 from udkjax.study.explain import explain as explain
 from udkjax.study.explanation import Explanation as Explanation

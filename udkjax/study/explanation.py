@@ -13,6 +13,8 @@ from udkjax.study.report import plain, row_label
 from udkjax.wording import plural
 
 MOST_MATRIX_COLUMNS = 18  # largest number of columns of a matrix on one line
+MOST_ROWS, FIRST_ROWS = 24, 12  # longer tables and lists are printed up to a row, and the others counted
+MOST_COLUMNS, FIRST_COLUMNS = 36, 18  # likewise for columns
 SMALLEST_PRINTED = 1e-12  # smallest entry that is not printed as 0, relative to the largest of the array
 SMALLEST_TERM = 1e-9  # smallest coefficient of a combination of rows that is not rounding, relative to the largest
 
@@ -115,22 +117,23 @@ def _columns(mechanism: Mechanism) -> list[str]:
 
 
 def _state(e: Explanation, columns: list[str]) -> list[str]:
-    bodies = ", ".join(f"{k + 1} {name}" for k, name in enumerate(e.mechanism.body_names))
+    bodies = ", ".join(_first([f"{k + 1} {name}" for k, name in enumerate(e.mechanism.body_names)]))
     head = f"{e.mechanism.name or 'mechanism'} at t = {e.t:g} s. Bodies: {bodies}. Coordinates of each: x, y (m), th (rad)."
     return [head, "", *_table(["q", "v"], columns, np.stack([e.q, e.v]))]
 
 
 def _constraints(e: Explanation, rows: list[str], columns: list[str]) -> list[str]:
     shown = np.abs(e.psi_q) > SMALLEST_PRINTED * np.abs(e.psi_q).max()
+    width, places = _width(rows), range(_shown(len(columns), MOST_COLUMNS, FIRST_COLUMNS))
+    pattern = [
+        f"  {name:<{width}}  " + " ".join("x" if row[k] else "." for k in places) for name, row in zip(rows, shown, strict=True)
+    ]
     return [
         "1. Constraints Psi(t, q) = 0; along a motion Psi_dot = Psi_q v + Psi_t = 0, and Psi_q a = gamma",
         *_table(rows, ["Psi", "Psi_dot", "gamma"], np.stack([e.psi, e.psi_dot, e.gamma], axis=1)),
         "",
         f"  The Jacobian Psi_q ({len(rows)} x {len(columns)}): its nonzero entries (x), then their values:",
-        *(
-            f"  {name:<{_width(rows)}}  " + " ".join("x" if entry else "." for entry in row)
-            for name, row in zip(rows, shown, strict=True)
-        ),
+        *_first(pattern, _left_out(len(rows), len(columns))),
         "",
         *_table(rows, columns, e.psi_q),
     ]
@@ -143,11 +146,12 @@ def _rank(e: Explanation, rows: list[str]) -> list[str]:
     if not e.null_rows.shape[1]:
         return [*lines, "  All rows are independent."]
     lines.append("  These combinations of rows vanish: adding any multiple of one to lambda leaves the motion unchanged.")
+    combinations = []
     for column in e.null_rows.T:
         column = column / column[np.argmax(np.abs(column))]
         terms = [f"{x:+.3g} {name}" for x, name in zip(column, rows, strict=True) if abs(x) > SMALLEST_TERM]
-        lines.append("    " + " ".join(terms))
-    return lines
+        combinations.append("    " + " ".join(_first(terms)))
+    return [*lines, *_first(combinations)]
 
 
 def _masses(e: Explanation, columns: list[str]) -> list[str]:
@@ -166,7 +170,7 @@ def _pseudoinverse(e: Explanation, rows: list[str], columns: list[str]) -> list[
     return [
         f"5. D = Psi_q M^(-1/2){'; angular rows of D and b are multiplied by the characteristic length' if weighted else ''}",
         *_table(rows, columns, e.D),
-        f"  Singular values: {' '.join(_number(x, e.singular_values.max(initial=0.0)) for x in e.singular_values)}",
+        f"  Singular values: {' '.join(_first([_number(x, e.singular_values.max(initial=0.0)) for x in e.singular_values]))}",
         "",
         f"  D^+, transposed (one row for each row of D), of rank {e.rank}:",
         *_table(rows, columns, e.D_plus.T),
@@ -180,14 +184,15 @@ def _accelerations(e: Explanation, columns: list[str]) -> list[str]:
 
 def _multipliers(e: Explanation, rows: list[str]) -> list[str]:
     marks = ["", *("unique" if unique else "not unique: the minimum-norm solution" for unique in e.unique)]
-    shown = zip(_table(rows, ["lambda"], e.multipliers[:, None]), marks, strict=True)
+    shown = zip(_table(rows, ["lambda"], e.multipliers[:, None]), marks, strict=False)
+    directions = [
+        f"  {name}: only the component of its force along {np.rad2deg(angle):.4g} degrees is unique"
+        for name, angle in _directions(e)
+    ]
     return [
         "7. lambda = -(D^+)^T D^+ b (N, N m), so that M a + Psi_q^T lambda = F",
         *(f"{line}   {mark}".rstrip() for line, mark in shown),
-        *(
-            f"  {name}: only the component of its force along {np.rad2deg(angle):.4g} degrees is unique"
-            for name, angle in _directions(e)
-        ),
+        *_first(directions),
         "",
         "  The constraints' forces on the bodies, -Psi_q^T lambda = M (a - a_F), are unique:",
         *_table(["force"], _columns(e.mechanism), e.constraint_force[None]),
@@ -235,10 +240,31 @@ def _width(names: list[str]) -> int:
     return max(map(len, names))
 
 
+def _shown(count: int, most: int = MOST_ROWS, first: int = FIRST_ROWS) -> int:
+    """Return how many of `count` rows or columns are printed."""
+    return count if count <= most else first
+
+
+def _first(lines: list[str], left_out: str = "") -> list[str]:
+    """Return lines to print: all, or the first ones and what is left out."""
+    shown = _shown(len(lines))
+    rest = left_out or (f"and {len(lines) - shown} more" if shown < len(lines) else "")
+    return [*lines[:shown], *([rest] if rest else [])]
+
+
+def _left_out(rows: int, columns: int) -> str:
+    """Return a line that counts the rows and columns of a matrix that are not printed; empty if there are none."""
+    more_rows, more_columns = rows - _shown(rows), columns - _shown(columns, MOST_COLUMNS, FIRST_COLUMNS)
+    counts = [plural(n, noun) for n, noun in ((more_rows, "row"), (more_columns, "column")) if n]
+    return f"  and {' and '.join(counts)} more, in the fields of the explanation" if counts else ""
+
+
 def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]:
-    """Format a matrix with names of its rows and columns; wide matrices are split into blocks."""
-    width, lines = _width(rows), []
+    """Format a matrix with names of its rows and columns; wide matrices are split into blocks, large ones shown in part."""
     sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
+    left_out = _left_out(len(rows), len(columns))
+    rows, columns = rows[: _shown(len(rows))], columns[: _shown(len(columns), MOST_COLUMNS, FIRST_COLUMNS)]
+    values, width, lines = values[: len(rows), : len(columns)], _width(rows), []
     cells = [[_number(x, size) for x, size in zip(row, np.broadcast_to(sizes, row.shape), strict=True)] for row in values]
     for start in range(0, len(columns), MOST_MATRIX_COLUMNS):
         part = slice(start, start + MOST_MATRIX_COLUMNS)
@@ -246,7 +272,7 @@ def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]
         lines += [""] if start else []
         for name, line in zip(["", *rows], [columns[part], *(line[part] for line in cells)], strict=True):
             lines.append(f"  {name:<{width}}  " + " ".join(f"{cell:>{w}}" for cell, w in zip(line, widths, strict=True)))
-    return lines
+    return [*lines, left_out] if left_out else lines
 
 
 def _number(x: float, size: float) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import tracemalloc
 from html import unescape
 
 import numpy as np
@@ -12,7 +13,7 @@ from tests.show.player.conftest import Motion
 from udkjax.integrate.events.conditions import Gap
 from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.marks import body_points, corners_of, marks, to_ground
-from udkjax.show.player.measure_curves import measures_of, rank_of, reaction_arrows, singular_values_over_time
+from udkjax.show.player.measure_curves import measures_of, reaction_arrows
 from udkjax.show.player.page import page
 from udkjax.show.player.player_data import PRECISION, run_record
 
@@ -123,11 +124,24 @@ def test_singular_values_and_rank_of_the_papers_linkage():
     poses = np.stack([mech.q0, mech.q0])
     poses[1] = np.nan
     run = Motion(ts=np.zeros(2), q=poses, v=0 * poses)
-    values = singular_values_over_time(mech, run)
-    assert values.shape == (2, 12) and np.isnan(values[1]).all()
-    assert values[0, 10] > 0.1 and values[0, 11] < 1e-14
-    found = rank_of(values)
-    assert found[0] == 11 and np.isnan(found[1])
+    rank, smallest = measures_of(mech, run, ("rank",), "")
+    assert rank.values[0] == 11 and np.isnan(rank.values[1])
+    expected = udk.singular_values(mech, 0.0, poses[0])
+    assert smallest.name == "singular value 11" and expected[11] < 1e-14
+    np.testing.assert_allclose(smallest.values, [expected[10], np.nan], rtol=1e-12)
+
+
+def test_the_rank_of_a_large_mechanism_is_found_without_dense_matrices():
+    """A dense Jacobian has 72 kB here; of each position the curve needs two numbers."""
+    mech = udk.library.chain(50)
+    run = Motion(ts=np.arange(200.0), q=np.tile(mech.q0, (200, 1, 1)), v=np.zeros((200, 50, 3)))
+    measures_of(mech, run, ("rank",), "")
+    tracemalloc.start()
+    rank, smallest = measures_of(mech, run, ("rank",), "")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200 * 36_000 and (rank.values == 100).all()
+    np.testing.assert_allclose(smallest.values, udk.singular_values(mech, 0.0, mech.q0)[99], rtol=1e-12)
 
 
 def test_measures_are_those_of_the_equations(slider_crank, run):

@@ -3,20 +3,18 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from udkjax.equations import determinacy
-from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.analysis import analyse
 from udkjax.equations.quantities import efforts, energy, violation
 from udkjax.equations.reactions import reactions, unique_reactions
-from udkjax.programs.deferred import deferred
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import conserves_energy
+from udkjax.study.diagnosis.configuration import RankedPositions
 
 SMALLEST_POSITIVE = 1e-17  # drawn instead of zero on a logarithmic axis; less than any nonzero violation or singular value
 
@@ -77,26 +75,6 @@ def measures_of(mechanism: Mechanism, solution: ShownMotion, wanted: Measures, l
     return found
 
 
-def singular_values_over_time(mechanism: Mechanism, solution: ShownMotion) -> Float[np.ndarray, "T k"]:
-    """Return the singular values of the scaled Jacobian (`udkjax.singular_values`) at each output time, the largest first."""
-    values = np.array(_singular_values(mechanism, analyse(mechanism), solution.ts, solution.q))
-    values[~np.isfinite(np.asarray(solution.q)).all((1, 2))] = np.nan
-    return values
-
-
-def rank_of(values: Float[np.ndarray, "T k"]) -> Float[np.ndarray, "T"]:
-    """Return, for each row, the number of singular values above `STATIC_RANK_TOL` times the largest; NaN for rows of NaN."""
-    if values.shape[1] == 0:
-        return np.zeros(len(values))
-    count = (values > determinacy.STATIC_RANK_TOL * values[:, :1]).sum(axis=1).astype(float)
-    return np.where(np.isfinite(values[:, 0]), count, np.nan)
-
-
-@deferred
-def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Float[Array, "T k"]:
-    return jax.vmap(lambda t, q: determinacy.singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
-
-
 def _violation(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     psi = np.asarray(violation(mechanism, solution))
     values = np.abs(psi) * np.asarray(analyse(mechanism).scales.weights)  # radians as arcs of the characteristic length
@@ -115,12 +93,15 @@ def _energy(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
 
 
 def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
-    values = singular_values_over_time(mechanism, solution)
-    count = rank_of(values)
-    curves = [MeasureCurve("rank", "", count)]
-    full = int(np.nanmax(count, initial=0))
+    """Return the rank of the scaled Jacobian, and the smallest singular value that is nonzero at the largest rank."""
+    positions, q = RankedPositions(mechanism, determinacy.STATIC_RANK_TOL), np.asarray(solution.q, float)
+    ts, q = np.asarray(solution.ts, float).tolist(), q.reshape(len(q), -1)
+    found = [positions.at(t, x) if np.isfinite(x).all() else None for t, x in zip(ts, q, strict=True)]
+    full = max((at.rank for at in found if at), default=0)
+    curves = [MeasureCurve("rank", "", np.array([at.rank if at else np.nan for at in found], float))]
     if full:
-        curves.append(MeasureCurve(f"singular value {full}", "", np.maximum(values[:, full - 1], SMALLEST_POSITIVE), log=True))
+        values = np.array([max(at.value(full), SMALLEST_POSITIVE) if at else np.nan for at in found])
+        curves.append(MeasureCurve(f"singular value {full}", "", values, log=True))
     return curves
 
 
