@@ -147,7 +147,7 @@ def numbers(report: Report):
 
 
 def tangents(report: Report):
-    """Runs a second with a derivative by a mass."""
+    """Runs per second with a derivative with respect to a mass."""
     mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, END, 2)
     known = udk.analyse(mechanism)
 

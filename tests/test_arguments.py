@@ -141,14 +141,14 @@ CHOICES = [
     ("method", udk.Projection(), "method must be a Pseudoinverse"),
     ("formulation", udk.Augmented, "formulation=udk.Augmented()"),
     ("formulation", udk.SVD(), "formulation must be a Formulation"),
-    ("engine", "Diffrax", 'engine must be one of "auto", "native", "diffrax", not the text "Diffrax"; did you mean "diffrax"?'),
+    ("engine", "Diffrax", 'engine must be one of "auto", "native", "diffrax", not "Diffrax"; did you mean "diffrax"?'),
     ("engine", None, "engine must be one of"),
     ("solver", diffrax.Tsit5, "solver must be an instance"),
     ("solver", "Tsit5", "solver=diffrax.Tsit5()"),
     ("solver", udk.SVD(), "solver must be an instance"),
     ("adjoint", diffrax.ForwardMode, "adjoint must be an instance"),
     ("throw", "no", "throw must be True or False"),
-    ("progress", print, "progress must be True, False or a progress meter"),
+    ("progress", print, "progress must be True, False or a diffrax progress meter"),
     ("analysis", "rank 11", "analysis must be an Analysis"),
     ("analysis", OTHER, "analysis must be an Analysis"),
 ]
@@ -161,7 +161,7 @@ def test_choices_of_a_wrong_type_are_refused(name, wrong, text):
 
 def test_a_solver_without_an_error_estimate_is_refused_with_the_cure():
     for choices in ({}, {"dt0": 1e-3}):
-        assert "Euler does not estimate them; give a solver such as" in message(
+        assert "Euler does not estimate any; give a solver such as" in message(
             udk.simulate, MECH, TS, solver=diffrax.Euler(), **choices
         )
 
@@ -183,7 +183,7 @@ def test_a_batch_of_mechanisms_is_refused_and_mapped_over_it_is_not():
 
 
 def test_the_analysis_of_another_mechanism_is_refused_and_that_of_other_numbers_is_not():
-    assert "analysis is that of another mechanism" in message(udk.simulate, MECH, TS, analysis=udk.analyse(OTHER))
+    assert "analysis belongs to another mechanism" in message(udk.simulate, MECH, TS, analysis=udk.analyse(OTHER))
     lighter = MECH.with_parameters({"body.coupler.mass": 1.0})
     assert udk.simulate(lighter, TS, analysis=udk.analyse(MECH)).result.is_success
 
@@ -193,7 +193,7 @@ def test_the_solution_of_another_mechanism_or_of_a_batch_is_refused(name):
     if inspect.signature(getattr(udk, name)).parameters["solution"].default is None:
         assert "solution" in message(call, name, solution=7.0)
     other = udk.simulate(OTHER, TS)
-    assert 'solution is of another mechanism: its bodies are "rod"' in message(call, name, solution=other)
+    assert 'solution belongs to another mechanism: its bodies are "rod"' in message(call, name, solution=other)
     batch = SimpleNamespace(ts=np.stack([TS] * 2), q=np.zeros((2, 3, N, 3)), v=np.zeros((2, 3, N, 3)))
     assert "solution is a batch of 2 solutions" in message(call, name, solution=batch)
     cut = SimpleNamespace(ts=TS, q=np.zeros((2, N, 3)), v=np.zeros((2, N, 3)))

@@ -54,7 +54,7 @@ def test_a_sweep_is_run_and_refused_where_it_is_another(tmp_path, grid, capsys):
 
     grid.write_text(GRID.replace("max_steps = 5", "max_steps = 6"))
     assert udkjax("sweep", PENDULUM, grid, "--out", out) == 1
-    assert "settings.max_steps: was 5, is 6" in capsys.readouterr().err
+    assert "settings.max_steps: was 5, is now 6" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

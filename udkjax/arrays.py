@@ -38,7 +38,7 @@ def is_within_jit() -> bool:
     return isinstance(_evaluated_p.bind(), Tracer)
 
 
-_evaluated_p = Primitive("is_evaluated")  # without inputs: nothing is put on a device to know whether it is evaluated or traced
+_evaluated_p = Primitive("is_evaluated")  # without inputs, so that the test for tracing puts nothing on a device
 _evaluated_p.def_impl(lambda: np.True_)
 _evaluated_p.def_abstract_eval(lambda: ShapedArray((), np.dtype(bool)))
 mlir.register_lowering(_evaluated_p, mlir.lower_fun(lambda: jnp.asarray(True), multiple_results=False))
@@ -60,7 +60,7 @@ _calls: Counter[tuple[tuple[int, ...], ...]] = Counter()  # number of calls by t
 
 
 def by_numpy(x: Any) -> Any:
-    """Return a number as a NumPy array unless it is traced or absent: what follows from concrete numbers stays concrete."""
+    """Return a number as a NumPy array unless it is traced or absent: results of concrete numbers stay concrete."""
     return x if x is None or isinstance(x, Tracer) else np.asarray(x)
 
 
@@ -135,7 +135,7 @@ def number_called(name: str, optional: bool = False) -> Callable[[Any], Any]:
         try:
             return number(value)
         except (TypeError, ValueError, OverflowError):
-            kind = "a text" if isinstance(value, str) else f"an object of type {type(value).__name__}"
+            kind = "a string" if isinstance(value, str) else f"an object of type {type(value).__name__}"
             raise TypeError(f"{name} must be a number or an array of numbers, not {kind}") from None
 
     return converted

@@ -29,7 +29,7 @@ class MissingExtraError(ModuleNotFoundError):
 
 
 class OptionalImport:
-    """Inside `with OptionalImport():`, a missing package of an extra raises an error that tells how to install it.
+    """Inside `with OptionalImport():`, a missing package of an extra raises an error that explains how to install it.
 
     Other import errors are passed on unchanged.
     """

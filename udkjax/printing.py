@@ -25,7 +25,7 @@ Plain = bool | int | float | complex | np.ndarray | np.generic
 
 
 class PrintedTable(NamedTuple):
-    """A title, and rows of cells below the names of the columns; without these the first column names the rows.
+    """A title, the names of the columns, and rows of cells. Without names of columns, the first column names the rows.
 
     Remarks, one sentence each, follow the rows.
     """

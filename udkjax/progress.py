@@ -93,7 +93,7 @@ def report_progress(
         finally:
             line.close()
     else:
-        raise TypeError(f'progress must be None, "auto", True, False or a function of a Progress, is {progress!r}')
+        raise TypeError(f'progress must be None, "auto", True, False or a function of a Progress, not {progress!r}')
 
 
 class _Line:

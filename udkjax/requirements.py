@@ -28,11 +28,11 @@ class ArgumentTypeError(ArgumentError, TypeError):
 
 
 def describe(value: Any) -> str:
-    """Describe an invalid value for the end of a message: 'not the class SVD', 'not the text "SVD"'."""
+    """Describe an invalid value for the end of a message: 'not the class SVD', 'not "SVD"'."""
     if isclass(value):
         return f"not the class {value.__name__}"
     if isinstance(value, str):
-        return f"not the text {abbreviate(value)}"
+        return f"not {abbreviate(value)}"
     if value is None or isinstance(value, bool | int | float):
         return f"not {value}"
     kind = type(value).__name__
@@ -107,7 +107,7 @@ def require_output_times(name: str, value: Any) -> None:
     """Require at least two finite, increasing times; of traced times, only the shape is checked."""
     times = array(name, value)
     if times.ndim != 1 or len(times) < 2:
-        expected = "a vector of at least two output times, from the start on"
+        expected = "a vector of at least two output times, beginning with the start"
         raise ArgumentError(f"{name} must be {expected}; its shape is {times.shape}")
     require_finite(name, times)
     if not isinstance(times, Tracer) and not np.all(steps := np.diff(times) > 0):

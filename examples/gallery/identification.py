@@ -1,6 +1,6 @@
 """Two masses of a four-bar, identified from its motion: the guess and the result.
 
-The measurements are simulated, so that the true values are known, with a noise of 0.01 rad.
+The measurements are simulated, with noise of 0.01 rad, so that the true values are known.
 """
 
 import numpy as np

@@ -41,7 +41,7 @@ def swing_of(mech: Mechanism, q: Float[ArrayLike, "bodies 3"]) -> Swing:
     """Return the swing of a parallelogram linkage that is released from rest at `q`; raise ValueError for other mechanisms."""
     linkage = parallelogram(mech, np.asarray(q), ALIKE)
     if linkage is None:
-        raise ValueError(f"{mech.name} is no parallelogram linkage that moves under gravity alone")
+        raise ValueError(f"{mech.name} is not a parallelogram linkage that moves under gravity alone")
     angle, omega = as_pendulum(mech, linkage)
     return Swing(omega, angle)
 

@@ -62,7 +62,7 @@ def read(path: Path) -> Any:
 
     data = xarray.load_dataset(path, engine="h5netcdf")
     if data.attrs.get("format") != FORMAT:
-        raise ValueError(f"this is no data of a report: its format is {data.attrs.get('format')!r}, not {FORMAT!r}")
+        raise ValueError(f"this is not the data of a report: its format is {data.attrs.get('format')!r}, not {FORMAT!r}")
     return data
 
 

@@ -69,7 +69,7 @@ def verdict(case: Case) -> tuple[str, str]:
             return str(error).split(":")[0], text
         names = {cls.__name__ for cls in type(error).__mro__}
         if not names & set(DOCUMENTED):
-            return f"{type(error).__name__} is no documented error", text
+            return f"{type(error).__name__} is not a documented error", text
         where = traceback.extract_tb(error.__traceback__)[-1].filename
         ours = (
             f"{os.sep}udkjax{os.sep}" in where

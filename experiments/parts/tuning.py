@@ -104,7 +104,7 @@ class Drift:
         return [minimize_squares(self.evaluate, guess, step_tol=SETTLED) for guess in np.log(GUESSES)]
 
     def last(self, z: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The length of Psi (B, 2) at the end of the run, and its derivative by the logarithm of both gains."""
+        """The length of Psi (B, 2) at the end of the run, and its derivative with respect to the logarithms of both gains."""
         found = [self.scene.equal(chunk, self.state, self.steps) for chunk in np.split(z, range(LANES, len(z), LANES))]
         J, r = (np.concatenate([x[k][:, self.steps - 1] for x in found]) for k in (0, 1))
         return length(r, J.sum(-1))

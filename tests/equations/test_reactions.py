@@ -172,5 +172,5 @@ def test_wrong_compliances_are_refused_by_name(compliances, message):
 
 
 def test_wrong_axes_are_refused():
-    with pytest.raises(ValueError, match='frame must be one of "ground", "body", "joint", not the text "world"'):
+    with pytest.raises(ValueError, match='frame must be one of "ground", "body", "joint", not "world"'):
         udk.reactions(beam(), at(udk.assemble(beam())), frame="world")  # pyright: ignore[reportArgumentType]

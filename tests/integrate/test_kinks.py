@@ -187,7 +187,7 @@ def test_forces_whose_kinks_are_not_located_are_told():
     import diffrax
 
     found = run(Brake, P, adjoint=diffrax.DirectAdjoint())
-    assert found.settings["kinks"] == "not located by an adjoint of diffrax's" and found.unlocated is None
+    assert found.settings["kinks"] == "not located with a diffrax adjoint" and found.unlocated is None
 
 
 def test_a_scene_without_kinks_has_none():

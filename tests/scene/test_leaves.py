@@ -198,7 +198,7 @@ def test_what_is_given_is_changed_in_place_and_what_follows_is_refused():
     assert lighter.gravity[1] == -1.6 and "gravity [0, -1.6]" in repr(lighter)
     for where in (lambda m: m.bodies["crank"].mass, lambda m: m.joints["B"].points, lambda m: list(m.bodies.values())[1].inertia):
         with pytest.raises(
-            udk.SceneError, match=r"(body|joint)\.\w+\.\w+ is no leaf of the mechanism: it follows from the drawing"
+            udk.SceneError, match=r"(body|joint)\.\w+\.\w+ is not a leaf of the mechanism: it follows from the drawing"
         ):
             eqx.tree_at(where, mechanism, jnp.zeros(()))
     given = mechanism.with_parameters({"body.crank.mass": 5.0})
@@ -245,7 +245,7 @@ def test_invalid_leaves_are_named_where_they_are_used():
     """A step of an optimizer may make a mass negative, which nothing checks until then."""
     negative = eqx.tree_at(lambda m: m.drawing.links["coupler"].mass, four_bar(), jnp.asarray(-1.0))
     for use in (end, udk.dumps, udk.assemble):
-        with pytest.raises(udk.SceneError, match=r'coupler" \(\w+\[1\]\)\.mass: must be > 0, is -1\.0'):
+        with pytest.raises(udk.SceneError, match=r'coupler" \(\w+\[1\]\)\.mass: must be > 0, not -1\.0'):
             use(negative)
 
 
@@ -259,7 +259,7 @@ def test_constants_of_gears_follow_from_their_radii(tmp_path):
     assert_array_equal(numbers(udk.load(tmp_path / "gear.toml")), numbers(changed))
     assert_array_equal(numbers(mechanism.with_parameters({name: changed.joints[joint].radii})), numbers(changed))
     with pytest.raises(
-        udk.SceneError, match=r"joint\.[\w ]+\.constant is no leaf of the mechanism: it follows from the initial guess"
+        udk.SceneError, match=r"joint\.[\w ]+\.constant is not a leaf of the mechanism: it follows from the initial guess"
     ):
         eqx.tree_at(lambda m: m.joints[joint].constant, mechanism, jnp.zeros(()))
 

@@ -39,5 +39,5 @@ def test_what_may_be_meant_is_left_alone(values):
 def test_a_body_without_a_joint_is_named():
     mech = rods()
     loose = udk.Mechanism(dict(mech.bodies) | {"bob": udk.Body(1, 1)}, mech.joints)
-    assert suspicions(loose) == ['body "bob" is in no joint: it flies by itself']
+    assert suspicions(loose) == ['body "bob" belongs to no joint: it moves freely']
     assert suspicions(udk.Mechanism({"bob": udk.Body(1, 1)})) == []

@@ -20,9 +20,9 @@ def test_a_name_or_a_table_is_what_it_stands_for():
 @pytest.mark.parametrize(
     ("setting", "given", "problem"),
     [
-        ("method", "vargas", 'no method "vargas"; did you mean "varga"?'),
-        ("method", 3, "no method 3; one of auto, elimination, svd"),
-        ("method", {"rank_tol": 1.0}, "no method None; one of auto"),
+        ("method", "vargas", 'unknown method "vargas"; did you mean "varga"?'),
+        ("method", 3, "unknown method 3; choose one of auto, elimination, svd"),
+        ("method", {"rank_tol": 1.0}, "unknown method None; choose one of auto"),
         ("method", {"type": "svd", "rank_tool": 1.0}, '"svd" has no "rank_tool"; did you mean "rank_tol"?'),
         ("stabilization", {"type": "none", "alpha": 1.0}, '"none" has no "alpha"'),
         ("solver", {"type": "dopri8", "scan_kind": "lax"}, '"dopri8" has no "scan_kind"'),

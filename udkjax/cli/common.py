@@ -54,7 +54,7 @@ Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not
 def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[str] | None) -> None:
     """Parse arguments (by default those of the process), and run the command that they name."""
     tyro.extras.subcommand_cli_from_dict(
-        dict(commands), prog="udkjax", args=arguments, description="Planar mechanisms, however redundantly constrained."
+        dict(commands), prog="udkjax", args=arguments, description="Planar mechanisms, even with redundant constraints."
     )
 
 
@@ -86,7 +86,7 @@ def is_of_library(scene: Path) -> bool:
 
 
 def output_times(t0: float, t1: float, dt: float) -> "np.ndarray":
-    """Return the times from t0 in steps of dt, including t1 if it is a step up to rounding; exit if the options are invalid."""
+    """Return the times from t0 in steps of dt, including t1 if a step ends there; exit if the options are invalid."""
     if not 0 < dt <= t1 - t0 < math.inf:
         refuse(f"--dt {dt:g} must be positive, and at most the time from --t0 {t0:g} to --t1 {t1:g}")
     if (t1 - t0) / dt > MOST_TIMES:

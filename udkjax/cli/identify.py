@@ -75,7 +75,7 @@ def identify(
         n_starts: maximum number of further first guesses to try.
         tol: tolerance of the integration.
         seed: seed of the further first guesses.
-        profile: parameters for which to compute confidence intervals by profile likelihood, which assumes no linear model.
+        profile: parameters for which to compute confidence intervals by profile likelihood, which does not assume a linear model.
         json: write the results as JSON, as in estimate.json.
     """
     check_folder(out)

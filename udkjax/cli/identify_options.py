@@ -69,7 +69,7 @@ class IdentifyOptions:
         return list(dict.fromkeys(full_names[_plain(text)] for text in given if _plain(text) in full_names))
 
     def _noise(self, groups: Groups) -> tuple[float | None, dict[str, float]]:
-        """Return the standard deviation of all channels, and those of single channels."""
+        """Return the standard deviation of all channels, and those of individual channels."""
         everywhere, by_channel = None, {}
         for text in (text for group in groups for text in group):
             channel, _, number = text.rpartition("=")

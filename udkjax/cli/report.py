@@ -37,8 +37,8 @@ def report(
 ) -> None:
     """Repeat the paper's study with further methods, and write a report (HTML) and its data (NetCDF).
 
-    It compares five pseudoinverses at three tolerances, with and without Baumgarte's stabilization, on the paper's five-bar
-    parallelogram, with the exact solution.
+    Five pseudoinverses at three tolerances, with and without Baumgarte stabilization, are compared with the exact solution of the
+    paper's five-bar parallelogram.
 
     Args:
         out: page to write (.html), or folder for report.html; the data is written to the same folder.

@@ -55,8 +55,8 @@ def simulate(
         method: pseudoinverse of the weighted constraint Jacobian.
         rank_tol: relative threshold of the rank; by default, one that suits the method.
         formulation: formulation of the accelerations; partitioning integrates independent coordinates only, without Baumgarte.
-        solver: integrator; verner65, adams and bdf are of udkjax, the others of diffrax.
-        stabilization: projection of each step on the constraints, Baumgarte's terms, or none.
+        solver: integrator; verner65, adams and bdf are part of udkjax, the others of diffrax.
+        stabilization: projection of each step onto the constraints, Baumgarte's terms, or none.
         alpha: Baumgarte's gain on the rate of the constraints (1/s).
         beta: Baumgarte's gain on the constraints (1/s).
         dt0: first step to try (s); by default it is estimated.

@@ -75,7 +75,7 @@ class Augmented(PointwiseFormulation):
 
 
 def solve_regular(matrix: Float[Array, "n n"], right: Vector) -> Vector:
-    """Return x of matrix x = right by LU with partial pivoting, P matrix = L U; NaN if the matrix is singular to rounding.
+    """Return x of matrix x = right by LU with partial pivoting, P matrix = L U; NaN if the matrix is singular up to rounding.
 
     Since entries of L are at most one, a pivot contains rounding errors of the order of the largest entry in its column of U. It
     counts as zero if it is at most n eps times this entry: with redundant rows it is at most 0.03, with independent rows at least

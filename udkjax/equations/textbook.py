@@ -94,7 +94,7 @@ class TextbookEquations(MechanismSystem):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """The weights of the rows. Elimination cannot tell small pivots from rounding: its redundant rows have weight zero."""
+        """The weights of the rows; in elimination redundant rows have weight zero, as small pivots look like rounding errors."""
         if not isinstance(self.method, Elimination) or not self.redundant:
             return self.scales.weights
         return self.scales.weights.at[np.array(self.redundant)].set(0.0)

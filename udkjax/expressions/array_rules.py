@@ -154,7 +154,7 @@ def choose(index: Scalar, cases: Sequence[Scalar]) -> Scalar:
 
 
 def choose_branch(graph: Graph, index: Scalar, branches: Sequence[Callable[[], list[np.ndarray]]]) -> list[np.ndarray] | None:
-    """Return the results of the branch of an unknown index; None if one has an opaque node, which must not run for nothing."""
+    """Return the results of the branch of an unknown index; None if one has an opaque node, which would always run."""
     before = len(graph.nodes)
     results = [branch() for branch in branches]
     if any(node.kind == "call" for node in graph.nodes[before:]):

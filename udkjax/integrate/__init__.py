@@ -1,4 +1,4 @@
-"""Trajectories: the only floor that knows diffrax, which it imports where a run asks for it."""
+"""Trajectories. Only this folder imports diffrax, and only when a run needs it."""
 
 from udkjax.lazy_names import lazy_names
 

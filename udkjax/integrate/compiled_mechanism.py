@@ -137,7 +137,7 @@ def _reason_for_diffrax(
     if meter is not None:
         return "a progress meter is diffrax's"
     if not is_explicit(solver):
-        return f"{type(solver).__name__} is no explicit Runge-Kutta method"
+        return f"{type(solver).__name__} is not an explicit Runge-Kutta method"
     return _reason_for_equations(equations)
 
 

@@ -31,8 +31,8 @@ SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))
 def differentiable(problem: Problem, has_concrete_times: bool = False) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
-    There are no derivatives by the numbers of the step controller (the sizes of steps are held constant), nor by times that were
-    concrete before the problem was traced.
+    There are no derivatives with respect to the numbers of the step controller (the sizes of steps are held constant), nor with
+    respect to times that were concrete before the problem was traced.
     """
     control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
     problem = replace(problem, **control)

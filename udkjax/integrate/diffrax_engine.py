@@ -25,7 +25,7 @@ from udkjax.transforms.gradients import stop_gradients
 def integrate_by_diffrax(
     problem: Problem, adjoint: diffrax.AbstractAdjoint | None = None, meter: diffrax.AbstractProgressMeter | None = None
 ) -> IntegratorOutput:
-    """Integrate one problem with any solver (default Dopri8) and adjoint (default: checkpoints for reverse mode) of diffrax."""
+    """Integrate one problem with any diffrax solver (by default Dopri8) and adjoint (by default checkpoints for reverse mode)."""
     ts = _leave_breakpoints(problem)
     y0 = initial = jnp.concatenate([problem.q, problem.v])
     equations = equations_for_diffrax(problem)
@@ -103,7 +103,7 @@ def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, un
     """Return a step over which the state y (n,), with this slope, changes by a hundredth of itself or, if more, of its unit.
 
     As in Hairer, Norsett, Wanner, II.4, without the second evaluation: the controller corrects the step. The unit, that of
-    `atol`, is needed for states that are zero, exactly or to rounding.
+    `atol`, is needed for states that are zero, exactly or up to rounding.
     """
     y, slope, span, rtol, atol, unit = stop_gradients((y, slope, span, rtol, atol, unit))
     scale = atol * unit + rtol * jnp.abs(y)
@@ -128,7 +128,7 @@ class _FrozenSteps(diffrax.PIDController):
     """A step controller whose steps have no derivatives.
 
     Each step depends on the previous one. After a step that a breakpoint has shortened, the following steps grow by factors of up
-    to ten, and their derivatives by the shortened step would grow equally fast.
+    to ten, and their derivatives with respect to the shortened step would grow equally fast.
     """
 
     def adapt_step_size(self, *args: Any, **kwargs: Any) -> Any:

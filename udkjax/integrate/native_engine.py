@@ -70,7 +70,7 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
 
 
 def serves_derivatives(active: Problem) -> bool:
-    """Return whether machine code has all `active` derivatives: it has those by the scene, the gains and the initial state."""
+    """Return whether machine code has all `active` derivatives; it has those with respect to scene, gains and initial state."""
     supported = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
     others = eqx.tree_at(supported, active, (None,) * 4, is_leaf=lambda x: x is None)
     return not any(x is True for x in jax.tree.leaves(others))

@@ -80,7 +80,7 @@ def simulate(
         ts: output times (T,) in s, increasing; the motion starts at ts[0].
         state: the initial `State`, used as given, or the `Closure` of an assembly. By default the scene's guess is assembled.
         rtol: relative tolerance of every coordinate and velocity. The sizes of steps are not differentiated, so there
-            are no derivatives by tolerances or by `dt0`.
+            are no derivatives with respect to tolerances or `dt0`.
         atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
             and a rate by the same over T, with L the characteristic length (`analyse`) and T the shortest of the characteristic
             time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. Equal tolerances thus
@@ -103,18 +103,19 @@ def simulate(
             adjoint, progress meter, device and method. "auto" uses machine code where possible; `Solution.settings`
             names the engine and the reason.
         events: actions where conditions cross zero: an `Event`, `JointLimit` or `Contact`, or a list of them, with the
-            actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to rounding, independently of
-            `ts`, and the run restarts after each; contacts that act on one another are hit together. Both engines support
-            events, also in batches, where each member has its own. Such runs have first derivatives, forward and reverse,
-            which include the changes of event times (saltation), but no derivatives by `ts`; with `Log` and `Stop` alone also
-            second ones. Jumps and kinks of forces of one's own (`where`, `max`, `abs`, `floor` of the state) are located in the
-            same way, without being listed: `Solution.unlocated` is the time from which they are not.
+            actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to machine precision,
+            independently of `ts`, and the run restarts after each; contacts that act on one another are hit together. Both
+            engines support events, also in batches, where each member has its own events. Such runs have first derivatives,
+            forward and reverse, which include the changes of event times (saltation), but no derivatives with respect to `ts`;
+            with only `Log` and `Stop` they also have second derivatives. Jumps and kinks of user-defined forces (`where`, `max`,
+            `abs`, `floor` of the state) are located in the same way, without being listed; `Solution.unlocated` is the time from
+            which they are not located.
         max_events: the largest number of events.
 
     Returns:
-        A `Solution` with q and v (T, bodies, 3): x, y in m and angle in rad, and their rates. `Solution.result` tells how the
-        run ended, `Solution.events` has the times of events with the states before and after; an output at the time of an
-        event is the state after the event.
+        A `Solution` with q and v (T, bodies, 3): x, y in m and angle in rad, and their rates. `Solution.result` is the
+        way in which the run ended, and `Solution.events` has the times of events with the states before and after; an output at
+        the time of an event is the state after the event.
 
     Raises:
         SimulationError: the run does not reach its end; the error carries the solution.
@@ -128,7 +129,9 @@ def simulate(
     require_output_times("ts", ts)
     ts = jnp.asarray(ts) if is_traced(ts) else ts  # also a list with tracers
     if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and np.asarray(rtol) + np.asarray(atol) < LEAST_ATOL:
-        raise ArgumentError(f"rtol = {rtol:g} and atol = {atol:g} are below rounding, which no step can meet: raise one of them")
+        raise ArgumentError(
+            f"rtol = {rtol:g} and atol = {atol:g} are below rounding errors, and no step can meet them: raise one of them"
+        )
     if state is None and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
     if drift_tol is None:
@@ -164,12 +167,12 @@ def simulate(
         from udkjax.integrate.events.kinks import kinks_of
 
         found = kinks_of(mechanism)
-        by_steps = "by an adjoint of diffrax's" if choices.adjoint else "with a progress meter" if choices.meter else ""
+        by_steps = "with a diffrax adjoint" if choices.adjoint else "with a progress meter" if choices.meter else ""
         is_located = is_located or (found.are_held and not by_steps)
         choices = choices._replace(kinks=found.remark(by_steps))
     if is_located:
         if not isinstance(mechanism, Mechanism) or choices.adjoint is not None or choices.meter is not None:
-            others = "an adjoint of diffrax's" if choices.adjoint else "progress"
+            others = "a diffrax adjoint" if choices.adjoint else "progress"
             what = others if isinstance(mechanism, Mechanism) else "a ConstrainedSystem"
             raise ValueError(f"a run with events needs a Mechanism, JAX's own derivatives and no progress meter: not {what}")
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
@@ -313,6 +316,6 @@ def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
     import diffrax
 
     if not isinstance(progress, bool | diffrax.AbstractProgressMeter):
-        raise ArgumentTypeError(f"progress must be True, False or a progress meter of diffrax's, {describe(progress)}")
+        raise ArgumentTypeError(f"progress must be True, False or a diffrax progress meter, {describe(progress)}")
     meter: Any = diffrax.TextProgressMeter() if progress is True else progress
     return None if isinstance(meter, diffrax.NoProgressMeter) else meter

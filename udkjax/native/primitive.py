@@ -221,7 +221,7 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
 
 
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
-    """Lower for a graphics card of NVIDIA: large batches run as a kernel; the host computes all else."""
+    """Lower for an NVIDIA graphics card: large batches run as a kernel; the host computes everything else."""
     name = kernel_target(operation, inputs) or _select_code(inputs, operation).name_on_card
     if not operation.is_reverse or max(x.shape[0] for x in inputs) < RECORDS:
         return _call_target(name, inputs, operation, times)

@@ -110,7 +110,7 @@ class RunWatched(RunStates):
 class RunTangents(RunStates):
     """Integrate, with the tangents of the states and of the end along directions."""
 
-    active: tuple[bool, ...] = ()  # for each number of the scene, whether derivatives by it are needed
+    active: tuple[bool, ...] = ()  # for each number of the scene, whether derivatives with respect to it are needed
 
     @property
     def tangents(self) -> int:

@@ -54,7 +54,7 @@ def number(value: NumberLike | None) -> Float[Array, ""] | None:
         with context:
             return None if value is None else jnp.asarray(value, dtype=dtype)
     except (TypeError, ValueError):
-        what = "a text" if isinstance(value, str) else f"an object of type {type(value).__name__}"
+        what = "a string" if isinstance(value, str) else f"an object of type {type(value).__name__}"
         raise TypeError(f"a threshold (rank_tol, or branch_tol of Auto) must be one number or None, not {what}") from None
 
 

@@ -96,8 +96,8 @@ def assemble(
 ) -> State:
     """Return a state with Psi(t, q) = 0 and Psi_dot(t, q, v) = 0, near a given one.
 
-    A state that satisfies all constraints is returned unchanged, up to rounding. The result has first and second derivatives by
-    every number of the mechanism and of the guess, even with redundant constraints.
+    A state that satisfies all constraints is returned unchanged, up to rounding. The result has first and second derivatives with
+    respect to every number of the mechanism and of the guess, even with redundant constraints.
 
     Args:
         mechanism: the mechanism.

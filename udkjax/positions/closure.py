@@ -27,7 +27,7 @@ NativeGuess = tuple[Mechanism, Scales, Array, Array, Array]  # mechanism, scales
 
 
 class MotionFrom(Motion):
-    """A motion law shifted in time: machine code has derivatives by its `start` (s), as by any number of the mechanism."""
+    """A motion law shifted in time by `start` (s): machine code has derivatives with respect to `start`, as to any number."""
 
     motion: Motion
     start: Number

@@ -8,7 +8,7 @@ a simple root of a smooth function. With X = (q, s), each measured by its scale,
 
 A step is accepted if the corrector converges near the prediction and the tangent has turned little; otherwise it is halved. So
 the branch stays the same, or the status is `lost`. E^+ is truncated: constraints may be redundant, and where
-branches meet and E loses rank, the old tangent leads across.
+branches meet and E loses rank, a step along the old tangent crosses the meeting.
 
 The sign of det [E; tau] changes where a branch meets another, and also where a step jumps to a neighbouring branch: such a step
 is accepted only if it is short. Branches closer to each other than such a step are treated as meeting.
@@ -61,7 +61,7 @@ class Reached(PrintsWords):
 
 
 class Points(NamedTuple):
-    """Positions over the values, their derivatives by the value, statuses, and the toggle if the motion met one."""
+    """Positions over the values, their derivatives with respect to the value, statuses, and the toggle if the motion met one."""
 
     q: Float[Array, "T n"]
     dq: Float[Array, "T n"]
@@ -233,7 +233,7 @@ def _advance(
     # A residual remains in directions that E^+ truncates; it is of second order in the step, and corrected in the next step.
     closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(corrected) <= CLOSURE.tol))
     good = near & (tangent @ tau >= LARGEST_BEND) & closed
-    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (clearance < NEAR_LOSS))  # the tangent leads across only from nearby
+    good = good & ~(lands & (eta > CLOSE_DISTANCE) & (clearance < NEAR_LOSS))  # the tangent crosses a meeting only from nearby
     good = good & ((side == state.side) | (eta <= CLOSE_DISTANCE))  # else the point is on a neighbouring branch
     folds = good & (tangent[-1] * tau[-1] < 0) & (eta > 0)
     passed = good & ~lands & ~folds & ((target - corrected[-1]) * way < 0)  # beyond the target: retry with a shorter step
@@ -285,7 +285,7 @@ def _narrow(
         return xp.where(is_found, toggle, at)
 
     at = curve.by.cond(ended & ~for_value & (clearance < NEAR_LOSS), across, lambda: at)
-    # The toggle is found: the target is beyond it, equal to rounding, or before it.
+    # The toggle is found: the target is beyond it, equal up to rounding, or before it.
     tolerance = AT_TOGGLE * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
     distance = (target - at[-1]) * way
     x, points = at * curve.units, state.points

@@ -4,7 +4,7 @@ At a meeting E has a second null vector, so Newton's method is inaccurate: its e
 q' and r / distance^2 in q''. But the branch is smooth. It is therefore followed to twelve values around the point, two to seven
 steps h away on either side, where E is well conditioned; q, q' and q'' are those of the polynomials through these values, with
 errors of order h^12. The differences from the polynomials through ten values bound the errors. The h with the smallest bound is
-used, and accepted if the bound is small and the position closes to rounding. The position does not close where branches merely
+used, and accepted if the bound is small and the position closes up to rounding. The position does not close where branches merely
 come close to each other, since the curve turns between them.
 """
 
@@ -19,7 +19,7 @@ from udkjax.positions.curve import AbstractCurve
 # 1e-16 / sigma^3 in q''. Below NEAR_LOSS, fewer than ten digits of q'' are correct, and q'' is interpolated; below
 # LOST_RANK no digit is correct.
 NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
-# Largest scaled distance from a point to a meeting which the tangent at the point leads across; it turns by about a degree.
+# Largest scaled distance from a meeting at which a step along the tangent still crosses it; the tangent turns by about a degree.
 CLOSE_DISTANCE = 0.02
 # Values of h, scaled. Errors of the polynomials are 3e-10, 3e-15 and less with these, if the next singularity of q(s) is one unit
 # away, and rounding errors of q'' are 2e-13, 2e-12 and 1e-11, if sigma grows by one per unit. With the smallest h the nearest
@@ -46,7 +46,7 @@ def _slope_weights() -> np.ndarray:
 
 
 def nodes(last: int) -> np.ndarray:
-    """Return the positions of the nodes in steps h: -last..-NEAREST_NODE and NEAREST_NODE..last."""
+    """Return the positions of the nodes in units of h: -last..-NEAREST_NODE and NEAREST_NODE..last."""
     side = np.arange(NEAREST_NODE, last + 1)
     return np.concatenate([-side[::-1], side])
 

@@ -152,12 +152,13 @@ def kinematics(
 
     The branch is that of `state`, or of the initial guess, and is followed from there by its arc length. Where it cannot be
     followed, the motion ends, with a `status` that says why. Branches closer than some 0.003 rad of transmission angle are
-    treated as meeting. Toggles, where the driver can go no farther, are located to rounding. Constraints may be redundant.
+    treated as meeting. Toggles, where the driver can go no farther, are located to machine precision. Constraints may be
+    redundant.
 
-    Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any order by every number of the mechanism
-    and by the values. Where branches meet (`Reached.singular`) they have first derivatives, but NaN by numbers that part the
-    branches, such as the length of one of two equal cranks; where velocities are `not_determined`, derivatives by numbers
-    that move the position are NaN.
+    Pure, jittable and batched by `vmap`; q, v, a and `limit` have exact derivatives of any order with respect to every number
+    of the mechanism and the values. Where branches meet (`Reached.singular`) they have first derivatives, which are NaN for
+    numbers that separate the branches, such as the length of one of two equal cranks. Where velocities are `not_determined`,
+    derivatives with respect to numbers that move the position are NaN.
 
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold.
@@ -193,11 +194,11 @@ def kinematics(
 def travel(
     mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, NumberLike] | None = None
 ) -> Travel:
-    """Return the values between which a coordinate can be driven: the toggles on either side, ds/dsigma = 0, to rounding.
+    """Return the values between which a coordinate can be driven: the toggles on either side, where ds/dsigma = 0.
 
     An angle that makes a whole turn has no limits. Bodies attached to a single other one, such as a free wheel or a pendulum,
-    limit nothing: they keep their pose relative to it. `lower` and `upper` have exact derivatives by every number of the
-    mechanism.
+    limit nothing: they keep their pose relative to it. `lower` and `upper` have exact derivatives with respect to every number
+    of the mechanism.
 
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold.

@@ -24,7 +24,7 @@ DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; a mar
 
 
 class MarchResult(NamedTuple):
-    """Positions and their derivatives by the value; the first `trusted` of them are closed and on one smooth curve.
+    """Positions and their derivatives with respect to the value; the first `trusted` of them are closed and on one smooth curve.
 
     `side` is the sign of det Psi_q, or 1 if Psi_q is not square or the independent rows are unknown; `first_side` is the side
     of the start.

@@ -44,7 +44,7 @@ class TrackedPaths(NamedTuple):
     Attributes:
         z: unknowns (N, M).
         status: status of each path (M,): ACCEPTED at a regular solution; INFINITE if an unknown goes to infinity or 0; SINGULAR
-            near a point where Newton's method does not converge to rounding; LOST if it stopped before the end.
+            near a point where Newton's method does not converge fully; LOST if it stopped before the end.
         t: last t of each path (M,), up to 1.
         steps: number of steps of each path (M,).
     """
@@ -130,7 +130,7 @@ class PathTracker:
         return TrackedPaths(out, status, reached, taken)
 
     def polish(self, z: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return solutions (N, M) at some parameters by Newton's method, and whether each converged to rounding."""
+        """Return solutions (N, M) at some parameters by Newton's method, and whether each converged up to rounding errors."""
         shared = np.concatenate([np.real(parameters), np.imag(parameters), np.zeros(2 * len(parameters))])
         zeros, best = np.zeros(z.shape[1]), np.full(z.shape[1], np.inf)
         for _ in range(END_CORRECTIONS):

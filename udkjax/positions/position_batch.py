@@ -26,8 +26,9 @@ class BatchPositions(PrintsTable):
 
     Attributes:
         q: x, y (m) and angle (rad) of each body, (M, T, bodies, 3).
-        dq: their derivatives by the value, (M, T, bodies, 3); None if not requested.
-        by_parameters: their derivatives by the free numbers, (M, T, bodies, 3, P), in the order of `entries`; or None.
+        dq: their derivatives with respect to the value, (M, T, bodies, 3); None if not requested.
+        by_parameters: their derivatives with respect to the free numbers, (M, T, bodies, 3, P), in the order of `entries`; or
+            None.
         reached: whether a member reached a value (M, T).
         transmission: distance of a position from a meeting of branches (M, T), from 0 to 1, with the sign of the branch; for a
             four-bar the sine of the transmission angle.
@@ -56,14 +57,14 @@ class PositionBatch:
     """Positions of a driven mechanism for batches of its numbers, compiled once.
 
     Each member follows its branch from its closed initial guess as far as the branch extends; members run in vector lanes and
-    on all cores. Psi(s, q) = 0 is solved to rounding; with E = Psi_q, dq/ds = -E^+ Psi_s and dq/dx = -E^+ Psi_x, by one
+    on all cores. Psi(s, q) = 0 is solved to machine precision; with E = Psi_q, dq/ds = -E^+ Psi_s and dq/dx = -E^+ Psi_x, by one
     elimination. Constraints may be redundant.
 
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold.
         driver: a driver or coordinate, as for `kinematics`.
         free: names of the numbers in which members differ: `pin.A`, `pin.C[0]`, `joint.B.points`.
-        derivatives: whether to compute derivatives by the value and the free numbers.
+        derivatives: whether to compute derivatives with respect to the value and the free numbers.
 
     Raises:
         SceneError: no such driver or number, positions do not follow from the driver, or machine code cannot evaluate an

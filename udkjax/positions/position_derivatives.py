@@ -9,7 +9,7 @@ If the residue R is zero, the smooth part is the derivative of the branch; other
 the change, and no derivative exists. Both parts are interpolated from points of the branch on both sides (crossing.py). R is
 linear in the change:
 numbers that each separate the branches, such as the lengths of two equal cranks, may not do so if changed together. Forward mode
-returns the derivative by such a change; reverse mode, which treats each number alone, returns NaN.
+returns the derivative along such a change; reverse mode, which treats each number alone, returns NaN.
 """
 
 from typing import Any
@@ -34,13 +34,14 @@ from udkjax.transforms.gradients import stop_gradients
 
 # Bound on residues, relative to the largest (s - s*) dq/dp: smaller ones are rounding errors, amplified by E^+ up to 100 times.
 RESIDUE = 1e-6
-MOST_MEETINGS = 8  # largest number of meetings in one call; at further ones, derivatives by numbers of the constraints are NaN
+# Largest number of meetings in one call; at further ones, derivatives with respect to numbers of the constraints are NaN.
+MOST_MEETINGS = 8
 
 Three = tuple[TimeSeries, TimeSeries, TimeSeries]  # of q, q' and q''
 
 
 def with_derivatives(curve: Curve, values: Float[Array, "T"], points: Points, regular: Bool[Array, "T"]) -> Three:
-    """Return closed positions, q' and q'', with their derivatives by the values and by the numbers of the mechanism.
+    """Return closed positions, q' and q'', with their derivatives with respect to the values and the numbers of the mechanism.
 
     Where branches meet (not `regular`), second derivatives are NaN.
     """
@@ -195,7 +196,7 @@ def _bind(operator: _Operator, vector: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def _ends_here(factor: Float[Array, "T"], curve: Curve, values: Float[Array, "T"]) -> Float[Array, "T"]:
-    """Return zeros whose derivatives by all numbers of the curve and values are the factor, zero or NaN."""
+    """Return zeros whose derivatives with respect to all numbers of the curve and values are the factor, zero or NaN."""
     return jnp.zeros_like(factor)
 
 

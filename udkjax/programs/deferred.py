@@ -2,7 +2,7 @@
 
 XLA takes about two milliseconds to compile an operation, and NumPy two microseconds to evaluate it: a program that runs once is
 faster without compilation. NumPy therefore evaluates a program until the evaluations have cost as much as compilation; from then
-on the compiled program runs, also on the host. The results agree to rounding.
+on the compiled program runs, also on the host. The results agree up to rounding errors.
 
 For JAX such a program is one operation, whose derivatives and batches are again deferred programs. In programs of a graphics card
 the host runs it, if it has loops or factorizations (native/base/host_program.py).

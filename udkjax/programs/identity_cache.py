@@ -95,7 +95,7 @@ _take_trace = getattr(jax.extend.core, "take_current_trace", None)
 
 
 def _current_trace() -> Any:
-    """Return the trace of operations that are called now; an object of its own if JAX does not tell."""
+    """Return the trace of operations that are called now; a new object if JAX does not provide it."""
     if _take_trace is None:
         return object()
     with _take_trace() as trace:

@@ -103,7 +103,7 @@ def argument_problems(function: Callable[..., object], given: GivenArguments) ->
 
 
 class ParameterCheck(NamedTuple):
-    """A check of a parameter; for None, `if_none` tells whether the check is applied, passes, or fails."""
+    """A check of a parameter; for None, `if_none` determines whether the check is applied, passes, or fails."""
 
     name: str
     check: ArgumentCheck
@@ -153,7 +153,7 @@ def _describe_class(cls: type) -> str:
     if cls is type(None):
         return "None"
     if cls in (bool, str):
-        return {bool: "True or False", str: "a text"}[cls]
+        return {bool: "True or False", str: "a string"}[cls]
     example = EXAMPLES.get(cls.__name__)
     return f"{article(cls.__name__)} {cls.__name__}" + (f", such as {example}," if example else "")
 

@@ -99,13 +99,15 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
 def name_mistake(name: object) -> str:
     """Return why messages, tables and commands cannot show the name of an element, with the cure; empty if they can."""
     if not isinstance(name, str) or not name:
-        return "missing" if name is None else f"must be a non-empty string, is {abbreviate(name)}"
+        return "missing" if name is None else f"must be a non-empty string, not {abbreviate(name)}"
     shown = "".join(c for c in name if unicodedata.category(c) not in ("Cc", "Cs", "Zl", "Zp")).strip()
     if shown == name:
         return ""
     what = "blanks at its ends" if shown == name.strip() else "line breaks or control characters"
     return (
-        f"must not have {what}, is {name!r}; write {quote(shown)}" if shown else f"must not be blank, is {name!r}; choose a name"
+        f"must not have {what}, as in {name!r}; write {quote(shown)}"
+        if shown
+        else f"must not be blank, but is {name!r}; choose a name"
     )
 
 
@@ -163,13 +165,13 @@ def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetad
     elif get_origin(annotation) is Literal:
         if not isinstance(value, str) or value not in get_args(annotation):
             choices = ", ".join(quote(choice) for choice in get_args(annotation))
-            yield f"{path}: must be one of {choices}, is {abbreviate(value)}{suggestion(value, get_args(annotation))}"
+            yield f"{path}: must be one of {choices}, not {abbreviate(value)}{suggestion(value, get_args(annotation))}"
     elif annotation in (str, bool):
         if not isinstance(value, annotation):
-            yield f"{path}: must be {'a string' if annotation is str else 'true or false'}, is {abbreviate(value)}"
+            yield f"{path}: must be {'a string' if annotation is str else 'true or false'}, not {abbreviate(value)}"
     elif get_origin(annotation) is tuple and get_args(annotation)[0] is str:
         if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
-            yield f"{path}: must be a list of names, is {abbreviate(value)}"
+            yield f"{path}: must be a list of names, not {abbreviate(value)}"
     elif isinstance(annotation, type) and issubclass(annotation, eqx.Module):
         yield from _check_nested(path, annotation, value)
 
@@ -181,7 +183,7 @@ def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
     elif isinstance(value, annotation) and isinstance(value, eqx.Module):
         yield from check_table(path, type(value), table_of(value), {})
     elif not isinstance(value, dict):
-        yield f"{path}: must be a table, is {abbreviate(value)}"
+        yield f"{path}: must be a table, not {abbreviate(value)}"
     elif annotation in CLASSES_WITHOUT_TYPE.values():
         yield from check_table(path, annotation, value, {})
     else:
@@ -213,8 +215,11 @@ def find_class(path: str, choices: Mapping[str, type], table: TomlTable) -> tupl
     if isinstance(kind, str) and kind in choices:
         return choices[kind], ""
     if kind is None:
-        return None, f"{path}.type: missing; one of {', '.join(choices)}"
-    return None, f"{path}.type: no type {abbreviate(kind)}{suggestion(kind, choices) or '; one of ' + ', '.join(choices)}"
+        return None, f"{path}.type: missing; choose one of {', '.join(choices)}"
+    return (
+        None,
+        f"{path}.type: unknown type {abbreviate(kind)}{suggestion(kind, choices) or '; choose one of ' + ', '.join(choices)}",
+    )
 
 
 def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
@@ -226,14 +231,14 @@ def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMet
         dims = [*dims[:-1], *map(str, array.shape[len(dims) - 1 :])]
     if array is None or array.ndim != len(dims) or (is_fixed and array.shape != tuple(map(int, dims))):
         expected = f"{' x '.join(dims)} numbers" if is_fixed else "numbers"
-        yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, is {abbreviate(value)}"
+        yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, not {abbreviate(value)}"
         return
     for dim, size in zip(dims, array.shape, strict=True):
         if not dim.isdigit() and sizes.setdefault(dim, size) != size:
-            yield f"{path}: must have {sizes[dim]} entries, as the list before it has, is {abbreviate(value)}"
+            yield f"{path}: must have {sizes[dim]} entries, like the list before it, not {abbreviate(value)}"
             return
     if array.ndim and len(array) < metadata.get("at_least", 0):
-        yield f"{path}: needs at least {metadata.get('at_least')} entries, is {abbreviate(value)}"
+        yield f"{path}: needs at least {metadata.get('at_least')} entries, not {abbreviate(value)}"
     if not isinstance(array, np.ndarray):
         return
     wrong = ~np.isfinite(array)
@@ -245,7 +250,7 @@ def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMet
 
 def _check_entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -> Iterator[str]:
     for index in map(tuple, np.argwhere(wrong)):
-        yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, is {abbreviate(float(array[index]))}"
+        yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, not {abbreviate(float(array[index]))}"
 
 
 def _as_array(value: object) -> np.ndarray | None:
@@ -287,7 +292,7 @@ def _check_bodies(where: str, cls: type, table: TomlTable) -> Iterator[str]:
     if not isinstance(bodies, list | tuple):
         return
     if is_in_format(cls) and len(bodies) != (n := getattr(cls, "n_bodies", 2)):
-        yield f"{where}.bodies: must name {n} {'body' if n == 1 else 'bodies'}, is {abbreviate(bodies)}"
+        yield f"{where}.bodies: must name {n} {'body' if n == 1 else 'bodies'}, not {abbreviate(bodies)}"
     named = table.get("carrier", GROUND)
     carrier = [named] if isinstance(named, str) and named != GROUND else []
     attached = [name for name in (*bodies, *carrier) if isinstance(name, str)]

@@ -49,7 +49,7 @@ def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> di
         for index, (key, element) in enumerate(items):
             if not isinstance(element, kinds[section]):
                 entry = SceneEntry(section, index, key, None, {})
-                problem = f"{entry.where}: must be of class {kinds[section].__name__}, is a {type(element).__name__}"
+                problem = f"{entry.where}: must be of class {kinds[section].__name__}, not a {type(element).__name__}"
                 entries.append(entry._replace(problem=problem))
                 continue
             element = jax.tree.map(_as_number, element)

@@ -64,7 +64,7 @@ def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
 def head_mistakes(scene: TomlTable, expected: Collection[str]) -> Iterator[str]:
     """Iterate over the mistakes in the top-level keys of a file."""
     if not isinstance(scene.get("name", ""), str):
-        yield f"name: must be a string, is {abbreviate(scene['name'])}"
+        yield f"name: must be a string, not {abbreviate(scene['name'])}"
     for key in scene:
         if key not in expected:
             is_plural = key.endswith("s") and key[:-1] in expected

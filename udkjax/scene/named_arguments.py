@@ -62,7 +62,7 @@ def require_history(name: str, value: Any, given: GivenArguments) -> None:
     bodies = getattr(value, "bodies", None)
     if isinstance(mechanism, Mechanism) and isinstance(bodies, tuple) and bodies and bodies != mechanism.body_names:
         listed = [", ".join(map(quote, x[:6])) + (", ..." if len(x) > 6 else "") for x in (bodies, mechanism.body_names)]
-        raise ArgumentError(f"{name} is of another mechanism: its bodies are {listed[0]}, those of the mechanism {listed[1]}")
+        raise ArgumentError(f"{name} belongs to another mechanism: its bodies are {listed[0]}, not {listed[1]}")
     ts, q, v = (array(f"{name}.{part}", getattr(value, part)) for part in ("ts", "q", "v"))
     expected_shape = (*ts.shape, len(mechanism.body_names), 3) if isinstance(mechanism, Mechanism) else q.shape
     if q.ndim == 4:
@@ -98,14 +98,14 @@ def _check_analysis(name: str, value: Any, given: GivenArguments) -> None:
         return
     owners = list(dict.fromkeys(owner for owner, _ in value.row_names))
     if value.coordinates != 3 * len(mechanism.body_names) or owners != list(mechanism.constraints):
-        raise ArgumentError(f"{name} is that of another mechanism: give udk.analyse(mechanism), or leave it out")
+        raise ArgumentError(f"{name} belongs to another mechanism: give udk.analyse(mechanism), or leave it out")
 
 
 def _of_diffrax(kind: str, example: str) -> ArgumentCheck:
     def check(name: str, value: Any, given: GivenArguments):
         diffrax = sys.modules.get("diffrax")  # no instance of its classes exists before it is imported
         if not (diffrax and isinstance(value, getattr(diffrax, kind))):
-            expected = f"an instance of diffrax's, such as {name}={example}, or None"
+            expected = f"an instance of a diffrax class, such as {name}={example}, or None"
             raise ArgumentTypeError(f"{name} must be {expected}, {describe(value)}")
 
     return check
@@ -117,7 +117,9 @@ def _check_solver(name: str, value: Any, given: GivenArguments) -> None:
     if not isinstance(value, sys.modules["diffrax"].AbstractAdaptiveSolver):
         kind = type(value).__name__
         cure = f"give a solver such as diffrax.Tsit5(), or diffrax.HalfSolver(diffrax.{kind}()), which estimates them"
-        raise ArgumentError(f"{name}: steps are chosen by errors, also with dt0, and {kind} does not estimate them; {cure}")
+        raise ArgumentError(
+            f"{name}: steps follow from estimated errors, even with dt0, and {kind} does not estimate any; {cure}"
+        )
 
 
 def _of_kind(condition: str, is_valid: Callable[[Any], bool]) -> ArgumentCheck:
@@ -197,7 +199,7 @@ CHECKS: dict[str, ArgumentCheck] = {
         'be a name, such as "huber", or a function', lambda x: isinstance(x, str) or (callable(x) and not isclass(x))
     ),
     "client": _of_kind("be a dask.distributed.Client, or None", _has("submit")),
-    "optimizer": _of_kind("be an optimizer of optax's, or None", lambda x: isinstance(x, str) or _has("update")(x)),
+    "optimizer": _of_kind("be an optax optimizer, or None", lambda x: isinstance(x, str) or _has("update")(x)),
     "method": _check_thresholds,
     "stabilization": _check_thresholds,
     "t": require_number,

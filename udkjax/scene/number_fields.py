@@ -76,7 +76,7 @@ def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
 def require_values(values: object, name: str) -> None:
     """Raise a `SceneError` unless `values` maps names to numbers; `name` is the scene's."""
     if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
-        raise SceneError([f"values must map names of parameters to numbers, is {abbreviate(values)}"], name)
+        raise SceneError([f"values must map names of parameters to numbers, not {abbreviate(values)}"], name)
 
 
 def replace_numbers(
@@ -158,7 +158,7 @@ def _fit(
     except (TypeError, ValueError, OverflowError):
         new = None
     if new is None:
-        return None, f"{given}: must be a number or an array, is {abbreviate(value)}"
+        return None, f"{given}: must be a number or an array, not {abbreviate(value)}"
     if old is None and index:
         return None, f"{given}: {name} is absent; set it as a whole"
     if shape is not None and (len(index) > len(shape) or any(i >= n for i, n in zip(index, shape, strict=False))):

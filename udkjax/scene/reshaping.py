@@ -32,8 +32,8 @@ def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: Numbe
         mechanism: The scene.
         bodies: The name of a body, or several.
         length: The length (m); it may be traced.
-        as_rod: Scale mass and inertia as of a rod with constant mass per metre, by the length and by its third power; by default
-            they do not change.
+        as_rod: Scale the mass with the length and the inertia with its third power, as for a rod with constant mass per metre; by
+            default they do not change.
 
     Returns:
         The changed mechanism.

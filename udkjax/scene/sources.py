@@ -194,7 +194,7 @@ class Derivation:
 
 
 class Follows:
-    """The stand-in of a number that is computed, in a tree whose leaves are no numbers: it cannot be used."""
+    """The stand-in of a number that is computed, in a tree whose leaves are not numbers: it cannot be used."""
 
     def __init__(self, text: str):
         self.text = text
@@ -219,7 +219,7 @@ _derived = deferred_if_traced(lambda source: source.derived())
 def elements_of(source: Any) -> Elements:
     """Return the elements that follow from a source, computed once for concrete numbers, and once in each trace.
 
-    Numbers that are leaves of the source are the same objects in the elements. If leaves are no numbers, as in `eqx.tree_at`,
+    Numbers that are leaves of the source are the same objects in the elements. If leaves are not numbers, as in `eqx.tree_at`,
     all other numbers are stand-ins that refuse to be used.
     """
     leaves, tree = jax.tree.flatten(source)
@@ -302,7 +302,7 @@ def _batch_axes(source: Any, leaves: Leaves) -> list[int]:
 
 @cache
 def _dimensions(cls: type) -> dict[str, int | None]:
-    """Return the number of dimensions of each dynamic field of a class, None if its annotation does not tell."""
+    """Return the number of dimensions of each dynamic field of a class, None if its annotation does not determine it."""
     texts = {f.name: getattr(f.type, "dim_str", "...") for f in dataclasses.fields(cls) if not f.metadata.get("static")}
     annotated = {name: getattr(key.annotation, "dim_str", "...") for name, key in keys(cls).items() if name in texts}
     return {name: None if "..." in text else len(text.split()) for name, text in (texts | annotated).items()}
@@ -311,6 +311,6 @@ def _dimensions(cls: type) -> dict[str, int | None]:
 def _with_stand_ins(source: Any, leaves: Leaves, tree: TreeDef) -> Elements:
     derivation = _derivations.get(tree)
     if derivation is None:
-        raise SceneError(["its leaves are no numbers: its elements follow from numbers"])
-    stand_ins = [Follows(f"{label} is no leaf of the mechanism: {source.cure}") for label in derivation.labels]
+        raise SceneError(["its leaves are not numbers, from which its elements would follow"])
+    stand_ins = [Follows(f"{label} is not a leaf of the mechanism: {source.cure}") for label in derivation.labels]
     return derivation.with_leaves(leaves, stand_ins)

@@ -72,4 +72,4 @@ def _loose_bodies(mechanism: Mechanism) -> Iterator[str]:
     connected = {name for element in mechanism.constraints.values() for name in mechanism.frames_of(element)}
     for name in mechanism.body_names if connected else ():
         if name not in connected:
-            yield f"body {quote(name)} is in no joint: it flies by itself"
+            yield f"body {quote(name)} belongs to no joint: it moves freely"

@@ -160,7 +160,7 @@ def read_quantity(text: str, wanted: str) -> float:
     """
     match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
     if match is None:
-        raise ValueError(f"must be a number, or a text with a number and its unit, is {quote(text)}")
+        raise ValueError(f"must be a number, or a string with a number and its unit, not {quote(text)}")
     number, units = match.groups()
     if not units and wanted:
         raise ValueError(f"{quote(text)} has no unit; it is measured in {_usual_units(wanted)}")

@@ -45,7 +45,7 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
     kinetic = f"kinetic up to {accuracy.kinetic_energy:.3g} J"
     if accuracy.work is None:
         change = format_error(accuracy.energy_change, accuracy.kinetic_energy)
-        changed = f"changes by at most {change} J, though nothing does work"
+        changed = f"changes by at most {change} J, although no work is done"
     else:
         changed = f"drivers, dampers and loads do {accuracy.work:.6g} J of work"
     lines = {

@@ -39,7 +39,7 @@ Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linear
 
 
 class Equilibrium(PrintsTable):
-    """A position of rest: `balanced` tells whether loads cancel, `omega2` whether it is stable.
+    """A position of rest: `balanced` is true if the loads cancel, and `omega2` shows whether it is stable.
 
     Attributes:
         q: x, y (m) and angle (rad) of each body.
@@ -110,8 +110,8 @@ def equilibrium(
     """Return a position of rest near a given position: N^T F = 0 on Psi = 0, where N spans the free directions.
 
     Newton's method with K = -F_q + (lambda^T Psi)_qq; steps are limited in length, and halved until the unbalanced loads
-    decrease. Pure, jittable and batched by `vmap` (`balanced` tells which members are at rest); differentiable by every number
-    of the mechanism, where the stiffness is not singular.
+    decrease. Pure, jittable and batched by `vmap` (`balanced` marks the members at rest); differentiable with respect to
+    every number of the mechanism, where the stiffness is not singular.
 
     Args:
         mechanism: its drivers hold the values of time t.

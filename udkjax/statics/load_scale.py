@@ -34,7 +34,7 @@ def load_scale(mechanism: Mechanism, scales: Scales, t: Time, q: Float[Array, "n
 
 
 def load_sizes(mechanism: Mechanism, t: Time, q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:
-    """Return the sum of the absolute loads on each coordinate (N, N m), of gravity and of each force element."""
+    """Return the sum of the absolute loads (N, N m) of gravity and of each force element on each coordinate."""
     total = jnp.abs(loads.mass(mechanism).reshape(-1, 3) * jnp.append(mechanism.gravity, 0.0))
     for kind, values in loads.evaluate_forces(lambda e, *frames: loads.loads_on_frames(e, t, *frames), mechanism, q, v):
         total = total.at[kind.bodies.T].add(jnp.abs(values[:, ~np.array(kind.structure.ground)]))

@@ -74,8 +74,9 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
     loads have a potential; a load that turns with a body has none. `s` and `damped_shapes` use all of K and include flutter;
     `omega2` and `shapes` use the symmetric part of K.
 
-    Pure, jittable and batched by `vmap`; eigenvalues and `shapes` have exact derivatives by every number of the mechanism, where
-    they are simple (those of `equilibrium` include the change of position); `damped_shapes` have no derivatives.
+    Pure, jittable and batched by `vmap`; eigenvalues and `shapes` have exact derivatives with respect to every number of the
+    mechanism, where they are simple (those of `equilibrium` include the change of position); `damped_shapes` have no
+    derivatives.
 
     Args:
         mechanism: its drivers hold the values of time t.

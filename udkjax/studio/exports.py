@@ -53,7 +53,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
 
 
 def shown(mechanism: Mechanism, run: Solution, suffix: str) -> Animation:
-    """Return a run as an animation; a page is live if machine code can express the mechanism."""
+    """Return a run as an animation; if it is a page, it is live if the mechanism can be compiled to machine code."""
     if suffix == ".html":
         with contextlib.suppress(ValueError, UnsupportedError):
             return animate(mechanism, run, live=True)

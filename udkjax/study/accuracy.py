@@ -100,7 +100,7 @@ def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[n
     """Return the exact x, y (m) and angle (rad) of all bodies at the times `ts` (s); None if this is not a parallelogram.
 
     The motion starts at `ts[0]` from `q0`, `v0`, both (bodies, 3). Links count as equal and parallel within `tol` times their
-    length, since assembly closes the loops only to rounding.
+    length, since assembly closes the loops only up to rounding errors.
     """
     ts, q0, v0 = (np.asarray(array, float) for array in (ts, q0, v0))
     linkage = parallelogram(mech, q0, tol)

@@ -57,8 +57,8 @@ def path(
 ) -> Float[Array, "T 2"]:
     """Return the path of a point of a body, or of a pin, over a motion; or the point's velocities or accelerations.
 
-    The function is pure, jittable, batched by `vmap`, and differentiable by every number of the mechanism, the point and the
-    motion.
+    The function is pure, jittable, batched by `vmap`, and differentiable with respect to every number of the mechanism, the
+    point and the motion.
 
     Args:
         mechanism: the mechanism that moved.

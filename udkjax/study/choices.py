@@ -55,7 +55,9 @@ def choice(setting: str, given: str | Mapping[str, str | float]) -> Choice:
     table = given if isinstance(given, Mapping) else {"type": given}
     name, numbers = table.get("type"), {key: value for key, value in table.items() if key != "type"}
     if not isinstance(name, str) or name not in options:
-        raise ValueError(f"no {setting} {abbreviate(name)}{suggestion(name, options) or '; one of ' + ', '.join(options)}")
+        raise ValueError(
+            f"unknown {setting} {abbreviate(name)}{suggestion(name, options) or '; choose one of ' + ', '.join(options)}"
+        )
     constructor = options[name]
     expected = [] if setting == "solver" else list(inspect.signature(constructor).parameters)
     for key in numbers:

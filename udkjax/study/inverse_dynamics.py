@@ -154,8 +154,8 @@ def inverse_dynamics(
 ) -> InverseDynamics:
     """Compute the efforts of drivers at the times ts (s) for a prescribed motion: M a - F = J^T mu + C^T f.
 
-    The function is pure and batched by `vmap`, with exact derivatives by every number of the mechanism, including those of the
-    motion.
+    The function is pure and batched by `vmap`, with exact derivatives with respect to every number of the mechanism, including
+    those of the motion.
 
     Args:
         mechanism: mechanism whose drivers prescribe the motion unless `motion` does; F are its force elements and gravity.

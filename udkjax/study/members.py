@@ -37,7 +37,7 @@ class MemberFunction(Protocol):
 
 
 class Program:
-    """A function of members, compiled for `piece` members on each device, with derivatives by K = `slopes` numbers."""
+    """A function of members, compiled for `piece` members on each device, with derivatives for K = `slopes` numbers."""
 
     def __init__(self, function: MemberFunction, slopes: int, piece: int, devices: Sequence[Any] = ()):
         self.function, self.slopes, self.piece, self.devices = function, slopes, piece, tuple(devices)

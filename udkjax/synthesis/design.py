@@ -130,8 +130,9 @@ def design(
     """Find mechanisms with the structure of a drawing that meet a goal, by least squares from many starts.
 
     Random mechanisms within the bounds are turned once. The best, moved and scaled to the goal as a whole if their pins are
-    free, are improved by the Levenberg-Marquardt method, in batches of compiled machine code, with exact derivatives by all free
-    numbers. Designs stay on one branch, pass positions in order, respect the limits, and are verified by `kinematics`.
+    free, are improved by the Levenberg-Marquardt method, in batches of compiled machine code, with exact derivatives with
+    respect to all free numbers. Designs stay on one branch, pass positions in order, respect the limits, and are verified by
+    `kinematics`.
 
     Args:
         drawing: the structure: a drawing, or a mechanism with one degree of freedom when its drivers are removed. Free pins

@@ -75,7 +75,7 @@ class Goal(PrintsTable):
         if self.start not in ("given", "free"):
             raise ValueError(f'start must be "given" or "free", not {quote(str(self.start))}')
         if self.values is None and (self.start != "given" or self.line):
-            raise ValueError("start and line tell where values count from: give values, too")
+            raise ValueError("start and line define where values are measured from: give values, too")
         if self.line and len(self.line) != 2:
             raise ValueError("line must name two pins, from one to the other")
 

@@ -19,7 +19,7 @@ Range = tuple[float, float]
 # Closer to a meeting of branches, real parts with clearances may change their branch.
 LEAST_TRANSMISSION = 3e-3
 DEFAULT_REACH = 2.0  # range of the search for unbounded pins, relative to the extent of targets and drawing
-DEFAULT_FACTOR = 4.0  # range of other numbers: value / factor to value * factor
+DEFAULT_FACTOR = 4.0  # range of other numbers: from value / factor to value * factor
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ class MotionPoint(NamedTuple):
         q: positions (bodies, 3) (m, rad).
         v: velocities (bodies, 3) (m/s, rad/s).
         a: accelerations (bodies, 3).
-        rate: dq/ds, the derivative by the driver's value (bodies, 3).
+        rate: dq/ds, the derivative with respect to the driver's value (bodies, 3).
         bend: d^2q/ds^2 (bodies, 3).
         loads: the loads (k, m) requested by `MotionTerm.loads`.
         numbers: the free numbers.
@@ -103,7 +103,7 @@ class MotionTerm(PrintsTable):
         raise NotImplementedError
 
     def residual(self, measure: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals of measures, and the derivatives of the residuals by the measures."""
+        """Return residuals of measures, and the derivatives of the residuals with respect to the measures."""
         unit, r, slope = self.weight * scale, np.zeros_like(measure), np.zeros_like(measure)
         if self.most is not None:
             above = measure > self.most

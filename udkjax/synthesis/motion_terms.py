@@ -23,7 +23,7 @@ from udkjax.synthesis.motion_goals import MotionPoint, MotionTerm
 
 
 class TermResiduals(NamedTuple):
-    """Residuals of M trials (M, K), their derivatives by the unknowns (M, K, P), and whether all positions exist (M,)."""
+    """Residuals of M trials (M, K), their derivatives dr/dx (M, K, P), and whether all positions exist (M,)."""
 
     r: np.ndarray
     by_unknowns: np.ndarray
@@ -99,7 +99,7 @@ class CompiledTerm:
         self._places, self.entries = programs.places[0], programs.measure.outputs[programs.places[0].by_parameters]
 
     def measures(self, x: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return measures (M, K), their derivatives by the unknowns (M, K, P), and whether all positions exist (M,)."""
+        """Return measures (M, K), derivatives with respect to the unknowns (M, K, P), and whether all positions exist (M,)."""
         s = self._values(x)
         solved = self._code(x, s, self._unit, longest=self._longest, threads=threads)
         finite = np.isfinite(solved.end).all(1)

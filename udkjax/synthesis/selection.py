@@ -55,7 +55,7 @@ def select(problem: DesignProblem, state: SearchState, results: int, threads: in
         worse = np.flatnonzero(losses > found[0][0].loss)
         _verify(problem, _Candidates(first.trials.take(worse), losses[worse]), results, found, REFUSALS)
     reason = "the motions of all trials within the limits leave their branches or reach dead points"
-    return Selection([design for design, _ in found], losses, "" if found else f"{reason}: ask for more transmission")
+    return Selection([design for design, _ in found], losses, "" if found else f"{reason}: raise `transmission`")
 
 
 def _within_limits(problem: DesignProblem, state: SearchState) -> _Candidates:

@@ -23,13 +23,13 @@ class TrialResiduals(NamedTuple):
     Attributes:
         q: positions (M, J, n).
         r: residuals (M, J, G).
-        by_value: derivatives of r by s (M, J, G).
-        by_unknowns: derivatives of r by x (M, J, G, P).
+        by_value: derivatives of r with respect to s (M, J, G).
+        by_unknowns: derivatives of r with respect to x (M, J, G, P).
         terms: residuals of motion goals (M, T).
-        terms_by_unknowns: derivatives of terms by x (M, T, P).
+        terms_by_unknowns: derivatives of terms with respect to x (M, T, P).
         transmission: transmission at each position (M, J), with the sign of the branch.
         limits: rows (M, K) that must not exceed zero, in the unit of residuals.
-        limits_by_unknowns: derivatives of limits by x (M, K, P).
+        limits_by_unknowns: derivatives of limits with respect to x (M, K, P).
         exists: whether all positions of a trial exist (M,).
     """
 

@@ -169,7 +169,7 @@ def test_what_is_no_direction_is_the_only_mistake(given):
     with pytest.raises(udk.SceneError) as refused:
         ramp(given)
     (problem,) = refused.value.problems
-    assert problem.startswith('slide "guide" (slide[0]).direction: must be a number, is [')
+    assert problem.startswith('slide "guide" (slide[0]).direction: must be a number, not [')
 
 
 @pytest.mark.parametrize("kind", [list, np.array, jnp.array])

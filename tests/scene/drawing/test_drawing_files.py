@@ -187,7 +187,7 @@ MISTAKES = [
     # units
     (drawn('"0.5 kg"', '"0.5 m"', head=MM), 'link "rocker" (link[2]).mass: "m" does not fit; it is measured in kg, g'),
     (drawn('"0.5 kg"', '"0.5 stone"', head=MM), 'link "rocker" (link[2]).mass: "stone" is not a known unit'),
-    (drawn('"0.5 kg"', '"half"', head=MM), 'link "rocker" (link[2]).mass: must be a number, or a text'),
+    (drawn('"0.5 kg"', '"half"', head=MM), 'link "rocker" (link[2]).mass: must be a number, or a string'),
     (drawn('"0.5 kg"', '"5"', head=MM), 'link "rocker" (link[2]).mass: "5" has no unit'),
     (drawn("[0, 0]", '[0, "1 s"]', head=MM), 'pins.O[1]: "s" does not fit; it is measured in m, mm, cm'),
     (drawn(head=MM + "gravity = [0, -9.81]\n"), "gravity[1]: -9.81 needs a unit, as length is in mm here: write"),
@@ -231,7 +231,7 @@ MISTAKES = [
     ),
     (
         drawn('ground = ["O", "C"]', 'ground = ["O", "C", "A"]', end='[[motor]]\npin = "A"\nspeed = 1'),
-        'motor "motor1" (motor[0]).pin: at "A" there must meet two links, or one and the ground; there are ground, crank, rod; '
+        'motor "motor1" (motor[0]).pin: "A" must join two links, or a link and the ground; it joins ground, crank, rod; '
         'say which two, such as of = ["ground", "crank"]',
     ),
     (drawn(end='[[motor]]\npin = "O"'), 'motor "motor1" (motor[0]).speed: give one of speed, motion and torque'),
@@ -292,7 +292,7 @@ def test_all_mistakes_at_once_and_none_twice():
     assert problems(text) == [
         'ground[1]: no pin named "c"; did you mean "C"?',
         'pins.A[0]: "kg" does not fit; it is measured in m, mm, cm',
-        'link "rod" (link[1]).width: must be >= 0, is -0.001',
+        'link "rod" (link[1]).width: must be >= 0, not -0.001',
     ]
 
 

@@ -115,11 +115,11 @@ def test_an_estimate_counts_as_made(candidates):
 
 
 def test_mistakes_are_told(candidates):
-    with pytest.raises(ValueError, match='criterion must be one of "D", "A", "E", not the text "X"'):
+    with pytest.raises(ValueError, match='criterion must be one of "D", "A", "E", not "X"'):
         design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, "X")  # pyright: ignore[reportArgumentType]
     with pytest.raises(udk.IdentificationError, match="candidates: the list is empty"):
         design_experiment(scene(), [], NAMES, [CHANNEL], TS, NOISE)
-    with pytest.raises(udk.IdentificationError, match="candidate 1: must be a Candidate, conditions or a start, is int"):
+    with pytest.raises(udk.IdentificationError, match="candidate 1: must be a Candidate, conditions or a start, not int"):
         design_experiment(scene(), [3], NAMES, [CHANNEL], TS, NOISE)  # pyright: ignore[reportArgumentType]
     with pytest.raises(udk.IdentificationError, match="of: mass is not among the parameters"):
         design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, of=["mass"])

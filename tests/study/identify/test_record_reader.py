@@ -115,7 +115,7 @@ def test_all_mistakes_of_a_file_are_told_at_once(mech, file):
         'there is no column "joint.O.fx"',
         '"deg" does not fit; it is measured in m, mm, cm',
         '"furlong" is not a known unit',
-        'must be a number, is "x"',
+        'must be a number, not "x"',
         "0.1 s does not exceed the previous time, 0.2 s",
     ):
         assert part in text
@@ -131,8 +131,8 @@ def test_all_mistakes_of_a_file_are_told_at_once(mech, file):
         ("time,body.crank.angle,body.crank.angle [deg]\n0,1,1\n", 'there are two columns "body.crank.angle"'),
         ("time,body.rod(0,0).x,body.rod.x,body.rod(0.0,0).x\n0,1,1,1\n", 'is the same channel as "body.rod(0,0).x"'),
         ("time,body.crank.angle\n,1\n", 'line 2, column "time": is empty'),
-        ("time,body.crank.angle\n0,1\n1,inf\n", 'line 3, column "body.crank.angle": must be a number, is "inf"'),
-        ("time;body.crank.angle\n0;0,5\n", 'must be a number, is "0,5"'),
+        ("time,body.crank.angle\n0,1\n1,inf\n", 'line 3, column "body.crank.angle": must be a number, not "inf"'),
+        ("time;body.crank.angle\n0;0,5\n", 'must be a number, not "0,5"'),
         ("time,body.crank.angle,\n0,1,2\n", "line 2: has 3 cells, the header has 2"),
         ("time,,body.crank.angle\n0,1,2\n", "a column has no heading"),
         ("time,body.crank.angle,record\n0,1,\n", 'line 2, column "record": is empty'),
@@ -201,9 +201,9 @@ def test_mistakes_in_mappings_say_which_and_where(mech):
     for problem, part in zip(
         found,
         (
-            'data[0], column "time": must be 2 numbers, is of type datetime64[s]',
-            'data[1], column "time": must be 3 numbers, is of shape (2,)',
-            'data[1], entry 0, column "body.rod.x": must be a number, is true',
+            'data[0], column "time": must be 2 numbers, but is of type datetime64[s]',
+            'data[1], column "time": must be 3 numbers, but is of shape (2,)',
+            'data[1], entry 0, column "body.rod.x": must be a number, not true',
             'noise, "crank": begins with none of',
             'noise: "body.crank.omega" is not measured in any record',
         ),
@@ -248,7 +248,7 @@ def test_a_dataset_reads_as_a_file_does_and_so_does_its_file(mech, tmp_path):
     assert len(record.times) == 3
     found = problems(mech, data.assign(extra=("side", [1.0])).rename(time="instant"))
     assert found == ['data: there is no coordinate "time"']
-    assert problems(mech, data.assign(extra=("side", [1.0]))) == ['data, "extra": must be along "time", is along ["side"]']
+    assert problems(mech, data.assign(extra=("side", [1.0]))) == ['data, "extra": must be along "time", not along ["side"]']
 
 
 def test_what_a_solution_writes_can_be_measured(mech):

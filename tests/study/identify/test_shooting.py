@@ -79,7 +79,7 @@ def test_whole_records_end_the_fit_where_they_can(problem):
 
 
 def test_an_unknown_strategy_is_refused(problem):
-    with pytest.raises(ValueError, match='strategy must be one of "auto", "pieces", not the text "shoot"'):
+    with pytest.raises(ValueError, match='strategy must be one of "auto", "pieces", not "shoot"'):
         identify(pendulum(), problem.records[0], NAMES, strategy="shoot")  # pyright: ignore[reportArgumentType]
 
 

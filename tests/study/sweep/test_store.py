@@ -92,10 +92,10 @@ def test_another_sweep_is_refused_and_the_difference_spelled_out(tmp_path):
     with pytest.raises(StoreError) as caught:
         FolderStore(tmp_path, other)
     for line in (
-        "settings.rtol: was 1e-08, is 1e-09",
+        "settings.rtol: was 1e-08, is now 1e-09",
         "scene: was mass = 1.0",
         "scene: is mass = 2.0",
-        "axes[1]: was 2.0, is 2.5",
+        "axes[1]: was 2.0, is now 2.5",
     ):
         assert line in str(caught.value)
     assert "format = 1" not in str(caught.value) and "axes[2]" not in str(caught.value)

@@ -66,7 +66,7 @@ def element_loads(
 
 
 def _evaluate(mechanism: Mechanism, ts: np.ndarray, qs: np.ndarray, vs: np.ndarray) -> list:
-    """Return kinds of elements with loads (states, elements, 3k) and their derivatives by q and v of the moving bodies."""
+    """Return kinds of elements with loads (states, elements, 3k) and derivatives with respect to q and v of the moving bodies."""
     kinds: list = []
 
     def at(t: Array, q: Array, v: Array) -> list:

@@ -22,7 +22,7 @@ def number_if_any(value: Any) -> Any:
 def require_name_text(name: str, value: object, may_be_empty: bool = False) -> None:
     """Raise ArgumentTypeError if a name is not a string, ValueError if it is empty."""
     if not isinstance(value, str):
-        raise ArgumentTypeError(f"{name} must be a text, {describe(value)}")
+        raise ArgumentTypeError(f"{name} must be a string, {describe(value)}")
     if not value and not may_be_empty:
         raise ValueError(f"{name} must not be empty")
 
@@ -46,7 +46,7 @@ def require_restitution(name: str, value: Any) -> None:
     """Raise unless a restitution is one number from 0 to 1."""
     require_number(name, value)
     if not isinstance(value, Tracer) and not 0 <= float(value) <= 1:
-        raise ValueError(f"{name} must be from 0 to 1, is {float(value):g}")
+        raise ValueError(f"{name} must be from 0 to 1, not {float(value):g}")
 
 
 def require_limits(where: str, lower: Any, upper: Any) -> None:
@@ -59,7 +59,7 @@ def require_limits(where: str, lower: Any, upper: Any) -> None:
     if lower is None or upper is None or isinstance(lower, Tracer) or isinstance(upper, Tracer):
         return
     if float(lower) > float(upper):
-        raise ValueError(f"{where}: lower must not be above upper, is {float(lower):g}, above {float(upper):g}")
+        raise ValueError(f"{where}: lower = {float(lower):g} must not be above upper = {float(upper):g}")
 
 
 def require_joint(name: str, value: object) -> None:

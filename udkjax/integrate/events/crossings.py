@@ -86,7 +86,7 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
 
 
 def cubic_root(cubic: Cubic, side: Array) -> Array:
-    """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1, to rounding."""
+    """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1."""
     low, width, places = jnp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
     for _ in range(DIVISIONS):
         width /= PARTS

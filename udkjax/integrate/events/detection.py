@@ -58,7 +58,7 @@ class Detection(NamedTuple):
     is_found: Bool[Array, ""]
     event: Int[Array, ""]
     root: Float[Array, ""]  # place of the crossing between these nodes, from 0 to 1
-    is_exact: Bool[Array, ""]  # whether the root is exact to rounding
+    is_exact: Bool[Array, ""]  # whether the root is exact up to rounding
     is_coarse: Bool[Array, ""]  # whether this or an earlier interval is too coarse
     last_sure: Int[Array, ""]  # the last node before a coarse interval that is certain
     coarse: Bool[Array, "C"]  # conditions for which that interval is too coarse

@@ -221,7 +221,7 @@ def expand_events(events: Sequence[ExpandsToEvents], mechanism: Mechanism) -> tu
 
 def _expand(event: ExpandsToEvents, k: int, mechanism: Mechanism, found: list[Event]) -> None:
     if not hasattr(event, "expand"):
-        raise ValueError(f"must be an Event, a JointLimit or a Contact, is a {type(event).__name__}")
+        raise ValueError(f"must be an Event, a JointLimit or a Contact, not a {type(event).__name__}")
     for one in event.expand(mechanism):
         require_name_text("name", one.name, may_be_empty=True)
         name = one.name or f"event{k + 1}"
@@ -257,11 +257,11 @@ def _with_name(event: Event, name: str) -> Event:
 def _check(event: Event, mechanism: Mechanism) -> None:
     where, action = f"event {quote(event.name)}", event.action
     if not isinstance(action, Action):
-        raise ValueError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., is a {type(action).__name__}")
+        raise ValueError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., not a {type(action).__name__}")
     if not isinstance(event.direction, int) or isinstance(event.direction, bool) or event.direction not in (-1, 0, 1):
         raise ValueError(f"{where}: the direction must be -1, 0 or 1, {describe(event.direction)}")
     if not callable(event.condition):
-        raise ValueError(f"{where}: the condition must be a function (t, frames), is a {type(event.condition).__name__}")
+        raise ValueError(f"{where}: the condition must be a function (t, frames), not a {type(event.condition).__name__}")
     try:
         value = jnp.asarray(event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())))
     except KeyError as error:
@@ -271,7 +271,7 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         probe = np.linspace(0.1, 0.9, mechanism.q0.size)
         with jax.ensure_compile_time_eval():
             result = event.condition(0.0, frames_of(mechanism.body_names, probe, probe))
-        if isinstance(result, Tracer):  # derivatives by the traced numbers would be lost
+        if isinstance(result, Tracer):  # derivatives with respect to the traced numbers would be lost
             cure = "make it an equinox module that holds them and has a `__call__`"
             raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
     if value.shape:

@@ -86,7 +86,7 @@ class ContactRows(NamedTuple):
 class Impulses(NamedTuple):
     """The results of an impact."""
 
-    impulse: Float[Any, "*m E"]  # in the unit of M v over that of the condition's derivative by q: N s of a gap
+    impulse: Float[Any, "*m E"]  # in the unit of M v over that of the condition's derivative with respect to q: N s of a gap
     rate: Float[Any, "*m E"]  # g_dot+
     remaining: Bool[Any, "*m"]  # whether constraints still drive a contact to penetrate
 

@@ -26,7 +26,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
 FREE = np.inf  # a side that is not held
-MOST_KINKS = 256  # of a run; beyond, sides are no longer held: what rests where a force jumps would never get on
+MOST_KINKS = 256  # of a run; then sides are no longer held, as a run at rest where a force jumps would make no progress
 
 
 class SmoothLoads:

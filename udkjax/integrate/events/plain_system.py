@@ -2,7 +2,7 @@
 
 A window contains output times, and nodes at which conditions and the forces of contacts at rest are evaluated (`detection`). If
 the nodes are too coarse for a condition, the window is repeated with an eighth of its length. If a condition crosses zero between
-two nodes, that interval becomes the next window. This is repeated until the zero of the cubic is exact to rounding, where the
+two nodes, that interval becomes the next window. This is repeated until the zero of the cubic is exact up to rounding, where the
 last window ends, or until the interval is as short as possible, as where a condition jumps.
 """
 

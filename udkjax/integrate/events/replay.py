@@ -70,7 +70,7 @@ def _(primals, tangents):
     if not any(has_tangent):
         return found, EventRun._make([None] * len(found))
     if jax.tree.unflatten(fixed.tree, has_tangent).ts:
-        raise NotImplementedError("a run with events has no derivatives by its output times")
+        raise NotImplementedError("a run with events has no derivatives with respect to its output times")
 
     if hybrid_plan(fixed).changes.any():
         xs = [_differentiate_once(x) for x in xs]
@@ -95,10 +95,10 @@ def _(primals, tangents):
 
 # --- derivatives
 #
-# Between events the flow is differentiable by its initial state and by all numbers. Let t0 be the time at which an event was
-# found, held fixed, and y the state before the event at t0. When numbers change, the condition is met at another time t0 + d:
-# h(t0 + d, y + f d) = 0 gives d = -h / h_dot to first order (implicit function theorem). The jump J is applied at that time, and
-# the state after it is moved back to t0 along the flow f+:
+# Between events the flow is differentiable with respect to its initial state and all numbers. Let t0 be the time at which an
+# event was found, held fixed, and y the state before the event at t0. When numbers change, the condition is met at another time
+# t0 + d: h(t0 + d, y + f d) = 0 gives d = -h / h_dot to first order (implicit function theorem). The jump J is applied at that
+# time, and the state after it is moved back to t0 along the flow f+:
 #
 #     y+ = J(t0 + d, y + f d) - f+ d,        dy+ = J_y dy - (J_y f + J_t - f+) h_y dy / h_dot,
 #

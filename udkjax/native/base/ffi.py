@@ -136,7 +136,7 @@ def no_memory(f: Function, frame: Value) -> Value:
 
 
 def text_of(f: Function, characters: bytes, space: int = 0) -> Value:
-    """Return the address of a text on the stack, followed by a zero and by `space` bytes for more."""
+    """Return the address of a string on the stack, followed by a zero and by `space` bytes for more."""
     words = np.frombuffer(characters + bytes(8 - len(characters) % 8), np.int64)
     text = Value(f, f.reserve(INT, len(words) + space // 8), POINTER)
     for k, x in enumerate(words):

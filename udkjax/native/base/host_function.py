@@ -136,7 +136,7 @@ def _lower(*inputs: Any, function: HostFunction) -> Sequence[Array]:
 
 
 def _lower_for_card(*inputs: Any, function: HostFunction) -> Sequence[Array]:
-    """Lower for a graphics card of NVIDIA."""
+    """Lower for an NVIDIA graphics card."""
     name = host_handler.register(*_target(function))
     return jax.ffi.ffi_call(name, _result_shapes(inputs, function))(*inputs)
 

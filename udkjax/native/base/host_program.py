@@ -1,11 +1,11 @@
-"""Deferred programs (programs/deferred.py) in programs of other devices than the CPU: one call of the host.
+"""Deferred programs (programs/deferred.py) in programs of devices other than the CPU: one call of the host.
 
 On a graphics card each operation of a program takes microseconds to begin, each step of a loop waits for the host, and each
 factorization of a small matrix takes a large part of a millisecond. Deferred programs with loops over small arrays, or with a few
 matrices to factorize, are therefore compiled for the CPU, when the program around them is lowered, and called as functions of the
 host (host_function.py). On the CPU they are parts of the program around them.
 
-Derivatives and batches of deferred programs are deferred programs; they come here by themselves.
+Derivatives and batches of deferred programs are deferred programs too, and are therefore handled here as well.
 """
 
 import math
@@ -29,8 +29,8 @@ from udkjax.programs.deferred import deferred_p
 LOOPS = {"scan", "while"}
 FACTORIZATIONS = {"cholesky", "eig", "eigh", "hessenberg", "householder_product", "lu", "qr", "geqrf", "geqp3", "schur", "svd"}
 HOST = "cpu"  # the platform for which a program is a part of the program around it
-SMALL = 2**14  # numbers: on fewer the host ends an operation before a card has begun it
-FEW_MATRICES = 64  # factorized one after another: some 10 us each on the host; a card takes half a millisecond for any number
+SMALL = 2**14  # for fewer numbers than this, the host completes an operation before a card has started it
+FEW_MATRICES = 64  # the host takes some 10 us for each factorization, a card half a millisecond for any number of them
 
 
 class HostProgram:

@@ -87,7 +87,7 @@ class Function:
         Args:
             local: For the thread of a GPU, the names of the arguments that point to its own memory; empty to run it on this
                 processor. Each pointer is cast once to its address space, which LLVM then infers for the addresses computed from
-                it. Functions are not inlined, as each copy would take room in the cache of instructions.
+                it. Functions are not inlined, as each copy would take room in the instruction cache.
         """
         casts, names = [], {n: n for _, n in self._arguments}
         for base, n in self._arguments:

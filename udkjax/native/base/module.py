@@ -33,7 +33,7 @@ class Module(Running):
     Args:
         plan: Choices that the code depends on.
         differentiated: Names of the scene's programs that the module differentiates.
-        active: For each number of the scene, whether derivatives by it are needed.
+        active: For each number of the scene, whether derivatives with respect to it are needed.
     """
 
     mode = FORWARD  # mode of differentiation

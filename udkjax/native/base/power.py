@@ -21,7 +21,7 @@ TERMS = 10  # terms of both series, for a relative error below 1e-9
 
 
 def power(f: Function, x: Value, exponent: float, whole: bool = False) -> Value:
-    """Return x^exponent for positive x; `whole` tells that the exponent is an integer."""
+    """Return x^exponent for positive x; `whole` is true if the exponent is an integer."""
     if whole:
         return _whole(f, x, int(exponent))
     return _exp2(f, _log2(f, x) * exponent)

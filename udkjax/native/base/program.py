@@ -194,7 +194,7 @@ def _convert(f: Function, a: Value, dtype: Any) -> Value:
 
 
 def _truncate(f: Function, a: Value, dtype: np.dtype) -> Value:
-    """Return the integer part; of a number beyond the range of its type the nearest of the range, and zero of NaN."""
+    """Return the integer part, clipped to the range of the type; zero for NaN."""
     bounds = np.iinfo(dtype)
     kind, of_double = llvm_type(INT, a.width), f"{'v' + str(a.width) if a.width > 1 else ''}f64"
     full = f"llvm.fpto{'u' if dtype.kind == 'u' else 's'}i.sat.{of_double.replace('f', 'i')}.{of_double}"
@@ -207,7 +207,7 @@ def _truncate(f: Function, a: Value, dtype: np.dtype) -> Value:
 
 
 def _divide_whole(f: Function, name: str, x: Value, y: Value) -> Value:
-    """Return the quotient of integers, rounded towards zero, or what remains; of zero as in JAX, where a processor would stop."""
+    """Return the quotient of integers, rounded towards zero, or the remainder; division by zero is as in JAX, without a trap."""
     is_zero, is_minus = y.is_(0), y.is_(-1)
     ratio = f.select(is_minus, 0 - x, f.arithmetic("div", x, f.select(is_zero | is_minus, 1, y)))
     return f.select(is_zero, -1, ratio) if name == "div" else f.select(is_zero, x, x - ratio * y)
@@ -234,7 +234,7 @@ def integer_power(a: Value, n: int) -> Value:
 
 
 def sincos(f: Function, a: Value) -> tuple[Value, Value]:
-    """Return sine and cosine, exact to rounding, by one reduction to within pi / 4 and two polynomials; no library calls."""
+    """Return sine and cosine, exact up to rounding, by one reduction to within pi / 4 and two polynomials; no library calls."""
     width, T, integers = a.width, a.type, llvm_type(INT, a.width)
     shifted = f.fma(a, 2 / math.pi, ROUND)
     turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUND, DOUBLE, width).name}", DOUBLE, width)

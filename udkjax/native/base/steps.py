@@ -45,13 +45,13 @@ GAP = ENDS_BEFORE + BEGINS_BEHIND
 
 # Pieces of the state.
 EDGE = 1e-7  # length of the step across the end of a piece, as a fraction of a step; its error is of the order of its square
-# Fraction of a step. An end of a piece nearer than this to an end of the step is located to rounding, from the state at that end.
+# Fraction of a step. An end of a piece closer than this to an end of the step is located exactly, from the state at that end.
 NEAR_END = 0.01
-# A repeated step ends slightly beyond the end of a piece; once the end has been located, a step ends just before it, and the next
-# leads across.
+# A repeated step ends slightly beyond the end of a piece. Once the end of the piece has been located, a step ends just before it,
+# and the next step crosses it.
 AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
 HALVINGS = 40  # bisections that locate the end of a piece within a step
-TRIES = 8  # attempts in succession to end a step at the end of a piece; at rest there, rounding decides which piece applies
+TRIES = 8  # successive attempts to end a step at the end of a piece; for a state at rest there, rounding decides between pieces
 
 POINTS = 4  # states that the interpolating polynomial passes through; with three, velocities between steps are less accurate
 # Fraction of a step. If less than this would remain for the last step, the remaining time is halved instead. Outputs of the

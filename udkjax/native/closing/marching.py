@@ -2,8 +2,8 @@
 
 A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects twice by Newton's
 method with elimination. All lanes take the same steps, even if some fail. Reliable positions are counted: up to the first
-position that is not closed to rounding, is far from its prediction, has too large a rotation of the tangent, or has a nearly
-dependent row. From there the caller continues by singular values.
+position that is not closed up to rounding errors, is far from its prediction, has too large a rotation of the tangent, or has a
+nearly dependent row. From there the caller continues by singular values.
 
 If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. The
 side changes where branches meet, and differs on another branch nearby.

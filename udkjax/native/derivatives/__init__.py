@@ -2,6 +2,6 @@
 
 A *member* is one run of a batch, in one of the *lanes*. A *direction* is a change of the numbers and the initial state; a
 *tangent* is the memory of the changes along one direction, with the same arrays as the run. A *cotangent*, an array named
-`bar`, is the derivative of the result by the array's numbers. A *point* is an accepted state, the *record* lists all points of
-a member. *Active* numbers have derivatives; *moving* constants depend on them.
+`bar`, is the derivative of the result with respect to the array's numbers. A *point* is an accepted state, the *record* lists
+all points of a member. *Active* numbers have derivatives; *moving* constants depend on them.
 """

@@ -1,1 +1,1 @@
-"""Machine code in programs that JAX compiles for a graphics card of NVIDIA: on the host, or as kernels of the card."""
+"""Machine code in programs that JAX compiles for an NVIDIA graphics card: on the host, or as kernels of the card."""

@@ -134,7 +134,7 @@ def _copy_and_call() -> Function:
 
 
 def _block(f: Function, size: Value) -> tuple[Value, Value]:
-    """Return memory of so many bytes, or null, and whether it is the pinned memory, which is taken here."""
+    """Return memory of `size` bytes, or null, and whether it is the pinned memory, which is then marked as in use."""
     block, is_pinned = f.variable(Value(f, "null", POINTER), POINTER, 1), f.variable(False, BOOL, 1)
     pinned = WORDS.load(f, PINNED)
     with f.if_(size <= WORDS.load(f, PINNED_SIZE, INT)):
@@ -256,11 +256,11 @@ def _thread_count() -> Function:
 
 
 def _schedule() -> Function:
-    """Write XLA_FFI_ThreadPool_Schedule: a thread for each task, which takes 20 us to start; without one the caller does it."""
+    """Write XLA_FFI_ThreadPool_Schedule: start a thread (20 us) for each task; if that fails, the caller runs the task."""
     f = Function("schedule", [(POINTER, "given")], returns="ptr", cold=True)
     task, data = (word(f, f.given["given"], offset, POINTER) for offset in (GIVEN, GIVEN + 8))
     thread = Value(f, f.reserve(INT), POINTER)
-    # A thread's function returns a pointer, a task nothing: nobody reads what is in the register.
+    # A thread's function returns a pointer, a task returns nothing: the pointer is never read.
     begun = f.op(f"call i32 @pthread_create(ptr {thread.name}, ptr null, ptr {task.name}, ptr {data.name})", "i32")
     f.choose(
         f.op(f"zext i32 {begun.name} to i64", INT).is_(0),

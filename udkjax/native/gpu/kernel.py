@@ -1,8 +1,8 @@
 """A run as a kernel: each thread of a GPU integrates one member, with the functions that serve members on the CPU.
 
-A thread's memory (`Layout`) is local memory, which the hardware interleaves by threads, so that the threads of a warp read one
-stretch of it together. The call record is a parameter of the kernel. The threads of a block begin each step together: all warps
-of a multiprocessor then run the same functions at about the same time, which its cache of instructions has room for.
+A thread's memory (`Layout`) is local memory, which the hardware interleaves by threads, so that the threads of a warp read a
+contiguous part of it together. The call record is a parameter of the kernel. The threads of a block begin each step together: all
+warps of a multiprocessor then run the same functions at about the same time, which fit into its instruction cache.
 """
 
 from collections.abc import Collection

@@ -51,7 +51,7 @@ def kernel_members() -> float:
 
 
 def kernel_target(operation: Operation, inputs: Sequence[Any]) -> str | None:
-    """Return the FFI target that runs a batch as a kernel; None if the host shall run it.
+    """Return the FFI target that runs a batch as a kernel; None if the host is to run it.
 
     Args:
         operation: the operation.

@@ -16,8 +16,8 @@ PTX = "+ptx78"  # the version, of CUDA 11.8: the first for sm_90
 OLDEST = (7, 0)  # compute capability: the first whose threads part and meet freely
 NEWEST = (9, 0)  # the newest capability in this version of PTX, which later GPUs accept as well
 LEVEL = 2  # of LLVM's code generation
-# Functions are called, not inlined: an inlined copy takes room in the cache of instructions. LLVM's combination of instructions
-# would remove the casts that tell pointers to a thread's own memory.
+# Functions are called, not inlined: an inlined copy takes room in the instruction cache. LLVM's combination of instructions
+# would remove the casts that mark pointers to a thread's own memory.
 PASSES = machine.PASSES
 
 
@@ -66,7 +66,7 @@ def assemble(code: str, capability: tuple[int, int], assembler: str) -> bytes:
 
 @cache
 def ptxas() -> str | None:
-    """Return the path of NVIDIA's assembler: of a wheel (JAX brings it), of an installed CUDA, or on the path; else None."""
+    """Return the path of NVIDIA's assembler: from a wheel (which JAX installs), an installed CUDA, or the path; else None."""
     spec, homes = find_spec("nvidia"), [os.environ.get("CUDA_HOME"), "/usr/local/cuda"]
     for wheels in spec.submodule_search_locations or () if spec else ():
         homes = [f"{wheels}/cu13", f"{wheels}/cuda_nvcc", *homes]

@@ -212,7 +212,7 @@ def time_to_singularity(module: Module, f: Function, s: Lane) -> Value:
 
 
 def step_around(module: Module, f: Function, s: Lane, time_left: Value, step: Value, otherwise: Value) -> Value:
-    """Return a step, instead of a failed one, with the singular configuration in the middle of a wide gap between its nodes."""
+    """Return a step to replace a failed one: the singular configuration is then in the middle of a wide gap between its nodes."""
     low, high = (float(x) for x in module.method.clearings)
     share = time_left / step
     candidate = time_left / f.select(share < low, f.const(low, DOUBLE, f.width), high)

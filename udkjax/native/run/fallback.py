@@ -41,8 +41,8 @@ def write_fallback(module: Module):
     mask = (s.stepping > 0.5) & (s.fallback > 0.5) & (s.safe < 0.5)
     invoke(f, s, mask)
     module.copy(f, "fallback a", "out", mask)
-    # The end of a fallback step: Newton's method for positions, velocities and accelerations if the pivots are not safe; always
-    # the tangent part of the errors.
+    # The end of a fallback step: the tangent part of the errors and, if the pivots are not safe, Newton's method for positions,
+    # velocities and accelerations.
     f, s = module.function("finish_by_fallback", [(POINTER, "work"), (POINTER, "out")])
     fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
     unsafe = fallback & (s.ok < 0.5)

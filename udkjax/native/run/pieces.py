@@ -12,8 +12,8 @@ from udkjax.native.base.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, H
 def write_leave(module: Module):
     """Write `leave`: decide in lanes of `again` whether a step that ends in another piece is accepted or repeated.
 
-    Such a step is repeated to end just before the end of the piece. A tiny step then leads across, and the run begins anew after
-    it: the accelerations of all points of an interpolation must belong to one piece.
+    Such a step is repeated to end just before the end of the piece. A tiny step then crosses the end, and the run begins anew:
+    the accelerations of all points of an interpolation must belong to one piece.
     """
     f, s = module.function("leave")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)

@@ -106,7 +106,7 @@ class Conditions:
     Attributes:
         key: texts of the programs.
         program: g and their rates, from t, q, v, a and the numbers of the conditions.
-        at_state: g, rates, second rates, and the derivatives of all g by t, by q and by v, from the same inputs.
+        at_state: g, rates, second rates, and the derivatives of all g with respect to t, q and v, from the same inputs.
         number_count: number of numbers of the conditions.
         by_velocity: mask of the conditions that depend on velocities; they have no second rates.
         rows: rows of Psi whose multipliers, with opposite sign, are watched after the conditions.

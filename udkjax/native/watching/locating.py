@@ -34,8 +34,8 @@ def write_locate(module: WatchMemory):
     f.call("look", work)
     event, seeks = crossed(), s.seeks > 0.5
     is_found = seeks & (event >= 0.0)
-    # A step to the crossing lies between two breakpoints. Right behind the first, and if the second has been reached, the
-    # crossing on the polynomial is taken: it is as accurate as the states.
+    # A step to the crossing lies between two breakpoints. Just after the first breakpoint, and if the second has been reached,
+    # the crossing is located on the polynomial instead, which is as accurate as the states.
     lands = is_found & (s.high - f.max(s.point0_t, s.fresh) > s.smallest * LEAST_STEP) & (s.lands < 0.5)
     s.where(seeks, stops=f.select(lands, zero, one), seeks=zero)
     s.where(is_found, event=event, sure_t=s.high, target=s.high)
@@ -77,7 +77,7 @@ def write_land(module: WatchMemory):
     goes_on = arrived & ~is_small & (s.landings < float(MOST_LANDINGS)) & (f.abs(change) < s.target - s.point2_t)
     s.where(goes_on, landing=float(WANTED), target=s.target + change, landings=s.landings + 1.0)
     is_complete, change = arrived & ~goes_on, f.select(is_small, change, zero)
-    change = f.max(change, s.start - s.point3_t)  # with a slow condition the correction may lead to before the start
+    change = f.max(change, s.start - s.point3_t)  # with a slow condition the corrected time may precede the start
     ahead = module.broadcast(f, change)
     is_exact = is_complete & is_small
     s.where(is_exact, sure_t=s.point3_t + change)

@@ -236,6 +236,6 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
         elif isinstance(item, Mapping) and section in DRAWN:
             entries.append(SceneEntry(section, k, name, cls, item))
         else:
-            problem = f"{where(section, k, name)}: must be a table or of class {cls.__name__}, is a {type(item).__name__}"
+            problem = f"{where(section, k, name)}: must be a table or of class {cls.__name__}, not a {type(item).__name__}"
             entries.append(SceneEntry(section, k, name, None, {}, problem))
     return entries

@@ -59,7 +59,7 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
     if not named["link"] and not named["body"]:
         problems.append("link: a drawing needs at least one link")
     if fixed_pins != ground:
-        problems.append(f"ground: must be a list of pins, is {abbreviate(ground)}")
+        problems.append(f"ground: must be a list of pins, not {abbreviate(ground)}")
     problems += [
         f"ground[{k}]: no pin named {quote(p)}{suggestion(p, named['pin'])}"
         for k, p in enumerate(fixed_pins)

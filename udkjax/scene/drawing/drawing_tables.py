@@ -37,7 +37,7 @@ def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneE
     tables = {key: scene.get(key, {}) for key in ("pins", "velocities")}
     for key, table in tables.items():
         if not isinstance(table, dict):
-            problems.append(f"{key}: must be a table, such as [{key}] with A = [0, 1] below, is {abbreviate(table)}")
+            problems.append(f"{key}: must be a table, such as [{key}] with A = [0, 1] below, not {abbreviate(table)}")
             return
     pins, velocities = tables.values()
     problems += [f"velocities.{name}: no pin of this name{suggestion(name, pins)}" for name in velocities if name not in pins]

@@ -50,7 +50,7 @@ class Units:
         self.problems: list[str] = []
         self.chosen: dict[str, str] = {}
         if chosen is not None and not isinstance(chosen, Mapping):
-            self.problems.append(f'units: must be a table such as {{length = "mm"}}, is {abbreviate(chosen)}')
+            self.problems.append(f'units: must be a table such as {{length = "mm"}}, not {abbreviate(chosen)}')
             return
         for kind, unit in (chosen or {}).items():
             if kind not in QUANTITY_KINDS:
@@ -58,7 +58,7 @@ class Units:
                 self.problems.append(f"units.{kind}: unknown quantity{known}")
             elif not isinstance(unit, str):
                 self.problems.append(
-                    f"units.{kind}: must be a unit, such as {quote(QUANTITY_KINDS[kind])}, is {abbreviate(unit)}"
+                    f"units.{kind}: must be a unit, such as {quote(QUANTITY_KINDS[kind])}, not {abbreviate(unit)}"
                 )
             else:
                 try:

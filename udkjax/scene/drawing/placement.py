@@ -142,7 +142,7 @@ def pair_mistakes(layout: PinLayout, pin: str, of: tuple[str, ...]) -> Iterator[
     members = layout.members(pin)
     listed = ", ".join(members) or "none"
     if not of and len(members) != 2:
-        yield f"pin: at {quote(pin)} there must meet two links, or one and the ground; there are {listed}" + (
+        yield f"pin: {quote(pin)} must join two links, or a link and the ground; it joins {listed}" + (
             "; say which two, such as of = [" + ", ".join(map(quote, members[:2])) + "]" if len(members) > 2 else ""
         )
     elif of and (len(of) != 2 or of[0] == of[1]):

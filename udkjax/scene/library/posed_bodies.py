@@ -49,7 +49,7 @@ def _as_concrete(value: ArrayLike) -> ArrayLike:
 
 
 def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: OneOrMore) -> tuple[PyTree, PyTree]:
-    """Return a function of s and its derivative for a rate of s, exact to rounding: by JAX, or by a complex step in NumPy.
+    """Return a function of s and its derivative for a rate of s, exact up to rounding: by JAX, or by a complex step in NumPy.
 
     Source: Squire and Trapp, Using complex variables to estimate derivatives of real functions, SIAM Review 40, 1998.
     """

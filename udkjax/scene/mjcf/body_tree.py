@@ -119,7 +119,7 @@ class BodyTree:
 
     def _add_inertial(self, read: AttributeReader, body: int, frame: SpaceFrame) -> None:
         if self.bodies[body].given:
-            read.refuse("its body has another one")
+            read.refuse("the body has another one")
         self.bodies[body].given.append(inertial_mass(read, frame.within(self.settings.frame(read))))
 
     def _add_joint(self, read: AttributeReader, body: int, frame: SpaceFrame) -> None:
@@ -127,7 +127,7 @@ class BodyTree:
         axis = frame.axes @ read.numbers("axis", (0.0, 0.0, 1.0))
         size = float(np.linalg.norm(axis))
         if kind not in JOINTS:
-            cure = "; a planar body that is free has two slides and a hinge" if kind == "free" else ""
+            cure = "; a free planar body has two slides and a hinge" if kind == "free" else ""
             read.refuse(f"a {kind} joint does not stay in a plane{cure}")
         elif not body:
             read.refuse("the world has no joints")

@@ -65,7 +65,7 @@ class CoupledLengths:
             length = self._distance(readers, read)
         given = read.numbers("springlength", (-1.0, -1.0), fewest=1)
         if "springlength" in read and len(read.text("springlength").split()) == 2 and given[1] > given[0]:
-            read.refuse("a springlength of two different values, between which a tendon is slack, is not taken over")
+            read.refuse("a springlength of two different values, between which a tendon is slack, is not supported")
         return length if length is None or given[0] == -1 else length._replace(at_rest=float(given[0]))
 
     def _distance(self, sites: list[AttributeReader], read: AttributeReader) -> CoupledLength | None:
@@ -77,7 +77,7 @@ class CoupledLengths:
 
     def _ends(self, sites: list[AttributeReader], read: AttributeReader) -> Ends | None:
         if [site.element.tag for site in sites] != ["site", "site"]:
-            read.refuse("a spatial tendon between two sites is a spring; over more sites, geoms or pulleys it is not taken over")
+            read.refuse("a spatial tendon between two sites is a spring; over more sites, geoms or pulleys it is not supported")
             return None
         known = self.model.tree.sites
         located = [known[site.text("site")] for site in sites if self.model.tree.find(site, "site", known, "site")]
@@ -94,7 +94,7 @@ class CoupledLengths:
         if not all(term.angles for term, _ in terms):
             if len(terms) == 1 and terms[0][1] == 1.0:
                 return terms[0][0]
-            read.refuse("couples slides: not taken over")
+            read.refuse("couples slides: not supported")
             return None
         angles: dict[int, float] = {}
         for term, factor in terms:
@@ -104,6 +104,6 @@ class CoupledLengths:
         angles = {body: coefficient for body, coefficient in sorted(angles.items()) if abs(coefficient) > EVEN * largest}
         length, at_rest = (sum(factor * getattr(term, name) for term, factor in terms) for name in ("length", "at_rest"))
         if min(angles, default=0) < 0:
-            read.refuse("couples one of the two hinges of a body: not taken over")
+            read.refuse("couples one of the two hinges of a body: not supported")
             return None
         return CoupledLength(length, at_rest, angles)

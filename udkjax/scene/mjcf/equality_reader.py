@@ -41,7 +41,7 @@ class EqualityReader:
     def _add_weld(self, read: AttributeReader) -> None:
         ends, rotation = self._attachment(read, "body2")
         if not read.number("torquescale", 1.0):
-            read.refuse("with a torquescale of 0 it is a connect: write one")
+            read.refuse("with a torquescale of 0 it acts as a <connect>: write a <connect>")
         normal = self.model.plane.normal
         if np.linalg.norm(rotation @ normal - normal) > AXES_TOL:
             read.refuse("turns its bodies out of the plane of the motion")
@@ -85,13 +85,13 @@ class EqualityReader:
     def _add_tendon(self, read: AttributeReader) -> None:
         offset, _ = self._line(read)
         if "tendon2" in read:
-            read.refuse("couples two tendons: not taken over")
+            read.refuse("couples two tendons: not supported")
         self._hold(read, self.lengths.named_tendon(read, "tendon1"), offset)
 
     def _line(self, read: AttributeReader) -> tuple[float, float]:
         coefficients = read.numbers("polycoef", (0.0, 1.0, 0.0, 0.0, 0.0), fewest=1)
         if coefficients[2:].any():
-            read.refuse(f"polycoef={quote(read.text('polycoef'))} is not linear: only its first two numbers are taken over")
+            read.refuse(f"polycoef={quote(read.text('polycoef'))} is not linear: only its first two numbers are supported")
         return float(coefficients[0]), float(coefficients[1])
 
     def _hold(self, read: AttributeReader, length: CoupledLength | None, offset: float) -> None:
@@ -119,7 +119,7 @@ class EqualityReader:
                 self.model.names((body1, body2)), radii, internal, self.model.names((carrier,))[0]
             )
         else:
-            read.refuse("holds a slide, or couples more than three bodies: not taken over")
+            read.refuse("holds a slide, or couples more than three bodies: not supported")
 
     def _put_joint(self, read: AttributeReader, ends: Ends, joint: Joint) -> None:
         self.joints[self._joint_name(read, "-".join(self.model.names(ends.bodies)))] = joint

@@ -46,11 +46,11 @@ class ForceReader:
         """Add the spring and the damper of a joint or a tendon, and refuse its unsupported attributes."""
         disabled = self.settings.disabled
         if "limit" not in disabled and self.settings.is_limited(read, "limited", "range"):
-            self._leave_or_refuse("limits", read, f"range is not taken over: {self._limit_cure(name, length, read)}")
+            self._leave_or_refuse("limits", read, f"range is not supported: {self._limit_cure(name, length, read)}")
         if "frictionloss" not in disabled and read.number("frictionloss"):
-            self._leave_or_refuse("frictionloss", read, "frictionloss is not taken over: give `udk.Friction`")
+            self._leave_or_refuse("frictionloss", read, "frictionloss is not supported: give `udk.Friction`")
         if "actuation" not in disabled and self.settings.is_limited(read, "actuatorfrclimited", "actuatorfrcrange"):
-            self._leave_or_refuse("forceranges", read, "actuatorfrcrange is not taken over: forces are not cut off")
+            self._leave_or_refuse("forceranges", read, "actuatorfrcrange is not supported: forces have no limits here")
         stiffness, damping = (
             0.0 if flag in disabled else self._linear_term(read, key)
             for key, flag in (("stiffness", "spring"), ("damping", "damper"))
@@ -60,7 +60,7 @@ class ForceReader:
     def _linear_term(self, read: AttributeReader, name: str) -> float:
         value = read.numbers(name, (0.0, 0.0, 0.0), fewest=1)
         if value[1:].any():
-            read.refuse(f"{name}={quote(read.text(name))} grows with powers of the motion: only its first number is taken over")
+            read.refuse(f"{name}={quote(read.text(name))} grows with powers of the motion: only its first number is supported")
         return float(value[0])
 
     def _limit_cure(self, name: str, length: CoupledLength, read: AttributeReader) -> str:
@@ -75,7 +75,7 @@ class ForceReader:
     def _leave_or_refuse(self, kind: str, read: AttributeReader, text: str) -> None:
         """Refuse a part of the model unless the caller leaves out parts of its kind."""
         if kind not in self.leave_out:
-            read.refuse(f'{text}; leave_out=["{kind}"] reads the model without')
+            read.refuse(f'{text}; leave_out=["{kind}"] leaves it out')
 
     def _add_actuator(self, read: AttributeReader, control: float) -> None:
         kind = read.element.tag
@@ -91,7 +91,7 @@ class ForceReader:
             if read.choice("biastype", ("none", "affine"), "none") == "affine":
                 bias = read.numbers("biasprm", (0.0, 0.0, 0.0), fewest=1)
         if self.settings.is_limited(read, "forcelimited", "forcerange"):
-            self._leave_or_refuse("forceranges", read, "forcerange is not taken over: forces are not cut off")
+            self._leave_or_refuse("forceranges", read, "forcerange is not supported: forces have no limits here")
         if self.settings.is_limited(read, "ctrllimited", "ctrlrange"):
             control = float(np.clip(control, *read.numbers("ctrlrange", (0.0, 0.0))))
         if "tendon" in read:
@@ -113,7 +113,7 @@ class ForceReader:
         if not stiffness and not damping and constant is None:
             return
         if stiffness < 0 or damping < 0:
-            read.refuse("pushes away from where it is, or along the motion: stiffness and damping must not be negative")
+            read.refuse("stiffness and damping must not be negative")
         elif length.slide:
             self._add_slide_force(name, length, read, force)
         elif length.ends and constant is None:
@@ -127,8 +127,8 @@ class ForceReader:
             if constant is not None:
                 self._put(name, Torque(bodies, factor * constant))
         else:
-            action = "with a constant force between two sites" if length.ends else "on angles of more bodies than two"
-            read.refuse(f"acts {action}, or on one of two hinges of a body: not taken over")
+            action = "with a constant force between two sites" if length.ends else "on the angles of more than two bodies"
+            read.refuse(f"acts {action}, or on one of two hinges of a body: not supported")
 
     def _add_slide_force(self, name: str, length: CoupledLength, read: AttributeReader, force: LinearForce) -> None:
         stiffness, damping, at_rest, constant = force
@@ -139,7 +139,7 @@ class ForceReader:
         hinges = [j for j in self.model.tree.bodies[slider].joints if j.kind == "hinge"]
         pin, axis = self.model.plane.flat((hinges or [joint])[0].anchor), self.model.plane.flat(joint.axis)
         if kinds not in ("s", "sh", "hs"):
-            read.refuse("acts on a slide of a body that has several: not taken over")
+            read.refuse("acts on a slide of a body with several slides: not supported")
             return
         owner, other, axis = (slider, holder, -axis) if kinds == "hs" else (holder, slider, axis)
         bodies, end = self.model.names((owner, other)), self.model.local(other, pin)
@@ -164,7 +164,7 @@ class ForceReader:
                 )
                 self._put(name, force_on_body)
         else:
-            read.refuse("acts on a slide between two moving bodies that turn against each other: not taken over")
+            read.refuse("acts on a slide between two moving bodies that turn against each other: not supported")
 
     def _put(self, name: str, force: ForceElement) -> None:
         self.forces[unique_name(name, self.forces)] = force

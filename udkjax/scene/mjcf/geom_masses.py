@@ -54,7 +54,7 @@ def geom_shape(read: AttributeReader, frame: SpaceFrame) -> tuple[str, np.ndarra
         axes = shortest_turn_of_z(direction) if half > 0 else np.eye(3)
         frame = frame.within(SpaceFrame(axes, ends.mean(axis=0)))
     if not np.all(size[: SHAPES[kind]] > 0):
-        read.refuse(f"the sizes of a {kind} must be greater than zero, are {' '.join(f'{x:g}' for x in size[: SHAPES[kind]])}")
+        read.refuse(f"the sizes of a {kind} must be greater than zero, not {' '.join(f'{x:g}' for x in size[: SHAPES[kind]])}")
     return kind, size, frame
 
 

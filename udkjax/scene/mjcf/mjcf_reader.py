@@ -54,7 +54,7 @@ def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), k
     path = "" if isinstance(source, str) and is_xml(source) else os.fspath(source)
     wrong = [name for name in leave_out if name not in LEFT_OUT]
     if isinstance(leave_out, str) or wrong:
-        raise SceneError([f"leave_out: must be a list of {', '.join(LEFT_OUT)}, is {abbreviate(leave_out)}"], path)
+        raise SceneError([f"leave_out: must be a list of {', '.join(LEFT_OUT)}, not {abbreviate(leave_out)}"], path)
     try:
         return mechanism_of_text(Path(path).read_text(encoding="utf-8") if path else str(source), path, leave_out, key)
     except UnicodeDecodeError as error:
@@ -98,7 +98,7 @@ def mechanism_of_text(
     if "contact" not in settings.disabled and "contacts" not in leave_out and (pairs := contact_pairs(root, tree, plane)):
         further = f" and {len(pairs) - 3} more pairs" * (len(pairs) > 3)
         messages.append(
-            f"contacts are not taken over, of {'; '.join(pairs[:3])}{further}: `udk.Contact` is an event for each point that hits"
+            f"contacts are not read: {'; '.join(pairs[:3])}{further}; give an event `udk.Contact` for each point that hits"
         )
     for message in messages:
         warnings.warn(message, MjcfWarning, stacklevel=stacklevel)
@@ -147,7 +147,7 @@ def _tree_joint(model: PlaneModel, body: int, joints: list[TreeJoint]) -> Joint 
     if kinds == "hh" and abs(anchors[1] - anchors[0]) > AXES_TOL * model.size:
         ends = [model.local(holder, anchors[0]), model.local(body, anchors[1])]
         return Distance(names, ends, abs(anchors[1] - anchors[0]))
-    text = "its joints are more than a body has in a plane: one hinge and two slides that are not parallel, at most"
+    text = "a body in a plane has at most one hinge and two slides that are not parallel"
     model.tree.settings.problems.append(f"{model.tree.bodies[body].where}: {text}")
     return None
 
@@ -183,12 +183,12 @@ def _add_armature(
     if armature < 0:
         joint.read.refuse("armature must not be negative")
     elif model.has_rod(number):
-        joint.read.refuse("the armature of one of two hinges of a body is not taken over")
+        joint.read.refuse("the armature of one of two hinges of a body is not supported")
     elif joint.kind == "slide":
         weight = model.plane.flat(model.tree.settings.gravity) * np.conj(model.plane.flat(joint.axis))
         if holder or not alone or abs(weight.real) > AXES_TOL * abs(weight):
             joint.read.refuse(
-                "the armature of a slide is taken over on the ground and across gravity, of a body without other joints"
+                "the armature of a slide is supported only on the ground, across gravity, and without other joints of its body"
             )
         bodies[body2] = replace(body, mass=body.mass + armature)
     elif not holder:

@@ -86,7 +86,8 @@ class _Writer:
         if "world" in mechanism.bodies:
             self.problems.append('body "world": in MJCF this is the name of the ground')
         self.problems += [
-            f"driver {quote(name)}: MJCF prescribes no motion; a <velocity> actuator comes near it" for name in mechanism.drivers
+            f"driver {quote(name)}: MJCF cannot prescribe a motion; a <velocity> actuator is similar"
+            for name in mechanism.drivers
         ]
 
     def text(self) -> str:
@@ -151,7 +152,7 @@ class _Writer:
         joint = self.mechanism.joints[joint_name]
         gap = float(np.max(np.abs(joint.residual(0.0, *(self.frames[body] for body in joint.bodies)))))
         if gap > OPEN_LOOP * max(self.size, 1.0):
-            cure = "MJCF takes bodies where they stand: start them from `udk.assemble`"
+            cure = "MJCF uses the initial positions as they are: close them with `udk.assemble`"
             self.problems.append(f"joint {quote(joint_name)}: is open by {gap:.3g} (m, rad), and {cure}")
         first, second = (self.frames[body] for body in joint.bodies)
         if isinstance(joint, Revolute):
@@ -228,7 +229,9 @@ class _Writer:
 
     def _add_force(self, name: str, force: Any) -> None:
         if any(isinstance(value, Held) for value in vars(force).values()):
-            self.problems.append(f"force {quote(name)}: MJCF has no samples; give a number, and MuJoCo the samples as controls")
+            self.problems.append(
+                f"force {quote(name)}: MJCF has no samples; give a number here, and pass the samples to MuJoCo as controls"
+            )
         elif isinstance(force, Spring):
             attributes = {"springlength": _numbers(force.length), "stiffness": _numbers(force.stiffness)}
             self._add_spatial(name, force.bodies, force.points, **attributes, **_damping(force.damping))
@@ -272,7 +275,7 @@ class _Writer:
         """Add a tendon that is a sum of hinges; return its name, or an empty string if the sum is empty."""
         if not hinges:
             self.problems.append(
-                f"{kind} {quote(name)}: its bodies do not turn against each other, and MJCF knows angles of hinges alone"
+                f"{kind} {quote(name)}: its bodies do not turn against each other, and MJCF only has the angles of hinges"
             )
             return ""
         title = self._unique(name)

@@ -41,7 +41,9 @@ class ModelSettings:
             at_top = element in root.children
             name = element.attributes.get("class", MAIN if at_top else "")
             if not name or (at_top and name != MAIN):
-                problems.append(f"{element.where}: class={quote(name)}: it is main at the top, and needs a name of its own below")
+                problems.append(
+                    f"{element.where}: class={quote(name)}: the default class at the top is main; rename the classes below it"
+                )
             class_defaults = self._defaults.setdefault(
                 name, {tag: dict(values) for tag, values in self._defaults[parent].items()}
             )
@@ -54,7 +56,7 @@ class ModelSettings:
     def read(self, element: XmlElement, childclass: str = MAIN, section: str = "") -> AttributeReader:
         """Return the attributes of an element with the defaults of its class, or of the class of the body that holds it.
 
-        `section` is the tag of its defaults, if it differs from its own tag.
+        `section` is the tag of the defaults, if it differs from the tag of the element.
         """
         name = element.attributes.get("class", childclass)
         if name not in self._defaults:

@@ -99,10 +99,10 @@ _KNOWN: dict[str, _Attributes] = {
     "key": _Attributes("name qpos qvel ctrl", "time act mpos mquat plastic"),
 }
 _CURES = {
-    "freejoint": 'a planar body that is free has two <joint type="slide"/> and a hinge',
+    "freejoint": 'a free planar body has two <joint type="slide"/> and a hinge',
     "springdamper": "give stiffness and damping",
     "dampratio": "give kv",
-    "gravcomp": "leave out the weight by a <motor>",
+    "gravcomp": "balance the weight by a <motor>",
 }
 
 
@@ -120,13 +120,13 @@ def unknown_parts(root: XmlElement) -> list[str]:
         key = path if parent.tag in CONTEXTS and element.tag in ("joint", "tendon", "site", "geom") else element.tag
         if key not in _KNOWN:
             skipped.add(id(element))
-            problems.append(f"{element.where}: not taken over{_cure(element.tag)}")
+            problems.append(f"{element.where}: not supported{_cure(element.tag)}")
             continue
         known = _KNOWN[key]
         words = {*known.used.split(), *known.idle.split()}
         for name, value in element.attributes.items():
             if name not in words and not _is_without_effect(value, known.inactive.get(name)):
-                problems.append(f"{element.where}: {name}={quote(value)} is not taken over{_cure(name)}")
+                problems.append(f"{element.where}: {name}={quote(value)} is not supported{_cure(name)}")
     return problems
 
 

@@ -68,7 +68,7 @@ def _included(element: XmlElement, source: str, within: tuple[str, ...]) -> list
     name = element.attributes.get("file", "")
     try:
         if not source or name in within:
-            why = "it includes itself" if source else "a text has no folder to find it in: read the model from its file"
+            why = "it includes itself" if source else "a string has no folder to find it in: read the model from its file"
             raise SceneError([f"{element.where}: file={quote(name)} cannot be included: {why}"], source)
         text = (Path(source).parent / name).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -102,7 +102,7 @@ class AttributeReader:
         return default
 
     def numbers(self, name: str, default: Sequence[float] | np.ndarray, fewest: int | None = None) -> np.ndarray:
-        """Return finite numbers: as many as the default, or at least `fewest`, completed from the default."""
+        """Return finite numbers, as many as the default has; if at least `fewest` are given, the default supplies the rest."""
         if name not in self.values:
             return np.array(default, float)
         words = self.values[name].split()

@@ -196,8 +196,8 @@ class Engine {
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
 
-  /** The conditions of events at a state: g, its first and second rates, derivatives by t, q and v, and for each impact the
-   *  velocities due to a unit impulse along it. */
+  /** The conditions of events at a state: g, its first and second rates, derivatives with respect to t, q and v, and for each
+   *  impact the velocities due to a unit impulse along it. */
   conditions(numbers, settings, state) {
     const {data: {events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
     const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
@@ -215,7 +215,7 @@ class Engine {
   /** One over the mass, or the inertia, of each coordinate. */
   inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
 
-  /** Energies (J) at the states of a run and, if asked for, the force or torque of each driver (N or N m) and the forces x, y (N)
+  /** Energies (J) at the states of a run and, if requested, the force or torque of each driver (N or N m) and the forces x, y (N)
    *  of the joints of `data.forces`, for all joints time by time; these are empty if rows are redundant: forces are not unique. */
   measure(parameters, run, efforts = false, forces = false) {
     if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
@@ -250,7 +250,7 @@ class Engine {
     return found;
   }
 
-  /** `measure` for a run in which contacts come to rest: each part by the engine that holds its contact. */
+  /** `measure` for a run in which contacts come to rest: each part of the run is measured by the engine that computed it. */
   measureParts(parameters, {ts, q, v, count, held, marks}, efforts, forces) {
     const n = this.size, parts = [];
     for (let from = 0, to = 0; from < count; from = to) {

@@ -136,7 +136,7 @@ export class CurvesPanel {
     return Math.hypot(run.v[k] - w * (at[1] - run.q[k + 1]), run.v[k + 1] + w * (at[0] - run.q[k]));
   }
 
-  /** The angle (degrees, 0 to 180) between two links at their pin: from it to the farthest other pin of each. */
+  /** The angle (degrees, 0 to 180) at a pin between the lines to the farthest other pin of each of its two links. */
   angles(pin, each) {
     const {document} = this.studio, here = placeOf(document, pin), met = members(document, pin).filter(name => name !== "ground");
     const links = met.map(name => list(document, "link").findIndex(link => link.name === name));

@@ -17,10 +17,10 @@ function read(value, plain, units) {
   return found[2] === undefined ? +found[1] * plain : +found[1] * (units[found[2]] ?? NaN);
 }
 
-/** A length in metres, from a number or a text such as "12 mm"; NaN if it is neither. */
+/** A length in metres, from a number or a string such as "12 mm"; NaN if it is neither. */
 export const length = (value, document) => read(value, lengthUnit(document), LENGTHS);
 
-/** An angle in radians, from a number or a text such as "30 deg"; NaN if it is neither. */
+/** An angle in radians, from a number or a string such as "30 deg"; NaN if it is neither. */
 export const angle = (value, document) => read(value, angleUnit(document), ANGLES);
 
 /** A place in metres, or null if it is not a pair of lengths. */
@@ -38,7 +38,7 @@ export function direction(value, document) {
 
 export const tidy = x => +(+x).toPrecision(DIGITS) + 0;
 
-/** Metres as a number in the file's unit, or, if the old value was a text with a unit, as a text in that unit. */
+/** Metres as a number in the file's unit, or, if the old value was a string with a unit, as a string in that unit. */
 export function written(metres, document, old) {
   const found = typeof old === "string" ? TEXT.exec(old) : null;
   const unit = found?.[2] && LENGTHS[found[2]];

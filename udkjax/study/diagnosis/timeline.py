@@ -1,8 +1,8 @@
 """The rank of the constraints along a trajectory: singular values at the output times, and rank changes between them.
 
 A singular value that vanishes at t* is proportional to |t - t*| nearby: its samples have a minimum with a kink, which can be
-located to rounding. Between output times the trajectory is integrated again from the previous one, and interpolated by a quintic
-through q, v and a.
+located to machine precision. Between output times the trajectory is integrated again from the previous one, and interpolated by
+a quintic through q, v and a.
 """
 
 from itertools import pairwise

@@ -122,7 +122,7 @@ def design_experiment(
     experiments = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
     problems = [] if experiments else ["candidates: the list is empty"]
     if not 1 <= pick <= max(len(experiments), 1):
-        problems.append(f"pick must be from 1 to {len(experiments)}, the number of candidates, is {pick}")
+        problems.append(f"pick must be from 1 to {len(experiments)}, the number of candidates, not {pick}")
     if problems:
         raise IdentificationError(problems)
     ts = np.asarray(ts, float)
@@ -168,7 +168,7 @@ def _candidate(given: Candidate | Mapping[str, ArrayLike] | Start | State, k: in
     elif isinstance(given, Start | State):
         candidate = Candidate(initial_state=given)
     if candidate is None:
-        raise IdentificationError([f"candidate {k + 1}: must be a Candidate, conditions or a start, is {type(given).__name__}"])
+        raise IdentificationError([f"candidate {k + 1}: must be a Candidate, conditions or a start, not {type(given).__name__}"])
     return candidate if candidate.name else Candidate(candidate.conditions, candidate.initial_state, f"candidate {k + 1}")
 
 

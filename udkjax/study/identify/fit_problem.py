@@ -180,9 +180,9 @@ class FitProblem:
         yield (u.values(z)[:, which] - u.mean[which]) / u.sigma[which], J
 
     def by_unknowns(self, by: np.ndarray, run: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Convert derivatives by x and by the state of each row's run, (B, R, P + S), to derivatives by z, (B, R, K)."""
+        """Convert derivatives with respect to x and the state of each row's run, (B, R, P + S), to those for z, (B, R, K)."""
         P = len(self.unknowns.names)
-        J = np.zeros((*by.shape[:2], self.K + 1))  # the last column collects the derivatives by unused entries
+        J = np.zeros((*by.shape[:2], self.K + 1))  # the last column collects the derivatives for unused entries
         columns = self.columns[run] % (self.K + 1)
         np.put_along_axis(J, np.broadcast_to(columns, (len(z), *columns.shape)), by[..., P:], 2)
         J[..., :P] = by[..., :P] * self.unknowns.dx_dz(z[:, :P])[:, None]

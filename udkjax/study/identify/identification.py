@@ -107,7 +107,7 @@ def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None
     """Return first guesses of all unknowns; those of initial states are zero."""
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
     if not 0 <= n_starts <= MOST_STARTS:
-        raise IdentificationError([f"n_starts: must be a number of guesses between 0 and {MOST_STARTS:,}, is {n_starts}"])
+        raise IdentificationError([f"n_starts: must be a number of guesses between 0 and {MOST_STARTS:,}, not {n_starts}"])
     if guesses is None:
         return first
     given = np.asarray(guesses, float)

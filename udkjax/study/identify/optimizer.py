@@ -77,7 +77,7 @@ def named_loss(name: str, residuals: int) -> Loss:
         return squares
     if name in ROBUST:
         return partial(robust, rho=ROBUST[name], residuals=residuals)
-    raise IdentificationError([f"loss must be 'least_squares', {' or '.join(map(repr, ROBUST))}, is {name!r}"])
+    raise IdentificationError([f"loss must be 'least_squares', {' or '.join(map(repr, ROBUST))}, not {name!r}"])
 
 
 def robust(plain: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:

@@ -135,16 +135,16 @@ def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unkn
         raise ValueError("needs a first guess: Parameter(..., guess=...)")
     guess = float(given)
     if not np.isfinite(guess):
-        raise ValueError(f"the first guess must be a finite number, is {guess}")
+        raise ValueError(f"the first guess must be a finite number, not {guess}")
     usual = "bounded" if p.bounds is not None else "positive" if _is_positive(mechanism, target, guess) else "free"
     kind = p.transform or usual
     if kind not in get_args(Transform):
-        raise ValueError(f"transform must be one of {', '.join(get_args(Transform))}, is {kind!r}")
+        raise ValueError(f"transform must be one of {', '.join(get_args(Transform))}, not {kind!r}")
     low, high = p.bounds if p.bounds is not None else (np.nan, np.nan)
     if p.bounds is not None and not np.isfinite(p.bounds).all():
-        raise ValueError(f'bounds must be two finite numbers, are ({low}, {high}); without an upper bound, use "positive"')
+        raise ValueError(f'bounds must be two finite numbers, not ({low}, {high}); without an upper bound, use "positive"')
     if low >= high:
-        raise ValueError(f"bounds must be (low, high), the lower one first, are ({low}, {high})")
+        raise ValueError(f"bounds must be (low, high), the lower one first, not ({low}, {high})")
     if kind == "bounded" and not low < guess < high:
         raise ValueError(f"the first guess {guess:g} must be between the bounds ({low}, {high}): change the guess or the bounds")
     if kind == "positive" and not guess > 0:
@@ -154,7 +154,7 @@ def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unkn
         raise ValueError("prior must be (mean, standard deviation), with a deviation > 0")
     scale = p.scale if p.scale is not None else abs(guess) or 1.0
     if not scale > 0:
-        raise ValueError(f"scale must be > 0, is {scale}")
+        raise ValueError(f"scale must be > 0, not {scale}")
     at_scene_value = part.same and guess == part.value
     return Unknown(name, _units(mechanism, target), target, kind, at_scene_value, guess, low, high, scale, mean, sigma)
 
@@ -189,7 +189,7 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
     """Return the numbers that a parameter refers to; an array has one for each entry."""
     of, scaled = p.of, p.share == "scale"
     if p.share not in ("value", "scale"):
-        raise ValueError(f'share must be "value" or "scale", is {p.share!r}')
+        raise ValueError(f'share must be "value" or "scale", not {p.share!r}')
     if isinstance(of, str):
         of, scaled = _read(mechanism, of, scaled)
     if isinstance(of, Length):

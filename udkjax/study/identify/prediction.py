@@ -1,4 +1,4 @@
-"""Predictions of measured values, with exact derivatives by all unknowns.
+"""Predictions of measured values, with exact derivatives with respect to all unknowns.
 
 A member is one run: a mechanism with its own parameters along one record. Parameters, initial states, times and tolerances are
 inputs of a compiled program; the mechanism's structure, the targets, the channels and the length of a record are static.
@@ -41,7 +41,7 @@ class Runs(NamedTuple):
     ts: np.ndarray  # (N, T) s; the motion begins at the first time
     q: np.ndarray | None  # (N, bodies, 3) guess of the initial state; None: that of the scene
     v: np.ndarray | None
-    bases: np.ndarray  # (N, 2, 3 bodies, S) derivatives of q and v by the unknowns of the initial state
+    bases: np.ndarray  # (N, 2, 3 bodies, S) derivatives of q and v with respect to the unknowns of the initial state
     conditions: Mapping[str, np.ndarray]  # values by name, (N, ...)
 
 
@@ -54,7 +54,7 @@ class Members(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Predicted values of members, with derivatives by (x, shift), and the results of the runs."""
+    """Predicted values of members, with derivatives with respect to (x, shift), and the results of the runs."""
 
     y: Float[np.ndarray, "M T C"]
     dy: Float[np.ndarray, "M T C P+S"]

@@ -123,10 +123,10 @@ class _TableReader:
         kind, shape = (cells.dtype.kind, cells.shape) if isinstance(cells, np.ndarray) else ("O", (len(cells),))
         if kind in "mM" or shape != (count,):
             found = f"type {np.asarray(cells).dtype}" if kind in "mM" else f"shape {shape}"
-            self.add(heading, f"must be {count} numbers, is of {found}")
+            self.add(heading, f"must be {count} numbers, but is of {found}")
             return np.full(count, np.nan)
         found = np.asarray(cells, float) if kind in "iuf" else np.array([_number(cell) for cell in cells], float)
-        self.add_each(heading, np.flatnonzero(np.isinf(found)), lambda k: f"must be a number, is {abbreviate(cells[k])}")
+        self.add_each(heading, np.flatnonzero(np.isinf(found)), lambda k: f"must be a number, not {abbreviate(cells[k])}")
         return scale * found
 
     def rows_by_record(self) -> list[tuple[str, np.ndarray]]:

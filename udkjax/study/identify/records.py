@@ -128,7 +128,7 @@ class Record:
 
     def _check_times(self, t0: float | None, problems: list[str]) -> None:
         if self.times.ndim != 1 or not self.times.size:
-            problems.append(f"time: must be a vector of at least one time, is of shape {self.times.shape}")
+            problems.append(f"time: must be a vector of at least one time, but is of shape {self.times.shape}")
             self.times = np.zeros(0)
         elif not np.isfinite(self.times).all():
             problems.append(f"time: entry {int(np.flatnonzero(~np.isfinite(self.times))[0])} is not a finite number")
@@ -149,7 +149,7 @@ class Record:
                 shapes = self.times.shape, sigma.shape
                 used = sigma[np.isfinite(self.values[channel])] if sigma.shape == self.times.shape else sigma
                 if sigma.shape != self.times.shape:
-                    problems.append(f"noise of {quote(str(channel))}: must be a number or of shape {shapes[0]}, is {shapes[1]}")
+                    problems.append(f"noise of {quote(str(channel))}: must be a number or of shape {shapes[0]}, not {shapes[1]}")
                 elif not (np.isfinite(used).all() and (used > 0).all()):
                     problems.append(f"noise of {quote(str(channel))}: a standard deviation must be a finite number > 0")
                 found[channel] = sigma
@@ -168,7 +168,7 @@ def output_times(record: Record) -> tuple[Float[np.ndarray, "T"], int]:
 
 
 def pad_times(ts: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "length"]:
-    """Return the times, padded with slightly later times to a length."""
+    """Return the times, padded to a length with slightly later times."""
     span = max(ts[-1] - ts[0], PADDING)
     return np.concatenate([ts, ts[-1] + PADDING * span * np.arange(1, length - len(ts) + 1)])
 
@@ -224,9 +224,9 @@ def _numbers(name: str, given: ArrayLike | Sequence[float], shape: tuple[int, ..
     try:
         array = np.asarray(given, float)
     except (TypeError, ValueError):
-        problems.append(f"{quote(name)}: must be numbers, is {given!r:.40}")
+        problems.append(f"{quote(name)}: must be numbers, not {given!r:.40}")
         return np.zeros(shape or 0)
     if shape is not None and array.shape != shape:
-        problems.append(f"{quote(name)}: must have a value for each of the {shape[0]} times, is of shape {array.shape}")
+        problems.append(f"{quote(name)}: must have a value for each of the {shape[0]} times, but is of shape {array.shape}")
         return np.zeros(shape)
     return array

@@ -59,7 +59,7 @@ def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: l
         yield _table_of_columns(source, [(str(key), value) for key, value in data.items()], problems)
     else:
         kinds = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of these"
-        problems.append(f"{source}: must be {kinds}, is {type(data).__name__}")
+        problems.append(f"{source}: must be {kinds}, not {type(data).__name__}")
 
 
 def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterator[Table]:
@@ -183,7 +183,7 @@ def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, pro
             columns[str(key)] = TableColumn(np.broadcast_to(variable.values, count), variable.attrs.get("units"))
         else:
             problems.append(
-                f"{source}, {quote(str(key))}: must be along {quote(time)}, is along {abbreviate(list(variable.dims))}"
+                f"{source}, {quote(str(key))}: must be along {quote(time)}, not along {abbreviate(list(variable.dims))}"
             )
     return Table(source, columns, [f"entry {k}" for k in range(count)], name)
 

@@ -24,8 +24,8 @@ from udkjax.study.noise import SIGNIFICANCE
 from udkjax.wording import join_names
 
 POOR_ERROR = 0.5  # standard error reported as large, relative to the value or to the scale of a parameter of either sign
-HIGH_CORRELATION = 0.98  # correlation at which a combination of two parameters is ten times less accurate than the other
-LEAST_NOISE = 1e-15  # noise below this, relative to the assumed noise, is rounding
+HIGH_CORRELATION = 0.98  # at this correlation, one combination of two parameters is ten times less accurate than the other one
+LEAST_NOISE = 1e-15  # noise below this, relative to the assumed noise, is a rounding error
 NOISE_ITERATIONS, EQUAL_NOISE = 50, 1e-10  # alternating updates of noise and gamma: largest number, relative tolerance
 # Coefficients below this, relative to the largest of a direction, count as zero. Directions are as accurate as this if their
 # singular value exceeds the errors of the Jacobian by the inverse factor.
@@ -36,7 +36,8 @@ COMMON_FACTOR_TOL = 1e-2  # relative difference of factors that are called a com
 class UnknownValues(NamedTuple):
     """The K unknowns at an estimate: parameters first, then nuisance unknowns.
 
-    `kinds` are "positive", "bounded" or "free", as in `parameters`; `dx_dz` are derivatives by the dimensionless unknowns.
+    `kinds` are "positive", "bounded" or "free", as in `parameters`; `dx_dz` are derivatives with respect to the dimensionless
+    unknowns.
     """
 
     names: Sequence[str]

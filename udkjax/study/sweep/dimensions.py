@@ -143,7 +143,7 @@ def _column(
     elif hasattr(values, "ppf"):
         problems.append(f"axis {quote(name)}: a distribution needs a design to draw from it, such as design=Sobol(1024)")
     elif not isinstance(values, Sized) or len(values) == 0:
-        problems.append(f"axis {quote(name)}: needs at least one value, is {abbreviate(values)}")
+        problems.append(f"axis {quote(name)}: needs at least one value, not {abbreviate(values)}")
     if len(problems) > before or values is None:
         return None
     if not callable(of) and any(target in CHOICES for target in of):
@@ -151,7 +151,7 @@ def _column(
     numbers = _numbers(values)
     may_be_nan = not callable(of) and all(target in _SETTING_OF_NUMBER for target in of)  # for members that do not use it
     if numbers is None or not np.all(np.isfinite(numbers) | (may_be_nan & np.isnan(numbers))):
-        problems.append(f"axis {quote(name)}: must be finite numbers, one entry per value, is {abbreviate(values)}")
+        problems.append(f"axis {quote(name)}: must be finite numbers, one entry per value, not {abbreviate(values)}")
         return None
     if not callable(of):
         problems += _misfits(mechanism, name, of, numbers)
@@ -215,7 +215,7 @@ def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.nda
         if target in NUMBERS and numbers.ndim != 1:
             yield f"axis {quote(name)}: {target} is a number, so its values are a list of numbers, not of shape {numbers.shape}"
         elif target in NUMBERS and np.any(numbers < 0):
-            yield f"axis {quote(name)}: {target} must not be negative, is {np.nanmin(numbers):g}"
+            yield f"axis {quote(name)}: {target} must not be negative, but is {np.nanmin(numbers):g}"
 
 
 def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:

@@ -131,7 +131,7 @@ def differences(before: JsonValue, now: JsonValue) -> list[str]:
             ]  # without the two lines of file names
             lines += [f"{path}: {'was' if line[0] == '-' else 'is'} {line[1:]}" for line in compared if line[0] != "@"]
         elif json.dumps(a) != json.dumps(b):  # as text, nan equals nan, and true differs from 1
-            lines.append(f"{path}: was {abbreviate(a)}, is {abbreviate(b)}")
+            lines.append(f"{path}: was {abbreviate(a)}, is now {abbreviate(b)}")
     return lines if len(lines) <= MOST_LINES else [*lines[:MOST_LINES], f"and {len(lines) - MOST_LINES} more"]
 
 

@@ -90,7 +90,7 @@ class _GridReader:
         with OptionalImport():
             import xarray
         if not isinstance(given, str):
-            return self.wrong("reference", f"must be the name of a file written by udkjax simulate, is {abbreviate(given)}")
+            return self.wrong("reference", f"must be the name of a file written by udkjax simulate, not {abbreviate(given)}")
         try:
             with xarray.open_dataset(self.folder / given, engine="h5netcdf") as data:
                 return data["q"].transpose("time", "body", "coordinate").values
@@ -105,7 +105,7 @@ class _GridReader:
                     self.wrong(key, "ts is also given: leave one of them out")
             ts = self.numbers("ts", given["ts"])
             if ts is not None and (ts.ndim != 1 or len(ts) < 2 or not np.all(np.diff(ts) > 0)):
-                self.wrong("ts", f"must be at least two increasing times (s), is {abbreviate(given['ts'])}")
+                self.wrong("ts", f"must be at least two increasing times (s), not {abbreviate(given['ts'])}")
             return ts
         if "t1" not in given:
             return self.wrong("t1", "missing; write t1 = 10.0 (s), or ts = [...]")
@@ -113,14 +113,14 @@ class _GridReader:
         if t0 is None or t1 is None:
             return None
         if not t0 < t1:
-            return self.wrong("t1", f"must be later than t0 = {t0:g}, is {t1:g}")
+            return self.wrong("t1", f"must be later than t0 = {t0:g}, not {t1:g}")
         if "dt" not in given:
             return np.array([t0, t1])
         dt = self.number("dt", given["dt"])
         if dt is None:
             return None
         if not 0 < dt <= t1 - t0:
-            return self.wrong("dt", f"must be positive and at most t1 - t0 = {t1 - t0:g}, is {dt:g}")
+            return self.wrong("dt", f"must be positive and at most t1 - t0 = {t1 - t0:g}, not {dt:g}")
         return t0 + dt * np.arange(int((t1 - t0) / dt + 1e-6) + 1)  # includes t1 if it is t0 + k dt up to rounding
 
     def axis(self, path: str, name: str, given: Toml) -> Axis | Zipped:
@@ -133,7 +133,7 @@ class _GridReader:
             return Zipped({k: self.axis(f"{path}.zipped.{key_of(k)}", k, v) for k, v in axes.items()})
         of, units = self.of(f"{path}.of", given.get("of")), given.get("units")
         if units is not None and not isinstance(units, str):
-            units = self.wrong(f"{path}.units", f"must be a text, is {abbreviate(units)}")
+            units = self.wrong(f"{path}.units", f"must be a string, not {abbreviate(units)}")
         remaining = {key: value for key, value in given.items() if key not in ("of", "units")}
         if "distribution" in remaining:
             return Axis(self.distribution(path, remaining), of, units)
@@ -144,7 +144,7 @@ class _GridReader:
 
     def values(self, path: str, name: str, given: Toml) -> np.ndarray | list[Choice]:
         if not isinstance(given, list) or not given:
-            self.wrong(path, f"must be a list of values, or a table with from, to and num, is {abbreviate(given)}")
+            self.wrong(path, f"must be a list of values, or a table with from, to and num, not {abbreviate(given)}")
             return []
         if name not in CHOICES:
             numbers = self.numbers(path, given)
@@ -162,7 +162,7 @@ class _GridReader:
         num = self.whole(f"{path}.num", given.get("num", 2), 1)
         scale = given.get("scale", "linear")
         if scale not in SCALES:
-            self.wrong(f"{path}.scale", f"must be one of {', '.join(map(quote, SCALES))}, is {abbreviate(scale)}")
+            self.wrong(f"{path}.scale", f"must be one of {', '.join(map(quote, SCALES))}, not {abbreviate(scale)}")
         elif scale == "log" and low is not None and high is not None and min(low, high) <= 0:
             self.wrong(path, 'from and to must be positive if scale is "log"')
         elif low is not None and high is not None and num is not None:
@@ -193,7 +193,7 @@ class _GridReader:
         if isinstance(given, list):
             return self.names(path, given)
         if not isinstance(given, dict) or not given:
-            return self.wrong(path, f"must be a name, a list of names or a table, is {abbreviate(given)}")
+            return self.wrong(path, f"must be a name, a list of names or a table, not {abbreviate(given)}")
         if "length" in given:
             self.check_keys(path, given, ("length", "as_rod"))
             return Length(self.names(f"{path}.length", given["length"]), given.get("as_rod", False) is True)
@@ -221,7 +221,7 @@ class _GridReader:
         members, seed = self.whole("design.members", given.get("members"), 1), self.whole("design.seed", given.get("seed", 0), 0)
         if kind not in DESIGNS:
             cure = f"must be one of {', '.join(map(quote, DESIGNS))}"
-            return self.wrong("design.type", f"{cure}, is {abbreviate(kind)}{suggestion(kind, DESIGNS)}")
+            return self.wrong("design.type", f"{cure}, not {abbreviate(kind)}{suggestion(kind, DESIGNS)}")
         return None if members is None or seed is None else DESIGNS[kind](members, seed)
 
     # --- single values
@@ -249,7 +249,7 @@ class _GridReader:
         """Read a table."""
         if isinstance(given, dict):
             return given
-        self.wrong(path, f"must be a table, is {abbreviate(given)}")
+        self.wrong(path, f"must be a table, not {abbreviate(given)}")
         return {}
 
     def names(self, path: str, given: Toml) -> tuple[str, ...]:
@@ -257,21 +257,21 @@ class _GridReader:
         names = [given] if isinstance(given, str) else given
         if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
             return tuple(map(str, names))
-        self.wrong(path, f"must be a list of names, is {abbreviate(given)}")
+        self.wrong(path, f"must be a list of names, not {abbreviate(given)}")
         return ()
 
     def number(self, path: str, given: Toml) -> float | None:
         """Read a finite number."""
         if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
             return float(given)
-        self.wrong(path, f"must be a finite number, is {abbreviate(given)}")
+        self.wrong(path, f"must be a finite number, not {abbreviate(given)}")
         return None
 
     def whole(self, path: str, given: "Toml | None", smallest: int) -> int | None:
         """Read a whole number."""
         if isinstance(given, int) and not isinstance(given, bool) and given >= smallest:
             return given
-        self.wrong(path, "missing" if given is None else f"must be a whole number, at least {smallest}, is {abbreviate(given)}")
+        self.wrong(path, "missing" if given is None else f"must be a whole number, at least {smallest}, not {abbreviate(given)}")
         return None
 
     def numbers(self, path: str, given: Toml) -> np.ndarray | None:
@@ -282,7 +282,7 @@ class _GridReader:
             values = np.array(None)
         if values.dtype.kind in "iuf" and values.ndim and np.isfinite(values).all():
             return values.astype(float)
-        self.wrong(path, f"must be a list of finite numbers, is {abbreviate(given)}")
+        self.wrong(path, f"must be a list of finite numbers, not {abbreviate(given)}")
         return None
 
 

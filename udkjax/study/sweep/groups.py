@@ -128,7 +128,7 @@ class GroupRun:
         return Own(choices, {column.name: column.numbers[places[column.name]] for column in self.numbers}, members)
 
     def mechanism(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> Mechanism:
-        """Return the mechanism of one member, with `shift` added to the numbers to differentiate by."""
+        """Return the mechanism of one member, with `shift` added to the variables of differentiation."""
         mechanism = self._setting("mechanism", shared, own)
         values: dict[str, np.ndarray | Array] = {}
         for column in self.numbers:
@@ -168,7 +168,7 @@ class GroupRun:
         return values | numbers | {"ts": ts}
 
     def __call__(self, shared: Shared, own: Own, shifts: Array) -> Outputs:
-        """Return the stored variables of one member, with `shifts` (names,) added to the numbers to differentiate by."""
+        """Return the stored variables of one member, with `shifts` (names,) added to the variables of differentiation."""
         shift = dict(zip(self.names, shifts, strict=True))
         mechanism = self.mechanism(shared, own, shift)
         closure, settings = self._closure(shared, own, mechanism), self.settings(shared, own, shift)
@@ -198,7 +198,7 @@ class GroupRun:
         return stored | {name: stored[of] for name, (of, _) in self._names_of_slopes(slopes).items()}
 
     def _names_of_slopes(self, slopes: Mapping[str, object]) -> dict[str, tuple[str, int]]:
-        """Return, for each derivative, its variable and the index of the name to differentiate by."""
+        """Return, for each derivative, its variable and the index of its variable of differentiation."""
         return {f"d_{of}_d_{by}": (of, k) for of in slopes if of not in (END, *self.seconds) for k, by in enumerate(self.names)}
 
     def _closure(self, shared: Shared, own: Own, mechanism: Mechanism) -> Closure | None:

@@ -156,7 +156,9 @@ def _reference(given: Reference, ts: np.ndarray) -> Reference:
         return given
     q = np.asarray(getattr(given, "q", given), float)
     if q.ndim != 3 or q.shape[0] != len(ts) or q.shape[2] != 3:
-        raise ValueError(f"reference: must be coordinates at the {len(ts)} output times, (T, bodies, 3), is of shape {q.shape}")
+        raise ValueError(
+            f"reference: must be coordinates at the {len(ts)} output times, (T, bodies, 3), but is of shape {q.shape}"
+        )
     return q
 
 

@@ -74,8 +74,8 @@ def sweep(
         design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are then ranges (low, high) or frozen
             distributions of scipy.stats, and all of them lie along the dimension "member".
         reference: for the measure "error": a Solution, coordinates (T, bodies, 3), or a function of (mechanism, ts).
-        derivatives: names of parameters and axes: the dataset also has the derivatives of all stored variables by each of them,
-            as `d_<variable>_d_<name>`, in forward mode.
+        derivatives: names of parameters and axes: the dataset also has the derivatives of all stored variables with respect to
+            each of them, as `d_<variable>_d_<name>`, in forward mode.
         units: units of the variables that functions store, by name, such as {"height": "m"}.
         engine: "dask": on the workers of a `client`; "devices": in this process; "auto": on a client if one is given.
         client: a client of dask.distributed; by default the most recent one.

@@ -38,7 +38,7 @@ class Displacements(NamedTuple):
 
 
 class DyadEquations(NamedTuple):
-    """g at all displacements (J, M), and its derivatives by x (two), r (two), p and s, (6, J, M)."""
+    """g at all displacements (J, M), and its derivatives with respect to x (two), r (two), p and s, (6, J, M)."""
 
     g: ArrayOrBall
     slopes: tuple[ArrayOrBall, ...]
@@ -112,7 +112,7 @@ def newton_and_tangent() -> ScalarProgram:
     """Return the program that maps unknowns, s, displacements at s = 0 and their rates to the Newton step and the rate dz/ds.
 
     Inputs: real parts, then imaginary parts, of the 16 unknowns, of s, of the displacements d_1 to d_8, D_1 to D_8 at s = 0, and
-    of the derivatives of these by s. Outputs: real and imaginary parts of the step and of the rate.
+    of the derivatives of these with respect to s. Outputs: real and imaginary parts of the step and of the rate.
     """
     graph, inputs = Graph(), []
 
@@ -151,7 +151,7 @@ def newton_and_tangent() -> ScalarProgram:
 def _dyad(
     joints: list[ComplexScalar], f: ComplexScalar, d: ComplexScalar, D: ComplexScalar, moves: tuple[ComplexScalar, ComplexScalar]
 ) -> tuple[ComplexScalar, list[ComplexScalar], list[ComplexScalar]]:
-    """Return dg/df, the derivatives by x, X, r, R, and -g and -dg/ds."""
+    """Return dg/df, the derivatives with respect to x, X, r, R, and -g and -dg/ds."""
     x, X, r, R = joints
     inverse = ComplexScalar(f.re + 1.0, f.im).inverse()
     F = -(f * inverse)

@@ -105,8 +105,8 @@ def require_nine_points(points: np.ndarray) -> None:
             on_it = np.abs(rows[:, columns] @ normal) <= ON_IT
             if np.count_nonzero(on_it) > MOST_ON_A_LINE:
                 raise ValueError(
-                    f"goal: {np.count_nonzero(on_it)} of the targets are on one {what}: a four-bar's curve meets a {what} in at "
-                    f"most {MOST_ON_A_LINE} places, or it is a part of the curve, as of infinitely many: use `design`"
+                    f"goal: {np.count_nonzero(on_it)} of the targets are on one {what}: a coupler curve meets a {what} in at "
+                    f"most {MOST_ON_A_LINE} places, or contains it, as infinitely many four-bars do: use `design`"
                 )
 
 

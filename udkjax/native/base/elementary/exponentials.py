@@ -18,7 +18,7 @@ EXP = (
     2.4801587325547743e-05, 2.7557255400206422e-06, 2.75572736431103e-07, 2.5105217004720745e-08, 2.0914686968086876e-09,
 )  # fmt: skip
 LARGEST, SMALLEST = 710.7, -746.0  # e^x, and sinh x, overflow above; e^x vanishes below
-NEGLIGIBLE = 2.0**-54  # expm1 x = x to rounding
+NEGLIGIBLE = 2.0**-54  # below, expm1 x rounds to x
 
 
 class Reduced(NamedTuple):

@@ -22,7 +22,7 @@ from udkjax.native.base.ir import Function, Value
 
 SQRT_HALF = 0x3FE6A09E00000000  # bits of a number slightly below sqrt(1/2)
 INVERSE_LOG2 = (1.4426950216293335, 1.9259629911266175e-08)  # 1 / log 2; the first has 26 digits
-HUGE, TINY = 2.0**28, 2.0**-28  # above, asinh x = log(2 x), and below, asinh x = atanh x = x to rounding
+HUGE, TINY = 2.0**28, 2.0**-28  # up to rounding, asinh x = log(2 x) above, and asinh x = atanh x = x below
 # (log((1 + s) / (1 - s)) / s - 2) / s^2 as a function of s^2, error 2^-51
 LOG = (
     0.666666666666667, 0.3999999999989889, 0.28571428626253836, 0.22222211089379496, 0.1818289243253687, 0.15331611722055008,
