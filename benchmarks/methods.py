@@ -41,12 +41,12 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
         chosen = {name: chosen[name] for name in ("Auto", "Greville", "NullSpaceQR")}
     single = {name: (by(**choices), 1.0) for name, choices in chosen.items()}
     batch = {f"{name}, {members}": (jax.vmap(by(**choices)), masses) for name, choices in chosen.items()}
-    plain = {f"{name}, plain JAX": (by("diffrax", **choices), 1.0) for name, choices in list(chosen.items())[2:] if not smoke}
+    plain = {f"{name}, plain JAX": (by("jax", **choices), 1.0) for name, choices in list(chosen.items())[2:] if not smoke}
     solvers = {}
     if not smoke:
         for solver in (udk.Adams(), udk.BDF()):
             solvers[type(solver).__name__] = by(solver=solver), 1.0
-            solvers[f"{type(solver).__name__}, plain JAX"] = by("diffrax", solver=solver), 1.0
+            solvers[f"{type(solver).__name__}, plain JAX"] = by("jax", solver=solver), 1.0
     traced = {
         "jit of a mechanism": (of_mechanism, linkage),
         "function of the library": (of_geometry, -0.7),

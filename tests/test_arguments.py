@@ -141,7 +141,7 @@ CHOICES = [
     ("method", udk.Projection(), "method must be a Pseudoinverse"),
     ("formulation", udk.Augmented, "formulation=udk.Augmented()"),
     ("formulation", udk.SVD(), "formulation must be a Formulation"),
-    ("engine", "Diffrax", 'engine must be one of "auto", "native", "diffrax", not "Diffrax"; did you mean "diffrax"?'),
+    ("engine", "Diffrax", 'engine must be one of "auto", "native", "diffrax", "jax", not "Diffrax"; did you mean "diffrax"?'),
     ("engine", None, "engine must be one of"),
     ("solver", diffrax.Tsit5, "solver must be an instance"),
     ("solver", "Tsit5", "solver=diffrax.Tsit5()"),

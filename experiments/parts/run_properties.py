@@ -93,7 +93,7 @@ def check_runs(tally: Tally, seed: int, structures: Iterable[int], members: int,
         q = np.asarray(found.q) / unit
         size = np.maximum(1.0, np.max(abs(q), axis=(1, 2, 3)))
         if by_diffrax:
-            other = jax.jit(jax.vmap(_runner(first, "diffrax")))(*batch)
+            other = jax.jit(jax.vmap(_runner(first, "jax")))(*batch)
             both = ended & (np.asarray(other.code) == udk.Result.successful)
             tally.leave_out(
                 "the engines end differently", int(np.sum(ended != (np.asarray(other.code) == udk.Result.successful)))
@@ -163,7 +163,7 @@ def _check_partitioning(
         tally.add("CoordinatePartitioning", np.max(abs(found[k] - s.a) / s.unit) / size_of_a / growth(s), scene.label)
     if not integrates:
         return
-    run = jax.jit(jax.vmap(_runner(first, "diffrax", formulation)))(*batch)
+    run = jax.jit(jax.vmap(_runner(first, "jax", formulation)))(*batch)
     both = ended & (np.asarray(run.code) == udk.Result.successful)
     tally.leave_out("a run by partitioning that ends early and reports it", int(np.sum(ended & ~both)))
     for k in np.flatnonzero(both):

@@ -274,9 +274,7 @@ class Reversal(udk.ForceElement):
         return [self.time]
 
 
-@pytest.mark.parametrize(
-    ("engine", "end"), [("native", 0.3), ("native", 0.5), pytest.param("diffrax", 0.5, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("engine", "end"), [("native", 0.3), ("native", 0.5), pytest.param("jax", 0.5, marks=pytest.mark.slow)])
 def test_an_event_and_the_end_may_be_at_a_breakpoint(engine, end):
     ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1)}, forces=[Reversal(["ball"])], gravity=(0.0, 0.0))
     line = udk.Event(lambda t, at: at["ball"].x - 0.045, udk.Log(), name="line")  # which it passes at 0.3 s, but for rounding

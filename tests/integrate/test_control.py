@@ -51,12 +51,12 @@ def restarted(mechanism, ts, tolerances=EXACT):
     return np.stack([found[t].q for t in ts]), np.stack([found[t].v for t in ts])
 
 
-@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_a_run_is_the_one_that_is_started_anew_at_each_sample(engine):
     mechanism = held_cart()
     found = udk.simulate(mechanism, TS, engine=engine, **EXACT)
     q, v = restarted(mechanism, TS)
-    tol = {"native": 1e-11, "diffrax": 1e-10}[engine]  # of diffrax it is the interpolation between steps that errs
+    tol = {"native": 1e-11, "jax": 1e-10}[engine]  # of diffrax it is the interpolation between steps that errs
     assert_allclose(found.q, q, rtol=0, atol=tol)
     assert_allclose(found.v, v, rtol=0, atol=10 * tol)
 
@@ -192,7 +192,7 @@ def test_steps_of_several_side_by_side():
     assert_allclose(several.q[0], rollout(torque, force).q, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_steps_of_a_driven_mechanism(engine):
     """The time goes on from step to step."""
     drive = udk.Driver(["ground", "rod"], "angle", udk.Sine(1.0, 2.0))

@@ -147,7 +147,7 @@ def test_both_engines_start_beside_the_manifold_alike():
         return (there - back) / 2e-4
 
     native = slope("native")
-    assert_allclose(slope("diffrax"), native, atol=2e-5 * np.abs(native).max())  # 5e-4 where one of them does not
+    assert_allclose(slope("jax"), native, atol=2e-5 * np.abs(native).max())  # 5e-4 where one of them does not
 
 
 @pytest.mark.slow

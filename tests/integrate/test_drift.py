@@ -31,7 +31,7 @@ def reference(mech):
     return udk.simulate(mech, TS, rtol=1e-11, atol=1e-11).q
 
 
-@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("stabilization", "method"),
     [
@@ -53,7 +53,7 @@ def test_a_drifting_run_ends_at_a_singular_configuration(stabilization, method, 
     assert gains == (stabilization is not None)
 
 
-@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("gain", [10.0, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_a_run_that_is_stabilized_well_passes(gain, engine):
     solution = udk.simulate(swing(), TS, stabilization=udk.Baumgarte(gain, gain), engine=engine, **TIGHT)

@@ -69,7 +69,7 @@ def test_no_crossing_is_lost_at_any_frequency():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("engine", ["native", "jax"])
 @pytest.mark.parametrize("f", [200, 500, 1000, 2000])
 @pytest.mark.parametrize("outputs", [2, 50])
 def test_conditions_of_position_velocity_and_time(f, engine, outputs):
@@ -155,7 +155,7 @@ def test_a_condition_that_is_not_a_number_is_named():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("engine", ["native", "jax"])
 def test_a_condition_that_is_not_a_number_is_data_in_a_batch(engine):
     where = np.array([0.5, 2.0, -0.1])
     with warnings.catch_warnings():
@@ -169,7 +169,7 @@ def test_a_condition_that_is_not_a_number_is_data_in_a_batch(engine):
     assert np.isfinite(sol.q[0, :2]).all() and np.isnan(sol.q[0, 2]).all()
 
 
-@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_an_event_at_a_sample_or_an_output_happens_once(engine):
     """Its root is found to rounding: a state from before it would cross again."""
     held = udk.Held(np.random.default_rng(0).normal(size=(4, 2)), 0.25)

@@ -43,11 +43,11 @@ def by_page(scene, folder):
     return np.reshape(found["q"], (len(scene.ts), 3)), found["times"]
 
 
-ENGINES = {"native": by_simulate("native"), "diffrax": by_simulate("diffrax"), "page": by_page}
+ENGINES = {"native": by_simulate("native"), "jax": by_simulate("jax"), "page": by_page}
 
 
 CASES = [
-    pytest.param(name, engine, marks=pytest.mark.slow if engine == "diffrax" and name != "thrown" else ())
+    pytest.param(name, engine, marks=pytest.mark.slow if engine == "jax" and name != "thrown" else ())
     for name in EXACT
     for engine in ENGINES
 ]

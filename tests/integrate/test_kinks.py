@@ -129,7 +129,7 @@ def test_derivatives_pass_through_a_jump():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["native", "diffrax"])
+@pytest.mark.parametrize("engine", ["native", "jax"])
 def test_derivatives_of_both_engines_in_reverse(engine):
     slope = jax.grad(lambda p: place(Brake, p, engine=engine))(jnp.asarray(P))
     np.testing.assert_allclose(slope, jax.grad(braked)(jnp.asarray(P)), rtol=1e-9)

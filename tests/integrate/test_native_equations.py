@@ -157,7 +157,7 @@ def test_batches_and_derivatives():
 @pytest.mark.parametrize("solver", [udk.Adams(), udk.BDF(), diffrax.Kvaerno5()])
 def test_runs_of_other_solvers_take_the_steps_of_the_plain_form(solver):
     mechanism = udk.library.compound_pendulum()
-    one, two = (udk.simulate(mechanism, TIMES, rtol=1e-6, atol=1e-6, solver=solver, engine=e) for e in ("auto", "diffrax"))
+    one, two = (udk.simulate(mechanism, TIMES, rtol=1e-6, atol=1e-6, solver=solver, engine=e) for e in ("auto", "jax"))
     assert abs(int(one.stats["accepted"]) - int(two.stats["accepted"])) <= 2
     assert_allclose(one.q, two.q, rtol=0, atol=1e-7)
 
@@ -210,3 +210,12 @@ def test_rates_of_concrete_numbers_are_those_of_the_textbook(number, own):
 def test_rates_without_machine_code_are_refused():
     with pytest.raises(ValueError, match="no machine code for Mine"):
         ConcreteRates(udk.library.parallelogram(), type("Mine", (udk.SVD,), {})())
+
+
+def test_machine_code_evaluates_the_equations_that_diffrax_integrates():
+    """With `engine="jax"` nothing is machine code, so that it can be compared."""
+    mechanism = udk.library.parallelogram()
+    analysis = udk.analyse(mechanism)
+    for engine, is_native in (("diffrax", True), ("jax", False)):
+        plan = compile_mechanism(mechanism, analysis, udk.Auto(), udk.Projection(), engine=engine).plan
+        assert plan.operation is None and (plan.evaluation is not None) is is_native

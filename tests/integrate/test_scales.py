@@ -132,7 +132,7 @@ def test_under_jit_a_call_computes_the_same(given):
 SMALL = [0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1e-17, 3e-16, 1e-12, 1e-8, -1e-17, -1e-9]
 
 
-ENGINES = ["native", pytest.param("diffrax", marks=pytest.mark.slow)]
+ENGINES = ["native", pytest.param("jax", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -103,14 +103,14 @@ def compile_mechanism(
     projects = isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem)
     projected, breakpoints = equations.constrained and projects, system.breakpoints
     operation, evaluation, rows = None, None, 0
-    why = "it was asked for" if engine == "diffrax" else _reason_for_diffrax(equations, solver, adjoint, meter)
+    why = "it was asked for" if engine in ("diffrax", "jax") else _reason_for_diffrax(equations, solver, adjoint, meter)
     if not why:
         operation = _run_operation(equations, solver, projected, breakpoints)
         textbook = textbook_of(equations)
         rows = len(textbook.scales.rows) - len((textbook.redundant or ()) if eliminates(textbook.method) else ())
         missing = unsupported(operation.code)
         why = f"the scene uses {missing}, which is not arithmetic on numbers" if missing else ""
-    elif engine == "auto":
+    elif engine != "jax":
         evaluation = evaluation_of(equations)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" uses diffrax instead')

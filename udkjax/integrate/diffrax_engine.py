@@ -15,7 +15,7 @@ from udkjax.integrate.drift import DriftController
 from udkjax.integrate.native_equations import equations_for_diffrax
 from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.integrate.projection import project, project_all, violation
+from udkjax.integrate.projection import STATES_AT_ONCE, project, project_all, violation
 from udkjax.integrate.solvers import is_explicit
 from udkjax.integrate.solvers.counting import NOT_COUNTED, CountingController, evaluations
 from udkjax.native.base.steps import FACTORS, Status
@@ -55,7 +55,7 @@ def integrate_by_diffrax(
     ys = jnp.where(later[:, None], ys, y0)  # a run without an accepted step has no saved states
     projected = project_all(equations, ts[1:], ys[1:]) if problem.compiled.plan.projected else ys[1:]
     ys = jnp.concatenate([initial[None], projected])
-    violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys))
+    violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys), batch_size=STATES_AT_ONCE)
     lost = jnp.min(jnp.where(reached & ~(violated <= problem.drift_tol), np.arange(float(len(ts))), np.inf))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, Status.STEP_LIMIT, Status.STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, Status.DONE, status)

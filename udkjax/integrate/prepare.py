@@ -64,7 +64,12 @@ class Choices(NamedTuple):
     def take_diffrax(self) -> bool:
         """True if diffrax integrates every mechanism with these choices."""
         others = self.adjoint is not None or self.meter is not None or not is_explicit(self.solver)
-        return self.engine == "diffrax" or others
+        return self.engine in ("diffrax", "jax") or others
+
+    @property
+    def integrator(self) -> str:
+        """What integrates where machine code does not: "diffrax", or "jax" if its equations are to be plain JAX, too."""
+        return "jax" if self.engine == "jax" else "diffrax"
 
     def arrays(self) -> "Choices":
         """Return the choices with arrays of JAX instead of plain numbers, which would be constants of compiled programs."""
@@ -80,7 +85,7 @@ class Choices(NamedTuple):
             ("solver", "Dopri8" if self.solver is None else type(self.solver).__name__),
             ("max_steps", str(self.max_steps)),
             ("first_step", "chosen" if self.dt0 is None else "given"),
-            ("engine", f"diffrax: {why_not_native}" if why_not_native else "native"),
+            ("engine", f"{self.integrator}: {why_not_native}" if why_not_native else "native"),
             *([("kinks", self.kinks)] if self.kinks else []),
         )
 

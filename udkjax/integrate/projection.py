@@ -9,6 +9,8 @@ from udkjax.native.base.steps import NORMAL_ERROR_WEIGHT
 from udkjax.printing import PrintsLine
 from udkjax.transforms.gradients import stop_gradients
 
+STATES_AT_ONCE = 64  # evaluated together at outputs: the memory that they take is limited, and there are few loops
+
 
 class Projection(PrintsLine):
     """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
@@ -45,4 +47,4 @@ def project_all(equations: AbstractSystem, ts: Float[Array, "T"], ys: Float[Arra
 
     Interpolated states are farther from the manifold than the ends of steps, so they are projected twice.
     """
-    return jax.lax.map(lambda at: project(equations, at[0], project(equations, *at)), (ts, ys))
+    return jax.lax.map(lambda at: project(equations, at[0], project(equations, *at)), (ts, ys), batch_size=STATES_AT_ONCE)

@@ -62,7 +62,7 @@ def simulate(
     throw: bool = True,
     progress: Any = None,
     analysis: Analysis | None = None,
-    engine: Literal["auto", "native", "diffrax"] = "auto",
+    engine: Literal["auto", "native", "diffrax", "jax"] = "auto",
     events: Any = None,
     max_events: int = MAX_EVENTS,
 ) -> Solution:
@@ -100,8 +100,9 @@ def simulate(
         analysis: the mechanism's `Analysis`; by default computed here.
         engine: "native" is machine code generated from the scene's expressions, on the CPU: explicit Runge-Kutta methods with
             elimination, under vmap in lanes that step independently. "diffrax" is `diffrax.diffeqsolve`: every solver,
-            adjoint, progress meter, device and method. "auto" uses machine code where possible; `Solution.settings`
-            names the engine and the reason.
+            adjoint, progress meter and method; machine code evaluates the equations where possible. "jax" is "diffrax" with
+            equations in plain JAX, on every device. "auto" uses machine code where possible; `Solution.settings` names the
+            engine and the reason.
         events: actions where conditions cross zero: an `Event`, `JointLimit` or `Contact`, or a list of them, with the
             actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to machine precision,
             independently of `ts`, and the run restarts after each; contacts that act on one another are hit together. Both

@@ -42,7 +42,7 @@ def step(
     atol: NumberLike = 1e-8,
     max_steps: int = MOST_STEPS_OF_INTERVAL,
     analysis: Analysis | None = None,
-    engine: Literal["auto", "native", "diffrax"] = "auto",
+    engine: Literal["auto", "native", "diffrax", "jax"] = "auto",
 ) -> State:
     """Return the state one control interval later, with inputs held constant.
 

@@ -50,7 +50,7 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
 
 
 def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
-    """Run a small simulation; return its engine, "native", "diffrax" or "none", and the reason."""
+    """Run a small simulation; return its engine, "native", "diffrax", "jax" or "none", and the reason."""
     try:
         solution = run(double_pendulum(), np.array([0.0, 0.1]))
     except Exception as error:

@@ -93,7 +93,7 @@ class PlainSystem:
         def of_phase(p: int, t: Array, q: Array, v: Array, added: Added) -> tuple[Array, Array]:
             # Velocities jump, so `equations.project`, whose derivatives hold for small corrections, cannot be used.
             equations = self.hybrid.textbook(p, added)
-            return uk.project(equations.mechanism, t, q, v, equations.method, equations.weights)
+            return uk.project(equations.mechanism, t, q, v, equations.inverse, equations.weights)
 
         t, q, v, phase, added = without_member(at)
         q, v = self.hybrid.in_phase(phase, of_phase, t, q, v, added, is_free=is_free)

@@ -257,7 +257,7 @@ def _solution(
         **({} if kinks is None else {"kinks": kinks.count}),
     }
     why = next(filter(None, reasons), "")
-    engine = f"diffrax: {why}" if all(reasons) else f"native, in some phases diffrax: {why}" if why else "native"
+    engine = f"{choices.integrator}: {why}" if all(reasons) else f"native, in some phases diffrax: {why}" if why else "native"
     settings = dict(choices.settings(why)) | {"engine": engine}
     settings |= {"max_events": str(given.max_events)} if names else {}
     with jax.debug_nans(False):  # NaN stands for outputs after the end of a run
