@@ -26,7 +26,7 @@ def test_auto_of_rows_leaves_out_known_rows():
 
 
 def test_auto_of_rows_takes_singular_values_near_dependence():
-    """Of a batch, some members need them; each is what it is alone, and those have the columns of all rows."""
+    """Some members of a batch need them; each member is what it is alone, and these use all rows."""
     Ds = np.stack([nearly_dependent(share) for share in (0.0, 0.5, 1.0)])
     inverses, ranks = jax.jit(jax.vmap(lambda D: (METHOD(D), METHOD.rank(D))))(Ds)
     assert list(map(int, ranks)) == [4, 4, 3]

@@ -68,7 +68,7 @@ class Choices(NamedTuple):
 
     @property
     def integrator(self) -> str:
-        """What integrates where machine code does not: "diffrax", or "jax" if its equations are to be plain JAX, too."""
+        """The engine of a run without machine code: "diffrax", or "jax" if the equations are plain JAX, too."""
         return "jax" if self.engine == "jax" else "diffrax"
 
     def arrays(self) -> "Choices":
