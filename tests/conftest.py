@@ -1,4 +1,4 @@
-"""What more than one floor is tested with."""
+"""Fixtures that tests of several folders share."""
 
 import gc
 import json
@@ -47,7 +47,7 @@ def pytest_configure(config):
 
 @pytest.fixture(scope="module", autouse=True)
 def mapped_memory():
-    """Forget compiled programs before there are more than a process may map: XLA maps memory for each, many times."""
+    """Drop compiled programs before the process reaches its limit of memory maps, of which XLA makes many for each program."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_text().splitlines()) > MAPS:
@@ -56,13 +56,13 @@ def mapped_memory():
 
 @pytest.fixture(scope="session")
 def data():
-    """A file of reference values, by its name."""
+    """Return a file of reference values by its name."""
     return lambda name: json.loads((DATA / f"{name}.json").read_text())
 
 
 @pytest.fixture(scope="session")
 def compilations():
-    """What is compiled while a function runs, or taken from a cache: how long XLA took for each (s), and 0 of our own code."""
+    """Record the programs compiled, or read from a cache, while a function runs: XLA's time for each (s), 0 for our code."""
     seen: list[float] = []
 
     def listen(event: str, duration_secs: float, **_):
@@ -100,13 +100,13 @@ def placed():
 
 @pytest.fixture(scope="session")
 def linkage():
-    """The paper's."""
+    """The paper's linkage."""
     return udk.library.parallelogram()
 
 
 @pytest.fixture(scope="module")
 def browser():
-    """Headless Chromium, which a module closes again: while it is there, its thread can run no other event loop."""
+    """Headless Chromium for the tests of a module. While it runs, its thread cannot run another event loop."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'")
     path = next((path for path in CHROMIUM if Path(path).exists()), None)
     if path is None:

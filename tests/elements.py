@@ -1,7 +1,7 @@
-"""One of each type of the scene format: where a new joint, driver or force element is one line and meets every test.
+"""One instance of each type of the scene format, included in every test of elements: add a new type here in one line.
 
-It is then read from a file and written to one; its rows are counted; and its loads, or Psi, Psi_q, Psi_dot and gamma, in both
-engines are held against JAX's derivatives of what it states.
+Each element is read from a file and written to one, and its rows are counted; its loads, or Psi, Psi_q, Psi_dot and gamma, are
+compared in both engines with JAX's derivatives.
 """
 
 import udkjax.scene as udk

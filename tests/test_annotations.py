@@ -1,4 +1,4 @@
-"""Beartype checks the annotated shapes of the textbook and the pseudoinverses; each alias of types is defined once."""
+"""Beartype checks the annotated shapes of the textbook functions and the pseudoinverses; each type alias is defined once."""
 
 import ast
 from collections import Counter
@@ -53,7 +53,7 @@ def test_arrays_have_the_annotated_shapes():
 
 
 def is_type(node: ast.expr) -> bool:
-    """True if an expression is made of types, as the value of an alias is."""
+    """Return True if an expression consists of types, like the value of an alias."""
     match node:
         case ast.Subscript():
             return is_type(node.value)
@@ -67,7 +67,7 @@ def is_type(node: ast.expr) -> bool:
 
 
 def aliases(text: str) -> list[str]:
-    """The aliases of types, and the classes, that a module defines. Type variables are its own."""
+    """Return the type aliases and the classes that a module defines, without type variables."""
     found = []
     for node in ast.parse(text).body:
         match node:

@@ -1,4 +1,4 @@
-"""The plan of the house in the documentation shows the folders and imports that there are."""
+"""The plan in the documentation shows the existing folders and imports."""
 
 import importlib
 import sys

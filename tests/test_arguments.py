@@ -1,4 +1,4 @@
-"""The door: what public functions cannot use is refused by name, before anything is computed; traced, it is data."""
+"""Invalid arguments of public functions are refused by name before anything is computed; traced ones lead to a result code."""
 
 import inspect
 from types import SimpleNamespace
@@ -21,7 +21,7 @@ WRONG_SHAPES = [(1, 3), (3,), (2, 3), (3, N), (N + 1, 3), (400, 3), (N, 2), (2, 
 
 
 def functions_of(parameter: str) -> list[str]:
-    """The public functions with such a parameter."""
+    """Return the public functions that have this parameter."""
     found = [name for name in udk.__all__ if inspect.isfunction(getattr(udk, name))]
     found = [name for name in found if parameter in inspect.signature(getattr(udk, name)).parameters]
     assert found
@@ -29,7 +29,7 @@ def functions_of(parameter: str) -> list[str]:
 
 
 def call(name: str, **given: Any) -> Any:
-    """Call a public function with the arguments given, and for all others that it needs with some that fit."""
+    """Call a public function with the given arguments, and with valid ones for all others that it requires."""
     fitting = {
         "mechanism": MECH,
         "ts": TS,
@@ -52,7 +52,7 @@ def call(name: str, **given: Any) -> Any:
 
 
 def message(function, *arguments: Any, **given: Any) -> str:
-    """The text of the TypeError or ValueError that a call raises."""
+    """Return the text of the TypeError or ValueError that a call raises."""
     with pytest.raises((TypeError, ValueError)) as error:
         function(*arguments, **given)
     return str(error.value)
@@ -213,7 +213,7 @@ def test_settings_of_studies_are_those_of_simulate():
 
 
 def test_a_member_with_a_number_that_is_not_finite_is_an_invalid_argument():
-    """Whichever number of a scene it is, and no other member is: masses, points, gravity, motions of drivers, stiffnesses."""
+    """For masses, points, gravity, motions of drivers and stiffnesses; other members are unaffected."""
     crank = udk.library.slider_crank()
     springs = {"spring": udk.Spring(["ground", "slider"], [[3.0, 0.0], [0.0, 0.0]], stiffness=1.0, length=0.5, damping=0.1)}
     driver = {"motor": udk.Driver(["ground", "crank"], "angle", udk.Polynomial([crank.q0[0, 2], 1.0]))}
@@ -233,7 +233,7 @@ def test_a_member_with_a_number_that_is_not_finite_is_an_invalid_argument():
 
 @pytest.mark.parametrize("events", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_what_turns_out_to_be_of_no_use_is_the_result_of_a_member(events):
-    """Traced numbers are known by their shapes alone: the run that they spoil says so, and no other."""
+    """Only the shapes of traced numbers are known in advance: the affected run, and no other, returns the result."""
     listed = udk.Event(lambda t, at: at["rod"].angle - 10.0, udk.Log()) if events else None
     state = udk.assemble(OTHER)
 

@@ -25,7 +25,7 @@ PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
 
 
 def test_help_is_printed_without_importing_jax_and_offers_json():
-    """One process asks for the help of every command."""
+    """One process prints the help of every command."""
     code = (
         "import sys; from udkjax.cli import COMMANDS, main\n"
         "for command in [[], *([name] for name in COMMANDS)]:\n"
@@ -70,7 +70,7 @@ def test_a_scene_is_a_file_or_a_mechanism_of_the_library(tmp_path, monkeypatch, 
 
 @pytest.mark.slow
 def test_what_a_run_prints_is_measured(tmp_path, capsys):
-    """Loose tolerances without stabilization: the error and the drift that are printed must be large, not the default's."""
+    """Loose tolerances without stabilization: the printed error and drift must be large, unlike with the defaults."""
     arguments = ("simulate", PARALLELOGRAM, "--t1", 3, "--out", tmp_path / "run.nc")
     errors = {}
     for tol in (1e-3, 1e-10):

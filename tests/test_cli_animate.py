@@ -15,7 +15,7 @@ SCENE = "examples/four_bar.toml"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run in a file, with a variable of its own over time."""
+    """Return a file of a run, with an additional variable over time."""
     path = tmp_path_factory.mktemp("runs") / "four_bar.nc"
     mech = udk.load(SCENE)
     sol = udk.simulate(mech, np.linspace(0, 1, 21))
@@ -73,7 +73,7 @@ def test_a_scene_of_classes_of_ones_own_is_refused(run, tmp_path, capsys):
 
 
 def test_a_run_that_failed_is_shown_and_how_it_ended_is_said(tmp_path, capsys):
-    """By a file and by a scene, on the page and on the terminal; in Python by a warning."""
+    """For a file and for a scene, on the page and in the terminal; in Python by a warning."""
     mech = udk.load(SCENE)
     failed = udk.simulate(mech, np.linspace(0.0, 1.0, 21), max_steps=3, throw=False)
     failed.to_xarray(mech).to_netcdf(tmp_path / "failed.nc", engine="h5netcdf")

@@ -27,7 +27,7 @@ FILES = {"identified.toml", "estimate.json", "estimate.csv", "fit.nc", *PICTURES
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    """Two runs of a pendulum whose inertia is not the scene's; mass and inertia by a common factor change nothing."""
+    """Two runs of a pendulum whose inertia differs from the scene's; a common factor of mass and inertia has no effect."""
     ts = np.linspace(0.0, 1.5, 31)
     q = np.asarray(udk.simulate(udk.load(PENDULUM).with_parameters({INERTIA: TRUTH}), ts).q)[:, 0, 2]
     rng = np.random.default_rng(5)

@@ -1,4 +1,4 @@
-"""Commands about a mechanism, each against the results of the functions, as JSON and as a file."""
+"""Commands about a mechanism, compared with the results of the functions, as JSON and as files."""
 
 import csv
 import json
@@ -137,7 +137,7 @@ B = [0, -120]
 
 
 def test_statics_says_what_holds_a_toggle_clamp(tmp_path, capsys):
-    """A force P at the knee of two links that stand at a slope of 1 to 12 presses by P / 2 times 12, however the work starts."""
+    """A force P at the knee of two links with a slope of 1 to 12 presses with 12 P / 2, in every position of the workpiece."""
     scene = tmp_path / "clamp.toml"
     scene.write_text(CLAMP)
     (found,) = results(capsys, "statics", scene, "--out", tmp_path / "s.csv")["equilibria"]
@@ -191,7 +191,7 @@ def test_inverse_and_simulate_draw_what_they_find(tmp_path, capsys):
 
 
 def test_kinematics_says_what_the_links_do(tmp_path, capsys):
-    """A crank of 50 and a ground of 100 between arms of 125, by hand; and a mechanism whose positions are undetermined."""
+    """A crank of 50 and a ground of 100 between arms of 125, by hand; and a mechanism with undetermined positions."""
     hoeken = """
 format = 2
 units = {length = "mm"}

@@ -1,4 +1,4 @@
-"""Where JAX looks for values that are not numbers, ordinary calls and their derivatives pass: none is computed and discarded."""
+"""With jax.debug_nans, ordinary calls and their derivatives pass: no NaN is computed and discarded."""
 
 import jax
 import numpy as np
@@ -57,7 +57,7 @@ CALLED = {"kinematics": motion, "travel": lambda m: udk.travel(m, "body.c.angle"
 
 @pytest.mark.parametrize("name", fast(["simulate", "energy and violation", "kinematics", "stop"], [*CALLS, *CALLED]))
 def test_ordinary_calls_pass_where_jax_looks_for_values_that_are_no_numbers(name):
-    """Their derivatives, too, of `CALLS`; those of positions are looked at in test_kinematics.py."""
+    """Also the derivatives of `CALLS`; test_kinematics.py checks those of positions."""
     with jax.debug_nans(True):
         if name in CALLED:
             CALLED[name](MECH)

@@ -1,4 +1,4 @@
-"""Where JAX computes: the default device, the host beside it, and devices of the user's choice. CPU devices stand in for all."""
+"""Where JAX computes: the default device, the host, and devices chosen by the user. CPU devices represent all others."""
 
 import os
 import subprocess
@@ -73,7 +73,7 @@ with jax.default_device(other):
 
 
 def test_numbers_of_the_user_are_computed_beside_the_default_device():
-    """Programs outside of others run on the host; results are on the default device."""
+    """Programs outside of others run on the host; their results are on the default device."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
     environment = {**os.environ, "XLA_FLAGS": flags}
     subprocess.run([sys.executable, "-c", BESIDE], env=environment, check=True, timeout=300)

@@ -1,7 +1,7 @@
-"""What the documentation says is true: blocks run and print what they say, names, files and commands exist, links lead somewhere.
+"""The documentation is correct: code blocks print the stated results; names, files, commands and links exist.
 
-A block of Python says what it prints by a comment on the line, `print(x)  # -> 3.14 (m)`, or by a block of `text` behind it, in
-which `...` stands for anything. Numbers agree to the digits that are shown; what is in brackets behind two spaces is a comment.
+A block of Python states its output in a comment on the line, `print(x)  # -> 3.14 (m)`, or in a following block of `text`, in
+which `...` stands for anything. Numbers agree to the digits that are shown; text in brackets after two spaces is a comment.
 """
 
 import ast
@@ -41,7 +41,7 @@ every_page = pytest.mark.parametrize("page", PAGES, ids=name_of)
 
 
 def agrees(printed: str, said: str) -> bool:
-    """Whether a text is what was said of it: numbers to the digits that are shown, all else to the letter but for spaces."""
+    """Return True if the output agrees with the stated one: numbers to the digits shown, other text exactly except for spaces."""
     pattern = "".join(".*" if part == "..." else re.escape(part) for part in re.split(r"(\.\.\.)", NUMBER.sub("0", said)))
     if not re.fullmatch(re.sub(r"(\\[ \n])+", r"\\s+", pattern), NUMBER.sub("0", printed).strip(), re.S):
         return False
@@ -50,13 +50,13 @@ def agrees(printed: str, said: str) -> bool:
 
 
 def digit(number: str) -> float:
-    """The size of one in the last digit of a number as written."""
+    """Return the value of one unit in the last digit of a number as written."""
     mantissa, _, exponent = number.partition("e")
     return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
 
 
 def untrue(text: str, names: dict) -> list[str]:
-    """Run a page's blocks, one after another; return what they print otherwise than it says, by line."""
+    """Run the blocks of a page in order; return the outputs that differ from the stated ones, by line."""
     wrong, printed, lines = [], [], text.splitlines()
 
     def show(*values, sep=" ", **_):
@@ -129,7 +129,7 @@ def test_its_links_lead_somewhere(page):
 
 @cache
 def sources() -> dict[Path, ast.Module]:
-    """The modules of the package and of its studies."""
+    """Return the modules of the package and of its studies."""
     files = (path for folder in ("udkjax", "experiments", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
     return {path: ast.parse(path.read_text()) for path in files}
 
@@ -140,7 +140,7 @@ LONG = {"jnp": "jax.numpy", "np": "numpy", "eqx": "equinox", "eqxi": "equinox.in
 
 @cache
 def identifiers() -> set[str]:
-    """All names that the package and its studies know: of modules, of Python, keys of dictionaries and of scenes."""
+    """Return all names in the package and its studies: of modules and of Python, keys of dictionaries and of scenes."""
     found = {*dir(builtins), "udk", "udkjax", "pytest", "Args", "Returns", "Raises", "Source"}
     for script in (ROOT / "udkjax/show/player").glob("*.js"):
         found |= set(re.findall(r"\w+", script.read_text()))
@@ -161,12 +161,12 @@ def identifiers() -> set[str]:
 
 
 def has(owner: object, name: str) -> bool:
-    """Whether an object has an attribute, also one that only its instances have: a field."""
+    """Return True if an object has an attribute, or a field that only its instances have."""
     return hasattr(owner, name) or any(name in vars(cls).get("__annotations__", {}) for cls in getattr(owner, "__mro__", ()))
 
 
 def exists(name: str) -> bool:
-    """Whether a dotted name exists: of the public face and of other libraries exactly, else every part of it somewhere."""
+    """Return True if a dotted name exists: public names and names of other libraries exactly, otherwise each part somewhere."""
     head, *rest = name.replace("udkjax.paper", "experiments.paper").split(".")  # so it is called where it is installed
     if head in ("udk", "udkjax") or (head in udkjax.__all__ and head[0].isupper()):
         owner: object = udkjax if head in ("udk", "udkjax") else getattr(udkjax, head)
@@ -203,7 +203,7 @@ SCENE_NAMES = re.compile(
 
 
 def missing(text: str) -> Iterator[str]:
-    """What is in backticks, looks like a name or a file, and does not exist."""
+    """Return the texts in backticks that look like a name or a file and do not exist."""
     for code in CODE.findall(text):
         if PATH.fullmatch(code):
             if not any(
@@ -223,7 +223,7 @@ def test_its_names_and_files_exist(page):
 
 
 def prose() -> Iterator[tuple[str, str]]:
-    """Each docstring and each comment of the package and its studies, and where it is."""
+    """Return each docstring and comment of the package and its studies, with its place."""
     for path, tree in sources().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
@@ -296,7 +296,7 @@ def test_every_option_is_described_as_the_help_does(name, capsys):
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """The command lines of a page, without what surrounds them."""
+    """Return the command lines of a page without the surrounding text."""
     shell = "\n".join(block for kind, block in BLOCK.findall(text) if kind == "sh").replace("\\\n", " ")
     for line in [*shell.splitlines(), *CODE.findall(BLOCK.sub("", text))]:
         for part in re.split(r"&&|#|;", line):
@@ -306,7 +306,7 @@ def commands(text: str) -> Iterator[list[str]]:
 
 
 def wrong(words: list[str]) -> str:
-    """What is wrong with a command line; an empty text if nothing is."""
+    """Return the mistake in a command line; an empty string if there is none."""
     program, *rest = words
     options = [word.partition("=")[0] for word in rest if word.startswith("--")]
     if program == "udkjax":

@@ -21,7 +21,7 @@ FUNCTIONS = {name: x for name, x in PUBLIC.items() if inspect.isfunction(x)}
 
 
 def described(doc: str, section: str) -> set[str]:
-    """The names that a section of a docstring in Google's style describes."""
+    """Return the names described in a section of a docstring in Google's style."""
     found = re.search(rf"^{section}:\n((?: +.*\n?|\n)+)", doc, re.M)
     return set(re.findall(r"^ {4}\**(\w+): ", found[1], re.M)) if found else set()
 
@@ -54,14 +54,14 @@ def test_a_missing_argument_is_noticed():
 
 
 def without_subject(text: str) -> list[str]:
-    """The first lines of docstrings that begin with a word that no sentence with a subject begins with."""
+    """Return the first lines of docstrings that begin with a word that cannot begin a sentence with a subject."""
     kinds = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
     docs = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
     return [doc.splitlines()[0] for doc in docs if NO_SUBJECT.match(doc) or OBJECT.match(doc)]
 
 
 def clauses(text: str) -> list[str]:
-    """The descriptions of arguments and attributes, and the comments, that begin with a clause in place of a noun or a verb."""
+    """Return descriptions of arguments and attributes, and comments, that begin with a clause instead of a noun or verb."""
     kinds = ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
     docs = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
     sections = [found for doc in docs for found in re.findall(r"^(?:Args|Attributes):\n((?: +.*\n?|\n)+)", doc, re.M)]

@@ -1,4 +1,4 @@
-"""Doors: what floors import of each other is listed in the `__init__.pyi` of the folder it comes from, and nothing else is."""
+"""Doors: the `__init__.pyi` of a folder lists exactly the names that other folders import from it."""
 
 import ast
 from functools import cache
@@ -17,18 +17,18 @@ MOST_NAMES = {"scene": 90, "equations": 81, "native": 40}
 
 @cache
 def nodes_of(text: str) -> list[ast.ImportFrom | ast.Attribute]:
-    """The nodes of a text that say what it imports and what it takes of that."""
+    """Return the nodes of a module that import names or use attributes of them."""
     return [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.ImportFrom | ast.Attribute)]
 
 
 def imported_names(file: Path) -> list[Name]:
-    """Every name that a file imports from the package, wherever in the file it does so."""
+    """Return every name that a file imports from the package, anywhere in the file."""
     nodes = [n for n in nodes_of(file.read_text(encoding="utf-8")) if isinstance(n, ast.ImportFrom)]
     return [(n.module or "", name.name) for n in nodes if (n.module or "").split(".")[0] == "udkjax" for name in n.names]
 
 
 def door(root: Path, floor: str) -> set[Name]:
-    """The names in the stub of a floor, each in its module, and in the face of the floor."""
+    """Return the names in the stub of a folder, each in its module, and those in the public stub."""
     names = imported_names(root / floor / "__init__.pyi")
     return {*names, *((f"udkjax.{floor}", name) for _, name in names)}
 
@@ -38,7 +38,7 @@ def floors(root: Path) -> list[str]:
 
 
 def used_names(root: Path) -> dict[str, dict[Name, list[str]]]:
-    """Names that other floors import from each floor with a door, and the importing files."""
+    """Return the names that other folders import from each folder with a door, and the importing files."""
     found: dict[str, dict[Name, list[str]]] = {floor: {} for floor in floors(root)}
     for file in sorted(root.rglob("*.py")):
         place = file.relative_to(root)
@@ -53,7 +53,7 @@ def used_names(root: Path) -> dict[str, dict[Name, list[str]]]:
 
 
 def names_through_modules(root: Path) -> dict[str, set[Name]]:
-    """The names of each floor that other floors use, where those reached through an imported module count one by one."""
+    """Return the names of each folder that other folders use; names reached through an imported module count one by one."""
     found = {floor: set(names) for floor, names in used_names(root).items()}
     for file in sorted(root.rglob("*.py")):
         nodes = nodes_of(file.read_text(encoding="utf-8"))

@@ -1,6 +1,7 @@
-"""Phrases that no native speaker writes are found by their patterns in docstrings, comments, messages and pages.
+"""Phrases that no native speaker writes are found by patterns in docstrings, comments, messages and pages.
 
-`CLEAN` lists the rooms and pages without any. Patterns cannot find all: a sentence that has to be read twice is a defect as well.
+`CLEAN` lists the folders and pages without any. Patterns cannot find everything: a sentence that has to be read twice is a
+defect as well.
 """
 
 import ast
@@ -88,7 +89,7 @@ PHRASES = [
 
 
 def texts(source: str) -> tuple[list[str], list[str]]:
-    """The docstrings and comments of a module, and its other texts of several words."""
+    """Return the docstrings and comments of a module, and its other texts of several words."""
     tree = ast.parse(source)
     owners = [node for node in ast.walk(tree) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)]
     docs = [node.body[0].value for node in owners if ast.get_docstring(node)]  # pyright: ignore[reportAttributeAccessIssue]
@@ -107,7 +108,7 @@ def texts(source: str) -> tuple[list[str], list[str]]:
 
 
 def script_texts(source: str) -> tuple[list[str], list[str]]:
-    """The comments of a JavaScript module, and its strings of several words."""
+    """Return the comments of a JavaScript module, and its strings of several words."""
     found = re.findall(r'"(?:[^"\\\n]|\\.)*"|`(?:[^`\\]|\\.)*`|/\*.*?\*/|(?:^//[^\n]*\n)+|//[^\n]*', source, flags=re.M | re.S)
     comments = [re.sub(r"^ *(//|/?\*+/?) ?|\*/$", "", text, flags=re.M).strip() for text in found if text.startswith("/")]
     return comments, [text[1:-1] for text in found if not text.startswith("/") and " " in text.strip()]
@@ -118,12 +119,12 @@ def one_line(text: str) -> str:
 
 
 def prose(page: str) -> str:
-    """A page without its blocks of code."""
+    """Return a page without its blocks of code."""
     return re.sub(r"^( *)```.*?^\1```", "", page, flags=re.M | re.S)
 
 
 def findings(begun: list[str], other: list[str]) -> list[str]:
-    """The phrases that patterns find: those of a beginning in the first texts, the others in all."""
+    """Return the phrases that patterns find: patterns of beginnings are applied to the first texts, the others to all."""
     found = [match[0] for text in begun for pattern, *_ in BEGINNINGS if (match := re.match(pattern, text))]
     lines = [line for text in (*begun, *other) for line in (*text.splitlines(), one_line(text))]
     found += [match[0] for line in lines for pattern, *_ in PHRASES if (match := re.search(pattern, line, re.IGNORECASE))]

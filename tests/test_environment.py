@@ -1,4 +1,4 @@
-"""What importing the package sets up: float64, an end without a search for garbage, and nothing else."""
+"""Importing the package enables float64 and skips garbage collection at exit, and changes nothing else."""
 
 import os
 from pathlib import Path
@@ -46,7 +46,7 @@ print(len(traces))
 
 
 def test_nothing_of_python_is_changed_and_it_ends_without_looking_for_garbage(tmp_path):
-    """Functions that were registered before are called later; files that are open are written all the same."""
+    """Functions registered earlier are called later, and open files are still written."""
     code = """
 import atexit, gc, os, sys
 before = sys.meta_path[:], gc.isenabled(), gc.get_threshold()

@@ -1,8 +1,8 @@
-"""Joint types and the modules that ask for them: each cell of the table is found by calling the module.
+"""Joint types and the modules that treat them specially: each cell of the table is tested by calling the module.
 
-"served": the module does something for this type that it does not do for a class of one's own with the same equations;
-"refused": an error names the joint; "-": the module treats it as it treats any joint. A new type needs a column here, and
-nowhere else a list: who adds one reads off which modules may want to know it.
+"served": the module treats this type differently from a user-defined class with the same equations; "refused": an error names
+the joint; "-": the module treats it like any joint. A new type needs a column here and no other list: its author reads off
+which modules may have to handle it.
 """
 
 from collections import Counter
@@ -54,7 +54,7 @@ motion ranges     served    served    -         -         -         -         - 
 
 
 class Own(udk.Joint):
-    """A joint of one's own with the equations of another."""
+    """A user-defined joint with the equations of another."""
 
     other: udk.Joint
 
@@ -70,7 +70,7 @@ class Own(udk.Joint):
 
 
 class OwnAtPoints(Own):
-    """The same, of joints that have points."""
+    """The same for joints with points."""
 
     @property
     def points(self):
@@ -107,13 +107,13 @@ def chain(joint: udk.Joint) -> udk.Mechanism:
 
 
 def motion_of(mechanism: udk.Mechanism, turn: float = 0.0) -> Motion:
-    """Return a motion that begins at the initial guess, where everything turns as far at each time."""
+    """Return a motion that begins at the initial guess, with the same rotation of all bodies at each time."""
     q = jnp.stack([mechanism.q0, mechanism.q0 + jnp.array([0.0, 0.0, turn])])
     return Motion(jnp.array([0.0, 1.0]), q, 0 * q)
 
 
 def outcome(is_served: Callable[[], object]) -> str:
-    """Return what happens, where errors name the joint."""
+    """Return the outcome of a call: "refused" if the error names the joint."""
     try:
         return "served" if is_served() else "-"
     except (udk.SceneError, ValueError) as error:
@@ -134,7 +134,7 @@ def follows_radius(joint: udk.Joint) -> bool:
 
 
 def axles(joint: udk.Joint) -> dict[str, udk.Joint]:
-    """Return the pins of wheels on their carrier, where each is."""
+    """Return the pins of wheels on their carrier, one for each wheel."""
     if not isinstance(joint, udk.Gear):
         return {}
     frames = {name: body.frame() for name, body in BODIES.items()}
@@ -147,7 +147,7 @@ def axles(joint: udk.Joint) -> dict[str, udk.Joint]:
 
 
 def reactions_differ(joint: udk.Joint) -> bool:
-    """Tell whether loads in axes and about points of the joint are others than those of a joint of one's own."""
+    """Return True if loads in the axes and about the points of the joint differ from those of a user-defined joint."""
     found = []
     for one in (joint, own(joint)):
         mechanism = scene({"J": one})
@@ -162,13 +162,13 @@ def reactions_differ(joint: udk.Joint) -> bool:
 
 
 def slot_for(joint: udk.Joint) -> udk.Slot:
-    """Return a slot through the point of a joint, which holds one direction of it again."""
+    """Return a slot through the point of a joint, which holds one of its directions a second time."""
     points = getattr(joint, "points", None)
     return udk.Slot(joint.bodies, P if points is None else np.asarray(points), axis=0.3)
 
 
 def can_be_drawn(joint: udk.Joint) -> bool:
-    """Tell whether the studio draws a joint of a body on the ground, or of wheels on their carrier, which mesh."""
+    """Return True if the studio can draw a joint between a body and the ground, or between meshing wheels on a carrier."""
     pins = axles(joint)
     if isinstance(joint, udk.Gear):
         one, two = (BODIES[name].position for name in joint.bodies)
@@ -186,14 +186,14 @@ def with_slot(joint: udk.Joint) -> udk.Mechanism:
 
 
 def moves_on_pins(joint: udk.Joint) -> bool:
-    """Tell whether a body follows another that is turned."""
+    """Return True if a body follows another that is turned."""
     mechanism = chain(joint)
     hanging = udk.Mechanism(dict(mechanism.bodies), {name: mechanism.joints[name] for name in "AJ"})
     return bool(np.any(udk.with_angle(hanging, "a", 0.3).q0[1] != hanging.q0[1]))
 
 
 def has_fixes(joint: udk.Joint) -> bool:
-    """Tell whether a constraint can be relaxed by less than taking it away."""
+    """Return True if a constraint can be relaxed without removing it."""
     mechanism = scene({"J": joint})
     at = RankedPositions(mechanism, 1e-9).at(0.0, np.asarray(mechanism.q0, float).ravel())
     return len(list(changes_of(mechanism, "J", at, np.ones((len(udk.analyse(mechanism).row_names), 1))))) > 1
@@ -211,7 +211,7 @@ def peaks(joint: udk.Joint) -> bool:
 
 
 def compliance(joint: udk.Joint) -> bool:
-    """Tell whether one number serves several rows; of one row it is what any joint takes."""
+    """Return True if one number serves several rows; for a single row, every joint accepts one number."""
     mechanism = scene({"J": joint})
     udk.reactions(mechanism, motion_of(mechanism), compliances={"J": 0.1})
     return len(udk.analyse(mechanism).row_names) > 1

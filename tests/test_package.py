@@ -1,4 +1,4 @@
-"""The house: floors import only from below, the public face is what it says, and importing it costs nothing."""
+"""Folders import only from lower floors, the public names are those of the stub, and importing the package is cheap."""
 
 import os
 import re
@@ -53,7 +53,7 @@ ONLY_IN = {
 
 
 def violations(root: Path) -> list[str]:
-    """The imports of the package below `root` from floors above or beside, or from libraries that belong to another floor."""
+    """Return imports of the package below `root` from floors above or beside, or of libraries that belong to another floor."""
     found = []
     for file in sorted(root.rglob("*.py")):
         place = file.relative_to(root)

@@ -33,7 +33,7 @@ class Balance(HTMLParser):
 
 
 def anything(*arguments: Any) -> Any:
-    """Stand for a function of the user's own."""
+    """A placeholder for a user's function."""
 
 
 def cells(text: str) -> list[list[str]]:
@@ -43,7 +43,7 @@ def cells(text: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def objects() -> dict[str, object]:
-    """Every kind of object that a user gets, by the name of its class."""
+    """Return every kind of object that a user receives, by the name of its class."""
     mech, ts = udk.library.driven_pendulum(), np.linspace(0.0, 0.5, 6)
     free = udk.Mechanism({"a": udk.Body(1.0, 0.1, [0.5, 0.0])}, {"A": udk.Revolute(["ground", "a"], [[0, 0], [-0.5, 0]])})
     run = udk.simulate(free, ts, events=[udk.Event(lambda t, at: t - 0.25, udk.Log(), name="late")])

@@ -1,4 +1,4 @@
-"""Progress means the same in every function: a line after two seconds, at once, never, or a callable's own."""
+"""Progress means the same in every function: a line after two seconds, at once, or never, or a user's callable."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""The parts of `.ci/slow`: they hold every slow test once, and a part that has passed is not run again."""
+"""The parts of `.ci/slow` contain every slow test once, and a part that has passed is not run again."""
 
 import subprocess
 import sys

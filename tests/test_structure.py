@@ -1,6 +1,6 @@
-"""No two modules import each other, neither inside functions nor for types; a folder imports only from floors below it.
+"""No two modules import each other, even inside functions or for types; a folder imports only from lower floors.
 
-The floors themselves, and which libraries belong to which, are in test_package.py.
+The floors, and the libraries that belong to each, are tested in test_package.py.
 """
 
 import ast
@@ -18,7 +18,7 @@ ROOT = Path(udkjax.__file__).parent
 
 
 def modules(root: Path) -> dict[str, Path]:
-    """Every module below `root`, by its full name; a package stands for its `__init__`."""
+    """Return every module below `root` by its full name; a package is represented by its `__init__`."""
     found = {}
     for file in sorted(root.rglob("*.py")):
         parts = [root.name, *file.relative_to(root).with_suffix("").parts]
@@ -27,14 +27,14 @@ def modules(root: Path) -> dict[str, Path]:
 
 
 def imported(file: Path, name: str, known: dict[str, Path]) -> set[str]:
-    """The modules that one imports, anywhere in its text: at its top, inside functions, for types."""
+    """Return the modules that a module imports anywhere: at its top, inside functions, or for types."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
     found = {full if full in known else full.rpartition(".")[0] for full in imports(file, package)}
     return {module for module in found if module in known and module != name}
 
 
 def circles(root: Path) -> set[frozenset[str]]:
-    """The sets of modules that import each other, directly or by way of others."""
+    """Return the sets of modules that import each other, directly or through others."""
     known = modules(root)
     # The package itself names everything that is public, for type checkers, and loads it when it is asked for.
     names = [name for name in known if name != root.name]

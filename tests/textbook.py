@@ -1,4 +1,4 @@
-"""The terms of a mechanism's equations as the textbook has them, in one program: what several floors hold theirs against."""
+"""The terms of a mechanism's equations in textbook form, in one program, with which several folders are compared."""
 
 from typing import NamedTuple
 

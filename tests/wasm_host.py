@@ -1,4 +1,4 @@
-"""WebAssembly outside of a page: a module of the engine with a memory of its own, by wasmtime."""
+"""WebAssembly outside of a page: a module of the engine with its own memory, by wasmtime."""
 
 import ctypes
 import math
@@ -13,7 +13,7 @@ STACK, PAGE, LINE = 2**20, 2**16, 64
 
 
 class Host:
-    """An instance of a module, and calls of what it exports."""
+    """An instance of a module, and calls of its exports."""
 
     def __init__(self, code: bytes, data_end: int):
         store = self.store = wasmtime.Store()
@@ -37,18 +37,18 @@ class Host:
         return place
 
     def begin(self):
-        """Forget what was put into memory."""
+        """Forget everything in memory."""
         self._end = self._start
 
     def put(self, numbers: Any) -> int:
-        """Put numbers into memory; return their address."""
+        """Write numbers to memory; return their address."""
         data = np.ascontiguousarray(numbers, float)
         place = self._reserve(data.nbytes)
         self.memory.write(self.store, data.tobytes(), place)
         return place
 
     def numbers(self, place: int, count: int) -> np.ndarray:
-        """Return numbers that are in memory."""
+        """Return numbers from memory."""
         return np.frombuffer(bytes(self.memory.read(self.store, place, place + 8 * count)))
 
     def call(self, name: str, *addresses: int):
@@ -73,7 +73,7 @@ def record_of(
     results: Sequence[int],
     following: int,
 ) -> list[int]:
-    """Return the words of the record that `run` is called with."""
+    """Return the words of the call record of `run`."""
     from udkjax.native.base.layout import INPUTS
 
     names, outputs = (*INPUTS, *module.inputs), (*module.results, *module.outputs)
@@ -87,7 +87,7 @@ def record_of(
 
 
 def run_without_contraction(module: Any, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
-    """The same on this processor, compiled without its fused multiply-add."""
+    """Run the same code on this processor, compiled without fused multiply-add."""
     from udkjax.native.base import machine
 
     llvm = machine._llvm()

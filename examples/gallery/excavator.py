@@ -1,4 +1,4 @@
-"""An excavator's arm sinks on its cylinders, with the forces in its pins.
+"""An excavator's arm sinks on its cylinders, and the forces in its pins are shown.
 
 Boom, stick and bucket are held by cylinders, which are springs with dampers here.
 """

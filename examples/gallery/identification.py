@@ -1,4 +1,4 @@
-"""Two masses of a four-bar, identified from its motion: the guess and the result.
+"""Two masses of a four-bar, identified from its motion: the motions with the first guess and with the result.
 
 The measurements are simulated, with noise of 0.01 rad, so that the true values are known.
 """

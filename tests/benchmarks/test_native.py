@@ -1,4 +1,4 @@
-"""The C++ program computes the exact motion, alone, in lanes, and with derivatives."""
+"""The C++ program computes the exact motion: single runs, runs in lanes, and runs with derivatives."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def _compiler():
 
 @pytest.mark.parametrize("start", STARTS)
 def test_it_is_exact(start):
-    """From +60 degrees it goes through singular configurations, by singular values. The links stay on their pivots."""
+    """From +60 degrees it crosses singular configurations, by singular values. The links stay on their pivots."""
     task = problem(start)
     for tolerance, error in ((1e-6, 1e-4), (1e-8, 1e-6), (1e-10, 1e-8)):
         run = native.run(states=True, start=start, tolerance=tolerance, seconds=0.0)

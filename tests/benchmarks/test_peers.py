@@ -1,4 +1,4 @@
-"""Peers are measured as they should be: what is missing is named, what is installed converges to the exact motion."""
+"""Peers are measured correctly: missing ones are named, and installed ones converge to the exact motion."""
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ DOP853 = scipy_numpy.PEERS[0]
 
 @pytest.fixture(scope="module")
 def state():
-    """Coordinates that are not quite closed, any velocities."""
+    """Coordinates that are not quite closed, and arbitrary velocities."""
     noise = np.random.default_rng(0).normal(size=(2, 12))
     return np.concatenate([peer.problem(-45.0, 1.0).q0 + 1e-6 * noise[0], noise[1]])
 

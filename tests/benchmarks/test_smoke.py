@@ -1,4 +1,4 @@
-"""The benchmarks run, and their baselines compute what they are compared with."""
+"""The benchmarks run, and their baselines solve the same problems as udkjax."""
 
 import json
 from importlib import import_module
@@ -61,7 +61,7 @@ def test_a_benchmark_runs_in_small(name):
 
 @pytest.mark.slow
 def test_identification():
-    """The true values are reached, also by differences, and every claim finds its row."""
+    """The true values are found, also with differences, and every claim has its row."""
     figures = identification.main(smoke=True)
     first, noisy, *timed = figures
     assert first["name"] == "linkage" and first["reached"] == 1.0 and first["error"] < 1e-8
@@ -76,7 +76,7 @@ def test_identification():
 
 @pytest.mark.slow
 def test_measurements_tell_what_is_to_be_found():
-    """No parameter of the smallest case could be another one: central differences of what is measured."""
+    """The measurements determine each parameter of the smallest case, by central differences."""
     m = measurements.linkage(end=2.0)
     predicted, truth = m.predictor(), m.unknowns.guess
     values = np.asarray(predicted(truth, 1e-10)[0])
@@ -97,7 +97,7 @@ def test_first_guesses_of_every_measurement_are_around_the_truth():
 
 @pytest.mark.slow
 def test_the_command_writes_figures_table_and_page(tmp_path):
-    """With figures of an earlier run in the folder, which it does not repeat."""
+    """Figures of an earlier run in the folder are included, and not computed again."""
     earlier = [{"name": "udkjax", "start": -45.0, "outputs": "end only", "target": 1e-6, "per_second": 123.0}]
     (tmp_path / "batch.json").write_text(json.dumps({"machine": {}, "figures": earlier}))
     main(["startup", "--smoke", "--out", str(tmp_path)])
@@ -113,7 +113,7 @@ def test_the_command_writes_figures_table_and_page(tmp_path):
 
 
 def test_work_at_equal_error():
-    """Between two points that were measured, on a straight line in logarithms; not beyond them."""
+    """Interpolated between two measured points, on a straight line in logarithms; not extrapolated."""
     work = Work([(1e-4, 100), (1e-8, 400)])
     assert work.at(1e-6) == pytest.approx(200)
     assert np.isnan(work.at(1e-9))

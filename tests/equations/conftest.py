@@ -8,7 +8,7 @@ from tests.textbook import terms
 
 @pytest.fixture(scope="session")
 def kkt():
-    """Accelerations and multipliers from M a + Psi_q^T lambda = F, Psi_q a = gamma, in the sense of least squares."""
+    """Return accelerations and multipliers from M a + Psi_q^T lambda = F, Psi_q a = gamma, by least squares."""
 
     def solved(mechanism, t, q, v):
         x = terms(mechanism, t, q, v)
@@ -21,7 +21,7 @@ def kkt():
 
 @pytest.fixture(scope="session")
 def closed():
-    """The closed position that a mechanism of the library starts from, and random velocities that its constraints allow; flat."""
+    """Return the closed initial position of a mechanism of the library, and random velocities within its constraints; flat."""
 
     def state(mechanism, seed=0):
         q = mechanism.q0.ravel()
@@ -34,5 +34,5 @@ def closed():
 
 @pytest.fixture(scope="session")
 def linkage():
-    """The paper's, at an ordinary angle."""
+    """The paper's linkage at a generic angle."""
     return udk.library.parallelogram(np.deg2rad(-50))

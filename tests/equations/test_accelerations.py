@@ -1,4 +1,4 @@
-"""Accelerations and multipliers: against exact solutions, against other formulations, and the principles they obey."""
+"""Accelerations and multipliers, compared with exact solutions, other formulations, and the principles that they satisfy."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -32,7 +32,7 @@ IN_LINE = np.array([0.0, 0.0, np.pi, np.pi, 1e-9]), np.array([0.0, 2.0, 0.0, -3.
 
 @pytest.fixture(scope="module", params=fast(["Auto", "Varga"], METHODS))
 def moved(request, linkage, placed, data):
-    """By a method: angles and angular velocities, accelerations and multipliers; in line; and where reactions are known."""
+    """The linkage by each method, at generic angles, in line, and where reactions are known."""
     angles = np.concatenate([np.linspace(-3.0, -0.15, 12), np.linspace(0.15, 3.0, 12)])
     known = reference(data, "rest_-50deg")
     states = [[x.ravel() for x in np.meshgrid(angles, [0.0, -1.0, 7.0])], IN_LINE, (known["theta"], known["thetad"])]
@@ -45,7 +45,7 @@ def moved(request, linkage, placed, data):
 
 
 def test_the_linkage_moves_as_its_exact_equation_says(moved):
-    """3.05 theta'' = -3.5 g cos(theta), at any angle but the two where all links are in line, and at any angular velocity."""
+    """3.05 theta'' = -3.5 g cos(theta), at any angular velocity and at any angle except the two where all links are in line."""
     theta, rate, a, _ = moved[1]["ordinary"]
     exact = -3.5 * 9.81 * np.cos(theta) / 3.05
     assert_allclose(a[:, :3, 2], np.stack([exact] * 3, 1), atol=1e-11)
@@ -56,7 +56,7 @@ def test_the_linkage_moves_as_its_exact_equation_says(moved):
 
 
 def test_in_line_too(moved):
-    """There the rank is 10, and the minimum-norm solution keeps to the parallelogram; Elimination promises nothing."""
+    """The rank is then 10, and the minimum-norm solution follows the parallelogram; Elimination makes no promise."""
     name, found = moved
     if name == "Elimination":
         return
@@ -67,7 +67,7 @@ def test_in_line_too(moved):
 @pytest.mark.parametrize("method", [udk.Auto(), udk.SVD(), udk.GramSchmidt()], ids=["Auto", "SVD", "GramSchmidt"])
 @pytest.mark.parametrize("ratio", [1.0, 1e4, 1e8, 1e10])
 def test_a_light_rod_carries_a_heavy_one(method, ratio):
-    """Two equations in the angles from hanging, solved by a determinant whose terms are all positive."""
+    """Two equations in the angles from hanging, solved with a determinant whose terms are all positive."""
     s1, s2, w1, w2 = 0.4, -0.7, 1.0, 0.5
     mech = udk.library.double_pendulum((s1, s2), (w1, w2), (1.0, 1.0), (1.0, ratio))
     sin, cos, g = np.sin(s1 - s2), np.cos(s1 - s2), 9.81
@@ -100,7 +100,7 @@ def test_reactions_of_minimum_norm(linkage, placed, data, case):
 
 
 def test_multipliers_are_those_reactions_for_every_method(moved, data):
-    """lambda of a pin acts on the link, body 2, as -lambda, with M a + Psi_q^T lambda = F; none of it is self-stress."""
+    """The multiplier lambda of a pin acts on the link, body 2, as -lambda, with M a + Psi_q^T lambda = F; no self-stress."""
     known = reference(data, "rest_-50deg")
     theta, _, a, multipliers = moved[1]["known"]
     assert a.shape[1:] == (4, 3)
@@ -130,7 +130,7 @@ def test_a_constraint_said_many_times_changes_nothing(data):
 
 @pytest.mark.parametrize("method", [METHODS["Auto"], METHODS["SVD"]], ids=["Auto", "SVD"])
 def test_baumgarte_feeds_the_violation_back(method):
-    """Psi_q a = gamma - 2 alpha Psi_dot - beta^2 Psi, away from the manifold, where rows are independent."""
+    """Psi_q a = gamma - 2 alpha Psi_dot - beta^2 Psi away from the manifold, where rows are independent."""
     mech, random = udk.library.four_bar(), np.random.default_rng(5)
     q, v = (x + 0.1 * random.standard_normal(x.shape) for x in (mech.q0, mech.v0))
     t, gains = jnp.array(0.0), udk.Baumgarte(3.0, 7.0)
@@ -147,7 +147,7 @@ def test_baumgarte_feeds_the_violation_back(method):
 
 @pytest.fixture(scope="module")
 def nearby():
-    """States almost closed, to 1e-7."""
+    """States that are closed to about 1e-7."""
 
     def states(name, count=4):
         mech, random = getattr(udk.library, name)(), np.random.default_rng(6)
@@ -260,7 +260,7 @@ def test_also_when_numbers_are_traced(linkage):
 
 
 def test_a_mechanism_made_of_traced_numbers():
-    """Nothing is known of its rows: singular values throughout."""
+    """Its independent rows are unknown, so singular values are used throughout."""
 
     @jax.jit
     def angular(angle):
@@ -276,7 +276,7 @@ def test_a_mechanism_made_of_traced_numbers():
 
 
 def test_derivatives_of_accelerations(linkage, placed):
-    """d(theta'')/d(theta), with respect to a mass that the exact equation knows, and second derivatives."""
+    """d(theta'')/d(theta), the derivative with respect to a mass in the exact equation, and second derivatives."""
 
     def angular(theta, mass):
         mech = linkage.with_parameters({"body.coupler.mass": mass})

@@ -37,7 +37,7 @@ def test_the_length_is_that_of_the_longest_arm_wherever_the_origin_is():
 
 
 def test_what_the_rows_are_measured_by():
-    """A row in metres changes by L where its body moves by L; one in radians by one; a gear's by its radius."""
+    """A row in metres changes by L if its body moves by L, one in radians by one, and a gear's by its radius."""
     gear = udk.analyse(udk.library.planetary_gear()).scales
     names = udk.analyse(udk.library.planetary_gear()).row_names
     block = udk.Mechanism({"block": udk.Body(1.0, 0.04)}, {"rail": udk.Prismatic(["ground", "block"], np.zeros((2, 2)), 0.0)})
@@ -47,7 +47,7 @@ def test_what_the_rows_are_measured_by():
 
 
 def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
-    """Mechanisms that differ in these alone share what was found."""
+    """Mechanisms that differ only in masses and loads share the result."""
     mechanism = udk.library.parallelogram(-0.6)
     udk.analyse(mechanism)
     monkeypatch.setattr("udkjax.equations.analysis.redundant_rows", None)
@@ -57,7 +57,7 @@ def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
 
 
 def test_a_traced_mechanism_has_the_rows_of_the_concrete_one_that_it_was_made_from_and_scales_of_its_own():
-    """By machine code under jit, by NumPy or machine code under vmap alone; `grad` takes them as fixed."""
+    """By machine code under jit, by NumPy or machine code under vmap alone; `grad` treats the rows as constant."""
     mechanism = udk.library.parallelogram()
     heavy = lambda mass: mechanism.with_parameters({"body.coupler.mass": mass, "body.coupler.inertia": mass})  # noqa: E731
     made, whole = jax.jit(lambda mass, whole: (udk.analyse(heavy(mass)), udk.analyse(whole)))(1e6, mechanism)
@@ -82,7 +82,7 @@ def assert_scales(found, mechanism):
 
 @pytest.mark.parametrize("count", [1, 30])
 def test_bodies_that_nothing_holds_have_scales(count):
-    """The scales follow from inertia and gravity, by NumPy for any number of bodies, and by machine code."""
+    """Without constraints, the scales follow from inertia and gravity: by NumPy for any number of bodies, and by machine code."""
     falling = udk.Mechanism({f"b{k}": udk.Body(2.0, 0.5, [float(k), 0.0]) for k in range(count)}, {})
     found = udk.analyse(falling)
     assert_allclose([found.length, found.mass, found.time], [0.5, 2.0, np.pi * np.sqrt(0.5 / 9.81)], rtol=1e-14)
@@ -91,7 +91,7 @@ def test_bodies_that_nothing_holds_have_scales(count):
 
 @pytest.mark.parametrize("make", [udk.library.planetary_gear, udk.library.driven_pendulum, udk.library.elliptic_trammel])
 def test_scales_by_arrays_of_jax_and_by_machine_code_are_those_of_numpy(make):
-    """Scenes with drivers, gears and force elements; JAX operations are for other devices."""
+    """Scenes with drivers, gears and force elements; JAX operations serve devices other than the CPU."""
     mechanism = make()
     programs, numbers = scene_programs(mechanism), np.array([*numbers_as_vector(mechanism.numbers), 0.0, 0.0])
     known = scales.scales_p.by_numpy(numbers, programs)
@@ -100,11 +100,11 @@ def test_scales_by_arrays_of_jax_and_by_machine_code_are_those_of_numpy(make):
 
 
 def test_a_mechanism_made_while_something_is_traced():
-    """Its plain numbers stay known; of traced masses and loads the redundant rows are known, of traced geometry they are not."""
+    """Its plain numbers stay concrete. Redundant rows are known with traced masses and loads, but not with traced geometry."""
     seen = []
 
     def rail(mass, arm):
-        """A block on a rail that two equal slots and a stop for its angle hold."""
+        """A block on a rail, held by two equal slots and a constraint on its angle."""
         slots = {name: udk.Slot(["ground", "block"], [[0.0, 0.0], [x * arm, 0.0]], 0.0) for name, x in (("one", -1), ("two", 1))}
         joints = {**slots, "angle": udk.Angle(["ground", "block"])}
         return udk.Mechanism({"block": udk.Body(mass, 0.1)}, joints, gravity=[mass, 0])
@@ -139,7 +139,7 @@ print(udk.analyse(mechanism).redundant_rows, udk.accelerations(mechanism, 0.0, m
 
 
 def row_of_cranks(count, speed, contradicted=False):
-    """Cranks side by side, one of them held twice, and a rod that lengthens from 3.16 m and reaches the first as far as 4 m."""
+    """Cranks side by side, one with a redundant constraint, and a rod driven from 3.16 m that reaches the first up to 4 m."""
     bodies = {f"crank{k}": udk.Body(1.0, 0.1, position=[1.0 + 3 * k, 0.0]) for k in range(count)}
     joints = {f"pin{k}": udk.Revolute(["ground", f"crank{k}"], [[3 * k, 0.0], [-1.0, 0.0]]) for k in range(count)}
     joints["copy"] = joints["pin1"]
@@ -150,7 +150,7 @@ def row_of_cranks(count, speed, contradicted=False):
 
 @pytest.mark.parametrize("large", [False, True])
 def test_what_drivers_cannot_reach_is_given_up_soon(monkeypatch, large):
-    """As many rows are redundant as where the driver can go on; where it never can, too, but not where drivers contradict."""
+    """The redundant rows are the same whether or not a driver reaches its values; contradictory drivers give None."""
     choose, solved = redundancy.kinematic_rows, []
 
     def counted(mechanism):
@@ -185,7 +185,7 @@ SPARSE = ["DEPENDENT_PIVOT", "CLEAR_TOL", "NEGLIGIBLE_SHARE"]
 
 @pytest.fixture
 def written_anew():
-    """Programs of scenes, of which thresholds are part."""
+    """Drop the programs of scenes, which contain thresholds."""
 
     def forget():
         scale_program._kernel.cache_clear()
@@ -202,7 +202,7 @@ def written_anew():
     ("name", "large"), [*((name, False) for name in DENSE), *((name, True) for name in SPARSE)], ids=lambda x: str(x)
 )
 def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name, large, factor):
-    """As many rows are redundant, and what closed closes, to rounding."""
+    """The same number of rows is redundant, and mechanisms that closed still close."""
     scenes = {kind: getattr(udk.library, kind)() for kind in ("parallelogram", "planetary_gear")}
     expected = {kind: udk.analyse(mechanism).redundant for kind, mechanism in scenes.items()}
     name, _, field = name.partition(".")

@@ -1,4 +1,4 @@
-"""The public functions of a state: each one program, with the values and the derivatives of the plain ones."""
+"""The public functions of a state: each is one program, with the values and derivatives of the uncompiled function."""
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ def test_it_is_one_program(name, compilations):
 
 
 def test_it_is_transformed_as_the_plain_one_is():
-    """By time, by positions and by numbers of the scene; mapped over positions given as lists."""
+    """Differentiated with respect to time, positions and numbers of the scene; mapped over positions given as lists."""
 
     def values(psi, gamma, singular_values):
         mech = lambda length: MECH.with_parameters({"joint.B.points": jnp.stack([jnp.stack([length, 0.0]), jnp.zeros(2)])})  # noqa: E731

@@ -1,4 +1,4 @@
-"""The other formulations: the same function where the Udwadia-Kalaba equation is regular; elsewhere they are what they are."""
+"""The other formulations agree with the Udwadia-Kalaba equation where it is regular, and differ as documented elsewhere."""
 
 import equinox as eqx
 import jax
@@ -38,7 +38,7 @@ def mechanism(name):
 
 @deferred  # all of them in one program, which evaluates what they share once
 def all_of(mech, t, q, v, formulations, baumgarte=None):
-    """Accelerations by the Udwadia-Kalaba equation, and by each of the formulations."""
+    """Accelerations by the Udwadia-Kalaba equation and by each formulation."""
     solve = lambda f: equations_of(mech, udk.SVD(), baumgarte, f).accelerations(t, q, v)  # noqa: E731
     return solve(None), {name: solve(f) for name, f in formulations.items()}
 
@@ -53,14 +53,14 @@ def agree(reference, found, tol=1e-10):
 
 @pytest.mark.parametrize("name", REGULAR)
 def test_regular_mechanisms(name, closed):
-    """Driven ones too."""
+    """Including driven ones."""
     mech = mechanism(name)
     q, v = closed(mech)
     agree(*all_of(mech, T0, q, v, ALL))
 
 
 def test_off_the_manifold_and_with_gains(closed):
-    """Baumgarte's terms are in the right-hand side of them all. (With partitioning there are none: it closes each state.)"""
+    """All of them have Baumgarte's terms on the right-hand side, except partitioning, which closes each state."""
     mech = mechanism("compound_pendulum")
     q, v = closed(mech)
     shift = jnp.asarray(np.random.default_rng(1).standard_normal((2, len(q)))) * 1e-2
@@ -90,7 +90,7 @@ SPRING = {"spring": udk.Spring(["ground", "lower"], [[0.3, 0.5], [0.1, 0.0]], st
 
 
 def test_a_driver_and_force_elements(kkt, closed):
-    """Against the KKT equations written down plainly."""
+    """Compared with the KKT equations in plain form."""
     mech = driven(SPRING)
     q, v = closed(mech)
     reference, found = all_of(mech, T0, q, v, ALL)
@@ -107,7 +107,7 @@ def test_without_constraints():
 
 
 class Ball(eqx.Module):
-    """A point mass on a sphere, in coordinates with a full mass matrix; the constraint is said `copies` times."""
+    """A point mass on a sphere, in coordinates with a full mass matrix; the constraint is given `copies` times."""
 
     copies: int = eqx.field(static=True, default=1)
 
@@ -123,7 +123,7 @@ class Ball(eqx.Module):
 
 
 def test_systems_of_the_users_own():
-    """With one constraint by plain LU, and with three times the same by those that can."""
+    """With one constraint by plain LU, and with three copies of it by the formulations that can handle copies."""
     q, v = jnp.array([0.6, 0.1, -0.8]), jnp.array([0.2, 1.0, 0.3])
     robust = {k: f for k, f in ROBUST.items() if k != "CoordinatePartitioning"}
     for copies, formulations in ((1, {"Augmented": LU}), (3, robust)):
@@ -160,7 +160,7 @@ def test_a_pivot_of_plain_LU_that_is_a_rounding_error_counts_as_zero(linkage, pl
 
 
 def test_and_by_nothing_where_a_joint_is_given_twice():
-    """There the pivot is exactly zero. The others take the copy for what it is."""
+    """The pivot is then exactly zero. The other formulations recognize the copy."""
     single = mechanism("compound_pendulum")
     double = udk.Mechanism(single.bodies, {"pin": single.joints["pin"], "again": single.joints["pin"]})
     q, v = single.q0.ravel(), jnp.array([0.3, 0.1, 0.0])
@@ -184,7 +184,7 @@ def test_in_line(linkage, placed):
 
 @pytest.mark.parametrize("name", ["CoordinatePartitioning", *but_slow("Augmented NullSpaceQR NullSpaceSVD")])
 def test_derivatives(name, closed):
-    """With respect to time, state, masses and loads, forward and backward, against differences; and second ones."""
+    """With respect to time, state, masses and loads, forward and reverse, compared with differences; and second derivatives."""
     mech, formulation = driven(SPRING), ALL[name]
     q, v = closed(mech)
 
@@ -211,7 +211,7 @@ def test_derivatives(name, closed):
 
 
 def partitioned(mechanism, t, q, v):
-    """The equations with the partition that is chosen at a state, and which coordinates are independent."""
+    """The equations with the partition chosen at a state, and the mask of independent coordinates."""
     equations = equations_of(mechanism, None, None, udk.CoordinatePartitioning())
     held = deferred(lambda e, t, q, v: e.fix_partition(t, q, v))(equations, t, q, v)
     assert held.independent is not None
@@ -224,7 +224,7 @@ def project_state(equations, q, v):
 
 
 def test_the_dependent_follow_from_the_independent(linkage, placed):
-    """Move every dependent coordinate by up to 0.05: Newton finds back, and the independent ones stay to the bit."""
+    """Dependent coordinates are moved by up to 0.05: Newton's method restores them; independent ones do not change."""
     q, v = (x.ravel() for x in placed(-0.8, 1.3))
     held, independent = partitioned(linkage, T0, q, v)
     assert int(independent.sum()) == 1
@@ -245,7 +245,7 @@ def test_a_guess_too_far_away_is_not_a_number(linkage, placed):
 
 
 def test_completion_has_derivatives(linkage, placed):
-    """Along the independent coordinate: those of the parallelogram; along a dependent one: none."""
+    """Along the independent coordinate the derivative is that of the parallelogram; along dependent ones it is zero."""
     angle = jnp.array(-0.8)
     pose = lambda s: jnp.concatenate([x.ravel() for x in placed(s, 1.3)])  # noqa: E731
     y = pose(angle)

@@ -1,4 +1,4 @@
-"""Systems of the user's own: other coordinates, masses that are not diagonal, rolling and gliding."""
+"""User-defined systems: other coordinates, mass matrices that are not diagonal, rolling and sliding."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ CHOICES: Any = {"rtol": 1e-10, "atol": 1e-10}
 
 
 class Ball(eqx.Module):
-    """A point mass on a sphere: the same constraint said `copies` times."""
+    """A point mass on a sphere, with `copies` of the same constraint."""
 
     weight: jax.Array
     radius: jax.Array
@@ -46,7 +46,7 @@ BALL_START = (jnp.array([0.6, 0.0, -0.8]), jnp.array([0.0, 1.5, 0.0]))
 
 
 def test_redundancy():
-    """Three times the same constraint moves as one does; its multiplier is shared."""
+    """Three copies of a constraint act like one, and share its multiplier."""
     (q, v), triple = BALL_START, Ball(BALL.weight, BALL.radius, 3).system()
     pull = 1.5**2 - G * q[2]  # towards the centre, per mass; lambda = weight pull / (2 radius)
 
@@ -60,7 +60,7 @@ def test_redundancy():
 
 
 def test_gains_feed_violations_back():
-    """Psi is fed back with both gains, a velocity constraint with the first: off the manifold, computed by hand."""
+    """Both gains act on Psi, the first one on a velocity constraint; compared with a calculation by hand, off the manifold."""
     t, q, v = 0.3, jnp.array([0.7, 0.2, -0.8]), jnp.array([0.3, 1.0, 0.5])
     system = udk.ConstrainedSystem(BALL.mass, BALL.force, BALL.constraint, lambda t, q, v: v[0] - 0.2 * v[1] - t)
     a = udk.accelerations(system, t, q, v, stabilization=udk.Baumgarte(3.0, 7.0))
@@ -69,7 +69,7 @@ def test_gains_feed_violations_back():
 
 
 def test_the_tangential_part_is_what_projection_leaves():
-    """On a sphere: the part of changes of position and velocity that is orthogonal to the radius."""
+    """On a sphere, the part of changes of position and velocity that is orthogonal to the radius."""
     equations = equations_of(Ball(BALL.weight, BALL.radius, 3).system())
     q, v = BALL_START
     dq, dv = jnp.array([0.3, -0.2, 0.5]), jnp.array([1.0, 2.0, -1.0])
@@ -79,7 +79,7 @@ def test_the_tangential_part_is_what_projection_leaves():
 
 @pytest.mark.slow
 def test_a_batch_and_a_gradient():
-    """Each radius is its own motion; derivatives of the end with respect to radius and speed against differences."""
+    """Each radius has its own motion; derivatives with respect to radius and speed are compared with differences."""
 
     def end(p):
         ball = Ball(jnp.array(2.0), p[0])
@@ -98,7 +98,7 @@ def test_a_batch_and_a_gradient():
 
 
 def double(redundant):
-    """A double pendulum of two unit point masses in its angles; `redundant` adds their sum as a coordinate, and says so twice."""
+    """A double pendulum of two unit point masses in its angles; if `redundant`, their sum is a coordinate, constrained twice."""
 
     def mass(q):
         c = jnp.cos(q[0] - q[1])
@@ -121,7 +121,7 @@ def double(redundant):
 
 
 def in_angles():
-    """The spherical pendulum in polar angles, by SciPy: theta from straight down, phi around."""
+    """The spherical pendulum in polar angles, by SciPy: theta from straight down, phi around the vertical."""
 
     def slope(t, y):
         theta, _, p, w = y
@@ -174,7 +174,7 @@ def side_by_side():
     ids=lambda x: type(x).__name__,
 )
 def test_each_kind_of_constraint_along_a_motion(stabilization):
-    """Holonomic and not, linear and not, of time, redundant, and with a full mass matrix: against what is known of each."""
+    """Holonomic and nonholonomic, linear and nonlinear, time-dependent, redundant, and with a full mass matrix."""
     (system, parts), projected = side_by_side(), isinstance(stabilization, udk.Projection)
     angles, rates = np.array([1.0, -0.4]), np.array([0.3, 1.2])
     q = np.concatenate([BALL_START[0], BEAD[0], np.zeros(2), np.zeros(3), angles, [angles.sum()]])
@@ -200,7 +200,7 @@ def test_each_kind_of_constraint_along_a_motion(stabilization):
 
 
 def test_a_mass_matrix_that_is_not_diagonal():
-    """The added coordinate weighs 1e-3 along the sum of the angles: M + 1e-3 u u^T, explicitly."""
+    """The added coordinate weighs 1e-3 along the sum of the angles: explicitly M + 1e-3 u u^T."""
     q, v = jnp.array([1.0, -0.4]), jnp.array([0.3, 1.2])
     u = jnp.ones(2)
     plain = double(False)

@@ -1,4 +1,4 @@
-"""Large scenes, whose redundant rows are found, and which are closed, by sparse arithmetic."""
+"""Large scenes are closed, and their redundant rows found, by sparse arithmetic."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +28,7 @@ REDUNDANT = {
 
 @pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in REDUNDANT])
 def test_sparse_analysis_finds_as_many_rows_as_singular_values_which_do_as_well(name, monkeypatch):
-    """At every position that the other has seen, what stays is as far from dependent as what the other leaves."""
+    """At every position of the dense analysis, the retained rows are as far from dependence as those that it retains."""
     mech, choose = REDUNDANT[name](), redundancy.kinematic_rows
     q, found = np.asarray(mech.q0).ravel(), []
     for size in (False, True):

@@ -1,4 +1,4 @@
-"""Reactions in any axes and about any point, which of them are unique, and how compliances share the others."""
+"""Reactions in all axes and about all points, their uniqueness, and the sharing of forces by compliances."""
 
 from types import SimpleNamespace
 
@@ -50,7 +50,7 @@ def test_tangential_parts_of_the_paper_s_linkage_are_unique_and_axial_ones_are_n
 
 
 def test_uniqueness_is_that_of_a_jacobian_written_by_hand(linkage):
-    """The linkage with the self-stress of its closed form, u = (f e, -f e), f = (1, -2, 1): NumPy, and the null vector."""
+    """The linkage with the self-stress of its closed form, u = (f e, -f e), f = (1, -2, 1); the null vector is by NumPy."""
     theta = 0.3
     mechanism = udk.library.parallelogram(theta)
     e, across = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
@@ -78,7 +78,7 @@ def test_a_thousand_states_at_once(linkage, placed):
 
 
 def beam(stiff_at=(-1.0, 0.0, 1.0), torque=2.0):
-    """A beam on upright rods, and one that holds it sideways."""
+    """A beam on upright rods, and a rod that holds it sideways."""
     rods = {f"rod{k}": udk.Distance(["ground", "beam"], [[x, -1.0], [x, 0.0]]) for k, x in enumerate(stiff_at)}
     rods["side"] = udk.Distance(["ground", "beam"], [[-3.0, 0.0], [-1.0, 0.0]])
     load = udk.Torque(["ground", "beam"], torque)
@@ -86,7 +86,7 @@ def beam(stiff_at=(-1.0, 0.0, 1.0), torque=2.0):
 
 
 def hand_split(spots, stiffness, force, torque):
-    """Forces of springs that hold a rigid beam: k (u + phi x), with the sum and the moment that it needs."""
+    """Forces of springs that hold a rigid beam: k (u + phi x), with the required sum and moment."""
     spots, stiffness = np.asarray(spots), np.asarray(stiffness)
     matrix = np.array([[stiffness.sum(), stiffness @ spots], [stiffness @ spots, stiffness @ spots**2]])
     lift, turn = np.linalg.solve(matrix, [force, torque])
@@ -107,7 +107,7 @@ def test_a_beam_on_three_supports_is_shared_as_springs_share_it(compliance):
 
 
 def test_a_joint_without_compliance_is_rigid():
-    """Two rigid supports carry the beam as if there were no third; of three the least norm is what is left."""
+    """Two rigid supports carry the beam as if there were no third support; with three, the least norm decides."""
     found = supports(beam(), {"rod2": 1e-6})
     assert_allclose(found, [2.0, 3.0 * G - 2.0, 0.0], atol=1e-9)
     plain = supports(beam(), None)
@@ -143,7 +143,7 @@ def test_the_split_has_the_derivatives_of_differences():
 
 
 def test_axes_and_points_of_a_slider_crank_against_newton_s_laws():
-    """In the guide's own axes the force is across alone; about a joint's own point a pin has no torque."""
+    """In the axes of the guide, the force is only across it; about the joint's own point, a pin has no torque."""
     mechanism = udk.library.slider_crank(0.7)
     state = at(udk.assemble(mechanism))
     a = np.asarray(udk.accelerations(mechanism, 0.0, state.q[0], state.v[0]))

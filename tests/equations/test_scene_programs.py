@@ -1,4 +1,4 @@
-"""Every term of the equations against its definition: residuals of the elements, and JAX's own derivatives of them."""
+"""Every term of the equations, compared with its definition: the residuals of the elements and JAX's derivatives of them."""
 
 from types import SimpleNamespace
 
@@ -20,7 +20,7 @@ from udkjax.programs.deferred import deferred
 
 
 class Ellipse(udk.Joint):
-    """A point of body 2 stays on an ellipse of body 1; written with arrays, and with an array as its answer."""
+    """A point of body 2 stays on an ellipse of body 1; written with arrays, and returning an array."""
 
     shape: jax.Array
     point: jax.Array
@@ -34,7 +34,7 @@ class Ellipse(udk.Joint):
 
 
 class Table(udk.Joint):
-    """Height over x from a table, a soft step, a branch, a loop, a linear system: whatever JAX can trace."""
+    """Height over x from a table, a soft step, a branch, a loop, a linear system: any function that JAX can trace."""
 
     heights: tuple
     slope: float = 0.3
@@ -55,7 +55,7 @@ class Table(udk.Joint):
 
 
 class Belt(udk.Joint):
-    """Three bodies, the ground in the middle."""
+    """Three bodies, with the ground in the middle."""
 
     radius: float
 
@@ -84,7 +84,7 @@ class Stop(udk.ForceElement):
 
 
 class Drag(udk.ForceElement):
-    """Quadratic drag, a gust that comes with time, and a potential as well."""
+    """Quadratic drag, a time-dependent gust, and a potential."""
 
     coefficient: jax.Array
 
@@ -101,7 +101,7 @@ class Drag(udk.ForceElement):
 
 @pytest.fixture(scope="module")
 def mech():
-    """One of each, far from closed; it is not meant to move."""
+    """One element of each type, far from closed; the mechanism need not be able to move."""
     return udk.Mechanism(
         bodies=BODIES,
         joints={
@@ -163,7 +163,7 @@ OWN_JOINTS = ["revolute of two", "to ground", "slot of two", "rack of two", "ell
 
 @pytest.fixture(scope="module")
 def definitions(mech, states):
-    """The same, of the residuals of the elements by JAX's own derivatives."""
+    """The same terms from the residuals of the elements by JAX's own derivatives."""
 
     @deferred  # NumPy evaluates JAX's program sooner than XLA compiles it
     def at(state):
@@ -199,7 +199,7 @@ def test_values_are_inputs_and_types_are_structure(mech):
 
 @pytest.fixture(scope="module")
 def machine():
-    """A slider-crank that is driven by a motor between crank and rod, with springs, dampers, friction and loads."""
+    """A slider-crank driven by a motor between crank and rod, with springs, dampers, friction and loads."""
     plain = udk.library.slider_crank(angle=0.7, driven=False)
     return udk.Mechanism(
         plain.bodies,

@@ -1,4 +1,4 @@
-"""Nothing is computed that a scene does not need: numbers of operations in its programs."""
+"""Programs contain only operations that the scene needs: counts of operations."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ CHOICES = ("gt", "ge", "and", "select_n")
 
 
 def programs(mechanism, policy=RankPolicy.DROP, baumgarte=False, analysis=None):
-    """The scene's programs, of the rows that are not redundant."""
+    """The programs of the scene, without redundant rows."""
     return scene_programs(mechanism, (analysis or analyse(mechanism)).redundant_rows or (), baumgarte, policy)
 
 
@@ -61,7 +61,7 @@ def plain(linkage):
 
 @pytest.fixture(scope="module")
 def rod():
-    """One pendulum rod, hung at its end."""
+    """A pendulum rod, hung at one end."""
     return udk.Mechanism({"rod": udk.Body(1.0, 0.1, [0.5, 0.0])}, {"A": udk.Revolute((GROUND, "rod"), [[0.0, 0.0], [-0.5, 0.0]])})
 
 
@@ -69,7 +69,7 @@ def rod():
 
 
 def test_the_papers_linkage_pinned(linkage, plain):
-    """11 rows in 12 coordinates: a reciprocal a pivot, nothing else divides, no root is left to the run. More is a decision."""
+    """11 rows in 12 coordinates: one reciprocal for each pivot, no other division, and no root. Decide before you allow more."""
     assert plain["div"] == plain["gt"] == plain["select_n"] == 11  # is the pivot small?
     assert "sqrt" not in plain
     assert trigonometry(plain) == {"sincos": 4}  # one pair a body
@@ -81,7 +81,7 @@ def test_the_papers_linkage_pinned(linkage, plain):
 
 
 def test_a_body_in_free_fall_takes_no_operation():
-    """a_F is a constant, its mass cancels, and there is nothing else."""
+    """a_F is constant, the mass cancels, and nothing else remains."""
     assert arithmetic(right_hand_side(udk.Mechanism({"stone": udk.Body(2.0, 0.1)}))) == 0
 
 
@@ -93,7 +93,7 @@ def test_without_drivers_time_is_not_used(linkage):
 
 
 def test_a_driver_costs_its_own_derivatives_only(rod):
-    """A motor that turns evenly has no second derivative: one row more to eliminate, no time, and no sine but the rod's."""
+    """A motor of constant speed has no second derivative: it adds one row to eliminate, no time, and no sine except the rod's."""
     even = joined(rod, drivers={"motor": udk.Driver((GROUND, "rod"), "angle", udk.Polynomial([0.0, 1.0]))})
     sine = joined(rod, drivers={"motor": udk.Driver((GROUND, "rod"), "angle", udk.Sine(1.0, 2.0))})
     counts = [right_hand_side(m) for m in (rod, even, sine)]
@@ -143,7 +143,7 @@ def test_without_stabilization_psi_and_its_rate_are_not_evaluated(linkage, plain
 
 
 class Exponential(udk.Joint):
-    """Equal angles, written so that it shows."""
+    """Equal angles, written with an exponential so that its evaluation can be counted."""
 
     def residual(self, t, *frames):
         one, two = frames
@@ -151,7 +151,7 @@ class Exponential(udk.Joint):
 
 
 def test_a_row_left_out_is_never_computed():
-    """Both joints say that the angles are equal. The second is left out, and with it the exponential."""
+    """Both joints require equal angles. The second is left out, and with it the exponential."""
     two = joined(
         udk.Mechanism({"rod": udk.Body(1.0, 0.1), "bar": udk.Body(1.0, 0.1, [1.0, 0.0])}),
         joints={"A": udk.Revolute((GROUND, "rod"), [[0.0, 0.0], [0.0, 0.0]]), "same": udk.Angle(("rod", "bar"))},
@@ -172,7 +172,7 @@ def test_a_duplicated_joint_adds_no_operation(linkage, copies, baumgarte, name):
 
 
 def test_pivots_that_are_refused_are_only_asked_about(linkage, plain):
-    """Dropping chooses at each pivot; refusing joins the answers for all of them."""
+    """With DROP each pivot is compared and selected; with REFUSE the comparisons are only combined."""
     refusing = right_hand_side(linkage, policy=RankPolicy.REFUSE)
     assert sum(refusing.values()) == sum(plain.values()) - plain["select_n"] + plain["gt"] - 1
 
@@ -186,7 +186,7 @@ def test_pivots_that_are_refused_are_only_asked_about(linkage, plain):
     ids=["parallelogram", "chain", "excavator"],
 )
 def test_pivots_that_need_not_wait_for_each_other_do_not(mechanism, pivots, most):
-    """A division takes several times as long as what is between two of them: those in a row are what a single run waits for."""
+    """A division takes several times as long as the operations between two divisions: chains of them limit a single run."""
     found = programs(mechanism, RankPolicy.REFUSE)
     program, row = unrolled(mechanism, policy=RankPolicy.REFUSE).program, {}
     for index in program.order:
@@ -210,7 +210,7 @@ def test_a_chain_of_loops_grows_linearly():
 
 
 def test_the_end_of_a_step_factorizes_once(linkage, plain):
-    """For velocities, accelerations and two changes: 11 reciprocals, of the pivots, and one, of the distance."""
+    """For velocities, accelerations and two changes: 11 reciprocals of the pivots, and one of the distance."""
     step = right_hand_side(linkage, "end_of_step")
     assert step["div"] == 12
     assert sum(step.values()) <= 2.5 * sum(plain.values())  # four linear systems instead of one
@@ -247,11 +247,11 @@ def test_only_what_moves_is_differentiated(linkage):
 
 
 def test_a_driver_that_is_not_differentiated_adds_only_its_row(rod):
-    """Along q and v, time does not move: of the motor's motion no derivative is taken beyond those in the accelerations."""
+    """Time is constant along q and v: the motor's motion has no derivatives beyond those in the accelerations."""
     motor = joined(rod, drivers={"motor": udk.Driver((GROUND, "rod"), "angle", udk.Sine(1.0, 2.0))})
     assert trigonometry(derivative(motor)[0]) == trigonometry(right_hand_side(motor))
 
 
 def test_a_projection_is_differentiated_by_one_further_factorization(linkage):
-    """At the state that it returns."""
+    """At the projected state."""
     assert sum(counts.get("div", 0) for counts in derivative(linkage, "projection")) == 11

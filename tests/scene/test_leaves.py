@@ -1,4 +1,4 @@
-"""Every number of a mechanism has one home: whatever JAX does to its leaves runs, prints and is saved."""
+"""Every number of a mechanism has one home: changes of leaves by JAX affect runs, printing and files alike."""
 
 import copy
 import pickle
@@ -22,7 +22,7 @@ DRAWINGS = sorted((Path(__file__).parents[2] / "examples" / "drawings").glob("*.
 
 
 def workshop():
-    """A drawing with every kind of element, partly given by hand; it is not meant to move."""
+    """A drawing with every kind of element, some with numbers given directly; it need not be able to move."""
     angle = np.linspace(0, 2 * np.pi, 7, endpoint=False)
     pins = {
         "O": (0, 0),
@@ -81,7 +81,7 @@ def changed_four_bar():
 
 
 def geared_pendulum():
-    """A pendulum that turns a wheel. The constant of the gear follows from the angles, which start at other values than zero."""
+    """A pendulum that turns a wheel. The constant of the gear follows from the angles, whose initial values are not zero."""
     bodies = {"rod": udk.Body(1.0, 0.1, [0.5, 0.0], 0.3), "wheel": udk.Body(2.0, 0.2, [1.0, 1.0], -0.4)}
     pins = {
         "pin": udk.Revolute(["ground", "rod"], [[0, 0], [-0.5, 0]]),
@@ -102,12 +102,12 @@ scenes = pytest.mark.parametrize("name", fast(["changed four-bar", "planetary_ge
 
 
 def numbers(mechanism):
-    """All numbers that run, and gravity."""
+    """All numbers that a run uses, and gravity."""
     return np.concatenate([np.ravel(x) for x in mechanism.numbers])
 
 
 def different(mechanism):
-    """The mechanism with each of its leaves a little different."""
+    """The mechanism with each of its leaves slightly changed."""
     leaves, tree = jax.tree.flatten(mechanism)
     rng = np.random.default_rng(3)
     return jax.tree.unflatten(tree, [x * (1 + 1e-5 * rng.uniform(size=x.shape)) + 1e-7 for x in leaves])
@@ -123,7 +123,7 @@ def test_leaves_are_the_independent_numbers(name):
 
 @scenes
 def test_each_leaf_changes_what_its_name_changes(name):
-    """Changed as a leaf, by name, and read from a file, a number gives the same mechanism, which prints alike."""
+    """A number changed as a leaf, by name, or in a file gives the same mechanism, which also prints the same."""
     mechanism = SCENES[name]()
     leaves, tree = jax.tree.flatten(mechanism)
     places = {id(x): k for k, x in enumerate(leaves)}
@@ -228,7 +228,7 @@ def test_mechanisms_that_share_arrays_keep_their_leaves_apart():
 
 @pytest.mark.parametrize("name", fast(["geared pendulum"], ["four-bar", "changed four-bar", "geared pendulum"]))
 def test_derivatives_by_leaves(name):
-    """Reverse mode over the whole mechanism, against differences of runs with one leaf changed, and by name."""
+    """Reverse mode over the whole mechanism, compared with differences of runs with one leaf changed, and by name."""
     mechanism = SCENES[name]()
     slopes = eqx.filter_jit(eqx.filter_grad(end))(mechanism).independent_parameters()
     run = jax.jit(end)
@@ -250,7 +250,7 @@ def test_invalid_leaves_are_named_where_they_are_used():
 
 
 def test_constants_of_gears_follow_from_their_radii(tmp_path):
-    """Whoever changes a radius as a leaf runs what a file with this radius runs."""
+    """If a radius is changed as a leaf, the run is the same as with a file that has this radius."""
     mechanism = library.planetary_gear()
     name = next(key for key in mechanism.parameters() if key.endswith(".radii"))
     joint = name.split(".")[1]

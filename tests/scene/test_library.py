@@ -107,7 +107,7 @@ def test_slider_crank_starts_as_in_the_reference():
 
 
 def test_a_spring_holds_the_slider_of_a_slider_crank(at):
-    """Stretched by 0.5 m from 1.5 m, the slider moving away at v: V = 1/2 k 0.25, and the damper brakes it."""
+    """Stretched by 0.5 m from 1.5 m, with the slider moving away at v: V = 1/2 k 0.25, and the damper brakes it."""
     mech = library.slider_crank(angle=0.0, spring=(40.0, 1.5, 3.0))
     frames = at(mech, mech.q0, mech.v0 + jnp.array([[0.0] * 3, [0.0] * 3, [0.2, 0.0, 0.0]]))
     spring = mech.forces["spring"]
@@ -117,7 +117,7 @@ def test_a_spring_holds_the_slider_of_a_slider_crank(at):
 
 
 def test_the_excavator_is_in_equilibrium_on_its_cylinders(at):
-    """With its cylinders as they are, turning the boom, the stick or the bucket changes its potential energy by nothing."""
+    """With the free lengths of its springs, a rotation of boom, stick or bucket does not change the energy to first order."""
     start = library.excavator()
     lengths = {f"force.{name}.length": spring.length for name, spring in start.forces.items()}
 

@@ -222,7 +222,7 @@ def test_it_can_be_sent_to_another_process(everything, same):
 
 
 def test_a_rod_of_no_length_is_refused_where_rounding_gives_it_one():
-    """0.1 + 0.2 - 0.3 is 5.6e-17: its direction is that of the error. A rod that is small beside nothing is a rod."""
+    """0.1 + 0.2 - 0.3 is 5.6e-17, whose direction is meaningless. A short rod in a scene of the same size is valid."""
     for x, place in ((0.1 + 0.2, 0.3), (1.0, 1.0 + 1e-15), (0.0, 0.0)):
         with pytest.raises(udk.SceneError, match=r"joint\[0\]\).length: must be > 0, and is 0.0 in the initial guess"):
             udk.Mechanism({"b": udk.Body(1.0, 0.1, [x, 0.0])}, {"rod": udk.Distance(["ground", "b"], [[place, 0.0], [0.0, 0.0]])})
@@ -241,7 +241,7 @@ def _requiring(element):
 
 
 def test_traced_numbers_are_checked_as_concrete_ones_are(everything):
-    """One that must be positive is not; what must increase does not."""
+    """A number that must be positive is not; numbers that must increase do not."""
     hold = jax.jit(lambda element: traced_numbers_are_valid([element]))
     found = [one for element in everything.elements for one in _requiring(element)]
     assert len({(type(owner), name) for owner, name in found}) == 9
@@ -251,7 +251,7 @@ def test_traced_numbers_are_checked_as_concrete_ones_are(everything):
 
 
 def test_what_takes_nothing_from_the_guess_is_not_completed_again(monkeypatch):
-    """A change of one number is no work for the hundreds of rods of a truss: they have their lengths."""
+    """A change of one number causes no work for the hundreds of rods of a truss, whose lengths are given."""
     pair = ["a", "b"]
     joints = {
         "rod": udk.Distance(pair, P),

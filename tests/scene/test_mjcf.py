@@ -1,4 +1,4 @@
-"""MJCF in and out: held against MuJoCo's own accelerations where it is installed, against mechanisms, and against bad input."""
+"""MJCF, read and written: compared with MuJoCo's accelerations if it is installed, with mechanisms, and for bad input."""
 
 import importlib
 import importlib.util
@@ -102,7 +102,7 @@ LOOPS = """<mujoco><compiler angle="radian" eulerseq="XYZ"/><option gravity="1 2
 
 
 def differences(xml, count, seed, method):
-    """The largest relative differences of velocities and accelerations of bodies from MuJoCo's, at random states of each."""
+    """The largest relative differences of the velocities and accelerations of bodies from MuJoCo's, at random states."""
     mujoco = pytest.importorskip("mujoco")
     model = mujoco.MjModel.from_xml_string(xml)
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)

@@ -18,7 +18,7 @@ DAMPING = 0.4
 
 
 class Network(udk.ForceElement):
-    """A torque on a body, learned: a function of its angular velocity."""
+    """A learned torque on a body, a function of its angular velocity."""
 
     law: eqx.nn.MLP
 
@@ -57,7 +57,7 @@ def test_it_computes_what_the_network_says(network):
 
 
 def test_it_learns_a_damper(network):
-    """A few steps of gradient descent by the network's weights, towards the motion with a linear damper."""
+    """A few steps of gradient descent on the weights of the network, towards the motion with a linear damper."""
     (rod,) = network.body_names
     damped = pendulum(udk.TorsionSpring(["ground", rod], stiffness=0.0, damping=DAMPING))
     wanted = udk.simulate(damped, TS, rtol=1e-6, atol=1e-6).q[:, 0, 2]

@@ -1,4 +1,4 @@
-"""Other lengths and starts: the same mechanism as one that was built so, and a guess that stays closed."""
+"""Mechanisms with changed lengths and initial angles equal those built that way, and their guesses stay closed."""
 
 import jax
 import numpy as np

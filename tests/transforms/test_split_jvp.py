@@ -1,4 +1,4 @@
-"""A value and its changes along directions: one form where nothing transforms it any more, the parts for every transformation."""
+"""A value and its changes along directions: one combined operation if no transformation follows, otherwise its parts."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ def parts(x, direction):
 
 
 def marked(x, direction):
-    """The same, with a mark by which tests tell this form from the parts."""
+    """Return the same function with a mark by which tests distinguish the combined operation from its parts."""
     value, (change,) = parts(x, direction)
     return value, [change + 10.0]
 
