@@ -21,7 +21,7 @@ from udkjax.programs.control_flow import control_flow
 
 
 class ClosingRule(NamedTuple):
-    """When a position counts as closed, and how it is approached.
+    """Criteria of a closed position, and of the steps that approach it.
 
     Rounding errors of Psi are about 1e-15 in units of the scene's scales; in a scene that cannot be closed, Psi is as large as
     the errors of its lengths. `tol` lies between the two.

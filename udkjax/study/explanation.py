@@ -241,7 +241,7 @@ def _width(names: list[str]) -> int:
 
 
 def _shown(count: int, most: int = MOST_ROWS, first: int = FIRST_ROWS) -> int:
-    """Return how many of `count` rows or columns are printed."""
+    """Return the number of rows or columns, out of `count`, that are printed."""
     return count if count <= most else first
 
 
