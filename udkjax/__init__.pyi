@@ -1,4 +1,4 @@
-"""The public names, each from the module that it is in: `__init__.py` reads them here, as type checkers and editors do."""
+"""The public names, each from its own module: `__init__.py` reads them here, as type checkers and editors do."""
 
 from udkjax import equations as equations
 from udkjax import pinv as pinv

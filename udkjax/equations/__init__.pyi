@@ -1,4 +1,4 @@
-"""The door of `equations`: the names that floors above import, each from the module that it is in."""
+"""The door of `equations`: the names that floors above import, each from its own module."""
 
 from udkjax.equations import constraints as constraints
 from udkjax.equations import determinacy as determinacy

@@ -1,4 +1,4 @@
-"""The door of `expressions`: the names that floors above import, each from the module that it is in."""
+"""The door of `expressions`: the names that floors above import, each from its own module."""
 
 from udkjax.expressions.complex_scalars import ComplexScalar as ComplexScalar
 from udkjax.expressions.complex_scalars import solve_complex as solve_complex

@@ -1,4 +1,4 @@
-"""The door of `integrate`: the names that floors above import, each from the module that it is in."""
+"""The door of `integrate`: the names that floors above import, each from its own module."""
 
 from udkjax.integrate.compiled_mechanism import reason_for_plain as reason_for_plain
 from udkjax.integrate.events import Attach as Attach

@@ -1,4 +1,4 @@
-"""The door of `native`: the names that floors above import, each from the module that it is in."""
+"""The door of `native`: the names that floors above import, each from its own module."""
 
 from udkjax.native.base.code_cache import cache_folder as cache_folder
 from udkjax.native.base.code_cache import cached_files as cached_files

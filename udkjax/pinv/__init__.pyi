@@ -1,4 +1,4 @@
-"""The door of `pinv`: the names that floors above import, each from the module that it is in."""
+"""The door of `pinv`: the names that floors above import, each from its own module."""
 
 from udkjax import pinv as pinv
 from udkjax.pinv.auto import NEAREST as NEAREST

@@ -1,4 +1,4 @@
-"""The door of `positions`: the names that floors above import, each from the module that it is in."""
+"""The door of `positions`: the names that floors above import, each from its own module."""
 
 from udkjax.positions.assembly import AssemblyError as AssemblyError
 from udkjax.positions.assembly import AssemblyWarning as AssemblyWarning

@@ -146,7 +146,7 @@ def _at_meetings(curve: Curve, values: Array, found: Three, spacing: Array, acti
 
 
 class _Operator(eqx.Module):
-    """The changes by the numbers as a linear map with its transpose."""
+    """The linear map from changes of the numbers to changes of the positions, with its transpose."""
 
     matrix: Float[Array, "K 3 n P"]
     residue: Float[Array, "K P n"]

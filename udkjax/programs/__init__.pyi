@@ -1,4 +1,4 @@
-"""The door of `programs`: the names that floors above import, each from the module that it is in."""
+"""The door of `programs`: the names that floors above import, each from its own module."""
 
 from udkjax.programs.control_flow import BY_JAX as BY_JAX
 from udkjax.programs.control_flow import BY_NUMPY as BY_NUMPY

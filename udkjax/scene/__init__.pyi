@@ -1,4 +1,4 @@
-"""The door of `scene`: the names that floors above import, each from the module that it is in."""
+"""The door of `scene`: the names that floors above import, each from its own module."""
 
 from udkjax.scene import library as library
 from udkjax.scene.arguments import argument_problems as argument_problems

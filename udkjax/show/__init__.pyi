@@ -1,4 +1,4 @@
-"""The door of `show`: the names that floors above import, each from the module that it is in."""
+"""The door of `show`: the names that floors above import, each from its own module."""
 
 from udkjax.show.doctor import facts as facts
 from udkjax.show.doctor import summary as summary

@@ -1,4 +1,4 @@
-"""The door of `statics`: the names that floors above import, each from the module that it is in."""
+"""The door of `statics`: the names that floors above import, each from its own module."""
 
 from udkjax.statics.equilibrium import Equilibrium as Equilibrium
 from udkjax.statics.equilibrium import equilibria as equilibria

@@ -1,4 +1,4 @@
-"""The door of `studio`: the names that floors above import, each from the module that it is in."""
+"""The door of `studio`: the names that floors above import, each from its own module."""
 
 from udkjax.studio.serving import serve as serve
 

@@ -1,4 +1,4 @@
-"""The door of `synthesis`: the names that floors above import, each from the module that it is in."""
+"""The door of `synthesis`: the names that floors above import, each from its own module."""
 
 from udkjax.synthesis.complete import CompleteDesign as CompleteDesign
 from udkjax.synthesis.complete import CompleteDesigns as CompleteDesigns

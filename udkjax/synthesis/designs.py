@@ -45,7 +45,7 @@ class FoundDesign(PrintsTable):
     driver: Drive = eqx.field(static=True)
 
     def motion(self, count: int = 361) -> Kinematics:
-        """Return a motion by `kinematics`: a whole turn from the first position, or from the first to the last one.
+        """Return the motion, found by `kinematics`: a whole turn from the first position, or from the first to the last one.
 
         Args:
             count: number of values.

@@ -1,4 +1,4 @@
-"""The door of `transforms`: the names that floors above import, each from the module that it is in."""
+"""The door of `transforms`: the names that floors above import, each from its own module."""
 
 from udkjax.transforms.gradients import stop_gradients as stop_gradients
 from udkjax.transforms.linear_map import DifferentiableFunction as DifferentiableFunction

@@ -88,7 +88,7 @@ class HostRun:
         plan: common part of all runs.
         times: number of output times.
         coordinates: n.
-        plain: the plain form of one member; None: unresolved members get the code -1.
+        plain: the plain form of a run of one member. If it is None, unresolved members get the code -1.
     """
 
     plan: MachinePlan

@@ -1,4 +1,4 @@
-"""The names of drawings, each from the module that it is in."""
+"""The names of drawings, each from its own module."""
 
 from udkjax.scene.drawing.drawing import Drawing as Drawing
 from udkjax.scene.drawing.drawn_forces import Load as Load

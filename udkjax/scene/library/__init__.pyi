@@ -1,4 +1,4 @@
-"""The mechanisms, each from the module that it is in."""
+"""The mechanisms, each from its own module."""
 
 from udkjax.scene.library.andrews import andrews_squeezer as andrews_squeezer
 from udkjax.scene.library.drawn_mechanisms import four_bar as four_bar

@@ -55,7 +55,7 @@ class CompleteDesign(PrintsTable):
     driver: Drive = eqx.field(static=True)
 
     def motion(self, count: int = 361) -> Kinematics:
-        """Return a motion by `kinematics` from the first position: a whole turn, or to the farthest position of its branch.
+        """Return the motion from the first position, found by `kinematics`: a whole turn, or up to the end of its branch.
 
         Args:
             count: number of values.
