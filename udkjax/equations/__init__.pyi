@@ -59,11 +59,11 @@ from udkjax.equations.reactions import unique_reactions as unique_reactions
 from udkjax.equations.redundancy import dependent_constraints as dependent_constraints
 from udkjax.equations.redundancy import holders_of_driver as holders_of_driver
 from udkjax.equations.redundancy import kinematic_rows as kinematic_rows
+from udkjax.equations.run_programs import RunPrograms as RunPrograms
 from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales
 from udkjax.equations.scales import concrete_scales as concrete_scales
 from udkjax.equations.scales import scales_p as scales_p
-from udkjax.equations.scene_programs import ScenePrograms as ScenePrograms
 from udkjax.equations.scene_programs import scene_programs as scene_programs
 from udkjax.equations.sparse_rows import SparseRows as SparseRows
 from udkjax.equations.structure import numbers_as_vector as numbers_as_vector

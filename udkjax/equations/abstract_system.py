@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import Time, Vector
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scales import Scales
 
 
@@ -60,6 +61,16 @@ class AbstractSystem(eqx.Module):
     @abstractmethod
     def constrained(self) -> bool:
         """True if there are any constraints."""
+
+    @property
+    def programs(self) -> RunPrograms | None:
+        """The programs of the equations for machine code; None if there are none."""
+        return None
+
+    @property
+    def programs_of_rows(self) -> RunPrograms | None:
+        """The programs that find independent rows, among all of them."""
+        return None
 
     def size(self, dq: Vector) -> Float[Array, ""]:
         """Return the largest component of a change of coordinates, relative to the system's units, which are 1 by default."""

@@ -65,11 +65,11 @@ def differentiate_constraint(
             if not entry.is_zero:
                 row[k] = entry
     if not any("time" in s.node.depends for s in value):
-        acceleration = _choose_shorter(graph, rows, acceleration, _gamma_by_entries(graph, rows, q, v))
+        acceleration = choose_shorter(graph, rows, acceleration, gamma_by_entries(graph, rows, q, v))
     return value, rows, rate, [-s for s in acceleration]
 
 
-def _gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
+def gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: list[Scalar]) -> list[Scalar] | None:
     """Return (Psi_q v)_q v as the sum of (dPsi_q[k]/dq[j]) v[j] v[k]; None if an entry contains an opaque expression."""
     entries = Differential(graph, [entry for row in rows for entry in row.values()], q)
     column = {s.index: j for j, s in enumerate(q)}
@@ -86,7 +86,7 @@ def _gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: l
     return total
 
 
-def _choose_shorter(graph: Graph, rows: list[SparseRow], first: list[Scalar], second: list[Scalar] | None) -> list[Scalar]:
+def choose_shorter(graph: Graph, rows: list[SparseRow], first: list[Scalar], second: list[Scalar] | None) -> list[Scalar]:
     """Return whichever of two equal lists of expressions needs fewer operations once the entries of the rows are computed."""
     if second is None:
         return first

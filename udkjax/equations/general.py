@@ -1,18 +1,26 @@
 """User-defined constrained systems by the same equation, with any coordinates and masses and with nonholonomic constraints."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Time, Vector
 from udkjax.arrays import number, number_called
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.scales import Scales
+from udkjax.equations.system_programs import system_programs
+from udkjax.equations.traced_system import TracedSystem, trace_system
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.pinv import SVD, Auto, Plus, Pseudoinverse
+from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
+from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.printing import PrintsLine
 
 
@@ -38,6 +46,10 @@ class ConstrainedSystem(PrintsLine):
     velocity_constraint: Callable[[Time, Vector, Vector], Float[ArrayLike, "k"]] | None = None
     breakpoints: Float[Array, "k"] | None = eqx.field(converter=number_called("breakpoints", optional=True), default=None)
 
+    def traced(self, n: int) -> TracedSystem:
+        """Return the system with its functions traced for n coordinates, as machine code needs it."""
+        return trace_system(self, n)
+
 
 class GeneralEquations(AbstractSystem):
     """The equations of a `ConstrainedSystem` by one method, with the interface of a mechanism's equations.
@@ -46,9 +58,35 @@ class GeneralEquations(AbstractSystem):
     a = a_F + L^(-T) D^+ b, which is a_F + M^(-1/2) D^+ b in other coordinates of the same metric.
     """
 
-    system: ConstrainedSystem
+    system: Any
     method: Pseudoinverse
     baumgarte: Baumgarte | None
+    redundant: tuple[int, ...] | None = eqx.field(static=True, default=None)  # rows are known when a run begins
+
+    @property
+    def mechanism(self) -> Any:
+        """The system."""
+        return self.system
+
+    @property
+    def programs(self) -> RunPrograms | None:
+        """The programs of a traced system; `Elimination` drops dependent rows, all other methods need marks as input."""
+        if not isinstance(self.system, TracedSystem):
+            return None
+        marks_rows, policy = not isinstance(self.method, Elimination), RankPolicy.of(self.method)
+        return system_programs(self.system, marks_rows, self.baumgarte is not None, policy)
+
+    @property
+    def programs_of_rows(self) -> RunPrograms | None:
+        return system_programs(self.system, False).with_all_rows if isinstance(self.system, TracedSystem) else None
+
+    @property
+    def scales(self) -> Scales:
+        """Units of one: coordinates are of order one."""
+        one: Any = np.ones(())  # NumPy's numbers, since each run asks for them
+        rows: Any = np.ones(sum(self.system.functions.row_counts))
+        tol: Any = np.asarray(RANK_TOL)
+        return Scales(length=one, arm=one, rate=one, mass=one, rows=rows, rank_tol=tol)
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         free, weight, plus, b = self._equation(t, q, v)
@@ -64,6 +102,16 @@ class GeneralEquations(AbstractSystem):
             plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
             q = q - weight(plus @ self._psi(t, q))
         for _ in range(2 if self.constrained else 0):
+            plus, weight = self._plus(q, self._slopes(t, q, v))
+            v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
+        return q, v
+
+    def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """Take a Newton step in position and one in velocity; on the manifold the result has the derivatives of a projection."""
+        if self.system.constraint is not None:
+            plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
+            q = q - weight(plus @ self._psi(t, q))
+        if self.constrained:
             plus, weight = self._plus(q, self._slopes(t, q, v))
             v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
         return q, v
@@ -141,8 +189,9 @@ class GeneralEquations(AbstractSystem):
         return jax.jvp(self._psi, (t, q), (jnp.ones_like(t), v))[1]
 
 
-def prepare_general(system: ConstrainedSystem, method: Pseudoinverse | None, baumgarte: Baumgarte | None) -> GeneralEquations:
-    """Choose a method on dense rows: their structure is unknown, so `Auto` is `SVD`."""
-    method = SVD() if method is None or type(method) is Auto else method
+def prepare_general(system: Any, method: Pseudoinverse | None, baumgarte: Baumgarte | None) -> GeneralEquations:
+    """Choose a method, by default `Auto`, which is `SVD` for dense rows."""
+    system = replace(system, breakpoints=None) if isinstance(system, TracedSystem) else system  # the run has them
+    method = Auto() if method is None else method
     tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol
     return GeneralEquations(system, eqx.tree_at(lambda m: m.rank_tol, method, tol, is_leaf=lambda x: x is None), baumgarte)

@@ -13,6 +13,7 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.textbook import prepare
+from udkjax.equations.traced_system import TracedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import prints_table, units
@@ -38,7 +39,7 @@ class Energy(NamedTuple):
 
 
 def equations_of(
-    system: Mechanism | ConstrainedSystem,
+    system: Mechanism | ConstrainedSystem | TracedSystem,
     method: Pseudoinverse | None = None,
     baumgarte: Baumgarte | None = None,
     formulation: Formulation | None = None,
@@ -56,10 +57,10 @@ def equations_of(
     Returns:
         The equations, ready to be evaluated at states (n,).
     """
-    if isinstance(system, ConstrainedSystem):
-        equations: AbstractSystem = prepare_general(system, method, baumgarte)
+    if isinstance(system, Mechanism):
+        equations: AbstractSystem = prepare(system, method, baumgarte, analysis)
     else:
-        equations = prepare(system, method, baumgarte, analysis)
+        equations = prepare_general(system, method, baumgarte)
     return equations if formulation is None else formulation.formulate(equations)
 
 

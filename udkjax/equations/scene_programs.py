@@ -13,6 +13,7 @@ import numpy as np
 
 from udkjax.annotations import TreeDef
 from udkjax.equations.differentiable_programs import DifferentiablePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
@@ -27,17 +28,11 @@ from udkjax.scene.mechanism import Mechanism
 # run faster, but tracing and compiling them takes longer the larger the scene is (python -m benchmarks scaling).
 UNROLLED_SCENE_OPERATIONS = 2800
 
-# The arrays that programs return; all others are scratch.
-RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces root energy independent multipliers".split())
 
+class ScenePrograms(RunPrograms):
+    """The programs of a scene.
 
-class ScenePrograms:
-    """Programs over arrays of numbers: they compute `RESULTS` from constants, t, q, v, dq and dv.
-
-    Intermediate results are stored in arrays of the sizes `scratch`; no number is overwritten after it has been read. `safe` is
-    one if all pivots exceed `safe_tol`; `distance`, the root of the smallest pivot relative to its diagonal entry, is the
-    distance from dependence. The docstring of each program names its results. The `policy` for small pivots concerns the
-    accelerations; corrections leave out the rows whose pivots do not exceed `drop_tol`.
+    Intermediate results are stored in arrays of the sizes `scratch`; no number is overwritten after it has been read.
     """
 
     def __init__(
@@ -69,11 +64,6 @@ class ScenePrograms:
         """The sizes of all arrays of a state that derivatives may need."""
         n = self.coordinate_count
         return self.scratch | {"q1": n, "v1": n}
-
-    @property
-    def term_count(self) -> int:
-        """The number of values that `equation_terms` returns."""
-        return self.coordinate_count + self.row_count
 
     @property
     def scale_count(self) -> int:

@@ -12,8 +12,10 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import Scales
+from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto, AutoOfRows, Elimination, Pseudoinverse
+from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -106,6 +108,16 @@ class TextbookEquations(MechanismSystem):
         if not isinstance(self.method, Elimination) or not self.redundant:
             return self.scales.weights
         return self.scales.weights.at[np.array(self.redundant)].set(0.0)
+
+    @property
+    def programs(self) -> ScenePrograms:
+        """The programs of the scene: if redundant rows are unknown, `Elimination` drops them, and other methods need marks."""
+        redundant = () if self.redundant is None and isinstance(self.method, Elimination) else self.redundant
+        return scene_programs(self.mechanism, redundant, self.baumgarte is not None, RankPolicy.of(self.method))
+
+    @property
+    def programs_of_rows(self) -> ScenePrograms:
+        return scene_programs(self.mechanism).with_all_rows
 
     @property
     def row_names(self) -> list[tuple[str, int]]:

@@ -10,13 +10,14 @@ from itertools import product
 from typing import NamedTuple
 
 from udkjax.equations.differentiable_programs import DifferentiableProgram
-from udkjax.equations.scene_programs import RESULTS, ScenePrograms
+from udkjax.equations.run_programs import RESULTS, RunPrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
 from udkjax.expressions.loop_derivative import COTANGENT, FORWARD, OTHER, PREFIXES, REVERSE, SECOND, TANGENT, TWICE
 from udkjax.expressions.loop_program import LoopProgram
 from udkjax.expressions.unroll import ArrayPlace, Arrays, unroll
 
 WITH_ENTRIES = ("rows_and_loads", "dense_accelerations", "dense_newton_q", "dense_newton_v")  # programs that return Psi_q
+ENTRIES = "psi_q", "couplings"  # the arrays that only these return
 
 
 class UnrolledProgram(NamedTuple):
@@ -40,7 +41,7 @@ class Unrolled:
     Args:
         programs: The programs as loops.
         names: Names of the programs to unroll.
-        differentiated: Names of the programs of `ScenePrograms.differentiable` to differentiate.
+        differentiated: Names of the programs of `differentiable` to differentiate.
         active: For each input of the prologue, whether derivatives with respect to it are needed.
         mode: Mode of differentiation: `FORWARD`, `TWICE`, or `REVERSE`, from cotangents of the results to those of q, v and the
             constants.
@@ -48,7 +49,7 @@ class Unrolled:
 
     def __init__(
         self,
-        programs: ScenePrograms,
+        programs: RunPrograms,
         names: Sequence[str],
         differentiated: Sequence[str] = (),
         active: Sequence[bool] = (),
@@ -64,7 +65,7 @@ class Unrolled:
         layout = unroll(programs.prologue, {"numbers": dict(enumerate(self.numbers))}, graph)["constants"]
         self._arrays: Arrays = {"constants": layout, **state}
         self._results = {
-            name: _entries(self._unroll(getattr(programs, name)), (*RESULTS, "psi_q") if name in WITH_ENTRIES else RESULTS)
+            name: _entries(self._unroll(getattr(programs, name)), RESULTS + (ENTRIES if name in WITH_ENTRIES else ()))
             for name in names
         }
         active_nodes = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])

@@ -36,9 +36,12 @@ from udkjax.expressions.scalar_program import ScalarProgram as ScalarProgram
 from udkjax.expressions.scalar_program import frontier as frontier
 from udkjax.expressions.scalar_program import operations as operations
 from udkjax.expressions.selection import absolute as absolute
+from udkjax.expressions.selection import both as both
 from udkjax.expressions.selection import greater as greater
 from udkjax.expressions.selection import maximum as maximum
 from udkjax.expressions.selection import where as where
+from udkjax.expressions.sparse_ldl import SparseLDL as SparseLDL
+from udkjax.expressions.sparse_ldl import factorize as factorize
 from udkjax.expressions.unroll import ArrayPlace as ArrayPlace
 from udkjax.expressions.unroll import Arrays as Arrays
 from udkjax.expressions.unroll import unroll as unroll

@@ -96,6 +96,11 @@ class Graph:
         self.nodes: list[Node] = []
         self._known: dict[Hashable, int] = {}
 
+    @property
+    def key(self) -> tuple[Hashable, ...]:
+        """All nodes, in order, as a tuple that is equal for equal graphs."""
+        return tuple(self._known)
+
     # --- leaves
 
     def input(self, name: Hashable, group: str, dtype: DTypeLike | None = None) -> Scalar:

@@ -13,10 +13,9 @@ from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.elements import has_pieces
 from udkjax.equations.formulations import FormulatedSystem, Formulation, WrappedSystem
-from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
-from udkjax.equations.scene_programs import ScenePrograms, scene_programs
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.projection import Projection
@@ -28,7 +27,6 @@ from udkjax.native.primitive import unsupported
 from udkjax.native.run.formulations import MethodCode
 from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
-from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -77,13 +75,13 @@ class CompiledMechanism:
         return SampleRows(self.textbook.mechanism, self.breakpoints)
 
     @cached_property
-    def textbook(self) -> TextbookEquations:
-        """The equations of a mechanism, without the formulation that may contain them."""
+    def textbook(self) -> Any:
+        """The equations, without the formulation that may contain them."""
         return textbook_of(self.equations)
 
 
 def compile_mechanism(
-    system: Mechanism | ConstrainedSystem,
+    system: Any,
     analysis: Analysis | None,
     method: Pseudoinverse,
     stabilization: Projection | Baumgarte | None,
@@ -108,8 +106,7 @@ def compile_mechanism(
         operation = _run_operation(equations, solver, projected, breakpoints)
         textbook = textbook_of(equations)
         rows = len(textbook.scales.rows) - len((textbook.redundant or ()) if eliminates(textbook.method) else ())
-        missing = unsupported(operation.code)
-        why = f"the scene uses {missing}, which is not arithmetic on numbers" if missing else ""
+        why = _reason_for_programs(operation.code)
     elif engine != "jax":
         evaluation = evaluation_of(equations)
     if engine == "native" and why:
@@ -119,7 +116,7 @@ def compile_mechanism(
 
 
 @cached_by_identity
-def compile_concrete(system: Mechanism, *choices: Any) -> CompiledMechanism:
+def compile_concrete(system: Any, *choices: Any) -> CompiledMechanism:
     """Return `compile_mechanism` of concrete numbers, with NumPy arrays: JAX would compile a program for each operation."""
     compiled = compile_mechanism(system.without_origin, *choices)
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, compiled)
@@ -143,12 +140,15 @@ def _reason_for_diffrax(
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
     """Return why machine code cannot evaluate such equations, whatever the scene; empty if it can."""
+    plain: Any = equations
     formulation = None
     if isinstance(equations, FormulatedSystem):
-        equations, formulation = equations.equations, equations.formulation
-    if type(equations) is not TextbookEquations:
-        return f"it knows the equations of a mechanism, not {type(equations).__name__}"
-    return reason_for_plain(equations.method, formulation)
+        plain, formulation = equations.equations, equations.formulation
+    if plain.programs is None and jax.config.jax_enable_x64:
+        return f"it does not know {type(plain).__name__}"
+    if formulation is not None and not isinstance(plain, TextbookEquations):
+        return f"it knows {type(formulation).__name__} of mechanisms only"
+    return reason_for_plain(plain.method, formulation)
 
 
 def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = None) -> str:
@@ -162,11 +162,17 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
     return ""
 
 
-def textbook_of(equations: AbstractSystem) -> TextbookEquations:
-    """Return the equations of a mechanism, without the formulation that may contain them."""
-    textbook = equations.equations if isinstance(equations, WrappedSystem) else equations
-    assert isinstance(textbook, TextbookEquations)  # also for a user-defined system
-    return textbook
+def _reason_for_programs(code: RunPrograms) -> str:
+    """Return why machine code cannot be written for programs; empty if it can."""
+    if code.excess:
+        return code.excess
+    missing = unsupported(code)
+    return f"{code.owner} uses {missing}, which is not arithmetic on numbers" if missing else ""
+
+
+def textbook_of(equations: AbstractSystem) -> Any:
+    """Return the equations of a mechanism or a user-defined system, without the formulation that may contain them."""
+    return equations.equations if isinstance(equations, WrappedSystem) else equations
 
 
 def eliminates(method: Pseudoinverse) -> bool:
@@ -177,9 +183,9 @@ def eliminates(method: Pseudoinverse) -> bool:
 def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None) -> RunStates:
     textbook = textbook_of(equations)
     mechanism = textbook.mechanism
-    elements = (*mechanism.constraints.values(), *mechanism.forces.values())
+    elements = (*mechanism.constraints.values(), *mechanism.forces.values()) if isinstance(mechanism, Mechanism) else ()
     return RunStates(
-        code=_programs(textbook),
+        code=textbook.programs,
         method=method_of(solver),
         projected=projected,
         breaks=breakpoints is not None or any(map(has_pieces, elements)),
@@ -199,15 +205,5 @@ def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
     if not equations.constrained or _reason_for_equations(equations):
         return None
     inner = textbook_of(equations)
-    operation = Accelerate(_programs(inner), *_method_code(equations))
-    return None if unsupported(operation.code) else operation
-
-
-def _programs(equations: TextbookEquations) -> ScenePrograms:
-    """Return the programs of a scene: small pivots are refused if the method has a rank-revealing fallback, else dropped.
-
-    `Elimination` drops dependent rows even if they are unknown; all other methods need them as input.
-    """
-    policy = RankPolicy.REFUSE if isinstance(equations.method, Auto) else RankPolicy.DROP
-    redundant = () if equations.redundant is None and isinstance(equations.method, Elimination) else equations.redundant
-    return scene_programs(equations.mechanism, redundant, equations.baumgarte is not None, policy)
+    operation = Accelerate(inner.programs, *_method_code(equations))
+    return None if _reason_for_programs(operation.code) else operation

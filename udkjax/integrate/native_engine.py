@@ -12,7 +12,6 @@ from jaxtyping import Array
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.formulations import FormulatedSystem
-from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -158,7 +157,7 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
         "atol": problem.atol,
         "smallest": problem.smallest,
         "first": 0.0 if problem.h is None else problem.h,
-        "length": problem.length,
+        "length": 1.0 if problem.length is None else problem.length,
         "omega": problem.rate,
         "max_steps": problem.max_steps,
         "drift_tol": problem.drift_tol,
@@ -216,9 +215,9 @@ def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, 
         return None
     equations = compiled.textbook
     mechanism = equations.mechanism.at(t)
-    operation = MarkRows(scene_programs(mechanism).with_all_rows)
+    operation = MarkRows(equations.programs_of_rows)
     tol = equations.scales.rank_tol
-    settings = {"length": length, "omega": rate}
+    settings = {"length": 1.0 if length is None else length, "omega": rate}
     numbers = [*mechanism.numbers, tol**2, 0.0]
     inputs = operation.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)
     results = call_concrete(operation, inputs, 2) if xp is np else native_p.bind(*inputs, operation=operation, times=2)

@@ -1,7 +1,7 @@
 """The input and the output of an integrator: the same for all of them."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -42,8 +41,8 @@ class Problem:
         return self.compiled.equations
 
     @property
-    def textbook(self) -> TextbookEquations:
-        """The equations of a mechanism, without the formulation that may contain them."""
+    def textbook(self) -> Any:
+        """The equations, without the formulation that may contain them."""
         return self.compiled.textbook
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:

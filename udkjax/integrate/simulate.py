@@ -151,7 +151,11 @@ def simulate(
         max_steps=max_steps,
         engine=engine,
     )
-    is_concrete = isinstance(mechanism, Mechanism) and mechanism.is_concrete
+    system = mechanism
+    if isinstance(mechanism, ConstrainedSystem) and jax.config.jax_enable_x64:
+        assert isinstance(state, State)  # checked above
+        system = mechanism.traced(np.size(state.q))
+    is_concrete = not isinstance(system, ConstrainedSystem) and system.is_concrete
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     all_concrete = is_concrete and not is_traced((ts, analysis, state, closure, choices))
     if isinstance(mechanism, Mechanism):
@@ -186,7 +190,7 @@ def simulate(
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
         located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
 
-    solution, missed, end = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
+    solution, missed, end = _run(system, analysis, ts, state, closure, choices, all_concrete)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution, throw)
     if missed:
@@ -218,7 +222,7 @@ def _required(solution: Solution, throw: bool) -> Solution:
 
 
 def _run(
-    system: Mechanism | ConstrainedSystem,
+    system: Any,
     analysis: Analysis | None,
     ts: Any,
     state: State | None,
@@ -230,23 +234,24 @@ def _run(
 
     With concrete numbers NumPy calls machine code directly; everything else is traced.
     """
-    if all_concrete and isinstance(system, Mechanism):
+    body_names = getattr(system, "body_names", ())
+    if all_concrete and not isinstance(system, ConstrainedSystem):
         with jax.ensure_compile_time_eval():  # concrete even while something else is traced
             compiled = compile_concrete(system, analysis, *choices.of_mechanism)
             if compiled.plan.is_native:
                 run = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
-                return _finish(run, integrate_concrete(run.problem), system.body_names, choices, np)
-    scene = system.without_origin if isinstance(system, Mechanism) else system
+                return _finish(run, integrate_concrete(run.problem), body_names, choices, np)
+    scene = system if isinstance(system, ConstrainedSystem) else system.without_origin
     arguments = scene, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
     if is_within_jit():  # concrete numbers become tracers, too
         return _simulate(*arguments)
     # Runs by diffrax are compiled at once: each step has hundreds of operations.
-    uses_diffrax = choices.take_diffrax or not isinstance(system, Mechanism)
+    uses_diffrax = choices.take_diffrax or isinstance(system, ConstrainedSystem)
     return _compiled(*arguments) if uses_diffrax else _deferred(*arguments)
 
 
 def _simulate(
-    system: Mechanism | ConstrainedSystem,
+    system: Any,
     analysis: Analysis | None,
     ts: Array,
     state: State | None,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.native.base.layout import FORMULATION_SETTINGS, INPUTS, OUTPUTS, SETTINGS, SHARE
 from udkjax.native.base.memory import Memory
@@ -33,7 +33,7 @@ from udkjax.native.watching.event_states import EventStates
 class Operation(ABC):
     """An operation on members of a scene."""
 
-    code: ScenePrograms
+    code: RunPrograms
 
     input_names: ClassVar[tuple[str, ...]] = INPUTS  # names of the first inputs
     settings: ClassVar[tuple[str, ...]] = SETTINGS  # names of the settings of this kind of operation

@@ -16,8 +16,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scales import scales_p
-from udkjax.equations.scene_programs import ScenePrograms
 from udkjax.native.base import host_program, machine
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
@@ -58,7 +58,7 @@ def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
 
 
 @lru_cache(maxsize=256)
-def unsupported(code: ScenePrograms) -> str:
+def unsupported(code: RunPrograms) -> str:
     """Return the unsupported operations of a scene; empty if there are none.
 
     For this check each kernel is written once, in loops; the text that is compiled may be unrolled and much longer.
@@ -316,14 +316,14 @@ def _scale_inputs(numbers: Any) -> list[Any]:
     return [numbers.reshape(-1, numbers.shape[-1]), np.zeros((1, 1)), *[empty] * (len(INPUTS) - 2)]
 
 
-def _find_scales(numbers: Array, programs: ScenePrograms) -> Array:
+def _find_scales(numbers: Array, programs: Any) -> Array:
     if numbers.dtype != np.float64 or unsupported(programs):
         return scales_p.by_jax(numbers, programs)
     (scales,) = native_p.bind(*_scale_inputs(numbers), operation=FindScales(programs), times=1)
     return scales.reshape(*numbers.shape[:-1], -1)
 
 
-def _scales_of_batch(numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
+def _scales_of_batch(numbers: np.ndarray, programs: Any) -> np.ndarray:
     """Evaluate the primitive of scales outside compiled programs; for a few vectors by NumPy, without compilation."""
     if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or unsupported(programs):
         return scales_p.by_numpy(numbers, programs)

@@ -12,6 +12,9 @@ The policy is static: it decides which of the two thresholds a program uses.
 
 from enum import Enum
 
+from udkjax.pinv.auto import Auto
+from udkjax.pinv.rule import Pseudoinverse
+
 
 class RankPolicy(Enum):
     """Treatment of pivots below a threshold."""
@@ -27,6 +30,11 @@ class RankPolicy(Enum):
     FALL_BACK = "fall back"
     """Leave out the rows whose pivots do not exceed `drop_tol`, and report whether all exceed `safe_tol`. Derivatives use this
     policy: elimination then agrees with the rank-revealing method that repeats rejected steps."""
+
+    @classmethod
+    def of(cls, method: Pseudoinverse) -> "RankPolicy":
+        """Return the policy of a method: small pivots are refused if it has a rank-revealing fallback, else dropped."""
+        return cls.REFUSE if isinstance(method, Auto) else cls.DROP
 
     @property
     def drops(self) -> bool:

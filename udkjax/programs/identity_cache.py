@@ -29,7 +29,7 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
     """Cache the results of a function by its arguments: numbers and strings by value, others by identity.
 
     A result is stored as long as its arguments exist and it is one of the `CACHE_SIZE` most recently used results. Arguments must
-    be concrete and must not change.
+    be concrete and must not change; a result with traced numbers, which functions may hold in their closures, is not stored.
     """
     cache: OrderedDict[tuple[Hashable, ...], tuple[list[Any], Result]] = OrderedDict()
     lock = RLock()  # an object may be deleted at any time, also within the lock
@@ -49,6 +49,8 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
                     cache.move_to_end(key)
             return stored[1]
         result = function(*args, **kwargs)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves(result)):
+            return result
         references = [_reference(x, lambda _: forget(key)) for x in objects]
         with lock:
             cache[key] = references, result

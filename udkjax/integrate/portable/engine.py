@@ -12,7 +12,8 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.scene_programs import ScenePrograms, scene_programs
+from udkjax.equations.run_programs import RunPrograms
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
@@ -249,14 +250,14 @@ def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram
     return _module(linked.code, linked.data_end, places=evaluation.places, size=evaluation.size)
 
 
-def _driver_places(mechanism: Mechanism, code: ScenePrograms) -> list[JsonObject]:
+def _driver_places(mechanism: Mechanism, code: RunPrograms) -> list[JsonObject]:
     """Return the row of each driver, and its place in the solution of the linear system."""
     names = [name for name, _ in code.row_names]
     rows = [names.index(name) for name in mechanism.driver_names]
     return [{"row": row, "place": code.eliminated_rows[row]} for row in rows]
 
 
-def joint_forces(mechanism: Mechanism, code: ScenePrograms) -> list[JsonObject]:
+def joint_forces(mechanism: Mechanism, code: RunPrograms) -> list[JsonObject]:
     """Return, for each constraint at a point, terms of the force on its second body (the first if the second is the ground).
 
     The load of a constraint on a body is -Psi_q^T lambda = Psi_q^T x, with x the solution of the linear system for its rows. It

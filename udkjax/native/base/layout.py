@@ -20,7 +20,7 @@ direction.
 from dataclasses import dataclass, field
 from typing import Any
 
-from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.steps import POINTS
 from udkjax.native.base.tableau import Method
@@ -40,7 +40,7 @@ INFO = ("code", "t", "tried", "accepted", "evaluations", "written", "lost")  # t
 class Plan:
     """All choices that the code of a module depends on."""
 
-    code: ScenePrograms
+    code: RunPrograms
     method: Method
     projected: bool
     breaks: bool

@@ -105,6 +105,8 @@ class Module(Running):
             p.add("numbers", -(-code.number_count // plan.width))
         if not self.unrolled:
             self._add_arrays("", code.scratch)
+        if code.couples and (self.takes_dense_rows or self.falls_back):
+            self._add_arrays("", {"couplings": code.scratch["couplings"], "change": n})
         if self.takes_dense_rows and "root" not in p.places:
             self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.unrolled else {}))
         if self.is_formulated:
@@ -175,6 +177,8 @@ class Module(Running):
             named |= {x: x for x in ("psi_q", "psi_dot", "root")}
         if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}
+        if "couplings" in self.places.places:
+            named["couplings"] = "couplings"
         return {x: ("work", self.places[place]) for x, place in named.items()}
 
     def write_programs(self):
@@ -182,6 +186,10 @@ class Module(Running):
             out = {"a": ("out", 0)} if name.startswith("accelerations") else {}
             self.write_program(name, self.arrays | out)
         self.write_prologue("prologue", self.unrolled)
+        if "couplings" in self.places.places:
+            at = {"couplings": ("work", self.places["couplings"]), "change": ("out", 0)}
+            self.loops.write(self.code.spread, "spread", ("work", "out"), at)
+            self.loops.write(self.code.gather, "gather", ("work", "out"), at)
 
     def write_program(self, name: str, at: Mapping[str, PointerPlace]):
         """Write one of the scene's programs as a function of `work` and `out`, with its arrays at the places `at`."""

@@ -1,6 +1,8 @@
 """Rows for dense methods: D = W Psi_q M^(-1/2), with W the characteristic length over the scale of each row.
 
-D is computed from the arrays `psi_q` and `root`, which holds M^(-1/2).
+D is computed from the arrays `psi_q` and `root`, which holds M^(-1/2). If M is not diagonal, these belong to other coordinates
+(equations/system_solver.py), to and from which the programs `gather` and `spread` lead. The rows of nonholonomic constraints,
+which come last, do not restrict positions.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,9 +40,9 @@ class RowEntries:
             if line not in module.loops.globals:
                 module.loops.globals.append(line)
 
-    def entries(self, f: Function) -> Iterator[tuple[Value, Value, Value, Value]]:
+    def entries(self, f: Function, count: int | None = None) -> Iterator[tuple[Value, Value, Value, Value]]:
         """Run the block for each entry with its row among the chosen rows, its column, its index in `psi_q`, and its factor."""
-        with f.each(self._count) as e:
+        with f.each(self._count if count is None else count) as e:
             row, column, place = (f.load(Value(f, _ENTRIES, POINTER), e * 3 + j, base=INT) for j in range(3))
             yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)
 
@@ -58,6 +60,8 @@ class WeightedRows(RowEntries):
     def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False, chosen: Sequence[int] | None = None):
         super().__init__(module, chosen)
         self._method = method
+        is_position = module.code.psi_q_entries[0] < module.code.position_rows
+        self.splits, self._position_entries = module.code.position_rows < module.m, int(np.sum(is_position))
         shape, width = (len(self._chosen), module.n), 1 if by_lane else module.plan.width
         self._layout = DenseLayout(module, method.matrices(*shape), shape, width=width)
         self._arguments = [(POINTER, "work"), *([(INT, "lane")] if by_lane else [])]
@@ -83,17 +87,17 @@ class WeightedRows(RowEntries):
         place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         f.store(x, f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 
-    def weighted_entries(self, f: Function) -> Iterator[tuple[Value, Value, Value]]:
+    def weighted_entries(self, f: Function, count: int | None = None) -> Iterator[tuple[Value, Value, Value]]:
         """Run the block for each entry of W Psi_q: its row, its column and its value."""
-        for row, column, place, factor in self.entries(f):
+        for row, column, place, factor in self.entries(f, count):
             yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", self.row_of_psi(f, row))
 
-    def factor(self, f: Function):
-        """Factorize D, from the current entries of Psi_q."""
+    def factor(self, f: Function, of_positions: bool = False):
+        """Factorize D, from the current entries of Psi_q; `of_positions`: only of the rows that restrict positions."""
         d = self.matrices(f)
         with f.each(d.m) as i:
             d.row("D", i).clear()
-        for row, column, value in self.weighted_entries(f):
+        for row, column, value in self.weighted_entries(f, self._position_entries if of_positions and self.splits else None):
             d.row("D", row).put(column, value * self.array(f, "root", column))
         self._call(f, "factor_rows")
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
@@ -31,7 +31,7 @@ class Closing(Module):
     results = ("state", "residuals", "rank")
     further = 1  # further corrections, of the closed state, which only change derivatives
 
-    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool] = ()):
+    def __init__(self, code: RunPrograms, vector: int, active: Sequence[bool] = ()):
         plan = Plan(code, EULER, projected=False, breaks=False, width=1, vector=vector, unrolled=False, steps=False)
         super().__init__(plan, active=active)
         self.active, self.count = active, len(self.moving)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.expressions.loop_derivative import FORWARD, REVERSE, TWICE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Layout
@@ -43,7 +43,7 @@ class ClosingForward(ClosingDerivative):
     outputs = ("dstate",)
     directions_in = 1
 
-    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
+    def __init__(self, code: RunPrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
         self.inputs = tuple(f"{way}{x}" for way in self.ways if way in GIVEN for x in ("numbers", "q", "v"))
         self.tangents = w = Layout(1, self.plan.vector)
@@ -139,7 +139,7 @@ class ClosingTwice(ClosingForward):
     ways = WAYS
     further = 2
 
-    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
+    def __init__(self, code: RunPrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
         self._eliminated = {x: ProgramDerivative(self, f"newton_{x}", "eliminated") for x in self.corrections}
         self.places.add("linearization", max(x.stored for x in self._eliminated.values()))
@@ -167,7 +167,7 @@ class ClosingReverse(ClosingDerivative):
     inputs = ("statebar",)
     outputs = ("numbersbar", "qbar", "vbar")
 
-    def __init__(self, code: ScenePrograms, vector: int, active: Sequence[bool]):
+    def __init__(self, code: RunPrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
         n, capacity, p = self.n, CLOSURE.steps + 1 + CLOSURE.velocities, self.places
         self.row = 3 + 2 * n  # length of a row of the record: index of the quantity, scale, whether limited, q and v before

@@ -12,7 +12,7 @@ side changes where branches meet, and differs on another branch nearby.
 import numpy as np
 
 from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
@@ -36,7 +36,7 @@ class Marching(Module):
     settings = ("length", "omega")
     results = ("qs", "dqs", "ddqs", "sides", "trusted")
 
-    def __init__(self, code: ScenePrograms, width: int, vector: int):
+    def __init__(self, code: RunPrograms, width: int, vector: int):
         plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=code.is_small, steps=False)
         super().__init__(plan)
         for name in ("previous dq", "previous ddq", "third derivative", "prediction"):

@@ -21,7 +21,8 @@ class DenseEquations:
 
     def __init__(self, module: Module, method: DenseMethod):
         self._in, self._rows = module, WeightedRows(module, method)
-        module.places.add("saved", module.n)
+        for name in ("state q", "state v"):
+            module.places.add(f"saved {name}", module.n)
 
     def write(self):
         """Write the functions that the module calls instead of programs."""
@@ -47,9 +48,14 @@ class DenseEquations:
 
     def _correct(self, f: Function, x: MatrixRow, start: str, to: str, sign: float = -1.0):
         """Write `start` plus or minus M^(-1/2) x; `to` is an array, or `out`."""
-        place = 0 if to == "out" else self._in.start(to, "work")
+        place, couples = 0 if to == "out" else self._in.start(to, "work"), self._in.code.couples
+        if couples:
+            with f.each(self._in.n) as i:
+                self._rows.put(f, "change", i, self._rows.array(f, "root", i) * x.entry(i))
+            self._in.invoke(f, "spread", "change")
         with f.each(self._in.n) as i:
-            change, old = self._rows.array(f, "root", i) * x.entry(i), self._rows.array(f, start, i)
+            change = self._rows.array(f, "change", i) if couples else self._rows.array(f, "root", i) * x.entry(i)
+            old = self._rows.array(f, start, i)
             pointer = f.given["out" if to == "out" else "work"]
             f.store(old + change if sign > 0 else old - change, pointer, i * f.width + place, f.width)
 
@@ -62,13 +68,18 @@ class DenseEquations:
 
     def _correct_position(self, f: Function):
         self._in.invoke(f, "dense_newton_q")
-        self._rows.factor(f)
+        self._rows.factor(f, of_positions=True)
         self._correct(f, self._rows.solve(f, "psi"), "state q", "corrected q")
 
     def _factor_and_correct_velocity(self, f: Function):
-        self._in.invoke(f, "dense_newton_v")
-        self._rows.factor(f)
-        self._correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+        def correct():
+            self._in.invoke(f, "dense_newton_v")
+            self._rows.factor(f)
+            self._correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+
+        correct()
+        if not self._in.code.is_linear:  # a second step of Newton's method
+            self._at(f, "state v", "result v", correct)
 
     def _correct_velocity(self, f: Function):
         self._factor_and_correct_velocity(f)
@@ -76,17 +87,21 @@ class DenseEquations:
 
     def _at(self, f: Function, name: str, other: str, do: Callable[[], None]):
         """Run `do` with the array `other` instead of `name`."""
-        module = self._in
-        module.copy(f, name, "saved")
+        module, saved = self._in, f"saved {name}"
+        module.copy(f, name, saved)
         module.copy(f, other, name)
         do()
-        module.copy(f, "saved", name)
+        module.copy(f, saved, name)
 
     def _project(self, f: Function):
         module = self._in
         self._correct_position(f)
 
         def correct_velocity():
+            if self._rows.splits:
+                self._factor_and_correct_velocity(f)
+                module.invoke(f, "psi")
+                return
             module.invoke(f, "psi_dot")
             self._correct(f, self._rows.solve(f, "psi"), "state v", "result v")
             module.invoke(f, "psi")
@@ -96,7 +111,13 @@ class DenseEquations:
     def _project_and_accelerate(self, f: Function):
         module = self._in
         self._factor_and_correct_velocity(f)
-        self._at(f, "state v", "result v", lambda: module.invoke(f, "equation_terms"))
+
+        def terms():
+            module.invoke(f, "equation_terms" if module.code.is_linear else "dense_accelerations")
+            if not module.code.is_linear:
+                self._rows.factor(f)
+
+        self._at(f, "state v", "result v", terms)
         self._correct(f, self._rows.solve(f, "terms", module.n), "terms", "result a", 1.0)
 
     def _end_step(self, f: Function):
@@ -109,5 +130,13 @@ class DenseEquations:
         self._correct_changes(f)
 
     def _correct_changes(self, f: Function):
-        for x in ("dq", "dv"):
-            self._correct(f, self._rows.solve_rates(f, f"state {x}"), f"state {x}", f"result {x}")
+        """Compute the tangent parts of changes, with the factors of all rows."""
+        for x in ("dv", "dq") if self._rows.splits else ("dq", "dv"):
+            change = f"state {x}"
+            if x == "dq" and self._rows.splits:
+                self._rows.factor(f, of_positions=True)
+            if self._in.code.couples:
+                self._in.copy(f, change, "change")
+                self._in.invoke(f, "gather", "change")
+            rates = self._rows.solve_rates(f, "change" if self._in.code.couples else change)
+            self._correct(f, rates, change, f"result {x}")

@@ -84,33 +84,52 @@ def _write_singular_values(module: Module):
     rows = WeightedRows(module, SVDCode(relative=True), by_lane=True)
     rows.write()
     of_lane = [(POINTER, "work"), (INT, "lane")]
+    couples, splits = module.code.couples, rows.splits
+    # For each result: the array to which it is added, its sign, and the right-hand side with the place of its first number.
+    solutions = {"a": ("terms", 1.0, "terms", module.n), "v": ("state v", -1.0, "psi_dot", 0), "q": ("state q", -1.0, "psi", 0)}
 
-    def put(f: Function, x: str, start: str, change: MatrixRow, sign: float):
+    def put(f: Function, x: str, change: MatrixRow, start: str, sign: float):
         with f.each(module.n) as i:
             part = rows.array(f, "root", i) * change.entry(i) * sign
-            rows.put(f, f"fallback {x}", i, rows.array(f, start, i) + part)
+            rows.put(f, f"fallback {x}", i, part if couples else rows.array(f, start, i) + part)
+
+    def spread(f: Function, x: str, start: str):
+        """Complete a result of all lanes, if M is not diagonal."""
+        module.invoke(f, "spread", f"fallback {x}")
+        with f.each(module.n) as i:
+            module.put_entry(f, f"fallback {x}", i, module.entry(f, start, i) + module.entry(f, f"fallback {x}", i))
 
     f = module.new_function("fallback_of_lane", of_lane, 1)
     rows.factor(f)
-    for x, right, place, start, sign in (
-        ("a", "terms", module.n, "terms", 1.0),
-        ("q", "psi", 0, "state q", -1.0),
-        ("v", "psi_dot", 0, "state v", -1.0),
-    ):
-        put(f, x, start, rows.solve(f, right, place), sign)
+    for x, (start, sign, right, place) in solutions.items():
+        if x == "q" and splits:
+            rows.factor(f, of_positions=True)
+        put(f, x, rows.solve(f, right, place), start, sign)
     f = module.new_function("fallback_tangent_part_of_lane", of_lane, 1)
-    rows.factor(f)
+    rows.factor(f, of_positions=True)
     for x in ("dq", "dv"):
-        put(f, x, f"state {x}", rows.solve_rates(f, f"state {x}"), -1.0)
-    for name, threshold in (("fallback", None), ("fallback_tangent_part", np.sqrt(ROUNDING_PIVOT))):
-        f, s = module.function(name, [(POINTER, "work"), (POINTER, "out")])
-        module.invoke(f, "rows_and_loads")
+        if x == "dv" and splits:
+            rows.factor(f)
+        put(f, x, rows.solve_rates(f, f"fallback {x}" if couples else f"state {x}"), f"state {x}", -1.0)
 
-        def each_lane(f: Function = f, s: Lane = s, name: str = name):
-            with module.each_lane(f, s.wanted) as k:
-                f.call(f"{name}_of_lane", f.given["work"], k)
+    def each_lane(f: Function, s: Lane, name: str):
+        with module.each_lane(f, s.wanted) as k:
+            f.call(f"{name}_of_lane", f.given["work"], k)
 
-        if threshold is None:
-            each_lane()
-        else:
-            with_threshold(f, module.places["fallback_tol"], f.const(threshold, DOUBLE, f.width), each_lane)
+    f, s = module.function("fallback", [(POINTER, "work"), (POINTER, "out")])
+    module.invoke(f, "rows_and_loads")
+    each_lane(f, s, "fallback")
+    if couples:
+        for x, (start, *_) in solutions.items():
+            spread(f, x, start)
+    f, s = module.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
+    module.invoke(f, "rows_and_loads")
+    if couples:
+        for x in ("dq", "dv"):
+            module.copy(f, f"state {x}", f"fallback {x}")
+            module.invoke(f, "gather", f"fallback {x}")
+    threshold = f.const(np.sqrt(ROUNDING_PIVOT), DOUBLE, f.width)
+    with_threshold(f, module.places["fallback_tol"], threshold, lambda: each_lane(f, s, "fallback_tangent_part"))
+    if couples:
+        for x in ("dq", "dv"):
+            spread(f, x, f"state {x}")

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
@@ -34,7 +34,7 @@ class RowMarks(Module):
     settings = ("length", "omega")
     results = ("marks",)
 
-    def __init__(self, code: ScenePrograms, width: int, vector: int):
+    def __init__(self, code: RunPrograms, width: int, vector: int):
         plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=code.is_small, steps=False)
         super().__init__(plan)
         self.places.add("independent", self.m)
@@ -63,9 +63,8 @@ class RowMarks(Module):
         setattr(s, "state t", s.start)
         with f.each(self.n) as i:
             self.put_entry(f, "state q", i, self.entry(f, "point3 q", i))
-            zero = f.const(0.0, DOUBLE, width)
-            self.put_entry(f, "state v", i, zero)
-            self.put_entry(f, "state dv", i, zero)
+            self.put_entry(f, "state v", i, self.entry(f, "point3 v", i))
+            self.put_entry(f, "state dv", i, f.const(0.0, DOUBLE, width))
             self.put_entry(f, "state dq", i, self.entry(f, "point3 v", i))
         rate = self.largest(f, lambda r: [f.abs(self.vector(f, "state dq", r)) * self.vector(f, "inverse unit", r)])
         moves = f.like(rate > s.omega * FREE, BOOL, width)

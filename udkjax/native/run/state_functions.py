@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
 
-from udkjax.equations.scene_programs import ScenePrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Layout, Plan
 from udkjax.native.base.loops import LoopWriter
@@ -35,7 +35,7 @@ class StateFunction(Trajectory):
     found: ClassVar[tuple[str, ...]]  # arrays of coordinates that are returned, concatenated
 
     def __init__(
-        self, code: ScenePrograms, pseudoinverse: DenseMethod | None, formulation: FormulationCode | None, width: int, vector: int
+        self, code: RunPrograms, pseudoinverse: DenseMethod | None, formulation: FormulationCode | None, width: int, vector: int
     ):
         super().__init__(
             Plan(
@@ -162,7 +162,7 @@ class Evaluation:
 
     exports = ("prologue", "accelerations", "energy")
 
-    def __init__(self, code: ScenePrograms, further: Sequence[Function] = ()):
+    def __init__(self, code: RunPrograms, further: Sequence[Function] = ()):
         n = code.coordinate_count
         self._code, self._further = code, list(further)
         layout = Layout(1, 1)
@@ -190,7 +190,7 @@ class ScaleCode(Memory):
     settings = ()
     results = ("scales",)
 
-    def __init__(self, code: ScenePrograms):
+    def __init__(self, code: RunPrograms):
         self._code, self.places = code, Layout(1, 1)
         for name, size in (code.scratch | code.scales.sizes).items():
             if name in code.scales.program.arrays:

@@ -1,0 +1,176 @@
+"""Systems of the user's own by machine code: the same functions, motions and derivatives as in plain JAX."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from udkjax.equations.general import prepare_general
+from udkjax.equations.traced_system import trace_system
+from udkjax.integrate.compiled_mechanism import compile_mechanism
+from udkjax.integrate.native_engine import mark_rows
+from udkjax.integrate.native_equations import native_equations
+from udkjax.programs.deferred import deferred
+from udkjax.requirements import ArgumentError
+
+TS = np.linspace(0.0, 2.0, 5)
+TIGHT: Any = {"rtol": 1e-10, "atol": 1e-10}
+
+
+def random_system(seed, n=5, m=2, k=1, couples=True, redundant=True, linear=True):
+    """Smooth functions with random coefficients; `redundant`: every row again, combined with others."""
+    rng = np.random.default_rng(seed)
+    a, b, c, w, e = (rng.normal(size=(rows, n)) for rows in (m, n, k, m, k))
+    mix, diagonal = rng.normal(size=(m, m)), 1 + rng.random(n)
+
+    def mass(q):
+        u = jnp.cos(b @ q)
+        return jnp.diag(diagonal * (1.2 + jnp.sin(q))) + (0.3 * jnp.outer(u, u) if couples else 0.0)
+
+    def force(t, q, v):
+        return jnp.sin(b @ q + t) - 0.3 * v * jnp.abs(v)
+
+    def constraint(t, q):
+        rows = a @ jnp.sin(q) + 0.2 * jnp.cos(w @ q + 0.3 * t)
+        return jnp.concatenate([rows, mix @ rows]) if redundant else rows
+
+    def velocity_constraint(t, q, v):
+        rows = c @ v + 0.3 * jnp.sin(e @ q) * v[0] + 0.1 * t + (0.0 if linear else 0.2 * v @ v)
+        return jnp.concatenate([rows, 2 * rows]) if redundant else rows
+
+    return udk.ConstrainedSystem(mass, force, constraint if m else None, velocity_constraint if k else None)
+
+
+KINDS: Any = [
+    {"linear": False},
+    {"couples": False, "k": 0},
+    {"m": 0, "redundant": False},
+    {"redundant": False, "n": 8, "m": 3, "k": 2},
+]
+METHODS = [udk.Auto(), udk.SVD(), udk.Elimination(), udk.Varga(), udk.Greville(), udk.Householder(), udk.GramSchmidt()]
+EACH = [(kind, method) for kind in KINDS for method in METHODS]
+
+
+@pytest.mark.parametrize(
+    ("kind", "method"), [*EACH[:2], *(pytest.param(*x, marks=pytest.mark.slow) for x in EACH[2:])], ids=lambda x: str(x)[:24]
+)
+def test_functions_of_a_state(kind, method):
+    """Accelerations, projections and tangent parts of random systems at random states, closed or not."""
+    system, n, t = random_system(1, **kind), kind.get("n", 5), 0.3
+    q, v, dq, dv = np.random.default_rng(2).normal(size=(4, n)) * 0.5
+    compiled = compile_mechanism(trace_system(system, n), None, method, udk.Projection(), None, udk.BDF())
+    by_code = native_equations(compiled, mark_rows(compiled, jnp.array(t), q, v, None, 1.0))
+    plain = prepare_general(system, udk.SVD(), None)
+
+    @deferred
+    def of_both(q, v, dq, dv):
+        a = [x.accelerations(t, q, v) for x in (by_code, plain)]
+        for _ in range(4):
+            q, v = plain.project(t, q, v)
+        tangent = [x.tangent_part(t, q, v, dq, dv) for x in (by_code, plain)]
+        near = q + 1e-4 * dq, v + 1e-4 * dv
+        return a, tangent, [by_code.project(t, *near), plain.project(t, *plain.project(t, *near))]
+
+    for found, expected in of_both(q, v, dq, dv):
+        for x, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            assert_allclose(x, wanted, rtol=0, atol=1e-12 * max(1.0, float(jnp.abs(wanted).max())))
+
+
+def in_a_bowl(p):
+    """A bead in a bowl that shakes, pulled along by the air; M is full, and a number is found in closures alone."""
+    mass, radius, gravity = p
+
+    def inertia(q):
+        return mass * jnp.diag(jnp.array([1.0, 1.0, 2.0])) + 0.3 * jnp.outer(q, q)
+
+    def force(t, q, v):
+        return mass * jnp.array([0.3 * jnp.sin(t), 0.0, -gravity]) - 0.1 * v
+
+    def constraint(t, q):
+        gap = q @ q - radius**2
+        return jnp.stack([gap, 2 * gap])
+
+    return udk.ConstrainedSystem(inertia, force, constraint)
+
+
+P = np.array([2.0, 1.0, 9.81])
+
+
+def end_in_bowl(p, **choices):
+    start = udk.State(p[1] * jnp.array([0.6, 0.0, -0.8]), p[0] * jnp.array([0.0, 0.75, 0.0]))
+    return udk.simulate(in_a_bowl(p), TS, start, **(TIGHT | choices)).q[-1]
+
+
+def test_derivatives_through_closures():
+    """Forward and reverse, by numbers that the functions close over and by the state, against differences."""
+    h, steps = 1e-5, np.eye(3)
+    differences = [(end_in_bowl(P + h * e) - end_in_bowl(P - h * e)) / (2 * h) for e in steps]
+    forward, reverse = (jax.jit(derivative(end_in_bowl))(P) for derivative in (jax.jacfwd, jax.jacrev))
+    assert_allclose(forward, reverse, rtol=0, atol=1e-13)
+    assert_allclose(reverse, np.stack(differences, 1), rtol=0, atol=2e-6)
+
+
+@pytest.mark.slow
+def test_second_derivatives():
+    slope, h = jax.jit(jax.jacfwd(end_in_bowl)), 1e-5
+    second = jax.jit(jax.jacfwd(jax.jacfwd(end_in_bowl)))(P)
+    differences = [(slope(P + h * e) - slope(P - h * e)) / (2 * h) for e in np.eye(3)]
+    assert_allclose(second, np.stack(differences, 2), rtol=0, atol=2e-5)
+    assert_allclose(jax.jit(jax.jacfwd(jax.jacrev(end_in_bowl)))(P), second, rtol=0, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("choice", [{"method": udk.SVD()}, {"stabilization": udk.Baumgarte(5.0, 5.0)}, {"stabilization": None}])
+def test_derivatives_of_other_choices(choice):
+    derivatives = [jax.jit(derivative(lambda p: end_in_bowl(p, **choice)))(P) for derivative in (jax.jacfwd, jax.jacrev)]
+    assert_allclose(*derivatives, rtol=0, atol=1e-12)
+    assert_allclose(derivatives[0], jax.jit(jax.jacfwd(end_in_bowl))(P), rtol=0, atol=1e-8)
+
+
+def test_members_of_a_batch_are_single_runs():
+    points = P * np.linspace(0.8, 1.2, 13)[:, None]
+    batch = jax.jit(jax.vmap(end_in_bowl))(points)
+    assert_allclose(batch[::4], [end_in_bowl(p) for p in points[::4]], rtol=0, atol=1e-12)
+
+
+def test_numbers_do_not_compile_again():
+    """Leaves of a module, and arrays of closures, are data of one program; zeros stay what they are."""
+
+    class Ball(eqx.Module):
+        weight: jax.Array
+
+        def mass(self, q):
+            return self.weight * jnp.eye(3)
+
+    def traced(weight, pull):
+        pull = np.array([0.0, 0.0, -pull])
+        return trace_system(udk.ConstrainedSystem(Ball(jnp.array(weight)).mass, lambda t, q, v: jnp.asarray(pull) + 0 * q), 3)
+
+    first, second = traced(2.0, 9.81), traced(3.0, 1.62)
+    assert first.functions == second.functions
+    assert [float(s.constant) for s in first.functions.force[:2]] == [0.0, 0.0]
+    assert first.functions.number_count == 4
+    assert [len(row) for row in first.functions.mass] == [1, 1, 1]
+
+
+def test_what_has_no_scalar_form_is_left_to_diffrax():
+    """The plan has the reason, which is among the settings of a run."""
+
+    def force(t, q, v):
+        return -jnp.linalg.svd(jnp.diag(q + 3.0), compute_uv=False)[::-1] * jnp.array([1.0, 2.0])
+
+    system = trace_system(udk.ConstrainedSystem(lambda q: jnp.eye(2), force), 2)
+    plan = compile_mechanism(system, None, udk.Auto(), udk.Projection()).plan
+    assert not plan.is_native
+    assert plan.why_not_native.endswith("which is not arithmetic on numbers")
+
+
+def test_the_shape_of_what_functions_return():
+    system = udk.ConstrainedSystem(lambda q: jnp.ones(3), lambda t, q, v: -q)
+    with pytest.raises(ArgumentError, match=r"mass must return \(3, 3\) for 3 coordinates, not an array of shape \(3,\)"):
+        udk.simulate(system, TS, udk.State(np.zeros(3), np.zeros(3)))

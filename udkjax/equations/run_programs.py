@@ -1,0 +1,43 @@
+"""The common base of the programs of a scene (scene_programs.py) and of a user-defined system (system_programs.py)."""
+
+from typing import TYPE_CHECKING, Any
+
+from udkjax.pinv.rank_policy import RankPolicy
+
+# The arrays that programs return; all others are scratch.
+RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces root energy independent multipliers".split())
+
+
+class RunPrograms:
+    """Programs over arrays of numbers: they compute `RESULTS` from constants, t, q, v, dq and dv.
+
+    `safe` is one if all pivots exceed `safe_tol`; `distance`, the root of the smallest pivot relative to its diagonal entry, is
+    the distance from dependence. The docstring of each program names its results. The `policy` for small pivots concerns the
+    accelerations; corrections leave out the rows whose pivots do not exceed `drop_tol`.
+    """
+
+    policy: RankPolicy
+    coordinate_count: int
+    row_count: int
+    couples: bool = False
+    """True if M is not diagonal: the programs `spread` and `gather` then change coordinates (native/base/weighted_rows.py)."""
+    owner: str = "the scene"
+    """The object whose functions the programs contain, for messages."""
+    excess: str = ""
+    """The reason why the programs are too long for machine code; empty if they are not."""
+    is_linear: bool = True
+    """True if constraints on velocities are linear in them."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...  # the programs, by their names
+
+    @property
+    def position_rows(self) -> int:
+        """The number of rows that restrict positions, which come first; by default all."""
+        return self.row_count
+
+    @property
+    def term_count(self) -> int:
+        """The number of values that `equation_terms` returns."""
+        return self.coordinate_count + self.row_count
