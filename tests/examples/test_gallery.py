@@ -42,7 +42,7 @@ def test_every_drawing_is_in_the_gallery_and_short():
 
 @pytest.mark.parametrize("name", gallery.DRAWINGS)
 def test_a_drawing_moves_as_it_is_drawn(name):
-    """It is closed as drawn, and has at most one freedom, which no motor has."""
+    """It is closed as drawn, and has at most one degree of freedom without a motor."""
     found = udk.check(udk.load(ROOT / "examples" / "drawings" / f"{name}.toml"))
     assert found.closed and found.residual_before < 1e-12 and found.degrees_of_freedom <= 1
     assert found.moved == found.suspicious == found.redundant == ()

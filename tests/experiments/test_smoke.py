@@ -1,4 +1,4 @@
-"""Every study runs in small and bears out its claim; so do the data that are committed, and the README quotes them."""
+"""Every study, run on a small scale, supports its claim. So do the committed data, and the README quotes them."""
 
 from importlib import import_module
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Functions as programs: traced, read into a graph, emitted."""
+"""Functions as programs: they are traced, read into a graph, and emitted."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,11 +16,11 @@ class Emitted(NamedTuple):
     shapes: list[tuple[int, ...]]
 
     def __call__(self, *arguments: Any) -> tuple[Any, ...]:
-        """The program on arrays, as the function itself would be called."""
+        """Call the program with arrays, like the function itself."""
         return self.shaped(self.program([a[place] for a in map(jnp.asarray, arguments) for place in np.ndindex(*a.shape)]), jnp)
 
     def on_floats(self, *arguments: Any) -> tuple[Any, ...]:
-        """The program on Python numbers."""
+        """Call the program with Python numbers."""
         return self.shaped(self.program([x.item() for a in arguments for x in np.asarray(a).flat]), np)
 
     def shaped(self, outputs: list[Any], xp: Any) -> tuple[Any, ...]:
@@ -34,7 +34,7 @@ class Emitted(NamedTuple):
 
 
 def emit_function(function: Callable, *examples: Any) -> Emitted:
-    """Every element of the (array) arguments becomes one input, every element of the result one output."""
+    """Make every element of the array arguments one input, and every element of the result one output."""
     examples = tuple(jnp.asarray(e) for e in examples)
     graph = Graph()
     inputs = []

@@ -1,4 +1,4 @@
-"""Derivatives of graphs: those of JAX, forward and transposed, from expressions that are shared and hold nothing superfluous."""
+"""Derivatives of graphs: equal to those of JAX, forward and transposed, with shared expressions and nothing superfluous."""
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +59,7 @@ def test_what_has_no_seed_does_not_move(graph, xyz):
 
 
 def test_derivatives_are_the_nodes_of_the_function_where_they_can_be(graph, xyz):
-    """A turned vector: the derivative of each component is the other one."""
+    """When a vector is turned, the derivative of each component is the other one."""
     angle, x, y = xyz
     one = traced(lambda a, x, y: jnp.cos(a) * x - jnp.sin(a) * y, graph, angle, x, y)
     other = traced(lambda a, x, y: jnp.sin(a) * x + jnp.cos(a) * y, graph, angle, x, y)

@@ -1,4 +1,4 @@
-"""Linear systems of expressions, against NumPy: constant pivots first, then rotations; transposed systems; redundant rows."""
+"""Linear systems of expressions compared with NumPy: constant pivots first, then rotations; transposes; redundant rows."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from udkjax.expressions.elimination import SymbolicFactors
 
 
 def system(seed, m, n):
-    """A sparse matrix with ones, minus ones and numbers of a run in it, as expressions, and its numbers."""
+    """A sparse matrix of ones, minus ones and numbers of a run, as expressions, with their values."""
     rng = np.random.default_rng(seed)
     graph, A, inputs, rows = Graph(), np.zeros((m, n)), [], []
     for i in range(m):

@@ -1,4 +1,4 @@
-"""Programs: evaluation on floats, and the split into early and later."""
+"""Programs: evaluation on floats, and the division into early and late parts."""
 
 import math
 
@@ -58,7 +58,7 @@ def test_an_operation_is_traced_once_for_each_value_it_has(emit):
 
 @pytest.fixture
 def split():
-    """m and l are parameters, q the state: sqrt(m) l (q + 1 / m) + l^2, early by parameters alone."""
+    """A function of parameters m and l and the state q: sqrt(m) l (q + 1 / m) + l^2. Terms without q are early."""
     graph = Graph()
     m, length = (graph.input(name, "parameter") for name in ("m", "l"))
     q = graph.input("q", "state")

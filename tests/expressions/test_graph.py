@@ -193,7 +193,7 @@ def test_simplified_expressions_have_the_same_value(tree, values):
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(_trees, _trees, st.lists(st.floats(-3, 3), min_size=3, max_size=3))
 def test_an_input_can_be_replaced_by_an_expression(tree, another, values):
-    """As if the expression had been built of it."""
+    """The result is as if the expression had been used from the start."""
     graph = Graph()
     inputs = [graph.input(k, "state") for k in range(3)]
     built = lambda tree, inputs: evaluated(tree, lambda k: inputs[k] if isinstance(k, int) else graph.constant(k), graph.sqrt)  # noqa: E731

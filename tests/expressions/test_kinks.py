@@ -1,4 +1,4 @@
-"""Expressions with held sides are smooth, and equal to the given ones as long as the sides are right."""
+"""Expressions with fixed sides are smooth, and equal to the original ones as long as the sides are right."""
 
 import jax
 import jax.numpy as jnp

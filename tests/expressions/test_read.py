@@ -1,4 +1,4 @@
-"""All that JAX can trace becomes a program that computes the same: on floats, under jit and vmap, and differentiated."""
+"""Everything that JAX can trace becomes a program with the same results: on floats, under jit and vmap, and differentiated."""
 
 import jax
 import jax.numpy as jnp
@@ -128,7 +128,7 @@ def test_read(function, emit):
 
 
 def test_branches_and_steps_of_values_that_are_not_finite(emit):
-    """By NumPy, and by floats where Python's operations raise, as by JAX."""
+    """NumPy agrees with JAX, and so do floats, for which Python's operations raise."""
     program = emit(lambda x: jnp.stack([jnp.where((x[0] > 0) & (x[1] < 2), 1 / x[0], jnp.floor(x[1])), jnp.abs(x[0])]), X[:2])
     rows = np.array([[0.0, 1.5], [0.5, -0.5], [np.nan, -np.inf], [0.5, 2.5], [1e-320, np.nan], [np.inf, 0.0]])
     expected = [[1.0, 0.0], [2.0, 0.5], [-np.inf, np.nan], [2.0, 0.5], [np.nan, 1e-320], [0.0, np.inf]]
@@ -143,7 +143,7 @@ def test_elementwise_functions_have_no_calls(name, emit):
 
 @pytest.mark.parametrize("name", CHOICES)
 def test_choices_are_written_out(name, emit):
-    """A branch, an unknown index and a sorted row are comparisons and choices between scalars."""
+    """A branch, an unknown index and sorting become comparisons and choices between scalars."""
     assert not [node for node in emit(FUNCTIONS[name], X, Y).program.graph.nodes if node.kind == "call"]
 
 
@@ -157,7 +157,7 @@ def test_a_branch_with_an_opaque_node_is_opaque_itself(emit):
 
 @pytest.mark.parametrize("name", ["long loop", "linear system"])
 def test_what_does_neither_is_opaque(name, emit):
-    """One node in place of a long loop or a factorization: not each of its steps."""
+    """A long loop or a factorization becomes one node, instead of a node for each of its steps."""
     assert [node for node in emit(FUNCTIONS[name], X, Y).program.graph.nodes if node.kind == "call"]
 
 

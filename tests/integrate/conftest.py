@@ -7,7 +7,7 @@ from tests.integrate.scenes import TS, Until
 
 @pytest.fixture(scope="session")
 def table():
-    """Rows of reference values by time, as times and one array a column."""
+    """Reference values by time: the times, and one array for each column."""
 
     def columns(reference, times=None):
         rows = {float(t): row for t, row in reference.items() if times is None or float(t) in times}
@@ -29,7 +29,7 @@ def motion(pendulum):
 
 @pytest.fixture(scope="session")
 def hung():
-    """A rod that swings from a pin; the pin is on a line, 1 m from a point above it, if that is not too high."""
+    """A rod that swings from a pin. The pin is on a line, 1 m from a point above it, if that point is not too high."""
     bodies = {"rod": udk.Body(1.0, 0.2, [1.0, -0.5], -0.8, angular_velocity=1.0)}
     joints = {
         "line": udk.Slot(["ground", "rod"], [[0.0, 0.0], [-0.75, 0.0]], axis=0.0),
@@ -40,5 +40,5 @@ def hung():
 
 @pytest.fixture(scope="session")
 def linkage():
-    """The paper's, at an ordinary angle."""
+    """The paper's linkage at an ordinary angle."""
     return udk.library.parallelogram(np.deg2rad(-50))

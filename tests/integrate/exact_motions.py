@@ -1,4 +1,4 @@
-"""Scenes whose motion is known in closed form, for every engine: in the air, at a spring, by a motor, and with impacts."""
+"""Scenes with a known motion, for every engine: free flight, a spring, a motor, and impacts."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ G = 9.81
 
 
 class ExactMotion(NamedTuple):
-    """A scene, output times, and the positions (T, 3) of its one body at them."""
+    """A scene, output times, and the positions (T, 3) of its only body at these times."""
 
     mechanism: udk.Mechanism
     ts: np.ndarray  # s
@@ -25,7 +25,7 @@ class ExactMotion(NamedTuple):
 
 
 class Table(eqx.Module):
-    """The height of the ball above a table that shakes."""
+    """The height of the ball above a shaking table."""
 
     amplitude: jax.Array
 
@@ -73,7 +73,7 @@ def _by_a_motor() -> ExactMotion:
 
 
 def _bouncing(restitution: float) -> ExactMotion:
-    """A ball from a metre above the floor: two flights after the first impact, or at rest on it."""
+    """A ball that falls from 1 m above the floor: two flights after the first impact, or at rest on the floor."""
     ball = udk.Body(1.0, 0.1, (0.0, 1.0), 0.0, (0.3, 0.0))
     impacts = np.sqrt(2 / G) * np.cumsum([1.0, 2 * restitution, 2 * restitution**2][: 3 if restitution else 1])
     ends = 0.9 * impacts[-1] if restitution else 1.0
@@ -91,7 +91,7 @@ def _bouncing(restitution: float) -> ExactMotion:
 
 
 def _thrown_by_a_table() -> ExactMotion:
-    """A ball on a table that shakes as a sin(15 t): they part where the table's acceleration is -g."""
+    """A ball on a table that moves as a sin(15 t). It leaves the table when the table's acceleration is -g."""
     a, w = 0.1, 15.0
     parts = float(np.arcsin(G / (a * w**2)) / w)
     ball = udk.Body(1.0, 0.1, (0.0, 0.0), 0.0, (0.0, a * w))

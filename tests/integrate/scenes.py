@@ -1,4 +1,4 @@
-"""Scenes and forces that several files simulate."""
+"""Scenes and forces that several test files simulate."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ TS = np.linspace(0.0, 1.0, 11)
 
 
 class Until(udk.ForceElement):
-    """A torque that is not a number from some time on."""
+    """A torque that is NaN after some time."""
 
     end: float
 

@@ -1,4 +1,4 @@
-"""Trajectories against exact solutions, with the settings that a user gets."""
+"""Trajectories compared with exact solutions, with the default settings."""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ STARTS = {  # angle, angular velocity, bound: the last four cross singular confi
 
 @pytest.mark.parametrize(("angle", "rate", "bound"), STARTS.values(), ids=STARTS)
 def test_linkage(angle, rate, bound):
-    """All coordinates at all times, and all joints closed."""
+    """All coordinates are right at all times, and all joints are closed."""
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)
     sol = udk.simulate(mech, TS, rtol=1e-9, atol=1e-9)
     assert sol.result == udk.Result.successful
@@ -51,7 +51,7 @@ def test_linkage(angle, rate, bound):
 
 
 def test_an_ordinary_run_has_no_step_rejected():
-    """Aiming higher, one in ten is, and as exact a run takes 15 % more."""
+    """With a more ambitious step size one step in ten is rejected, and a run of the same accuracy takes 15 % more."""
     mech = udk.library.parallelogram(np.deg2rad(-45))
     sol = udk.simulate(mech, TS, rtol=1e-9, atol=1e-9)
     assert error(mech, sol) <= 3e-10
@@ -60,14 +60,14 @@ def test_an_ordinary_run_has_no_step_rejected():
 
 @pytest.mark.parametrize("scene", ["four_bar", "scissor_lift", "double_pendulum"])
 def test_steps_that_would_be_rejected_are_foreseen(scene):
-    """Without that from 0.18 (the pendulum) to 0.28 (the lift) of them are."""
+    """Otherwise 0.18 (the pendulum) to 0.28 (the lift) of the steps are rejected."""
     sol = udk.simulate(getattr(udk.library, scene)(), np.linspace(0.0, 10.0, 201), rtol=3e-8, atol=3e-8)
     assert sol.stats["rejected"] < 0.18 * sol.stats["steps"]
 
 
 @pytest.fixture(scope="module")
 def undisturbed():
-    """Steps of the run that meets no singular configuration, by its tolerance."""
+    """Number of steps of a run that meets no singular configuration, by tolerance."""
     mech, known = udk.library.parallelogram(np.deg2rad(-45)), {}
 
     def steps(tol):
@@ -80,9 +80,10 @@ def undisturbed():
 
 @pytest.mark.parametrize("angle", [45, 60])
 def test_singular_configurations_cost_few_steps(angle, undisturbed):
-    """Against a run that meets none; without care for what projection takes back four times as many.
+    """The run is compared with one that meets none.
 
-    Of steps that do not know where the next one is a third is rejected.
+    Without taking into account what projection takes back it needs four times as many steps. If steps do not know where the
+    next singular configuration is, a third of them is rejected.
     """
     mech = udk.library.parallelogram(np.deg2rad(angle))
     for tol in (1e-11, 3e-12, 1e-12):
@@ -94,7 +95,7 @@ def test_singular_configurations_cost_few_steps(angle, undisturbed):
 
 @pytest.mark.parametrize("angle", [-0.01, 0.0, 0.01, 0.3])
 def test_runs_may_turn_back_in_singular_configurations(angle, undisturbed):
-    """Or just short of them, or just behind. Where steps beside one are tried shorter first, it takes 6 to 90 times as many."""
+    """Also just before or after one. If shorter steps were tried first nearby, runs would take 6 to 90 times as many."""
     mech = udk.library.parallelogram(np.deg2rad(angle))
     sol = udk.simulate(mech, TS, rtol=1e-12, atol=1e-12)
     assert error(mech, sol) <= 200e-12
@@ -105,7 +106,7 @@ def test_runs_may_turn_back_in_singular_configurations(angle, undisturbed):
 
 @pytest.mark.parametrize("tol", [1e-9, 3e-10, 1e-10])
 def test_crossing_keeps_energy_where_no_row_is_redundant_before_and_after(tol):
-    """To less than 1e-5 J; where rows count as redundant below 1e-4 of the largest singular value most lose 1e-4 to 6e-4 J."""
+    """The error is below 1e-5 J. If rows below 1e-4 of the largest singular value are redundant, it is mostly 1e-4 to 6e-4 J."""
     for angle in (60, 60.001, 60.002):
         mech = udk.library.peaucellier(np.deg2rad(angle), 3.0)
         energy = udk.energy(mech, udk.simulate(mech, np.linspace(0.0, 10.0, 101), rtol=tol, atol=tol)).total
@@ -113,7 +114,7 @@ def test_crossing_keeps_energy_where_no_row_is_redundant_before_and_after(tol):
 
 
 def test_outputs_beside_singular_configurations():
-    """Steps that end beside one have accelerations of few digits, which interpolation would spread over the next step."""
+    """Accelerations at the end of a nearby step are inaccurate; interpolation would spread the error over the next step."""
     mech = udk.library.parallelogram(np.deg2rad(60))
     for tol in np.geomspace(3e-9, 3e-10, 12):
         energy = udk.energy(mech, udk.simulate(mech, TS, rtol=tol, atol=tol)).total
@@ -122,7 +123,7 @@ def test_outputs_beside_singular_configurations():
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-11])
 def test_outputs_in_singular_configurations(tol):
-    """As exact as others: rows that rounding errors have made useless do not turn velocities: some were off by 0.2 rad/s."""
+    """They are as exact as others. Rows that rounding errors have made useless once changed velocities, some by 0.2 rad/s."""
     mech = udk.library.parallelogram(np.deg2rad(60))
     angle = lambda ts: exact(mech, np.append(0.0, ts), mech.q0, mech.v0)[1:, 0, 2]  # noqa: E731
     crossing = root_scalar(lambda t: angle(t)[0], bracket=(0.4, 0.7), xtol=1e-15).root
@@ -136,7 +137,7 @@ def test_outputs_in_singular_configurations(tol):
 
 
 def test_many_starts_cross_singular_configurations(linkage, placed):
-    """One start flatters: 64 spread by 5 degrees about each of three, every one of which crosses."""
+    """A single start may be lucky: 64 starts within 5 degrees of each of three angles, all of which cross."""
 
     @jax.jit
     def runs(angles, tol):
@@ -163,7 +164,7 @@ def test_many_starts_cross_singular_configurations(linkage, placed):
 
 @pytest.fixture(scope="module")
 def unstable(linkage):
-    """Run the linkage from -50 degrees in some way; return the solution, its error and its violation."""
+    """Run the linkage from -50 degrees with these settings; return the solution, its error and its violation."""
 
     def run(method, stabilization, angle=-50):
         mech = udk.library.parallelogram(np.deg2rad(angle))
@@ -174,7 +175,7 @@ def unstable(linkage):
 
 
 def test_truncated_and_not_stabilized_it_drifts(unstable):
-    """Redundancy makes the drift unstable: 1.59/s, so that rounding errors are large after 16 to 20 s."""
+    """Redundancy makes the drift unstable: at 1.59/s, rounding errors become large after 16 to 20 s."""
     sol, _, psi = unstable(udk.SVD(), None)
     size = np.abs(psi).max(axis=1)
     assert sol.result != udk.Result.successful or np.nanmax(size) > 1e-5
@@ -194,7 +195,7 @@ def test_a_fixed_choice_of_rows_does_not(unstable):
 @pytest.mark.slow
 @pytest.mark.parametrize("gain", [2.0, 5.0])
 def test_small_gains_hold_it(unstable, gain):
-    """Gains of 2 to 5 are above the rate at which the drift would grow."""
+    """Gains of 2 to 5 exceed the growth rate of the drift."""
     sol, wrong, psi = unstable(udk.SVD(), udk.Baumgarte(gain, gain))
     assert sol.result == udk.Result.successful
     assert wrong < 1e-7
@@ -227,7 +228,7 @@ def run(mech, ts):
 
 
 def test_simple_pendulum(data, table):
-    """IFToMM A01; the rod's multiplier is its force."""
+    """IFToMM A01. The rod's multiplier is its force."""
     ts, row = table(data("iftomm_A01_simple_pendulum")["reference_exact"], (0.5, 1, 2, 5, 10, 20))
     sol, loads = run(udk.library.simple_pendulum(), np.append(0.0, ts))
     assert_allclose(sol.q[1:, 0, :2], np.stack([row["x"], row["y"]], 1), atol=1e-8)
@@ -255,7 +256,7 @@ def test_elliptic_trammel(data, table):
 
 
 def test_driven_pendulum(data, table):
-    """No freedom is left: the motion is the driver's, and the torque is what inverse dynamics says."""
+    """No degree of freedom is left: the driver sets the motion, and the torque is that of inverse dynamics."""
     ts, row = table(data("driven_pendulum_rheonomic")["reference"])
     sol, loads = run(udk.library.driven_pendulum(), ts)
     assert_allclose(sol.q[:, 0, 2], row["theta"], atol=1e-12)

@@ -1,4 +1,4 @@
-"""Adams methods: order, cost beside VODE, accuracy, and all that a diffrax solver has to do."""
+"""Adams methods: order, cost compared with VODE, accuracy, and everything that a diffrax solver must support."""
 
 import math
 from typing import Any, Literal
@@ -25,7 +25,7 @@ QUICK = diffrax.PIDController(rtol=1e-9, atol=1e-9)
 
 
 def program(f, solver, counting=count_evaluations):
-    """Solve y' = f(t, y), with any numbers by one compilation: the run, the calls of f, and the calls as they are counted."""
+    """Solve y' = f(t, y) for any numbers with one compilation. Return the run, the actual calls of f, and the reported calls."""
     called = []
 
     def counted(t, y, args):
@@ -57,7 +57,7 @@ def program(f, solver, counting=count_evaluations):
 
 @pytest.fixture(scope="module")
 def swing():
-    """The program of the pendulum, by each corrector."""
+    """The program of the pendulum with each corrector."""
     return {corrector: program(pendulum, udk.Adams(corrector=corrector)) for corrector in ("pece", "iteration")}
 
 
@@ -67,7 +67,7 @@ def pendulums(swing, request):
 
 
 def exact_pendulum(ts):
-    """Angle (rad) and rate (rad/s), released at 2 rad."""
+    """Angle (rad) and rate (rad/s) of a pendulum released at 2 rad."""
     k, w = np.sin(1.0), np.sqrt(9.81)
     sn, cn, *_ = ellipj(ellipk(k**2) + w * np.asarray(ts), k**2)
     return np.stack([2 * np.arcsin(k * sn), 2 * k * w * cn], axis=1)
@@ -79,7 +79,7 @@ class TestPendulum:
 
     @pytest.mark.parametrize("tol", TOLERANCES)
     def test_error_is_that_asked_for(self, pendulums, tol):
-        """At the end and between the steps alike: the polynomial of a step is of the step's order."""
+        """It holds at the end and between steps: the polynomial of a step has the order of the step."""
         run, *_ = pendulums(self.y0, self.ts, tol)
         assert np.abs(run.ys - exact_pendulum(self.ts)).max() < 10 * tol
 
@@ -102,7 +102,7 @@ class TestPendulum:
         assert called == 1 + 2 * accepted + rejected
 
     def test_tightest_tolerance(self, pendulums):
-        """Rounding errors neither stop it nor make it crawl."""
+        """Rounding errors neither stop the run nor make its steps tiny."""
         run, called, _ = pendulums(self.y0, self.ts, 1e-13)
         assert np.abs(run.ys - exact_pendulum(self.ts)).max() < 1e-11
         assert called < 600
@@ -113,7 +113,7 @@ class TestPendulum:
 
 
 def ratios(problem, run):
-    """Calls, relative to those of VODE's Adams methods at equal error; Work interpolates between FINER tolerances."""
+    """Calls relative to those of VODE's Adams methods at equal error. Work is interpolated between FINER tolerances."""
     yardstick = Work([vode(problem, tol) for tol in FINER])
     found = []
     for tol in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
@@ -139,7 +139,7 @@ def test_cost_beside_vode_in_orbits(name, corrector):
 
 @pytest.fixture(scope="module", params=["pece", "iteration"])
 def steps(request):
-    """Steps of a fixed order and size for y' = f(t, y, args), from exact values of f before the start."""
+    """Steps of a fixed order and size for y' = f(t, y, args), with exact values of f before the start."""
     solver = udk.Adams(corrector=request.param, root_finder=Tolerances(1e-14, 1e-14), root_find_max_steps=9)
     rows = solver.max_order + 2
 
@@ -166,7 +166,7 @@ def steps(request):
 
 
 def test_polynomials_are_integrated_exactly(steps):
-    """Order k interpolates k + 1 values of f: exact up to degree k, and no higher."""
+    """Order k interpolates k + 1 values of f, and is exact up to degree k but no higher."""
     exact = lambda t, degree: jnp.array([(t + 3.0) ** (degree + 1)])  # noqa: E731
     run = steps(lambda t, y, degree: jnp.array([(degree + 1) * (t + 3.0) ** degree]), exact)
     for order in range(1, 13):
@@ -192,7 +192,7 @@ def test_order_of_convergence(steps):
 
 
 def oscillator(t, y, a):
-    """y'' = -a y: cos(sqrt(a) t) from (1, 0)."""
+    """Solve y'' = -a y from (1, 0): y = cos(sqrt(a) t)."""
     return {"y": y["v"], "v": -a * y["y"]}
 
 
@@ -205,7 +205,7 @@ def test_any_pytree_and_float_tolerances():
 
 
 class TestDerivatives:
-    """Of cos(sqrt(a) t) with respect to a and t."""
+    """Derivatives of cos(sqrt(a) t) with respect to a and t."""
 
     @staticmethod
     def end(a, t, adjoint, corrector: Literal["pece", "iteration"] = "pece"):
@@ -220,7 +220,7 @@ class TestDerivatives:
     @pytest.mark.slow
     @pytest.mark.parametrize("corrector", ["pece", "iteration"])
     def test_reverse_of_a_batch(self, corrector):
-        """Whose members end at different times."""
+        """The members end at different times."""
         end = lambda a, t: self.end(a, t, diffrax.RecursiveCheckpointAdjoint(), corrector)  # noqa: E731
         found = jax.jit(jax.vmap(jax.grad(end, argnums=(0, 1))))(self.a, self.t)
         np.testing.assert_allclose(found, self.exact, rtol=0, atol=1e-7)
@@ -258,7 +258,7 @@ QUARTER = ellipk(np.sin(1.0) ** 2) / np.sqrt(9.81)  # s, of its period
 
 
 def test_dense_output():
-    """As good as the steps, and continuous; an event is found in it."""
+    """It is as accurate as the steps, and continuous. An event is found in it."""
     run = swing_down(9.81)
     assert float(run.ts[0]) == pytest.approx(QUARTER, abs=1e-8)
     times = np.linspace(0.0, QUARTER, 500)
@@ -275,7 +275,7 @@ def test_time_of_an_event_has_a_derivative():
 
 
 class OnCircle(Wrapper):
-    """Steps of a solver, each ended on the unit circle: as a constraint would be held."""
+    """Steps of a solver, each followed by projection on the unit circle, as on a constraint."""
 
     solver: diffrax.AbstractSolver
 
@@ -288,7 +288,7 @@ class OnCircle(Wrapper):
 @pytest.mark.slow
 @pytest.mark.parametrize("corrector", ["pece", "iteration"])
 def test_projected_states_enter_the_history(corrector):
-    """The newest point is replaced, at no more than two calls an attempt, instead of a new start at every step."""
+    """The newest point is replaced, at no more than two calls per attempt, and the method need not start anew at every step."""
     on_circle = lambda solver, control: (OnCircle(solver), CountingController(control))  # noqa: E731
     run = program(lambda t, y: jnp.stack([y[1], -y[0]]), udk.Adams(corrector=corrector), on_circle)
     found, called, counted = run((1.0, 0.0), np.linspace(0.0, 20.0, 3), 1e-9)
@@ -300,7 +300,7 @@ def test_projected_states_enter_the_history(corrector):
 
 @pytest.mark.slow
 def test_jump():
-    """f jumps at 1: told so, the method begins anew there; not told, it finds its way too."""
+    """f jumps at 1. If the method knows of the jump, it starts anew there; otherwise it copes as well."""
     term = diffrax.ODETerm(lambda t, y, args: jnp.where(t < 1.0, 50.0 * jnp.cos(50.0 * t), 100.0 * jnp.cos(50.0 * t)))
     exact = np.sin(50.0) + 2 * (np.sin(100.0) - np.sin(50.0))
     steps = []
@@ -312,7 +312,7 @@ def test_jump():
 
 
 def test_first_step_out_of_the_domain():
-    """y' = -1 / (2 y), y = sqrt(1 - t): the step that is tried first ends where y is infinite."""
+    """y' = -1 / (2 y), y = sqrt(1 - t): the first trial step ends where y is infinite."""
     term = diffrax.ODETerm(lambda t, y, args: -0.5 / y)
     run = solve_ode(term, udk.Adams(), 0.0, 0.9, 2.0 - 1e-9, jnp.array(1.0), stepsize_controller=QUICK)
     assert float(run.ys[0]) == pytest.approx(np.sqrt(0.1), abs=3e-8)

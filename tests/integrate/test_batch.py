@@ -1,4 +1,4 @@
-"""Batches of runs by machine code: each the same as alone, and as by diffrax."""
+"""Batches of runs by machine code: each member equals its run alone, and its run by diffrax."""
 
 from typing import Any
 
@@ -50,7 +50,7 @@ def test_members_are_what_they_are_alone(pendulum):
 
 
 def test_outputs_of_a_batch_are_kept_once(pendulum):
-    """What is beside them is one chunk's, and what they violate the constraints by; nor are velocities kept that nobody uses."""
+    """Other results are kept for one chunk at a time, and velocities only if they are used."""
     ts = np.linspace(0.0, 2.0, 801)
 
     def outputs(rate):
@@ -72,7 +72,7 @@ def test_the_same_motion_as_by_diffrax(pendulum, solver):
 
 
 def test_outputs_are_as_exact_as_steps(pendulum):
-    """Positions and velocities between steps, against a run of steps that are much smaller."""
+    """Positions and velocities between steps are compared with a run of much smaller steps."""
     fine = np.linspace(0.0, 2.0, 301)
     coarse = udk.simulate(pendulum, fine, rtol=1e-9, atol=1e-9)
     exact = udk.simulate(pendulum, fine, rtol=1e-13, atol=1e-13)
@@ -83,7 +83,7 @@ def test_outputs_are_as_exact_as_steps(pendulum):
 
 
 def test_one_direction_for_all_members(pendulum):
-    """Values are batched, and the direction is not."""
+    """Values are batched, but the direction is not."""
     ts = jnp.linspace(0.0, 1.0, 5)
 
     def angle(inertia):
@@ -98,7 +98,7 @@ def test_one_direction_for_all_members(pendulum):
 
 
 def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
-    """A link's mass is one number of many, and stands in few of the constants of a linkage; no other has a derivative."""
+    """A link's mass appears in few constants of a linkage. Only these are differentiated."""
     linkage, found, machine_code = udk.library.parallelogram(np.deg2rad(-45)), [], primitive.machine_code
 
     def angle(mass):

@@ -1,4 +1,4 @@
-"""Backward differentiation formulas: their order, cost and accuracy, and all that a diffrax solver has to do."""
+"""Backward differentiation formulas: order, cost and accuracy, and everything that a diffrax solver must support."""
 
 import math
 from typing import Any
@@ -33,7 +33,7 @@ def controller(rtol, atol):
 
 @pytest.fixture(scope="module")
 def stiff(data):
-    """Runs of a stiff problem to several tolerances by one program, and its references."""
+    """Runs of a stiff problem at several tolerances by one program, and its references."""
     reference, done = data("stiff_problems"), {}
 
     def runs(name):
@@ -58,7 +58,7 @@ def stiff(data):
 
 
 def _solver_of(f):
-    """A program that solves y' = f, and lists of what it does: call f, differentiate it, trace it."""
+    """Return a program that solves y' = f, and lists of its calls, differentiations and traces of f."""
     called, differentiated, traced = [], [], []
 
     @jax.custom_jvp
@@ -96,7 +96,7 @@ def _solver_of(f):
 @pytest.mark.parametrize("name", fast(["Robertson"], STIFF))
 class TestStiffProblems:
     def test_error(self, stiff, name):
-        """It is within a factor of ten of the tolerance, at the end and on the way, before jumps, which enlarge it, too."""
+        """It is within a factor of ten of the tolerance, at the end and on the way, also before jumps, which enlarge it."""
         for rtol, errors, *_ in stiff(name)[0]:
             assert errors.max() < 10 * rtol
 
@@ -106,7 +106,7 @@ class TestStiffProblems:
             assert run.solver_state.evaluations <= called
 
     def test_cost(self, stiff, name):
-        """VODE, with the same formulas, takes more right-hand sides for the same error, on the average of the tolerances."""
+        """VODE uses the same formulas, and on average over the tolerances takes more right-hand sides for the same error."""
         found, vode = stiff(name)
         errors, calls = np.log([(row["error"], row["right_hand_sides"]) for row in vode]).T
         curve = np.polynomial.Polynomial.fit(errors, calls, 2)
@@ -115,7 +115,7 @@ class TestStiffProblems:
         assert np.mean(ratios) < 1.0
 
     def test_jacobian_serves_many_steps(self, stiff, name):
-        """Where none is taken, none is computed; diffrax forgets those of steps that were rejected."""
+        """It is computed only where it is used. Diffrax discards those of rejected steps."""
         for _, _, run, _, differentiated in stiff(name)[0]:
             steps, counted = int(run.stats["num_accepted_steps"]), int(run.solver_state.jacobians)
             assert counted <= differentiated <= counted + run.stats["num_rejected_steps"]
@@ -125,7 +125,7 @@ class TestStiffProblems:
 
 @pytest.fixture(scope="module")
 def steps():
-    """A function that makes steps of an order and a size: from the exact history of y' = -y^2, y = 1 / (2 + t)."""
+    """A function that makes steps of a given order and size from the exact history of y' = -y^2, y = 1 / (2 + t)."""
     solver = udk.BDF(root_finder=Tolerances(1e-12, 1e-12), root_find_max_steps=9)
     terms, exact = diffrax.ODETerm(lambda t, y, _: -(y**2)), lambda t: jnp.array([1 / (2 + t)])
 
@@ -162,7 +162,7 @@ def test_order_of_convergence(steps, order):
 
 
 def test_uneven_steps_follow_a_polynomial():
-    """A step of order k after steps of any size continues a polynomial of degree k, however stiff the equation."""
+    """After steps of any sizes a step of order k continues a polynomial of degree k, however stiff the equation."""
     times, t1 = np.array([0.0, -0.3, -0.35, -0.9, -1.0, -1.7]), 0.2
     p = np.polynomial.Polynomial([1.0, -2.0, 0.5, 1.5, -0.7, 0.3])
     solver = udk.BDF(root_finder=Tolerances(1e-12, 1e-12))
@@ -187,7 +187,7 @@ def _divided(p, times):
 
 
 def reaction(t, y, rates):
-    """x' = -k x^2 and its shadow z' = -s (z - x); without meaning where x is negative."""
+    """x' = -k x^2 and z' = -s (z - x), which is undefined for negative x."""
     k, s = rates
     x = jnp.where(y["x"] < 0, jnp.nan, y["x"])
     return {"x": -k * x**2, "z": -s * (y["z"] - x)}
@@ -219,7 +219,7 @@ def reacted():
 
 
 def test_stiffness_costs_nothing(reacted):
-    """z follows x + k x^2 / s, and its rate s does not bound the step."""
+    """z follows x + k x^2 / s, and its rate s does not limit the step."""
     for s in (1e3, 1e6):
         run, x = reacted(3.0, s), 1 / (1 + 3 * TS)
         np.testing.assert_allclose(run.ys["x"], x, rtol=1e-7)
@@ -228,7 +228,7 @@ def test_stiffness_costs_nothing(reacted):
 
 
 def test_step_without_a_solution_is_rejected(reacted):
-    """A first step of two makes x negative; the run recovers."""
+    """A first step of 2 makes x negative. The run recovers."""
     run = reacted(3.0, first=2.0)
     assert run.stats["num_rejected_steps"] > 0
     np.testing.assert_allclose(run.ys["x"], 1 / (1 + 3 * TS), rtol=1e-7)
@@ -236,7 +236,7 @@ def test_step_without_a_solution_is_rejected(reacted):
 
 @pytest.mark.slow
 def test_gradients(reacted):
-    """By rate and initial state; of x exactly, of z by differences."""
+    """Gradients with respect to rate and initial state: of x compared with the exact ones, of z with differences."""
     k, h = 3.0, 1e-3
     ahead = jax.jit(jax.jacfwd(lambda k, y: react(k, start=y).ys, argnums=(0, 1)))(k, 1.0)
     np.testing.assert_allclose(ahead["x"][0], -TS / (1 + k * TS) ** 2, rtol=1e-6)
@@ -259,7 +259,7 @@ def swing(t, y, args):
 
 @pytest.mark.slow
 def test_event_backward_in_time():
-    """cos t falls to zero at -pi / 2; on the way the step's own polynomial is the solution, and its derivative."""
+    """cos t falls to zero at -pi / 2. On the way, the step's polynomial gives the solution and its derivative."""
     event = diffrax.Event(lambda t, y, args, **_: y["x"], optx.Newton(1e-12, 1e-12))
 
     @eqx.filter_jit
@@ -287,7 +287,7 @@ def test_event_backward_in_time():
 
 
 def test_jump_begins_a_new_history():
-    """y' = -k (y - u(t)), u leaping from 0 to 1: told of the leap, the solver does not look for it by rejected steps."""
+    """y' = -k (y - u(t)), and u jumps from 0 to 1. A solver that knows of the jump does not search for it by rejected steps."""
     k = 50.0
     run: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, _: -k * (y - jnp.where(t < 1, 0.0, 1.0))),
@@ -306,7 +306,7 @@ def test_jump_begins_a_new_history():
 
 @pytest.mark.slow
 def test_linkage():
-    """The projection of each step costs BDF no steps, and large gains, which make the drift stiff, hardly any."""
+    """Projecting each step costs BDF no steps, and large gains, which make the drift stiff, hardly any."""
     mech, ts = udk.library.parallelogram(), jnp.linspace(0.0, 5.0, 11)
     exact = udk.simulate(mech, ts, rtol=1e-11, atol=1e-11)
     tols = {"rtol": 1e-8, "atol": 1e-8, "solver": udk.BDF()}

@@ -1,4 +1,4 @@
-"""Times where the motion is not smooth: outputs there are as exact as elsewhere, and so are their derivatives."""
+"""Times at which the motion is not smooth: outputs there are as accurate as elsewhere, and so are their derivatives."""
 
 from itertools import pairwise
 from typing import Any
@@ -22,7 +22,7 @@ MASS, INERTIA, ARM, ANGLE, GRAVITY = 1.0, 0.1, 0.5, -0.9, 9.81
 
 
 class Kicked(udk.Motion):
-    """A spline, with a constant acceleration beside it from a time on: one of a user's own, whose acceleration jumps."""
+    """A user-defined motion: a spline, plus a constant acceleration from some time on."""
 
     spline: udk.Spline
     switch: Any
@@ -37,7 +37,7 @@ class Kicked(udk.Motion):
 
 
 def pendulum(motion):
-    """A pendulum on a carriage that moves as told."""
+    """A pendulum on a carriage with a given motion."""
     bodies = {
         "carriage": udk.Body(2.0, 1.0),
         "rod": udk.Body(MASS, INERTIA, ARM * np.array([np.cos(ANGLE), np.sin(ANGLE)]), ANGLE),
@@ -55,20 +55,20 @@ def kicked(x):
 
 
 def start(knots):
-    """The rod at rest above a carriage that moves as the spline does."""
+    """The rod at rest above a carriage that follows the spline."""
     x, rate = jax.jvp(lambda t: natural_spline(t, knots, jnp.asarray(VALUES)), (0.0,), (1.0,))
     q = [[x, 0.0, 0.0], [x + ARM * np.cos(ANGLE), ARM * np.sin(ANGLE), ANGLE]]
     return udk.State(jnp.array(q), jnp.array([[rate, 0.0, 0.0], [rate, 0.0, 0.0]]))
 
 
 def angles(x, ts=TS, tol=1e-8, **choices):
-    """Angle and rate of the rod (2, T) as a function of the knots and of when the kick begins."""
+    """Angle and rate of the rod (2, T) as a function of the knots and of the time of the kick."""
     found = udk.simulate(kicked(x), ts, start(x[0]), rtol=tol, atol=tol, method=udk.Elimination(), throw=False, **choices)
     return jnp.stack([found.q[:, 1, 2], found.v[:, 1, 2]])
 
 
 def reference(knots=KNOTS, switch=SWITCH, kick=KICK, ts=TS):
-    """The same by the pendulum's own equation, from one breakpoint or output to the next."""
+    """The same by the pendulum's equation of motion, from each breakpoint or output to the next."""
     spline, y, found = CubicSpline(knots, VALUES, bc_type="natural"), np.array([ANGLE, 0.0]), {}
     stops = np.unique([*ts, *(t for t in (*knots, switch) if ts[0] < t < ts[-1])])
     found[ts[0]] = y
@@ -85,7 +85,7 @@ def reference(knots=KNOTS, switch=SWITCH, kick=KICK, ts=TS):
 
 
 def assert_within(found, expected, tol, times=10.0):
-    """All angles and rates: so many times what a step may err, which is tol (1 + |y|)."""
+    """Require that all angles and rates are within a multiple of the tolerance of a step, tol (1 + |y|)."""
     errors = np.abs(np.asarray(found) - expected) / (tol * (1.0 + np.abs(expected)))
     assert errors.max() < times, errors.max(axis=-1)
 
@@ -95,7 +95,7 @@ def assert_within(found, expected, tol, times=10.0):
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 def test_outputs_of_a_motion_by_a_spline(tol):
-    """Where the polynomials between states reached across knots, angles were off by 9e-3 and rates by 0.8 at 1e-6."""
+    """With interpolation across knots, angles were off by 9e-3 and rates by 0.8 at a tolerance of 1e-6."""
     mech = pendulum(udk.Spline(KNOTS, VALUES))
     sol = udk.simulate(mech, TS, start(KNOTS), rtol=tol, atol=tol)
     assert_within([sol.q[:, 1, 2], sol.v[:, 1, 2]], reference(kick=0.0), tol)
@@ -109,7 +109,7 @@ def single():
 
 @pytest.mark.parametrize("switch", [SWITCH, 0.71, np.nextafter(0.71, 1.0), 0.71 + 1e-9, 0.0, 2.0], ids=str)
 def test_outputs_of_a_motion_that_names_its_times(single, switch):
-    """Accelerations jump; also at a time that another breakpoint is at, or almost, and at the ends of the run."""
+    """Accelerations jump, also where two breakpoints coincide or nearly do, and at the ends of the run."""
     found = single((jnp.asarray(KNOTS), jnp.asarray(switch)), 1e-8)
     assert_within(found, reference(switch=switch), 1e-8)
 
@@ -133,7 +133,7 @@ def test_members_of_a_batch_have_breakpoints_of_their_own(single):
     ],
 )
 def test_other_solvers(choices):
-    """Of this engine, and of diffrax."""
+    """Other solvers of this engine and of diffrax."""
     ts = TS[::20]
     found = udk.simulate(kicked((KNOTS, SWITCH)), ts, start(KNOTS), rtol=1e-6, atol=1e-6, method=udk.Elimination(), **choices)
     assert_within([found.q[:, 1, 2], found.v[:, 1, 2]], reference(ts=ts), 1e-6)
@@ -144,7 +144,7 @@ def test_other_solvers(choices):
 
 @pytest.fixture(scope="module")
 def by_differences():
-    """Of the reference, along each knot and along the switch, at times that are none of them."""
+    """Derivatives of the reference with respect to each knot and the switch, at other times than these, by differences."""
     ts, h = np.linspace(0.0, 2.0, 12), 1e-4
     each = lambda k, sign: (KNOTS + sign * h * (np.arange(5) == k), SWITCH + sign * h * (k == 5))  # noqa: E731
     ahead, behind = (np.stack([reference(*each(k, s), ts=ts) for k in range(6)], -1) for s in (1, -1))
@@ -153,7 +153,7 @@ def by_differences():
 
 @pytest.mark.slow
 def test_derivatives_along_breakpoints(by_differences):
-    """Forward, and reverse by a recorded run; a spline's first knot is left out, before which it is another line."""
+    """Forward, and reverse by a recorded run. The first knot is left out, since the spline is another line before it."""
     ts, expected = by_differences
     x, weights = (jnp.asarray(KNOTS), jnp.asarray(SWITCH)), np.cos(np.arange(2.0 * len(ts))).reshape(2, -1)
     forward = jax.jit(jax.jacfwd(lambda x: angles(x, ts, dt0=0.03, adjoint=diffrax.ForwardMode())))(x)
@@ -170,7 +170,7 @@ CAM_TS = TS[::4]
 
 
 def follower(radii, rate, tol=1e-8, phi=PHI, **choices):
-    """Angle and rate (2, T) of a cam that turns freely, by the mass of its follower unevenly."""
+    """Angle and rate (2, T) of a free cam, which its follower turns unevenly, as a function of the follower's mass."""
     fixed, profile = np.zeros((2, 2)), udk.Profile(phi, radii)
     joints = {
         "pivot": udk.Revolute(["ground", "cam"], fixed),
@@ -187,7 +187,7 @@ def follower(radii, rate, tol=1e-8, phi=PHI, **choices):
 
 
 def by_energy(radii, rate):
-    """The same: the rate by the energy, and the time by its integral over the angle, from one knot to the next."""
+    """The same in another way: the rate from the energy, and the time from its integral over the angle, knot by knot."""
     spline = CubicSpline(np.append(PHI, PHI[0] + 2 * np.pi), np.append(radii, radii[0]), bc_type="periodic")
     inertia = lambda angle: INERTIA + MASS * spline(np.pi / 2 - angle, 1) ** 2  # noqa: E731
     energy = inertia(0.0) * rate**2 / 2 + MASS * GRAVITY * spline(np.pi / 2)
@@ -214,13 +214,13 @@ def cam():
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 def test_outputs_across_the_knots_of_a_cam(cam, tol):
-    """Where the polynomials between states reached across knots, rates were off by up to 0.7 rad/s."""
+    """With interpolation across knots, rates were off by up to 0.7 rad/s."""
     assert_within(cam(RADII, 4.0, tol, PHI), by_energy(RADII, 4.0), tol)
 
 
 @pytest.mark.slow
 def test_derivatives_across_the_knots_of_a_cam():
-    """Up to 80. Where the ends of steps lie in the piece behind, those of outputs before are off by 0.06."""
+    """They are as large as 80. If steps end in the piece after a knot, derivatives of outputs before it are off by 0.06."""
     weights, h = np.cos(np.arange(2.0 * len(CAM_TS))).reshape(2, -1), 1e-5
     x, along = (jnp.asarray(RADII), jnp.asarray(4.0)), (jnp.cos(jnp.arange(6.0)), jnp.asarray(1.0))
     forward = jax.jit(lambda x, dx: jax.jvp(lambda x: follower(*x, dt0=0.03, adjoint=diffrax.ForwardMode()), (x,), (dx,))[1])
@@ -232,13 +232,13 @@ def test_derivatives_across_the_knots_of_a_cam():
 
 
 def test_a_cam_at_rest_on_a_knot(cam):
-    """By rounding it may be in one piece or the other: the run ends all the same."""
+    """Rounding puts it in one piece or the other. In both cases the run ends."""
     phi, radii = np.pi / 2 + np.array([-2.0, -1.0, 0.0, 1.0, 2.0, np.pi]), np.array([1.2, 1.1, 1.0, 1.1, 1.2, 1.25])
     assert_allclose(cam(radii, 1e-15, 1e-8, phi), 0.0, atol=1e-9)
 
 
 class Buffer(udk.ForceElement):
-    """A spring that only pushes: of a user's own, and in two pieces."""
+    """A user-defined spring that only pushes: a force in two pieces."""
 
     stiffness: Any
 
@@ -250,7 +250,7 @@ class Buffer(udk.ForceElement):
 
 
 def test_a_force_that_names_its_pieces():
-    """A body runs against it, and back."""
+    """A body hits it and returns."""
     stiffness, rate, gap, tol = 400.0, 1.5, 0.6, 1e-8
     bodies = {"body": udk.Body(1.0, 1.0, (-gap, 0.0), velocity=(rate, 0.0))}
     mech = udk.Mechanism(bodies, forces={"buffer": Buffer(["body"], stiffness)}, gravity=(0.0, 0.0))
@@ -262,7 +262,7 @@ def test_a_force_that_names_its_pieces():
 
 
 class Reversal(udk.ForceElement):
-    """A force along x that changes its sign at a time."""
+    """A force along x that changes its sign at a given time."""
 
     time: float = 0.3
 

@@ -1,4 +1,4 @@
-"""Calls of known numbers: what lies between `simulate` and machine code, and what is compiled before a first result, counted."""
+"""Calls with known numbers: the work between `simulate` and machine code, and the programs compiled before a first result."""
 
 import gc
 import sys
@@ -20,7 +20,7 @@ SIX_BAR = ROOT.parent / "examples" / "six_bar.toml"
 
 
 def called(function: Callable[[], object]) -> set[tuple[str, str]]:
-    """Return the functions of the package that run, by file and name; expressions within them are theirs."""
+    """Return the functions of the package that run, by file and name. Comprehensions count as part of their function."""
     seen = set()
 
     def listen(frame, event, _):
@@ -39,7 +39,7 @@ def called(function: Callable[[], object]) -> set[tuple[str, str]]:
 
 
 def pendulums(count: int) -> udk.Mechanism:
-    """Bodies that hang side by side: a structure of its own for each count."""
+    """Bodies that hang next to each other. Each count is another structure."""
     bodies = {f"b{k}": udk.Body(1.0, 0.1, [float(k), -0.5], 0.3) for k in range(count)}
     joints = {f"j{k}": udk.Revolute(["ground", f"b{k}"], [[float(k), 0.0], [0.0, 0.5]]) for k in range(count)}
     return udk.Mechanism(bodies, joints)
@@ -62,7 +62,7 @@ def test_what_is_decided_of_a_mechanism_is_decided_once():
 
 
 def test_a_compiled_run_does_nothing_to_the_outputs_of_machine_code():
-    """JAX hands programs of a thousand operations and more to another thread, which takes 0.05 ms."""
+    """JAX hands programs of more than a thousand operations to another thread, which takes 0.05 ms."""
     mechanism = udk.library.parallelogram()
 
     def operations(outputs: int) -> float:
@@ -76,7 +76,7 @@ def test_a_compiled_run_does_nothing_to_the_outputs_of_machine_code():
 
 @pytest.mark.parametrize("count, transform", [(2, jax.grad), (3, jax.jacfwd)])
 def test_an_eager_derivative_takes_few_programs(compilations, count, transform):
-    """All of them are single operations of JAX's: NumPy evaluates what closes, runs and goes back."""
+    """All of them are single operations of JAX. NumPy does the rest of the assembly, the run and the reverse pass."""
     mechanism = pendulums(count)
 
     def last(mass):
@@ -104,7 +104,7 @@ def test_a_batch_at_once_is_its_members():
 
 
 def test_a_first_event_and_its_derivative_take_few_programs(compilations):
-    """None is that of the loop over windows: it would take seconds."""
+    """The loop over windows is not compiled, which would take seconds."""
     lowest = udk.Event(lambda t, frames: frames["b0"].angle, udk.Stop())
     mechanism, ts = pendulums(1), np.linspace(0.0, 2.0, 5)
 
@@ -130,14 +130,14 @@ def test_a_first_event_and_its_derivative_take_few_programs(compilations):
     ids=["function of the library", "with redundant rows", "drawing", "kinematics"],
 )
 def test_eager_transformations_over_a_geometry_take_few_operations(simulated):
-    """Each is some 0.1 ms of every call outside jit; geometry and scales are one operation each, whatever the mechanism."""
+    """Each takes some 0.1 ms per call outside jit. Geometry and scales are one operation each, whatever the mechanism."""
     assert len(jax.make_jaxpr(lambda a: simulated(a).q)(1.0).eqns) < 300
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(deferred_p is None, reason="this JAX has another cache")
 def test_an_event_that_is_written_in_the_function_it_serves_is_traced_once():
-    """Its condition is a new function in each call; one that compares with another level is another condition."""
+    """Its condition is a new function in each call, and yet the same condition, unless it compares with another level."""
     mechanism, ts = pendulums(1), np.linspace(0.0, 1.0, 5)
 
     def crossed(inertia, level):

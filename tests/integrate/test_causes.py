@@ -1,4 +1,4 @@
-"""Why runs fail, in words that are true: each against what is known of the scene."""
+"""Causes of failed runs are stated correctly: each is compared with what is known about the scene."""
 
 import pickle
 from collections.abc import Callable
@@ -62,7 +62,7 @@ def test_a_driver_beyond_the_reach_of_its_linkage(scale, choices, ts):
 
 
 def test_a_dead_point_without_pins_in_line(scale=1e-6):
-    """The coupler's far pin is the middle of a rod whose ends slide on two lines at right angles: a circle, as the rocker's."""
+    """The coupler ends at the middle of a rod whose ends slide on perpendicular lines: on a circle, as with a rocker."""
     plain = four_bar(scale)
     joints = {name: plain.joints[name] for name in "AB"}
     bodies = {name: plain.bodies[name] for name in ("crank", "coupler")}
@@ -84,7 +84,7 @@ def test_a_dead_point_without_pins_in_line(scale=1e-6):
 
 
 def test_a_run_does_not_go_on_beyond_the_reach_of_its_linkage():
-    """A full turn leads back into reach, but no motion leads there."""
+    """After a full turn the motion would be within reach again, but no motion leads there."""
     solution = failed(four_bar(motor=[START, 3.0]), np.array([0.0, 2 * np.pi / 3]), rtol=1e-6, atol=1e-6)
     assert solution.result == udk.Result.drift
     assert float(solution.time) == pytest.approx((TOGGLE - START) / 3.0, rel=1e-2)
@@ -92,7 +92,7 @@ def test_a_run_does_not_go_on_beyond_the_reach_of_its_linkage():
 
 
 def test_the_reach_of_a_length_and_the_error_of_a_run():
-    """A ram between two links of 1 m each: they are in line at 2 m."""
+    """A cylinder moves the ends of two links of 1 m apart: they are in line at 2 m."""
     link = lambda angle, at: udk.Body(1.0, 0.1, at, angle)  # noqa: E731
     tip = np.array([np.cos(1.0), np.sin(1.0)])
     bodies = {"a": link(1.0, tip / 2), "b": link(-1.0, tip * [1.5, 0.5])}
@@ -119,7 +119,7 @@ def test_drivers_that_contradict_each_other():
 
 @pytest.mark.parametrize("events", [None, pytest.param(udk.JointLimit("pin", upper=9.0), marks=pytest.mark.slow)])
 def test_initial_states_that_are_open_or_not_finite(pendulum, events):
-    """Singly and in a batch."""
+    """They are reported for a single run and in a batch."""
     state = udk.assemble(pendulum)
     q = jnp.stack([state.q, state.q.at[0, 0].add(0.1), state.q.at[0, 1].set(jnp.nan), state.q])
     v = jnp.stack([state.v, state.v, state.v, state.v.at[0, 2].set(jnp.inf)])
@@ -159,7 +159,7 @@ def test_loads_that_a_run_cannot_follow_are_named(name):
 
 
 def test_a_cause_belongs_to_its_solution_alone():
-    """It is static: solutions have one structure, and one that is made of others does not say what is not true of it."""
+    """All solutions have one tree structure, and a solution made from others does not state a wrong cause."""
     one, other = failed(four_bar(motor=[START, 2.0])), udk.simulate(four_bar(motor=[START, 0.1]), TS)
     assert jax.tree.structure(one) == jax.tree.structure(failed(four_bar(motor=[START, 1.9])))
     moved = eqx.tree_at(lambda s: s.time, one, 0.1)

@@ -1,4 +1,4 @@
-"""Mechanisms whose Psi_q is constant: whether a pivot is small depends on their numbers alone, which may be traced."""
+"""Mechanisms with a constant Psi_q: whether a pivot is small depends only on their numbers, which may be traced."""
 
 import jax
 import pytest

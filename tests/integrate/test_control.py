@@ -1,4 +1,4 @@
-"""Numbers held between samples, in a run and step by step: the same motion, and its derivatives by every sample."""
+"""Numbers held between samples, in one run or step by step: the same motion, and derivatives with respect to all samples."""
 
 from itertools import pairwise
 from typing import Any
@@ -22,7 +22,7 @@ TS = np.linspace(0.0, 0.6, 14).round(9)  # most of them between samples
 
 
 def cart(torque, force, links=1, **more) -> udk.Mechanism:
-    """A pendulum, or a chain of links, on a cart, with a motor in its pin; the cart is pushed."""
+    """A pendulum, or a chain of links, on a cart that is pushed, with a motor in its pin."""
     bodies, before = {"cart": udk.Body(1.0, 1.0)}, "cart"
     joints: dict[str, Any] = {"rail": udk.Prismatic(["ground", "cart"], np.zeros((2, 2)), 0.0, 0.0)}
     for k in range(links):
@@ -38,7 +38,7 @@ def held_cart(links=1) -> udk.Mechanism:
 
 
 def restarted(mechanism, ts, tolerances=EXACT):
-    """The states at ts, by a run of constant forces from each sample or output to the next."""
+    """The states at `ts` by runs of constant forces from each sample or output to the next."""
     values = [mechanism.forces[name].value if name == "motor" else mechanism.forces[name].vector for name in ("motor", "push")]
     breakpoints = np.concatenate([x.breakpoints for x in values])
     cuts = np.sort(np.append(ts, [t for t in np.unique(breakpoints.round(9)) if t < ts[-1] and abs(t - ts).min() > 1e-9]))
@@ -119,7 +119,7 @@ def test_second_derivatives_by_the_samples(loss):
 
 
 def code_of(samples: int) -> list[str]:
-    """The text of machine code of a run, and of its reverse mode."""
+    """The text of the machine code of a run, and of its reverse mode."""
     torque, times = udk.Held(np.ones(samples), 0.01), np.linspace(0.0, 1.0, samples + 1)
     motor = udk.Driver(["ground", "cart"], "x", udk.Spline(times, 0 * times))
     mechanism = cart(torque, [0.0, 0.0], drivers={"rail motor": motor})
@@ -131,12 +131,12 @@ def code_of(samples: int) -> list[str]:
 
 
 def test_the_code_does_not_depend_on_how_many_samples_there_are():
-    """So neither do its operations nor the time that it takes to compile; nor on the knots of a motion."""
+    """Neither do its operations or its compile time, and they do not depend on the knots of a motion either."""
     assert code_of(10) == code_of(10_000)
 
 
 def test_a_hundred_thousand_samples():
-    """Each takes the same time: one step; the gradient by all of them takes a few runs."""
+    """Each takes the same time, one step. The gradient with respect to all of them takes as long as a few runs."""
     count, dt = 100_000, 1e-4
     mechanism = udk.Mechanism({"body": udk.Body(1.0, 1.0)}, forces={"push": udk.Force("body", [0.0, 0.0])}, gravity=[0.0, 0.0])
     values = np.sin(np.arange(count) * dt)
@@ -157,7 +157,7 @@ def test_a_hundred_thousand_samples():
 
 
 def controlled(mechanism, dt, names=NAMES):
-    """Roll out inputs (N, ...) of a mechanism: all states."""
+    """Apply inputs (N, ...) to a mechanism and return all states."""
 
     def advance(state, now):
         t, *values = now
@@ -194,7 +194,7 @@ def test_steps_of_several_side_by_side():
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_steps_of_a_driven_mechanism(engine):
-    """The time goes on from step to step."""
+    """Time continues from step to step."""
     drive = udk.Driver(["ground", "rod"], "angle", udk.Sine(1.0, 2.0))
     bodies, pin = {"rod": udk.Body(1.0, 1 / 12, [0.5, 0.0])}, udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])
     mechanism, dt = udk.Mechanism(bodies, {"pin": pin}, {"drive": drive}), 0.1

@@ -1,4 +1,4 @@
-"""Right-hand sides are counted as they are called, one by one: by callbacks."""
+"""The reported number of right-hand sides is the number of their calls, counted by callbacks."""
 
 from functools import partial
 from typing import ClassVar, NamedTuple
@@ -42,7 +42,7 @@ class Told(NamedTuple):
 
 
 class Tells(diffrax.AbstractAdaptiveSolver):
-    """Heun's method, which says itself how often it calls: twice a step, and once before the first."""
+    """Heun's method, which reports its own number of calls: two per step, and one before the first step."""
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
@@ -66,7 +66,7 @@ class Tells(diffrax.AbstractAdaptiveSolver):
 
 
 def stiff(calls):
-    """A rate that jumps: steps are rejected there. Every call is counted."""
+    """A rate that jumps, so that steps are rejected. Every call is counted."""
 
     def rate(t, y, args):
         jax.debug.callback(calls.add)
@@ -77,7 +77,7 @@ def stiff(calls):
 
 @pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Heun(), Tells()], ids=["Tsit5", "Heun", "one that tells"])
 def test_every_call_is_counted(calls, solver):
-    """Also where the first step is rejected: nothing is kept from it, not even its first stage."""
+    """This includes a rejected first step, from which not even the first stage is kept."""
     (solver, control), term = count_evaluations(solver, controller(1e-3)), diffrax.ODETerm(stiff(calls))
 
     @jax.jit
@@ -94,7 +94,7 @@ def test_every_call_is_counted(calls, solver):
 
 @pytest.mark.slow
 def test_counting_changes_nothing():
-    """Steps, result and gradient are those of the solver alone."""
+    """Steps, result and gradient are those of the solver itself."""
 
     def run(choices, y0):
         term = diffrax.ODETerm(lambda t, y, args: -(y**3))
@@ -120,7 +120,7 @@ def test_solvers_without_a_tableau_are_not_counted(solver):
 
 
 class Oscillator(eqx.Module):
-    """Whose right-hand sides are counted."""
+    """A harmonic oscillator whose right-hand sides are counted."""
 
     calls: Calls
 
@@ -161,7 +161,7 @@ def test_what_forgets_its_last_stage_takes_it_again(calls, projected):
 
 
 class Remembers(Multistep):
-    """Euler's method, which says what it is told of jumps."""
+    """Euler's method, which records whether it is told of jumps."""
 
     root_finder: object = eqx.field(default_factory=tolerances_from_controller)
     root_find_max_steps: int = 1
@@ -180,7 +180,7 @@ class Remembers(Multistep):
 
 @pytest.mark.parametrize("jumped", [False, True])
 def test_a_projection_is_no_jump_to_a_multistep_method(calls, jumped):
-    """It would forget its history. A Runge-Kutta method only forgets its last stage."""
+    """A jump would make it discard its history. A Runge-Kutta method only discards its last stage."""
     solver = Constrained(Remembers(), True)
     equations, y0 = Oscillator(calls), jnp.array([1.0, 0.0])
     terms = diffrax.ODETerm(lambda t, y, equations: equations.derivative(t, y))
@@ -193,7 +193,7 @@ def test_a_projection_is_no_jump_to_a_multistep_method(calls, jumped):
 
 
 def test_the_first_step_may_be_given(pendulum):
-    """One right-hand side at the start, and one that is too long is rejected."""
+    """The start then takes one right-hand side, and a step that is too long is rejected."""
     stats = {dt0: udk.simulate(pendulum, TS, dt0=dt0).stats for dt0 in (0.01, 2.0, 1e-9)}
     stages = diffrax.Dopri8.tableau.num_stages - 1  # the last one serves interpolation alone
     for found in stats.values():
@@ -212,7 +212,7 @@ def test_a_first_step_is_checked(pendulum, dt0, problem):
 
 
 def counted(held):
-    """A stone that counts how often its force is asked for; `held` on a circle."""
+    """A stone that counts the evaluations of its force. If `held`, it moves on a circle."""
     count = Calls()
 
     def force(t, q, v):
@@ -231,7 +231,7 @@ def counted(held):
     ],
 )
 def test_right_hand_sides_are_counted(solver, held):
-    """A method that keeps its last stage for the next step takes one fewer, unless the step was projected away from it."""
+    """A method that uses its last stage again takes one fewer per step, unless projection has changed the state."""
     system, count = counted(held)
     sol = udk.simulate(system, TS, udk.State(np.array([0.6, 0.8]), np.zeros(2)), rtol=1e-5, atol=1e-5, solver=solver)
     jax.effects_barrier()

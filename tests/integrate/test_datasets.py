@@ -1,4 +1,4 @@
-"""Runs as datasets, and as files that anyone can read."""
+"""Runs as datasets, and as files that other programs can read."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Derivatives of runs and of assembly as JAX's users expect them: forward, reverse and further, with no extra argument."""
+"""Derivatives of runs and of assembly by JAX's transformations: forward, reverse and higher, without extra arguments."""
 
 from functools import partial
 
@@ -36,14 +36,14 @@ def linkage_at(angle):
 
 
 def of_linkage(x, **choices):
-    """Its angle after 2 s, of the initial angle and the mass of a link; redundant, of rank 11."""
+    """Its angle after 2 s as a function of the initial angle and a link's mass. It is redundant, of rank 11."""
     mechanism = LINKAGE.with_parameters({"body.link1.mass": x[1]})
     choices = {"rtol": 1e-10, "atol": 1e-10, "max_steps": 2048, "throw": False} | choices
     return udk.simulate(mechanism, TS, linkage_at(x[0]), **choices).q[-1, 0, 2]
 
 
 def of_pendulum(x, **choices):
-    """The angle of the second rod after 2 s, of the initial angle of the first, which assembly closes, and its mass."""
+    """The second rod's angle after 2 s as a function of the first rod's initial angle, which assembly uses, and its mass."""
     one = PENDULUM.body_names[0]
     mechanism = PENDULUM.with_parameters({f"body.{one}.mass": x[1], f"body.{one}.angle": x[0]})
     choices = {"rtol": 1e-10, "atol": 1e-10, "max_steps": 2048, "throw": False} | choices
@@ -55,7 +55,7 @@ FAST = ((of_pendulum, "hessian"), (of_linkage, "forward over forward"))
 
 
 def differences(f, x, h):
-    """First derivatives of eighth order, second by differences of these."""
+    """First derivatives by differences of eighth order; second ones by differences of first ones."""
     weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280]) / h
     found = [
         sum(w * np.asarray(f(x + k * h * d)) for k, w in zip(range(-4, 5), weights, strict=True) if w) for d in np.eye(len(x))
@@ -70,7 +70,7 @@ def slopes():
 
 @pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 11])
 def test_directions_side_by_side(count):
-    """Many directions of one run at once are what each of them is alone: with outputs, and with lanes that stay empty."""
+    """Derivatives along many directions at once equal those along each alone: with outputs, and with empty lanes."""
     names = [n for n in LINKAGE.parameters() if n.endswith(("mass", "inertia", "gravity", "link1.points", "angular_velocity"))]
     values = {n: LINKAGE.parameters()[n] for n in names}
     flat, back = ravel_pytree(values)
@@ -89,7 +89,7 @@ def test_directions_side_by_side(count):
 
 @pytest.mark.parametrize("f", [of_linkage, pytest.param(of_pendulum, marks=pytest.mark.slow)], ids=lambda f: f.__name__)
 def test_first_derivatives(f, slopes):
-    """Forward and reverse mode, and a direction: the same, and that of differences."""
+    """Forward mode, reverse mode and a single direction agree with each other and with differences."""
     x = AT[f]
     forward = slopes[f](x)
     assert_allclose(forward, differences(jax.jit(partial(f, rtol=1e-12, atol=1e-12)), x, 2e-3), rtol=1e-6)
@@ -112,7 +112,7 @@ def test_first_derivatives_are_those_of_the_exact_solution(exact, slopes):
     ],
 )
 def test_second_derivatives(f, second, slopes):
-    """In any order of modes: symmetric, and those of differences of first ones."""
+    """They are symmetric in any order of modes, and agree with differences of first derivatives."""
     x = AT[f]
     found = jax.jit(second(f))(x)
     assert_allclose(found, differences(slopes[f], x, 2e-3), rtol=1e-5)
@@ -120,7 +120,7 @@ def test_second_derivatives(f, second, slopes):
 
 
 def test_a_number_that_a_batch_shares():
-    """The gradient of a sum over a batch, and of a batch of batches, is the sum of the gradients."""
+    """The gradient of a sum over a batch, and over a batch of batches, is the sum of the gradients."""
     mechanism, rates = udk.library.compound_pendulum(), jnp.linspace(-1.0, 1.0, 4)
     start = udk.assemble(mechanism)
 
@@ -138,7 +138,7 @@ def test_a_number_that_a_batch_shares():
 
 @pytest.mark.slow
 def test_both_engines_start_beside_the_manifold_alike():
-    """They project the start: second derivatives take first ones of both, also along directions that open the loops."""
+    """Both project the start. Second derivatives use first ones of both engines, also in directions that open loops."""
     state, opening = linkage_at(-0.8), 1e-4 * np.eye(4, 3)
 
     def slope(engine):
@@ -159,7 +159,7 @@ def test_other_solvers_have_both_modes(solver, slopes):
 
 
 def assemble(x, mechanism=LINKAGE):
-    """What assembly makes of a rough guess of a linkage: of the first body's angle, and the last one's mass."""
+    """The assembled state of a linkage as a function of the first body's guessed angle and the last one's mass."""
     one, *_, last = mechanism.body_names
     mechanism = mechanism.with_parameters({f"body.{one}.angle": x[0], f"body.{last}.mass": x[1]})
     state = udk.assemble(mechanism, throw=False)
@@ -180,7 +180,7 @@ def test_derivatives_of_assembly(second):
 
 @pytest.mark.parametrize("opening", [0.0, 0.4], ids=["closed", "open"])
 def test_second_derivatives_of_assembly_by_machine_code(opening):
-    """Of a linkage without redundant rows, from a closed guess, and from an open one by steps that are limited."""
+    """A linkage without redundant rows, from a closed guess, and from an open one with steps of limited length."""
     mechanism = udk.library.four_bar()
     angle = mechanism.parameters()[f"body.{mechanism.body_names[0]}.angle"]
     f, x = partial(assemble, mechanism=mechanism), jnp.array([float(angle) + opening, 1.3])
@@ -195,7 +195,7 @@ def test_second_derivatives_of_assembly_by_machine_code(opening):
     ids=lambda x: type(x).__name__,
 )
 def test_second_derivatives_of_outputs_in_a_batch(stabilization):
-    """Between steps, of states that are projected or not; members side by side are those alone."""
+    """Outputs between steps, with and without projection. Members of a batch equal single runs."""
     mechanism = udk.library.four_bar()
     one, start = mechanism.body_names[0], udk.assemble(mechanism)
 

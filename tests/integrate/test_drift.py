@@ -1,4 +1,4 @@
-"""Runs that are not projected end where their drift is too large for the singular configuration that they meet."""
+"""Runs without projection end if their drift is too large for a singular configuration that they meet."""
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +73,7 @@ def test_the_length_of_a_mechanism_does_not_matter(scale):
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
-    """Of the nearest distance, and of the bound."""
+    """A factor of ten in the nearest distance or in the limit makes no difference."""
     runs = [
         (swing(), None, udk.SVD(1e-4)),
         (swing(), udk.Baumgarte(2.0, 2.0), udk.Auto()),

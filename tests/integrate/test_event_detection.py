@@ -1,4 +1,4 @@
-"""No crossing is lost: conditions that vary quickly, late, in pairs, with jumps; and what is said where one may be."""
+"""No crossing is missed: conditions that vary quickly, late, in pairs, or with jumps. If one might be, the run says so."""
 
 # pyright: reportOptionalMemberAccess=false
 # All of these runs have events.
@@ -25,7 +25,7 @@ def wave(xp, numbers, x):
 
 
 class Wave(eqx.Module):
-    """A condition of the place of the body, of four numbers."""
+    """A condition that depends on the position of the body and on four numbers."""
 
     numbers: jax.Array
 
@@ -44,7 +44,7 @@ def positions(sol):
 
 
 def test_no_crossing_is_lost_at_any_frequency():
-    """One compiled run for all: slow and fast ones, one that becomes fast late, products, and dips of a depth of 1e-6."""
+    """One compiled run for all: slow, fast and late fast conditions, products, and dips of a depth of 1e-6."""
     waves = np.array(
         [
             [3, 1, 0, 0],
@@ -73,7 +73,7 @@ def test_no_crossing_is_lost_at_any_frequency():
 @pytest.mark.parametrize("f", [200, 500, 1000, 2000])
 @pytest.mark.parametrize("outputs", [2, 50])
 def test_conditions_of_position_velocity_and_time(f, engine, outputs):
-    """Of a body under its weight, v = 1 - g t: all cross where they should."""
+    """A body falls, v = 1 - g t, and all conditions cross at the expected times."""
     fall = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 1.0])})
     conditions = {
         "x": (lambda t, at: jnp.sin(f * at["b"].x + 0.1), lambda t: np.sin(f * t + 0.1)),
@@ -88,7 +88,7 @@ def test_conditions_of_position_velocity_and_time(f, engine, outputs):
 
 
 def test_stop_stops_at_the_first_crossing_and_jumps_and_kinks_count_once():
-    """The fast condition is a constant up to 0.99 m, and ends the run where it crosses first."""
+    """The fast condition is constant up to 0.99 m, and ends the run at its first crossing."""
     events = [
         udk.Event(lambda t, at: jnp.sin(1000 * jnp.maximum(at["b"].x - 0.99, 0) + 0.1), name="end"),
         udk.Event(lambda t, at: jnp.where(at["b"].x > 0.4137, -1.0, 1.0), udk.Log(), name="jump"),
@@ -103,7 +103,7 @@ def test_stop_stops_at_the_first_crossing_and_jumps_and_kinks_count_once():
 
 
 def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
-    """A pendulum that logs where it passes and where it turns: machine code runs once for each event, and nothing else."""
+    """A pendulum logs where it passes and where it turns. Machine code runs once for each event."""
     runs, run = [], PhaseCode.run
     monkeypatch.setattr(PhaseCode, "run", lambda *given: runs.append(0) or run(*given))
     monkeypatch.setattr(simulate_events, "_deferred_run", None)
@@ -121,7 +121,7 @@ def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
 
 
 def test_what_is_too_fast_is_said():
-    """A condition that changes its sign from one number to the next."""
+    """A condition that changes its sign from each floating-point number to the next."""
     noise = udk.Event(lambda t, at: jnp.sin(1e13 * at["b"].x + 1.0) + 2 * jnp.sin(3e12 * at["b"].x), udk.Log(), name="noise")
     with pytest.warns(
         UserWarning, match='vary too quickly for the shortest window, 1e-9 T; crossings may be missed: "noise" from 0 s'
@@ -131,7 +131,7 @@ def test_what_is_too_fast_is_said():
 
 
 class RootOf(eqx.Module):
-    """1 + sqrt(end - x)."""
+    """The condition 1 + sqrt(end - x), which is NaN for x > end."""
 
     end: jax.Array
 
@@ -144,7 +144,7 @@ def quarter(t, at):
 
 
 def rooted(x, engine: Any = "native"):
-    """A run with a condition that is a number up to x."""
+    """A run with a condition that is NaN above a value of x."""
     events = [udk.Event(RootOf(x), udk.Log(), name="root"), udk.Event(quarter, udk.Log(), name="quarter")]
     return udk.simulate(POINT, [0, 0.3, 1.0], events=events, max_events=4, throw=False, engine=engine)
 
@@ -171,7 +171,7 @@ def test_a_condition_that_is_not_a_number_is_data_in_a_batch(engine):
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_an_event_at_a_sample_or_an_output_happens_once(engine):
-    """Its root is found to rounding: a state from before it would cross again."""
+    """Its root is found to machine precision. From a state just before it, the condition would cross again."""
     held = udk.Held(np.random.default_rng(0).normal(size=(4, 2)), 0.25)
     body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", held)})
     for output in ([], [0.5]):

@@ -1,4 +1,4 @@
-"""Runs with events by machine code, of members together, against their plain form and the textbook equations."""
+"""Batches with events by machine code, compared with their plain form and the textbook equations."""
 
 # pyright: reportOptionalMemberAccess=false
 # All of these runs have events.
@@ -42,7 +42,7 @@ LOCKS = [
 
 
 class ChangeEnds(Action):
-    """Pin the free end of the pendulum where it is as it passes the vertical, and take its own pin away."""
+    """Pin the free end of the pendulum where it is at the vertical, and release its other pin."""
 
     adds = True
 
@@ -82,7 +82,7 @@ def test_machine_code_does_what_the_plain_form_does(mechanism, events, end, monk
 
 
 def test_an_action_of_ones_own_is_a_class():
-    """A pendulum that goes over to its other end keeps its angular momentum about that: (0.1 - 0.25) w = (0.1 + 0.25) w'."""
+    """When the pendulum changes ends, it keeps its angular momentum about the new pin: (0.1 - 0.25) w = (0.1 + 0.25) w'."""
     found = udk.simulate(PENDULUM, np.linspace(0.0, 0.6, 4), events=CHANGE, rtol=1e-10, atol=1e-10)
     before, after = found.events.v_before[0, 0], found.events.v_after[0, 0]
     assert found.events.count == 1 and np.abs(before[2] + np.sqrt(G / 0.35)) < 1e-8
@@ -92,7 +92,7 @@ def test_an_action_of_ones_own_is_a_class():
 
 
 def test_members_of_a_batch_run_as_they_do_alone():
-    """Of balls that rest after some bounces, and others that do not; and one above no floor, which starts beyond it."""
+    """Some balls come to rest after a few bounces, others do not, and one starts below the floor."""
     ts, given = np.linspace(0, 2.0, 9), np.array([[0.2, 1.0], [0.9, 1.0], [0.5, 0.3], [0.5, -1.0], [1.2, 1.0]])
 
     def run(x):
@@ -114,7 +114,7 @@ def test_members_of_a_batch_run_as_they_do_alone():
 
 
 def phase_codes(mechanism, events):
-    """The machine code of all phases of a mechanism with events, and one over the masses."""
+    """The machine code of all phases of a mechanism with events, for single runs and for a batch of masses."""
     with jax.ensure_compile_time_eval():
         listed = expand_events(events, mechanism)
         phases = phases_of(mechanism, listed, analyse(mechanism))
@@ -136,7 +136,7 @@ def phase_codes(mechanism, events):
 
 
 def test_machine_code_knows_of_states_what_the_textbook_does():
-    """Accelerations, conditions with both rates and their derivatives, and what impulses do, of several states."""
+    """Accelerations, conditions with their rates and derivatives, and the effect of impulses, at several states."""
     mechanism, events = FIVE_BAR, [*STOPS, udk.Event(lambda t, at: at[FIVE_BAR.body_names[1]].omega * t, udk.Log(), name="turn")]
     (code, *_), inverse_mass = phase_codes(mechanism, events)
     listed, names = expand_events(events, mechanism), mechanism.body_names
@@ -173,7 +173,7 @@ def test_machine_code_knows_of_states_what_the_textbook_does():
 
 
 def test_the_force_of_a_contact_at_rest_ends_its_rest():
-    """A point on a dome, at rest at its top but for a push, leaves it where it would be pulled: where g cos = v^2 / r."""
+    """A point pushed from the top of a dome leaves it where the contact would have to pull: where g cos = v^2 / r."""
     radius, push = 1.2, 0.3
     ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, radius), velocity=(push, 0.0))})
     dome = udk.Event(lambda t, at: jnp.hypot(at["ball"].x, at["ball"].y) - radius, udk.Impact(0.0), name="dome")

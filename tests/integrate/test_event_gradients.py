@@ -1,4 +1,4 @@
-"""Derivatives of runs with events, against closed forms and differences."""
+"""Derivatives of runs with events, compared with closed forms and differences."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 # All of these runs have events; wrong arguments are meant.
@@ -13,7 +13,7 @@ from tests.integrate.exact_motions import Table
 
 
 def test_gradients_of_a_bouncing_ball():
-    """Forward, of the end, an output and an impact's time, by restitution, height and gravity."""
+    """Forward derivatives of the end, an output and an impact's time, with respect to restitution, height and gravity."""
     ts = TS[:9]
 
     def run(x):
@@ -43,7 +43,7 @@ def test_second_derivatives_are_refused():
 
 @pytest.mark.slow
 def test_gradients_through_catch_and_release():
-    """Forward against differences, and reverse against forward: a joint added, another released, masses and speed."""
+    """Forward mode agrees with differences, and reverse with forward: a joint is added and another released."""
     ts = np.linspace(0.0, 0.6, 4)
 
     def run(x):
@@ -64,7 +64,7 @@ def test_gradients_through_catch_and_release():
 
 @pytest.mark.slow
 def test_gradients_of_what_comes_to_rest():
-    """A pendulum that has come to rest at its stop is where the stop is, and forgets all else."""
+    """A pendulum that has come to rest at its stop depends only on the stop."""
 
     def end(limit, restitution, speed):
         numbers = {"body.link.velocity": jnp.stack([0 * speed, speed / 2]), "body.link.angular_velocity": speed}
@@ -78,7 +78,7 @@ def test_gradients_of_what_comes_to_rest():
 
 @pytest.mark.slow
 def test_gradients_of_a_contact_that_lets_go():
-    """A shaking table throws the ball where its own acceleration is -g; the time of that, and the end, by its amplitude."""
+    """A shaking table throws the ball when its acceleration is -g. The time and the end are differentiated by its amplitude."""
     ball = BALL.with_parameters({"body.ball.position": [0.0, 0.0], "body.ball.velocity": [0.0, 1.5]})
 
     def run(a):
@@ -109,7 +109,7 @@ def test_conditions_do_not_close_over_traced_numbers():
 
 
 def rocking_box(p):
-    """A box that falls on two feet, which take turns until it rests."""
+    """A box that falls on two feet and rocks between them until it rests."""
     feet = [udk.Contact("box", point=[-0.5, -0.2], name="L"), udk.Contact("box", point=[0.5, -0.2], name="R")]
     box = udk.Body(1.0, 0.3, position=jnp.stack([0.0 * p[0], p[0]]), angle=p[1], angular_velocity=p[2])
     return udk.simulate(udk.Mechanism({"box": box}), [0.0, 1.5], events=feet, rtol=1e-10, atol=1e-10)
@@ -123,6 +123,6 @@ def test_times_of_events_never_decrease():
 
 @pytest.mark.slow
 def test_what_rests_does_not_depend_on_how_it_fell():
-    """The event at which the second foot comes to rest counts, however close it is to the one before."""
+    """The event at which the second foot comes to rest counts, however close it is to the previous one."""
     slopes = jax.jacfwd(lambda p: rocking_box(p).v[-1, 0])(jnp.array([0.6, 0.0, -1.0]))
     np.testing.assert_allclose(slopes, 0.0, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Events: times and states against closed forms, jumps against their identities."""
+"""Events: times and states compared with closed forms, and jumps with their identities."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 # All of these runs have events; wrong arguments are meant.
@@ -24,7 +24,7 @@ def bounce(restitution, ts, height=1.0, speed=0.0, inertia=0.1, **more):
 
 
 def exact_bounces(restitution, count, height=1.0):
-    """The times of impacts, and the speeds with which they end."""
+    """The times of impacts, and the speeds just before them."""
     v = np.sqrt(2 * G * height) * restitution ** np.arange(1, count + 1)
     first = np.sqrt(2 * height / G)
     return first + np.append(0.0, np.cumsum(2 * v[:-1] / G)), v
@@ -77,7 +77,7 @@ def test_micrometres_bounce_alike():
 
 
 def swing(lower, restitution, ts, rtol=1e-11):
-    """The pendulum, from rest beside its pin, with a stop."""
+    """The pendulum, released at the height of its pin, with a stop."""
     stop = udk.JointLimit("A", lower=lower, restitution=restitution)
     return udk.simulate(PENDULUM, ts, rtol=rtol, atol=rtol, events=stop, max_events=ROOM)
 
@@ -96,7 +96,7 @@ def test_pendulum_bounces_off_a_stop_as_elliptic_integrals_say():
 
 @pytest.mark.parametrize("depth", [1e-4, 1e-8])
 def test_what_touches_hits_and_what_does_not_does_not(depth):
-    """A swing to -pi and a stop that much before or behind it: between two times of the grid it goes there and back."""
+    """A swing to -pi, with a stop just before or after it: between two times of the grid it goes there and back."""
     hit, miss = swing(-np.pi + depth, 1.0, TS / 4), swing(-np.pi - depth, 1.0, TS / 4)
     assert hit.events.count >= 1 and miss.events.count == 0
     half = 2 * ellipk(0.5) / np.sqrt(SWING)
@@ -123,12 +123,12 @@ def test_stop_of_a_redundant_mechanism():
 
 
 def table(t, at):
-    """How high the ball is above a table that shakes."""
+    """The height of the ball above a shaking table."""
     return at["ball"].y - 0.1 * jnp.sin(15.0 * t)
 
 
 def test_a_contact_lets_go_where_it_would_have_to_pull():
-    """Of a shaking table, which throws the ball where its acceleration is -g; and catches it again."""
+    """A shaking table throws the ball when its acceleration is -g, and catches it again."""
     ball = BALL.with_parameters({"body.ball.position": [0.0, 0.0], "body.ball.velocity": [0.0, 1.5]})
     events = [
         udk.Event(table, udk.Impact(0.0), name="table"),
@@ -151,7 +151,7 @@ def test_a_contact_lets_go_where_it_would_have_to_pull():
 
 
 def test_catch_and_release():
-    """Angular momentum about the pin at the catch, energy until the cut, and free flight behind it."""
+    """Angular momentum about the pin at the catch, energy until the release, and free flight after it."""
     ts = np.linspace(0.0, 1.0, 11)
     sol = udk.simulate(CATCH, ts, events=CAUGHT, rtol=1e-11, atol=1e-11, max_events=4)
     caught, cut = (float(t) for t in sol.events.time)
@@ -173,7 +173,7 @@ def test_catch_and_release():
 
 
 def test_two_at_one_instant():
-    """A ball in a corner meets both walls at once, and leaves both; two bodies are locked to one another meanwhile."""
+    """A ball in a corner hits both walls at once and leaves both. Meanwhile two bodies are locked to each other."""
     mech = udk.Mechanism(
         {
             "ball": udk.Body(1.0, 0.1, position=(1.0, 1.0), velocity=(-1.0, -1.0)),
@@ -225,7 +225,7 @@ def test_pendulums_of_a_batch_have_events_of_their_own():
 
 @pytest.mark.parametrize("name", fast(["parallelogram"], ["parallelogram", "four_bar", "n_four_bar"]))
 def test_jump_keeps_constraints_and_energy(name):
-    """Of redundant mechanisms, too: the jump is D^+ of the constraints' rows with the contact's appended."""
+    """This includes redundant mechanisms: the jump is D^+ of the constraints' rows and the contact's row."""
     mech = getattr(udk.library, name)()
     q, n, e = udk.assemble(mech).q.ravel(), len(mech.body_names) * 3, 0.6
     normal = jnp.zeros(n).at[2].set(1.0)

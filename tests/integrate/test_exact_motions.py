@@ -1,4 +1,4 @@
-"""Motions in closed form, by each engine: machine code, diffrax with the plain form of events, and WebAssembly in a page."""
+"""Motions in closed form with each engine: machine code, diffrax with events in plain form, and WebAssembly."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ def by_simulate(engine):
 
 
 def by_page(scene, folder):
-    """By node, with the modules of a page: its engine, and its loop of events in JavaScript."""
+    """The motion computed by Node.js with the modules of a page: its engine, and its event loop in JavaScript."""
     if (node := shutil.which("node")) is None:
         pytest.skip("node is not installed")
     engine = portable_engine(scene.mechanism, rtol=TOL, atol=TOL, events=scene.events)

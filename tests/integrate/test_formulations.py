@@ -1,4 +1,4 @@
-"""Whole runs by the other formulations: they end where the Udwadia-Kalaba equation does, or say why not."""
+"""Runs by other formulations end where the Udwadia-Kalaba equation does, or say why not."""
 
 import diffrax
 import equinox as eqx
@@ -39,7 +39,7 @@ def exact(mech, sol):
 
 @pytest.fixture(scope="module")
 def swinging():
-    """A four-bar with a spring and a damper, and how it moves."""
+    """A four-bar with a spring and a damper, and its motion."""
     bare = udk.library.four_bar()
     names = list(bare.bodies)
     spring = udk.Spring(["ground", names[1]], [[0.2, 1.5], [0.1, 0.0]], stiffness=8.0, length=0.5, damping=0.4)
@@ -67,7 +67,7 @@ def test_a_regular_mechanism(swinging, formulation, stabilization):
 @pytest.mark.slow
 @every
 def test_a_driven_mechanism(data, table, formulation):
-    """No freedom is left: of independent coordinates there are none, and nothing is integrated but the clock."""
+    """No degree of freedom is left: there are no independent coordinates, and nothing is integrated but time."""
     ts, row = table(data("slider_crank_constant_speed")["reference"])
     sol = tsit5(udk.library.slider_crank(), formulation, ts)
     assert_allclose(sol.q[:, 1, 2], row["phi"], atol=1e-11)
@@ -91,7 +91,7 @@ def of_rod(mech, sol):
     ("mech", "expected"), [(udk.library.compound_pendulum(), of_rod), (LINKAGE, exact)], ids=["pendulum", "linkage"]
 )
 def test_constraints_hold_without_stabilization(mech, expected):
-    """To rounding at every output, positions and velocities; and the motion is the exact one."""
+    """Positions and velocities satisfy them to machine precision at every output, and the motion is exact."""
     sol = tsit5(mech, udk.CoordinatePartitioning(), stabilization=None)
     assert_allclose(sol.q, expected(mech, sol), atol=2e-8)
     equations = equations_of(mech)
@@ -102,7 +102,7 @@ def test_constraints_hold_without_stabilization(mech, expected):
 
 @pytest.mark.slow
 def test_only_what_is_independent_is_judged():
-    """One step of a size that would fail: the error has one coordinate and its velocity; the others are zero."""
+    """With this step size the error is large in one coordinate and its velocity; in the others it is zero."""
     mech = LINKAGE
     equations = equations_of(mech, None, None, udk.CoordinatePartitioning())
     y0 = jnp.concatenate([mech.q0.ravel(), mech.v0.ravel()])
@@ -126,7 +126,7 @@ def test_only_what_is_independent_is_judged():
 
 @pytest.mark.slow
 def test_a_multistep_method():
-    """It is told to judge its errors by the independent components, and keeps its history when others become independent."""
+    """Its errors are those of independent components, and it keeps its history when other components become independent."""
     mech = LINKAGE
     reference = tsit5(mech, udk.CoordinatePartitioning(), stabilization=None)
     sol = udk.simulate(mech, TS, rtol=1e-9, atol=1e-9, solver=udk.Adams(), formulation=udk.CoordinatePartitioning())
@@ -136,7 +136,7 @@ def test_a_multistep_method():
 
 @pytest.mark.slow
 def test_batches_gradients_and_traced_numbers(placed):
-    """By forward mode, against differences, under vmap and jit."""
+    """Forward mode compared with differences, under vmap and jit."""
     mech = udk.library.parallelogram(np.deg2rad(-50))
 
     def angle(p):
@@ -157,7 +157,7 @@ def test_batches_gradients_and_traced_numbers(placed):
 
 
 def test_plain_LU_on_redundant_rows():
-    """A joint given twice: the first right-hand side is not a number, and the run says so."""
+    """A joint is given twice. The first right-hand side is NaN, and the run says so."""
     single = udk.library.compound_pendulum()
     mech = udk.Mechanism(single.bodies, {"pin": single.joints["pin"], "again": single.joints["pin"]})
     with pytest.raises(udk.SimulationError, match=r"not finite at t = 0 s: .*plain LU, and they are singular: 4 rows of rank 2"):
@@ -175,7 +175,7 @@ starts = pytest.mark.parametrize(("angle", "rate"), STARTS.values(), ids=STARTS)
 @starts
 @pytest.mark.parametrize("formulation", ROBUST.values(), ids=ROBUST)
 def test_twenty_seconds(formulation, angle, rate):
-    """The last three starts cross singular configurations; 11 of 12 rows are independent, or 10."""
+    """The last three starts cross singular configurations, where 10 of 12 rows are independent instead of 11."""
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)
     sol = udk.simulate(mech, LONG, rtol=1e-9, atol=1e-9, formulation=formulation, max_steps=5000)
     assert np.abs(exact(mech, sol) - sol.q).max() < 2e-6
@@ -184,7 +184,7 @@ def test_twenty_seconds(formulation, angle, rate):
 
 @starts
 def test_plain_LU_ends_where_it_begins(angle, rate):
-    """The pivot of the redundant row is a rounding error, zero or not, at all starts that differ by rounding."""
+    """The pivot of the redundant row is zero or a rounding error, for all starts that differ by rounding."""
     mech = udk.library.parallelogram(np.deg2rad(angle), rate)
     random, q = np.random.default_rng(0), np.asarray(mech.q0)
     q = q + np.spacing(np.abs(q)) * random.choice([-1, 0, 1], (24, *q.shape))

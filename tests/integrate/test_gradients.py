@@ -1,4 +1,4 @@
-"""Gradients: of accelerations against a closed form, of trajectories against elliptic functions; and joints given twice."""
+"""Gradients of accelerations and trajectories compared with closed forms; and joints given twice."""
 
 import json
 from functools import partial
@@ -23,12 +23,12 @@ METHODS = {m.__name__: m() for m in CLASSES}
 
 
 def fast(*chosen):
-    """All methods, of which those not chosen are marked as slow: compiling is what takes the time."""
+    """Parametrize over all methods; those not chosen are marked as slow, since compiling takes most of the time."""
     return [pytest.param(m, id=name, marks=[] if name in chosen else pytest.mark.slow) for name, m in METHODS.items()]
 
 
 def duplicated(mechanism, copies, joints=None):
-    """The mechanism with `copies` of each of its joints, or of those named."""
+    """The mechanism with `copies` of each of its joints, or of the named ones."""
     more = {f"{name} {k}": mechanism.joints[name] for name in joints or mechanism.joints for k in range(1, copies)}
     return udk.Mechanism(dict(mechanism.bodies), {**mechanism.joints, **more}, gravity=mechanism.gravity)
 
@@ -42,7 +42,7 @@ RATE = 1.3
 
 
 def state(angle, length, rate=RATE):
-    """q and v (12,), and q' and q'' along the angle: accelerations are q' theta'' + q'' rate^2."""
+    """q and v (12,), and q' and q'' with respect to the angle: accelerations are q' theta'' + q'' rate^2."""
 
     def q(s):
         e = jnp.stack([jnp.cos(s), jnp.sin(s)])
@@ -55,7 +55,7 @@ def state(angle, length, rate=RATE):
 
 
 def closed_form(p):
-    """3.05 theta'' = -3.5 g cos(theta) of the linkage, for any mass and length of its links."""
+    """Closed form of the linkage, 3.05 theta'' = -3.5 g cos(theta), for any mass and length of its links."""
     angle, mass, length = p
     inertia = 3 * (0.1 + mass * length**2 / 4) + 2.0 * length**2
     turn = -9.81 * (1.5 * mass + 2.0) * length * jnp.cos(angle) / inertia
@@ -64,7 +64,7 @@ def closed_form(p):
 
 
 def accelerations(mechanism, method, p):
-    """The same by the equations, with the three links' numbers tied, so that the loop stays closed."""
+    """The same from the equations of motion; the three links share their numbers, so that the loop stays closed."""
     angle, mass, length = p
     half, zero = length / 2, jnp.zeros_like(length)
     numbers = {f"body.link{i}.mass": mass for i in (1, 2, 3)}
@@ -76,7 +76,7 @@ def accelerations(mechanism, method, p):
 
 
 def derivatives(f):
-    """Values, the Jacobian by forward and by reverse mode, and the Hessian of a sum with weights."""
+    """Values, the Jacobian in forward and reverse mode, and the Hessian of a weighted sum."""
     total = lambda p: jnp.cos(jnp.arange(12.0)) @ f(p)  # noqa: E731
     return deferred(jax.vmap(lambda p: (f(p), jax.jacfwd(f)(p), jax.jacrev(f)(p), jax.hessian(total)(p))))
 
@@ -87,7 +87,7 @@ POINTS = jnp.stack([jnp.asarray(ANGLES), jnp.full(401, 1.2), jnp.full(401, 0.9)]
 
 @pytest.mark.parametrize("method", fast())  # in the fast tests: SVD at one angle, in tests/equations/test_accelerations.py
 def test_derivatives_of_accelerations(method):
-    """Finite at all angles; equal to the closed form, and so among the methods, wherever the rank is constant nearby."""
+    """They are finite at all angles, and equal the closed form with every method wherever the rank is constant nearby."""
     expected = derivatives(closed_form)(POINTS)
     found = derivatives(partial(accelerations, LINKAGE, method))(POINTS)
     ordinary = np.abs(np.sin(ANGLES)) > 1e-2
@@ -101,7 +101,7 @@ def test_derivatives_of_accelerations(method):
 
 
 def test_derivatives_agree_with_differences():
-    """The default off the closed form's reach, sideways gravity and one link's inertia; and the closed form itself."""
+    """The default where there is no closed form, with sideways gravity and another inertia; and the closed form itself."""
 
     def f(x):
         numbers = {"gravity": x[:2], "body.coupler.mass": x[2], "body.link2.inertia": x[3]}
@@ -121,7 +121,7 @@ def test_derivatives_agree_with_differences():
 
 @pytest.mark.parametrize("method", fast("Varga"))
 def test_projection_has_derivatives(method):
-    """A closed state stays; its change along the manifold stays too, and a change that opens the loop is taken back."""
+    """A closed state stays. A change along the manifold stays too, and one that opens the loop is taken back."""
     equations = prepare(LINKAGE, method)
     angle, length = jnp.array(-0.8), jnp.array(1.0)
     project = lambda q, v: jnp.concatenate(equations.project(0.0, q, v))  # noqa: E731
@@ -162,7 +162,7 @@ TS = np.array([0.0, 1.0, 2.0])
 
 
 def theta(p, mechanism=LINKAGE, method=None, adjoint=None):
-    """theta(2 s)."""
+    """The angle after 2 s."""
     angle, gravity, inertia = p
     numbers = {"gravity": jnp.stack([0.0, -gravity]), **{f"body.link{i}.inertia": inertia for i in (1, 2, 3)}}
     q, v, *_ = state(angle, jnp.ones(()), 0.0)
@@ -194,7 +194,7 @@ def test_a_duplicated_joint_changes_no_gradient_of_a_trajectory():
 
 
 def test_a_duplicate_that_holds_a_body_on_the_ground_changes_nothing():
-    """Where nothing can move, too."""
+    """This includes mechanisms that cannot move."""
     body = {"plate": udk.Body(1.0, 0.1, [0.2, 0.1], 0.3)}
     welds = {f"weld{k}": udk.Weld((GROUND, "plate"), [[0.0, 0.0], [0.0, 0.0]]) for k in range(3)}
     mech = udk.Mechanism(body, welds)
@@ -204,7 +204,7 @@ def test_a_duplicate_that_holds_a_body_on_the_ground_changes_nothing():
 
 
 def test_a_spring_between_pins_that_a_joint_holds_together_changes_no_gradient():
-    """Rounding alone is between its ends: derivatives of the direction of its force would be rounding over rounding."""
+    """The distance of its ends is a rounding error, and so the derivative of its force's direction would be arbitrary."""
     pendulum, ts = udk.library.double_pendulum(), np.linspace(0.0, 1.0, 5)
     elbow = pendulum.joints["elbow"]
     assert isinstance(elbow, udk.Revolute)

@@ -1,4 +1,4 @@
-"""Impacts and rest of several contacts together: against active sets by enumeration, energy, closed forms, differences."""
+"""Impacts and rest of several contacts at once: compared with enumerated active sets, energy, closed forms and differences."""
 
 # pyright: reportOptionalMemberAccess=false
 # All of these runs have events.
@@ -35,7 +35,7 @@ def enumerate_active_sets(W, b, allowed):
 
 
 def test_complementarity_is_that_of_enumeration_and_energy_never_grows():
-    """Random contacts, dependent ones among them, with restitutions of all kinds, of which some do not take part."""
+    """Random contacts, some of them dependent or not involved, with all kinds of restitution."""
     rng = np.random.default_rng(5)
     E, n = 5, 200
     U = rng.normal(size=(n, E, 4)) * 10 ** rng.uniform(-2, 2, size=(n, E, 1))
@@ -71,7 +71,7 @@ def test_complementarity_is_that_of_enumeration_and_energy_never_grows():
 
 
 def dumbbell(x, inertia, ts):
-    """A body on its left foot, at rest, that falls onto its right one; feet at +-a of the centre, m = 1."""
+    """A body that rests on its left foot and falls onto its right one; the feet are at +-a from the centre, m = 1."""
     angle, e = x[0], x[1]
     place = 0.5 * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     body = udk.Mechanism({"b": udk.Body(1.0, 1.0, position=(0.5, 0.0))}).with_parameters(
@@ -86,7 +86,7 @@ FALL = np.linspace(0.0, 0.19, 3)  # s: within it the right foot lands once
 
 
 def test_a_foot_at_rest_is_pushed_or_leaves_where_the_other_lands():
-    """It is pushed where I < m a^2, and leaves where I > m a^2, as the impulse at the right foot alone says."""
+    """It is pushed if I < m a^2, and leaves if I > m a^2, as the impulse at the right foot alone shows."""
     e = np.array([0.0, 0.3])
     sol = jax.jit(jax.vmap(lambda inertia: dumbbell(jnp.array([0.1, 0.3]), inertia, FALL)))(INERTIAS)
     index, q, before, after = (
@@ -106,7 +106,7 @@ def test_a_foot_at_rest_is_pushed_or_leaves_where_the_other_lands():
 
 @pytest.mark.slow
 def test_gradients_of_an_impact_with_a_contact_at_rest_beside_it():
-    """Against differences, where the contact at rest is pushed and where it leaves."""
+    """Compared with differences, for a contact at rest that is pushed, and for one that leaves."""
 
     def smooth(x, inertia):
         sol = dumbbell(x, inertia, FALL)
@@ -126,7 +126,7 @@ def feet(places, restitution):
 @pytest.mark.slow
 @pytest.mark.parametrize("places", [(-0.5, 0.5), (-0.5, 0.4, 0.5), (-0.5, -0.1, 0.4, 0.5)])
 def test_a_box_lands_on_all_its_feet(places):
-    """It bounces as a point does, however redundant its feet are, and rests on two of them, which do not let go."""
+    """It bounces like a point, however redundant its feet are, and comes to rest on two of them, which stay in contact."""
     box, e, first = udk.Mechanism({"box": udk.Body(1.0, 0.1, position=(0.1, 1.0))}), 0.5, np.sqrt(1.6 / G)
     sol = udk.simulate(box, np.linspace(0, 3, 7), events=feet(places, e), max_events=150)
     times = first * np.append(1, 1 + 2 * np.cumsum(e ** np.arange(1, 8)))
@@ -139,7 +139,7 @@ def test_a_box_lands_on_all_its_feet(places):
 
 @pytest.mark.slow
 def test_balls_in_a_row_and_a_body_on_a_body():
-    """Three balls, e = 1: the first bounces off the other two. A body that falls on a box, on its feet, as on the ground."""
+    """Three balls, e = 1: the first bounces off the other two. A body falls onto the feet of a box as onto the ground."""
     row = {f"b{k}": udk.Body(1.0, 0.1, position=(x, 0.0), velocity=(float(k == 0), 0.0)) for k, x in enumerate((0, 2, 3))}
     touching = [
         udk.Contact(f"b{k + 1}", point=[-0.5, 0], on=f"b{k}", through=[0.5, 0], normal=[1, 0], restitution=1.0) for k in (0, 1)
@@ -158,7 +158,7 @@ def test_balls_in_a_row_and_a_body_on_a_body():
 @pytest.mark.slow
 @pytest.mark.parametrize("restitutions", [(0.5, 0.5), (1.0, 0.0), (0.9, 0.3)])
 def test_a_ball_lands_in_a_wedge(restitutions):
-    """Of 60 degrees, both of whose walls it hits at once: as active sets say, and its energy does not grow."""
+    """It hits both walls of a 60 degree wedge at once. The impact agrees with active sets, and energy does not grow."""
     ball, a = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, 1.0))}), np.pi / 3
     normals = np.array([[np.sin(a), np.cos(a)], [-np.sin(a), np.cos(a)]])
     walls = [

@@ -1,4 +1,4 @@
-"""Jumps and kinks of forces that the state decides are located, and derivatives of first and second order pass through them."""
+"""Jumps and kinks of forces that depend on the state are located. First and second derivatives pass through them."""
 
 # pyright: reportArgumentType=false, reportOptionalMemberAccess=false
 import jax
@@ -53,7 +53,7 @@ class Saturated(Of):
 
 
 class Wrapped(Of):
-    """A comparison of a wrapped angle: its side changes where the angle is wrapped, too."""
+    """A comparison with a wrapped angle: it also changes its side where the angle is wrapped."""
 
     def along(self, t, x, v):
         angle = (10 * x + jnp.pi) % (2 * jnp.pi) - jnp.pi
@@ -118,7 +118,7 @@ def test_a_step_ends_at_a_jump_or_a_kink(kind, exact):
 
 @pytest.mark.slow
 def test_derivatives_pass_through_a_jump():
-    """Forward, by the first velocity, the size of the jump and the end."""
+    """Forward derivatives with respect to the initial velocity, the size of the jump and the end."""
     p = jnp.array([*P, 0.6])
 
     def end(p):
@@ -177,7 +177,7 @@ def test_events_of_the_user_stay_apart_from_kinks():
 
 
 def test_what_rests_where_its_force_jumps_is_told():
-    """Dry friction at rest changes its sign without end: after some of its jumps they are no longer located."""
+    """At rest, dry friction changes its sign endlessly. After some number of jumps they are no longer located."""
     found = run(Sign, np.array([0.3, 1.0]), throw=False)
     assert float(found.unlocated) == pytest.approx(0.3, abs=1e-9)
     assert not found.result.is_success

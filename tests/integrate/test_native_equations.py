@@ -1,4 +1,4 @@
-"""Accelerations and projections by machine code are those of the textbook, for each method, element and stabilization."""
+"""Accelerations and projections by machine code equal the textbook's, for each method, element and stabilization."""
 
 import diffrax
 import equinox as eqx
@@ -26,7 +26,7 @@ TIMES = np.linspace(0.0, 1.0, 6)
 
 
 def both(mechanism, chosen, stabilization=Projection()):
-    """The equations by machine code, of a pseudoinverse or a formulation, and by the textbook."""
+    """The equations by machine code, for a pseudoinverse or a formulation, and by the textbook."""
     analysis = udk.analyse(mechanism)
     method, formulation = (udk.Auto(), chosen) if isinstance(chosen, Formulation) else (chosen, None)
     compiled = compile_mechanism(mechanism.without_origin, analysis, method, stabilization, formulation, udk.BDF())
@@ -38,7 +38,7 @@ def both(mechanism, chosen, stabilization=Projection()):
 
 @deferred
 def terms(equations, t, q, v):
-    """D and b with their rows weighted, a_F and M^(-1/2) by the textbook."""
+    """Weighted D and b, a_F, and M^(-1/2), from the textbook."""
     mechanism, w = equations.mechanism, equations.scales.weights
     return (
         uk.D(mechanism, t, q, w),
@@ -54,7 +54,7 @@ def evaluate(equations, t, q, v, dq, dv):
 
 
 def agree(mechanism, chosen, stabilization=Projection(), closed=False, atol=1e-12):
-    """With a_F + M^(-1/2) D^+ b, with D^+ by NumPy, at a state near the guess; it need not be closed."""
+    """Compare with a_F + M^(-1/2) D^+ b, with D^+ by NumPy, at a state near the guess that need not be closed."""
     random = np.random.default_rng(3)
     state = udk.assemble(mechanism) if closed else udk.State(mechanism.q0, mechanism.v0)
     q, v = (x.ravel() + (0 if closed else 0.1) * random.standard_normal(x.size) for x in (state.q, state.v))
@@ -78,7 +78,7 @@ def agree(mechanism, chosen, stabilization=Projection(), closed=False, atol=1e-1
     "chosen", [METHODS[:1], pytest.param([*METHODS, *FORMULATIONS, udk.Augmented()], marks=pytest.mark.slow)], ids=["Auto", "all"]
 )
 def test_joints(names, chosen):
-    """By elimination: the terms that other methods take are the same."""
+    """With elimination; other methods use the same terms."""
     joints = {k: elements.JOINTS[k] for k in ("revolute", *(name.replace("_", " ") for name in names.split()))}
     agree(udk.Mechanism(elements.BODIES, joints), chosen)
 
@@ -100,7 +100,7 @@ def test_redundant_rows(angle):
 
 
 def test_what_is_no_number_does_not_last():
-    """A state whose velocity is none, and the same mechanism after it, in the same lane: of several, or the only one."""
+    """A state with a NaN velocity, followed in the same lane by a valid one: with several lanes, or a single one."""
     mechanism, t = udk.library.four_bar(), jnp.zeros(())
     state = udk.assemble(mechanism)
     q, v = state.q.ravel(), state.v.ravel()
@@ -117,14 +117,14 @@ def test_what_is_no_number_does_not_last():
 
 
 def test_a_singular_configuration():
-    """All links in line: the rank falls by one, and a is the solution of least norm. Elimination has half the digits there."""
+    """All links are in line: the rank falls by one, and a is the least-norm solution. Elimination has half the digits there."""
     chosen = [m for m in METHODS if not isinstance(m, udk.Elimination)] + FORMULATIONS
     agree(udk.library.parallelogram(angle=0.0, angular_velocity=0.7), chosen, closed=True, atol=1e-11)
 
 
 @pytest.mark.parametrize("method", [udk.Auto(), udk.Varga()], ids=["Auto", "Varga"])
 def test_projection(method):
-    """It satisfies all constraints by the smallest change in the mass metric: that is orthogonal to what they allow."""
+    """It satisfies all constraints by the smallest change in the mass metric, which is orthogonal to admissible motions."""
     mechanism = udk.library.parallelogram(angle=-0.7, angular_velocity=0.7)
     native, plain = both(mechanism, method)
     state = udk.assemble(mechanism)
@@ -166,7 +166,7 @@ def test_runs_of_other_solvers_take_the_steps_of_the_plain_form(solver):
     "formulation", [udk.Augmented(), pytest.param(udk.NullSpaceSVD(), marks=pytest.mark.slow)], ids=["LU", "SVD"]
 )
 def test_lanes_and_derivatives_of_runs_by_a_formulation(formulation):
-    """Members side by side are what each is alone; forward and reverse derivatives are those of the Udwadia-Kalaba equation."""
+    """Members of a batch equal single runs. Derivatives in both modes are those of the Udwadia-Kalaba equation."""
     mechanism = udk.library.four_bar()
 
     def end(mass, formulation):
@@ -195,7 +195,7 @@ def test_derivatives_of_a_run_through_an_adjoint():
 
 @pytest.mark.parametrize("number, own", [(0, udk.SVD), (3, udk.Householder)])
 def test_rates_of_concrete_numbers_are_those_of_the_textbook(number, own):
-    """For integrators outside of JAX: (v, a) off the manifold, with gains, at states one after another."""
+    """For integrators outside of JAX: (v, a) off the manifold, with gains, at one state after another."""
     linkage, method, gains = udk.library.parallelogram(), udk.OneOf.absolute(0.1, number=number), udk.Baumgarte(3.0, 5.0)
     rates, textbook = (
         ConcreteRates(linkage, method, gains),
@@ -213,7 +213,7 @@ def test_rates_without_machine_code_are_refused():
 
 
 def test_machine_code_evaluates_the_equations_that_diffrax_integrates():
-    """With `engine="jax"` nothing is machine code, so that it can be compared."""
+    """With `engine="jax"` no machine code is used, so that results can be compared."""
     mechanism = udk.library.parallelogram()
     analysis = udk.analyse(mechanism)
     for engine, is_native in (("diffrax", True), ("jax", False)):

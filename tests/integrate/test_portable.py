@@ -1,4 +1,4 @@
-"""The portable engine: its numbers are those of the scene with other parameters, and what it computes is what Python does."""
+"""The portable engine takes the numbers of a scene with other parameters, and computes what Python computes."""
 
 import base64
 import zlib
@@ -55,7 +55,7 @@ def test_numbers_follow_from_parameters(scene):
 
 @pytest.fixture(scope="module")
 def evaluated():
-    """Evaluate a mechanism by the module of evaluations, at a state: a function of both that returns arrays by name."""
+    """Return a function that evaluates a mechanism at a state with the module of evaluations, and returns arrays by name."""
     from tests.wasm_host import Host
 
     def evaluate(mechanism, t, q, v):
@@ -128,7 +128,7 @@ def test_a_pull_is_a_spring_to_a_place_and_a_damper():
 
 
 def test_numbers_of_conditions_follow_those_of_the_mechanism():
-    """The axis of a slide is a number of the scene, and of a condition that looks along it."""
+    """The axis of a slide is a number of the scene, and of a condition about the position along it."""
     from udkjax.arrays import number
     from udkjax.integrate.events.condition_program import condition_numbers
     from udkjax.integrate.events.conditions import WithinLimit, joint_coordinate

@@ -1,4 +1,4 @@
-"""The problems of the benchmarks end where they are said to end."""
+"""The benchmark problems end where they should."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_pendulum_ends_where_elliptic_functions_end():
 
 @pytest.mark.parametrize("name", NOT_STIFF)
 def test_end_state(name):
-    """The orbit multiplies an error of the first step by 1e3 to 1e4."""
+    """The orbit magnifies an error of the first step by a factor of 1e3 to 1e4."""
     problem = NOT_STIFF[name]
     found = solve_ivp(lambda t, y: problem.f(t, y, np), (0, problem.end), problem.y0, method="DOP853", rtol=3e-14, atol=1e-15)
     assert problem.error(found.y[:, -1]) < {"pendulum": 1e-12, "Arenstorf": 3e-10, "Pleiades": 1e-11}[name]

@@ -1,4 +1,4 @@
-"""One compilation serves all values of all numbers: what is compiled is counted, by JAX's own account."""
+"""One compiled program serves all values of all numbers. JAX's own counts are used."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ import udkjax as udk
 
 
 class Motion(NamedTuple):
-    """What energies and violations are asked of."""
+    """The states of which energies and violations are computed."""
 
     ts: np.ndarray
     q: np.ndarray
@@ -21,7 +21,7 @@ TS = np.linspace(0.0, 0.2, 5)
 
 @pytest.fixture(scope="module")
 def mechanisms():
-    """The same structure with two sets of numbers, the second assembled from another guess."""
+    """The same structure with two sets of numbers, the second one assembled from another guess."""
     mech = udk.library.double_pendulum()
     names = list(mech.bodies)
     numbers = {f"body.{names[0]}.mass": 2.5, f"body.{names[1]}.inertia": 0.4, "gravity": [0.3, -4.0]}

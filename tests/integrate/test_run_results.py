@@ -1,4 +1,4 @@
-"""How runs end: codes, causes, times, and what lies beyond; singly and in batches."""
+"""How runs end: codes, causes, times, and the outputs after the end; for single runs and in batches."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ RESULTS = udk.Result
 
 
 class BlowUp(udk.ForceElement):
-    """A force that grows without bound towards some time."""
+    """A force that grows without bound as some time approaches."""
 
     end: float
 
@@ -23,7 +23,7 @@ class BlowUp(udk.ForceElement):
 
 
 def ended(sol, result, time, tol):
-    """The run ended so, at about that time, and what lies beyond is not a number."""
+    """Require that the run ended with this code at about this time, and that later outputs are NaN."""
     assert sol.result == result
     assert_allclose(sol.time, time, atol=tol)
     reached = np.asarray(sol.ts <= sol.time)
@@ -98,7 +98,7 @@ def test_what_cannot_be_assembled(hung):
 
 @pytest.fixture(scope="module")
 def pinned_twice(pendulum):
-    """The same pin twice; `at` moves the second one along the rod, which can then no longer turn."""
+    """The same pin twice. `at` moves the second one along the rod, which then cannot turn."""
     mech = udk.Mechanism(pendulum.bodies, {"pin": pendulum.joints["pin"], "again": pendulum.joints["pin"]})
     assert udk.analyse(mech).redundant_rows == (2, 3)
     along = np.array([np.cos(float(mech.q0[0, 2])), np.sin(float(mech.q0[0, 2]))])
@@ -106,7 +106,7 @@ def pinned_twice(pendulum):
 
 
 def test_rows_that_become_independent_count_again(pinned_twice):
-    """It cannot move, and it does not move silently, though the analysis of other numbers is given."""
+    """It cannot move, and does not move silently, even with the analysis of other numbers."""
     stuck, other = pinned_twice(0.4), udk.analyse(pinned_twice(0.0))
     assert udk.analyse(stuck).redundant_rows != other.redundant_rows == (2, 3)
     sol = udk.simulate(stuck, TS, throw=False, analysis=other)
@@ -123,7 +123,7 @@ def test_and_say_so_where_numbers_are_traced(pinned_twice, motion):
 
 
 def test_a_batch_with_members_that_fail(hung):
-    """One cannot be closed, one gets a number that is not finite; the others are what they are alone, and nothing throws."""
+    """One cannot be closed, and one gets a NaN. The others equal their single runs, and no exception is raised."""
 
     def run(height, end, mass):
         values = {"joint.thread.points[0][1]": height, "force.motor.end": end, "body.rod.mass": mass}

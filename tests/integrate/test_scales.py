@@ -1,4 +1,4 @@
-"""A mechanism of a micrometre behaves as one of a kilometre, in milliseconds or seconds, of milligrams or tons."""
+"""A mechanism of a micrometre behaves like one of a kilometre, in milliseconds or seconds, in milligrams or tons."""
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ POSITION, RATE = 1e-10, 10 * TOL
 
 
 def deviation(mechanism, units, method=None, times=TS):
-    """How far the motion in other units is from that in our own: coordinates and velocities, in our own."""
+    """The difference, in SI units, between the motions in other units and in SI units."""
     length, time, _ = units
     run = lambda mech, ts: udk.simulate(mech, ts, rtol=TOL, atol=TOL, method=method)  # noqa: E731
     own, other = run(mechanism, times), run(scaled(mechanism, *units), times * time)
@@ -78,7 +78,7 @@ def test_the_analysis_is_the_same_in_all_units(name):
 
 @pytest.mark.parametrize("units", UNITS)
 def test_the_same_is_refused_in_all_units(units):
-    """A loop that is one percent out of closure does not close, however small it is; nor does one that an offset breaks."""
+    """A loop that misses closure by one percent does not close at any scale, nor does one broken by an offset."""
     mechanism = scaled(udk.library.parallelogram(), *units)
     point = np.asarray(mechanism.parameters()["joint.B2.points"])
     for off in (0.01, 1e-6):
@@ -116,7 +116,7 @@ def test_reactions_are_the_same_in_all_units():
 
 @pytest.mark.parametrize("given", ["one number", pytest.param("the whole mechanism", marks=pytest.mark.slow)])
 def test_under_jit_a_call_computes_the_same(given):
-    """Within rounding: the programs are compiled apart. (Runs through singular configurations amplify it a thousand times.)"""
+    """Results agree up to rounding, since programs differ. (Runs through singular configurations magnify it a thousandfold.)"""
     mechanism = udk.library.parallelogram()
     analysis, eager = udk.analyse(mechanism), udk.simulate(mechanism, TS)
     if given == "one number":
@@ -153,7 +153,7 @@ def test_a_body_at_rest_at_the_origin_but_for_rounding_falls(engine, tol):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_slider_at_the_origin_follows_its_driver(engine):
-    """sin(pi/2) - 1 and cos(pi/2) are zero but for rounding."""
+    """sin(pi/2) - 1 and cos(pi/2) are zero up to rounding."""
 
     motion = udk.Sine(amplitude=1.0, frequency=4.0, phase=np.pi / 2, offset=-1.0)
     guide = udk.Prismatic(["ground", "p"], [[0, 0], [0, 0]], np.pi / 2)
@@ -170,7 +170,7 @@ def test_a_slider_at_the_origin_follows_its_driver(engine):
 
 @pytest.mark.parametrize("x", [0.0, 5e-324, 1e-17, -3e-16])
 def test_arms_and_rows_of_rounding_are_none(x):
-    """Pins in the centres of mass, and a row that nothing moves at the guess, have the scales of exact zeros."""
+    """Pins in centres of mass, and a row that nothing changes at the guess, have the same scales as exact zeros."""
 
     class Parabola(udk.Joint):
         def residual(self, t, *frames):
@@ -186,7 +186,7 @@ def test_arms_and_rows_of_rounding_are_none(x):
 
 @pytest.mark.parametrize("inertia", [1e-10, 1e-16])
 def test_a_point_mass_swings(inertia):
-    """What hardly resists turning brings the row along the rod down to the root of I / m l^2 of the largest."""
+    """With little resistance to turning, the row along the rod has a size of only sqrt(I / m l^2) of the largest."""
     start, omega = 0.7, np.sqrt(9.81)
     place = [np.sin(start), -np.cos(start)]
     bob = udk.Mechanism(

@@ -1,4 +1,4 @@
-"""Runs: what goes in, outputs between the steps, traced mechanisms, and what is compiled."""
+"""Runs: inputs, outputs between steps, traced mechanisms, and what is compiled."""
 
 import diffrax
 import equinox as eqx
@@ -19,7 +19,7 @@ def test_output_times_are_checked(pendulum, ts):
 
 
 def test_it_may_start_at_any_time():
-    """The driver's clock is that of ts."""
+    """Drivers use the time of `ts`."""
     mech = udk.library.driven_pendulum()
     ts = np.array([0.7, 0.8, 1.9])
     sol = udk.simulate(mech, ts)
@@ -57,7 +57,7 @@ def test_outputs_lie_on_the_manifold_with_every_solver(pendulum, motion, solver)
 
 @pytest.mark.slow
 def test_output_times_do_not_change_the_motion(pendulum, motion):
-    """The steps are the solver's own; outputs are read off between them."""
+    """The solver chooses its steps; outputs are interpolated between them."""
     sol = udk.simulate(pendulum, FINE)
     assert sol.stats["steps"] == motion.stats["steps"]
     assert_allclose(sol.q[-1], motion.q[-1], atol=1e-13)
@@ -67,7 +67,7 @@ def test_output_times_do_not_change_the_motion(pendulum, motion):
 
 @pytest.mark.parametrize("tol", [1e-4, 1e-3])
 def test_an_output_beside_a_singular_configuration_is_closed(tol):
-    """At 0.55 s the links are 2e-5 rad from being in line, where elimination leaves a row open by up to the tolerance."""
+    """At 0.55 s the links are 2e-5 rad from being in line, where elimination may leave a row open up to the tolerance."""
     found = udk.simulate(udk.library.parallelogram(np.pi / 3), [0.0, 0.55, 1.0], rtol=tol, atol=tol, throw=False)
     assert abs(float(found.q[1, 0, 2])) < 1e-4 and found.settings["engine"] == "native"
     assert found.result == udk.Result.successful
@@ -75,7 +75,7 @@ def test_an_output_beside_a_singular_configuration_is_closed(tol):
 
 
 def test_a_short_last_step_leaves_outputs_as_exact():
-    """A free body moves on a line: outputs of a step before one that is a thousandth as long, or less, had other velocities."""
+    """A free body moves on a line. Outputs just before a step a thousand times shorter once had wrong velocities."""
     body, ts = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, gravity=[0, 0]), np.linspace(0.625, 0.63, 9)
     state = udk.State(np.array([[0.625, 0, 0]]), np.array([[1.000004, 0, 0]]))
     for rest in (1e-1, 1e-3, 1e-6):
@@ -84,7 +84,7 @@ def test_a_short_last_step_leaves_outputs_as_exact():
 
 
 def test_a_batch_of_mechanisms(pendulum):
-    """`eqx.filter_vmap` over whole mechanisms, tolerances and times."""
+    """`eqx.filter_vmap` over entire mechanisms, tolerances and times."""
     masses, tols = jnp.array([1.0, 2.0, 3.0]), jnp.array([1e-4, 1e-6, 1e-9])
     mechs = eqx.filter_vmap(lambda m: pendulum.with_parameters({"body.rod.mass": m}))(masses)
     batch = eqx.filter_vmap(lambda m, tol: udk.simulate(m, TS, rtol=tol, atol=tol))(mechs, tols)
@@ -98,7 +98,7 @@ def test_a_batch_of_mechanisms(pendulum):
 
 
 def test_a_mechanism_made_within_a_traced_function():
-    """Of a traced mass or of traced geometry, it is machine code as any other."""
+    """With a traced mass or traced geometry it runs in machine code like any other."""
     ts = np.linspace(0.0, 0.5, 3)
 
     def angle(mass, length):

@@ -1,4 +1,4 @@
-"""The default's tableau, which stands here so that a run need not import diffrax, is diffrax's."""
+"""The default's tableau is diffrax's; it is repeated in the package so that a run need not import diffrax."""
 
 from dataclasses import fields
 

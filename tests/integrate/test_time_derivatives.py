@@ -1,4 +1,4 @@
-"""Derivatives by times: of outputs, of the start, of control intervals and of assembly; by machine code, like all others."""
+"""Derivatives with respect to times, by machine code: of outputs, the start, control intervals and assembly."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ X = np.array([0.1, 0.9])  # the start and the length of a run (s)
 
 
 def states(mechanism, x):
-    """q and v in the middle and at the end of a run of times x, assembled at its start."""
+    """q and v in the middle and at the end of a run whose times depend on x, assembled at its start."""
     run = udk.simulate(mechanism, x[0] + x[1] * jnp.array([0.0, 0.5, 1.0]), rtol=1e-11, atol=1e-11)
     return jnp.concatenate([run.q.ravel(), run.v.ravel()])
 
@@ -60,7 +60,7 @@ def test_second_derivatives_by_times_and_numbers():
 
 
 def test_members_share_what_is_differentiated():
-    """Where the states of a batch are batched by their changes alone, too; at once and compiled."""
+    """This includes batches in which only the changes of states are batched; eagerly and compiled."""
     arm, shares = ARMS["driven"], jnp.array([0.9, 1.1])
 
     def f(x):
@@ -117,7 +117,7 @@ def test_tolerances_and_first_steps_have_no_derivatives():
 
 
 class Lift(udk.Joint):
-    """A joint of a user's that depends on time: the first body's point moves up."""
+    """A user-defined joint that depends on time: the first body's point moves up."""
 
     def residual(self, t, *frames):
         one, two = frames

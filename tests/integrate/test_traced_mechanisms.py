@@ -1,4 +1,4 @@
-"""A mechanism is an argument like any other: traced or stacked, made of traced numbers, it runs as a known one does."""
+"""A mechanism is an argument like any other: traced, stacked or made from traced numbers, it runs like a known one."""
 
 import warnings
 from dataclasses import replace
@@ -32,7 +32,7 @@ def no_warnings():
 
 
 def marks(mechanism):
-    """The independent rows as a run finds them, and how many there are in general."""
+    """The independent rows that a run finds, and the usual number of independent rows."""
     analysis = analyse(mechanism)
     compiled = compile_concrete(mechanism, replace(analysis, redundant_rows=None), AUTO, Projection())
     state, scales = udk.assemble(mechanism), analysis.scales
@@ -61,7 +61,7 @@ def test_at_rest_where_branches_meet_no_row_is_left_out():
 
 @pytest.fixture(params=[0.003, pytest.param(0.3, marks=pytest.mark.slow)])
 def other_step(request, monkeypatch):
-    """Ten times less and more than the step that is taken aside."""
+    """Multiply and divide the size of the trial step to the side by ten."""
 
     def forget():
         primitive.generate.cache_clear()
@@ -100,7 +100,7 @@ def test_a_jitted_function_of_a_mechanism_is_machine_code():
 
 
 def test_traced_numbers_mean_scales_of_their_own():
-    """A mechanism a thousand times as long and heavy takes the steps of a known one, under jit and beside others in a batch."""
+    """A mechanism a thousand times as long and heavy takes the same steps as a known one, under jit and in a batch."""
     linkage = udk.library.parallelogram(angle=-0.3)
     sizes = [linkage, scaled(linkage, length=1e3, mass=1e3)]
     known = [udk.simulate(mechanism, TIMES) for mechanism in sizes]
@@ -135,7 +135,7 @@ def test_singular_configurations_at_rest_and_passed(start):
 
 @pytest.mark.parametrize("derivative", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_derivatives_by_the_geometry(derivative):
-    """By the initial angle, against those of the exact motion: a pendulum's, and so a difference of its runs."""
+    """With respect to the initial angle, compared with the exact motion of a pendulum, and so with differences of runs."""
     end = lambda a: udk.simulate(udk.library.parallelogram(angle=a), TIMES[:5], rtol=1e-11, atol=1e-11).q[-1, 0, 2]  # noqa: E731
     h = 1e-4
     difference = (end(-0.5 + h) - end(-0.5 - h)) / (2 * h)
@@ -143,7 +143,7 @@ def test_derivatives_by_the_geometry(derivative):
 
 
 def test_a_row_that_numbers_make_independent_is_not_left_out():
-    """With one crank a little longer the three cannot turn together: the linkage stands still, traced as known."""
+    """If one crank is slightly longer, the three cannot turn together: the linkage is stiff, traced or known."""
     linkage = udk.library.parallelogram()
     points = linkage.parameters()["joint.B2.points"] + np.array([[0.0, 0.0], [0.05, 0.02]])
     longer = linkage.with_parameters({"joint.B2.points": points})

@@ -1,4 +1,4 @@
-"""Verner's pair: its conditions of order, and the polynomial between its steps."""
+"""Verner's pair: its order conditions, and the polynomial between its steps."""
 
 import math
 from collections import Counter
@@ -17,7 +17,7 @@ A = np.vstack([np.zeros(STAGES)] + [np.pad(row, (0, STAGES - len(row))) for row 
 
 
 def trees(order):
-    """Rooted trees: each the tuple of the trees that hang at its root."""
+    """Return rooted trees; each is the tuple of the subtrees at its root."""
     if order == 1:
         return [()]
 
@@ -42,7 +42,7 @@ def symmetry(tree):
 
 
 def weight(tree):
-    """Of the stages, in the condition that belongs to a tree: b . weight = 1 / density."""
+    """The stage weights of a tree's order condition: b . weight = 1 / density."""
     return math.prod((A @ weight(branch) for branch in tree), start=np.ones(STAGES))
 
 
@@ -79,7 +79,7 @@ def test_dense_output():
 
 @pytest.fixture(scope="module")
 def decay():
-    """y' = -y^2 over 2 s: errors at many times, and calls of f."""
+    """y' = -y^2 over 2 s: errors at many times, and the number of calls of f."""
     calls = []
 
     def f(t, y, args):

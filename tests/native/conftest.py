@@ -1,4 +1,4 @@
-"""Functions as machine code, on arrays; and trajectories by it, next to those of another engine."""
+"""Functions as machine code, called with arrays; and trajectories by it, for comparison with another engine."""
 
 import ctypes
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ WIDTHS = sorted({1, 2, machine.lanes()})
 
 
 def loaded(*functions: Function, globals: Sequence[str] = ()) -> Callable[..., None]:
-    """The last of some functions, to be called with arrays, whole numbers and numbers."""
+    """Compile functions; return the last one, to be called with arrays, integers and numbers."""
     last = functions[-1]
     library = machine.Library([machine.compile_module(text_of_module(functions, globals))], [last.name])
     kinds = {POINTER: ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
@@ -34,7 +34,7 @@ def loaded(*functions: Function, globals: Sequence[str] = ()) -> Callable[..., N
 
 @pytest.fixture(scope="module", autouse=True)
 def optimized_code():
-    """These tests are of the code that users run."""
+    """Require optimized code, which is what users run."""
     optimize(True)
     yield
     optimize(False)
@@ -51,7 +51,7 @@ def width(request):
 
 
 def as_machine_code(function: Callable, width: int, *examples: Any) -> Callable[..., np.ndarray]:
-    """A function of numbers as machine code, for arrays of them: (outputs, samples), of conditions zeros and ones."""
+    """A function of numbers as machine code, applied to arrays: (outputs, samples); conditions become zeros and ones."""
     examples = tuple(np.asarray(e) for e in examples)
     graph = Graph()
     inputs = [graph.input(k, "argument", e.dtype) for k, e in enumerate(examples)]

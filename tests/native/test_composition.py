@@ -1,4 +1,4 @@
-"""Runs by machine code compose with every transformation of JAX, and what is compiled is kept safely on disk."""
+"""Runs by machine code compose with every transformation of JAX, and compiled code is stored safely on disk."""
 
 import itertools
 import os
@@ -31,7 +31,7 @@ INERTIAS = jnp.array([0.3, 0.35, 0.4, 0.45])
 
 
 def angles(inertia, rtol=1e-10):
-    """The angles of the rod at the output times, of its moment of inertia."""
+    """The angles of the rod at the output times as a function of its moment of inertia."""
     mechanism = PENDULUM.with_parameters({"body.rod.inertia": inertia})
     run = udk.simulate(mechanism, TS, udk.State(PENDULUM.q0, PENDULUM.v0), rtol=rtol, atol=1e-10, throw=False, analysis=KNOWN)
     return run.q[:, 0, 2]
@@ -44,14 +44,14 @@ def angle(inertia, rtol=1e-10):
 
 @pytest.fixture(scope="module")
 def values():
-    """One by one, by compiled programs."""
+    """Values one by one, by compiled programs."""
     run = jax.jit(angle)
     return np.array([run(x) for x in INERTIAS])
 
 
 @pytest.fixture(scope="module")
 def slopes():
-    """By differences of eighth order."""
+    """Slopes by differences of eighth order."""
     weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
     run = jax.jit(lambda x: jax.lax.map(angle, x))
     return np.array([weights @ np.asarray(run(x + 4e-3 * np.arange(-4, 5))) / 4e-3 for x in INERTIAS])
@@ -74,7 +74,7 @@ WAYS = {
 
 @pytest.mark.parametrize("run", WAYS.values(), ids=WAYS)
 def test_every_way_gives_the_same_values(run, values):
-    """To rounding; to the last bit where a member runs alone, or in a program of its own."""
+    """They agree up to rounding, and bitwise if a member runs alone or in a program of its own."""
     assert_allclose(run(INERTIAS), values, rtol=0, atol=1e-13)
 
 
@@ -97,7 +97,7 @@ def test_every_way_gives_the_same_slopes(run, slopes):
 
 @pytest.fixture
 def record_length(monkeypatch):
-    """A function that sets the capacity of a record in points; JAX keeps the shapes of traced functions."""
+    """A function that sets the capacity of a record in points. JAX caches the shapes of traced functions."""
 
     def change(points):
         monkeypatch.setattr(record, "STORED", points)
@@ -108,7 +108,7 @@ def record_length(monkeypatch):
 
 
 def test_a_member_whose_record_is_too_long_is_run_again(record_length):
-    """On its way back; beside others whose record is long enough, and alone."""
+    """It is run again in the reverse pass: alone, and next to members whose record is long enough."""
     rtols = jnp.array([1e-4, 1e-6, 1e-8, 1e-10])  # of 11 to 14 points
     slopes = lambda: [jax.jit(jax.vmap(jax.jacrev(angles)))(INERTIAS[:n], rtols[:n]) for n in (1, 4)]  # noqa: E731
     expected = slopes()
@@ -127,7 +127,7 @@ def test_threads_share_machine_code(values):
 
 
 def test_a_member_does_not_depend_on_its_neighbours():
-    """To the last bit, beside others, in another lane, and beside one that fails."""
+    """It is bitwise the same next to others, in another lane, and next to one that fails."""
     run = jax.jit(jax.vmap(angle, (0, 0)))
     xs, tols = jnp.linspace(0.3, 0.5, 11), jnp.logspace(-4, -10, 11)
     found = run(xs, tols)
@@ -173,7 +173,7 @@ def test_devices_run_shards():
 
 
 def test_threads_of_xla_share_a_large_batch():
-    """Whoever computes them, the members are the same; also where many calls at once ask for more threads than there are."""
+    """Members are the same whichever thread computes them, also if many calls ask for more threads than there are."""
     xs = jnp.linspace(0.3, 0.45, 80)
     run = jax.jit(jax.vmap(angles))
     expected = jnp.concatenate([jax.vmap(angles)(part) for part in xs.reshape(10, 8)])
@@ -223,14 +223,14 @@ EAGER = COMPILED if deferred_p is None else ""
 @pytest.mark.skipif(sys.platform != "linux", reason="the size of the process is read from /proc")
 @pytest.mark.parametrize(("way", "name"), [pytest.param("eager", EAGER, marks=pytest.mark.slow), ("jit", COMPILED)])
 def test_a_record_without_memory_is_an_error(way, name):
-    """The record of a gradient grows with the number of steps; later calls are not affected."""
+    """The record of a gradient grows with the number of steps. Later calls are unaffected."""
     done = subprocess.run([sys.executable, "-c", WITHOUT_MEMORY, way], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.splitlines() == [f"{name}no memory for a computation by machine code", "True"]
 
 
 def closed_angle(x):
-    """Angle of a closed four-bar that was drawn with one pin at x; traced, as small scenes are closed without machine code."""
+    """Angle of a closed four-bar that was drawn with one pin at x. x is traced, as small scenes are closed by NumPy otherwise."""
     close = lambda x: udk.assemble(udk.library.four_bar().with_parameters({"pin.B": jnp.stack([x, 1.0])})).q[1, 2]  # noqa: E731
     return jax.vmap(close)(jnp.stack([x, x + 0.1]))
 
@@ -247,7 +247,7 @@ RUNS = {
 
 @pytest.mark.parametrize(("refused", "run"), [*(("malloc", name) for name in RUNS), ("realloc", "reverse")])
 def test_every_allocation_is_checked(monkeypatch, refused, run):
-    """All allocations of one kind fail; the code is compiled with a call of malloc or realloc replaced by null."""
+    """All allocations of one kind fail: a call of malloc or realloc in the code is replaced by null."""
     call, replaced, load = re.compile(rf"call ptr @{refused}\([^)]*\)"), [], primitive.load
 
     def load_refused(text, *arguments):  # under the name of the changed text: code of the other stays in use
@@ -380,7 +380,7 @@ for k in range(20):
 
 @pytest.mark.slow
 def test_processes_share_the_folder(folder):
-    """Several make and read the same files at once."""
+    """Several processes write and read the same files at once."""
     environment = {**os.environ, "UDKJAX_CACHE": str(folder), "PYTHONPATH": os.path.dirname(__file__)}
     processes = [subprocess.Popen([sys.executable, "-c", MANY], env=environment) for _ in range(2)]
     assert [p.wait(timeout=300) for p in processes] == [0, 0]
@@ -388,7 +388,7 @@ def test_processes_share_the_folder(folder):
 
 
 def test_a_module_is_compiled_in_parts_that_others_share(monkeypatch):
-    """Functions that are large alone, the others together; and what calls what, and constants, are found again."""
+    """Large functions separately, the others together. Functions that call each other, and constants, are linked."""
     monkeypatch.setattr(machine, "PART_LINES", 4)
     body = "".join(f"  %x{k} = fadd double %x{k - 1}, 1.0e0\n" for k in range(1, 9))
     large = "define double @eight(double %x0) {\n" + body + "  ret double %x8\n}\n"
@@ -407,7 +407,7 @@ def test_a_module_is_compiled_in_parts_that_others_share(monkeypatch):
 
 @pytest.mark.slow
 def test_equal_programs_are_equal_texts_in_every_process():
-    """Else the code of derivatives would be compiled anew in each."""
+    """Otherwise the code of derivatives would be compiled again in each."""
     program = """
 import udkjax as udk
 from udkjax.equations.scene_programs import scene_programs

@@ -1,4 +1,4 @@
-"""Runs by the paper's pseudoinverses in machine code are those of the plain form, with the same derivatives."""
+"""Runs with the paper's pseudoinverses in machine code equal those of the plain form, and so do their derivatives."""
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ TIMES = np.linspace(0.0, 2.0, 11)
     ids=lambda x: type(x).__name__,
 )
 def test_the_exact_motion_of_a_redundant_linkage(method, stabilization):
-    """The angle of its links: 3.05 theta'' = -3.5 g cos(theta), that of a pendulum released from rest."""
+    """The angle of its links satisfies 3.05 theta'' = -3.5 g cos(theta), like a pendulum released from rest."""
     start = np.deg2rad(-45)
     run = udk.simulate(
         udk.library.parallelogram(start), TIMES, rtol=1e-10, atol=1e-10, method=method, stabilization=stabilization
@@ -68,7 +68,7 @@ def test_derivatives_are_those_of_elimination(method):
 
 
 def test_thresholds_are_data():
-    """One program for all thresholds: with one above all singular values nothing holds the links, and they fall apart."""
+    """One program serves all thresholds. With one above all singular values, nothing holds the links, and they fall apart."""
     linkage = udk.library.parallelogram(np.deg2rad(-45))
 
     def end(rank_tol):

@@ -1,4 +1,4 @@
-"""Elementary functions in LLVM's text: their errors, special values, and freedom from functions outside the module."""
+"""Elementary functions in LLVM IR: their errors, special values, and independence of functions outside the module."""
 
 import math
 import re
@@ -37,7 +37,7 @@ def between(start, end, count=COUNT // 4):
 
 
 def of_sizes(start, end, count=COUNT // 4):
-    """Numbers of any size from 2^start to 2^end."""
+    """Numbers of all sizes from 2^start to 2^end."""
     return 2.0 ** RNG.uniform(start, end, count)
 
 
@@ -99,7 +99,7 @@ HUGE_ANGLES = {  # and their tangents
 
 
 def program(name, width):
-    """A function `apply(x, y, out)` of groups of numbers."""
+    """A function `apply(x, y, out)` on groups of numbers."""
     f = Function("apply", [(POINTER, "x"), (POINTER, "y"), (POINTER, "out"), ("i64", "groups")], width)
     with f.each(f.given["groups"]) as k:
         given = [f.load(f.given[x], k * width, width) for x in ("x", "y")[: len(CASES[name].arguments)]]
@@ -120,7 +120,7 @@ def evaluate(code):
 
 
 def errors(found, exact):
-    """Errors in units in the last place of the exact results; those that are not finite must be equal."""
+    """Errors in units in the last place of the exact result. Results that are not finite must be equal."""
     with np.errstate(over="ignore"):
         rounded = exact.astype(float)
     is_finite = np.isfinite(rounded)
@@ -146,7 +146,7 @@ def test_errors_are_small_for_numbers_of_all_sizes(evaluate, name):
 
 
 def special_arguments(name):
-    """All special numbers, or all pairs of these."""
+    """All special numbers, or all pairs of them."""
     grid = np.meshgrid(*[SPECIAL] * len(CASES[name].arguments))
     return [x.ravel() for x in grid]
 
@@ -216,7 +216,7 @@ def test_no_operation_needs_a_function_outside_of_its_module(name):
 
 
 class Everything(udk.ForceElement):
-    """A torque on a body that depends on its angle by many elementary functions."""
+    """A torque on a body that depends on its angle through many elementary functions."""
 
     def loads(self, t, *frames):
         (body,) = frames
@@ -248,7 +248,7 @@ def test_modules_of_runs_and_derivatives_need_memory_management_alone(monkeypatc
 
 
 def test_graphics_cards_round_as_processors_do():
-    """PTX neither calls functions outside nor fuses further products and sums."""
+    """PTX neither calls outside functions nor fuses additional products and sums."""
     functions = [program(name, 1) for name in CASES]
     for k, f in enumerate(functions):
         f.name = f"apply{k}"

@@ -1,4 +1,4 @@
-"""First calls of an operation are of code that is compiled quickly: what it finds, and when optimized code takes its place."""
+"""First calls of an operation use quickly compiled code: its results, and when optimized code takes its place."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ TS = np.linspace(0.0, 1.0, 11)
 
 @pytest.fixture
 def calls(monkeypatch, tmp_path):
-    """Calls that are made quickly, with their outputs: the code, its inputs, the shapes of its outputs, and what it finds."""
+    """Calls by quickly compiled code: the code, its inputs, the shapes of its outputs, and its results."""
     monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
     monkeypatch.setattr(machine, "_compiler", lambda: str(tmp_path))  # whose code nobody has loaded
     primitive.machine_code.cache_clear()

@@ -1,4 +1,4 @@
-"""Functions of Python in compiled programs: alone, in batches, in loops, and where they fail."""
+"""Python functions in compiled programs: alone, in batches, in loops, and when they fail."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from udkjax.native.base.host_function import call_host
 
 @dataclass(frozen=True)
 class Norms:
-    """The norm of each row, times a number that all share."""
+    """The norm of each row, times a number common to all."""
 
     fails: bool = False
 

@@ -1,4 +1,4 @@
-"""Each operation of the layer over LLVM's text does what it says, for one state and for lanes of them."""
+"""Each operation of the layer above LLVM IR does what its docstring says, for one state and for lanes of states."""
 
 import operator
 
@@ -83,7 +83,7 @@ def test_a_number_is_written_to_its_last_bit(code, number):
 
 
 def test_the_larger_is_the_second_where_one_is_no_number(code, width):
-    """In that order a running maximum ignores NaN."""
+    """With this order of arguments a running maximum ignores NaN."""
     x, y = pairs()
     assert_array_equal(binary(code, width, lambda f, a, b: f.max(a, b), x, y), np.where(x > y, x, y))
     assert_array_equal(binary(code, width, lambda f, a, b: f.min(a, b), x, y), np.where(x < y, x, y))
@@ -142,7 +142,7 @@ def test_one_lane_is_set_where_a_mask_says(code, width):
 
 
 def test_loops_and_branches(code):
-    """Sums over i < j of those pairs of [0, n) that have another parity; and Collatz' steps of n."""
+    """Sums over pairs i < j in [0, n) of different parity; and the number of Collatz steps of n."""
     f = Function("loops", [(POINTER, "out"), (INT, "n")])
     n, pairs_, steps = f.given["n"], f.variable(0, INT), f.variable(0, INT)
     with f.each(n) as i, f.each(n, i + 1) as j, f.if_(f.logic("and", i + j, 1).is_(1)):
@@ -169,7 +169,7 @@ def test_loops_and_branches(code):
 
 
 def test_functions_call_one_another_with_memory_of_their_own(code):
-    """Memory reserved within a loop is reserved once: a thousand iterations take no more of the stack than one."""
+    """Memory reserved within a loop is reserved once: a thousand iterations take no more stack than one."""
     inner = Function("inner", [(POINTER, "x"), (INT, "k")])
     place = inner.reserve(DOUBLE, 100_000)
     inner.store(1.0, inner.at(place, 99_999))

@@ -1,4 +1,4 @@
-"""The programs of scenes as loops: held against the textbook, run row by row; their derivatives against differences."""
+"""The programs of scenes as loops, compared with the textbook; their derivatives, compared with differences."""
 
 import dataclasses
 from functools import cached_property
@@ -72,7 +72,7 @@ def textbook(mechanism, t, q, v, weights, gains=None, method=udk.SVD()):
 
 
 class At:
-    """The programs of a scene at some state near its guess, run row by row."""
+    """The programs of a scene at a state near its guess, run row by row."""
 
     def __init__(self, mechanism, baumgarte=None, every=False):
         redundant = analyse(mechanism).redundant_rows or ()
@@ -119,7 +119,7 @@ class At:
         return np.concatenate([found[x] for x in RESULTS[name]])
 
     def evaluated(self, name, q, v):
-        """The arrays that a differentiable program leaves."""
+        """The arrays after a differentiable program."""
         found = self.arrays(q=q, v=v)
         loops.run(self.code.differentiable[name].program, found)
         return found
@@ -176,7 +176,7 @@ def test_what_is_tangential(at):
 
 
 def test_steps_with_care_take_all_rows():
-    """Beside singular configurations rows that are redundant elsewhere are not, and others are."""
+    """Near singular configurations, rows that are redundant elsewhere are not, and others are."""
     at = At(udk.library.parallelogram(), every=True)
     flat = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0], [2.0, 0.0, 0.0]]).ravel()
     at.numbers[-2] = 1e-10
@@ -193,7 +193,7 @@ RESULTS = {"accelerations": ["a"], "projection": ["q1", "v1"], "newton_q": ["q1"
 
 
 def test_no_number_is_written_once_it_was_read():
-    """Derivatives rely on it."""
+    """Derivatives rely on this."""
     code = At(loaded()).code
     programs = [code.differentiable[name].program for name in RESULTS]
     for program in programs:
@@ -256,7 +256,7 @@ def test_derivatives_against_differences(at, name):
 @pytest.mark.parametrize("at", ["linkage", "gears", "loaded"], indirect=True)
 @pytest.mark.parametrize("name", ["accelerations", "projection", "newton_q"])
 def test_second_derivatives_against_differences(at, name):
-    """Along two directions that open the loops, too: a projection is right to second order where it is taken twice."""
+    """This includes two directions that open the loops: a projection repeated once is right to second order."""
     code, random = at.code, np.random.default_rng(7)
     results, evaluated = RESULTS[name], code.differentiable[name]
     q, v = on_the_manifold(at) if name == "projection" else (at.q, at.v)
@@ -359,7 +359,7 @@ def test_unrolled_programs_equal_loops(at):
 
 
 def beside_each_other(mechanism: udk.Mechanism, copies: int) -> udk.Mechanism:
-    """So many copies of a mechanism in one scene."""
+    """A number of copies of a mechanism in one scene."""
 
     def renamed(element, k):
         return dataclasses.replace(element, bodies=tuple(b if b == "ground" else f"{b} {k}" for b in element.bodies))
@@ -371,7 +371,7 @@ def beside_each_other(mechanism: udk.Mechanism, copies: int) -> udk.Mechanism:
 
 @pytest.fixture(scope="module")
 def linkages():
-    """A linkage, and eight of it in one scene."""
+    """A linkage, and eight of them in one scene."""
 
     def pair(angle):
         alone = udk.library.parallelogram(np.deg2rad(angle))
@@ -391,7 +391,7 @@ def test_a_large_scene_moves_as_its_parts_do(linkages, angle, bound):
 
 @pytest.mark.slow
 def test_derivatives_of_a_large_scene_are_those_of_its_parts(linkages):
-    """Derivatives of runs and of closing their initial states, in forward and reverse mode."""
+    """Derivatives of runs and of the assembly of their initial states, in forward and reverse mode."""
     ts, slopes = np.linspace(0.0, 0.3, 4), []
     for mechanism, copies in zip(linkages(-50.0), (1, 8), strict=True):
         names = [f"body.{name}.mass" for name in mechanism.body_names if name.startswith("link1")]

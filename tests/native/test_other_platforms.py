@@ -87,13 +87,13 @@ def given(name):
 
 
 def targets(text):
-    """The names of the host's operations in a program."""
+    """The names of the host operations in a program."""
     return re.findall(r"custom_call @(udkjax_\w+)", text)
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW)) for x in PROGRAMS])
 def test_the_host_computes_for_a_graphics_card(name):
-    """The same as on the CPU, by the handlers that copy, and nothing else: no other integrator."""
+    """The operations are those of the CPU, with handlers that copy, and no other integrator is used."""
     traced = jax.jit(PROGRAMS[name]).trace(given(name))
     cpu, card = (traced.lower(lowering_platforms=(platform,)).as_text() for platform in ("cpu", "cuda"))
     assert targets(cpu) and targets(card) == [f"{x}_copied" for x in targets(cpu)]
@@ -118,7 +118,7 @@ FAST = {"kinematics", "equilibrium"}
 @pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in FAST)) for x in SOLVES])
 def test_a_solve_for_a_graphics_card_is_one_call(name):
-    """Without loops and factorizations on the card; on the CPU it is a part of the program."""
+    """There are no loops or factorizations on the card. On the CPU the solve is a part of the program."""
     solve, calls = SOLVES[name]
     traced = jax.jit(solve).trace(jnp.asarray(0.35))
     cpu, card = (traced.lower(lowering_platforms=(platform,)).as_text() for platform in ("cpu", "cuda"))
@@ -132,7 +132,7 @@ def test_a_solve_for_a_graphics_card_is_one_call(name):
     ("solve", "most", "word"), [(_eigenvalues, host_program.FEW_MATRICES, "cusolver"), (_root, host_program.SMALL, "while")]
 )
 def test_large_batches_stay_on_the_card(solve, most, word):
-    """Batches of matrices, and of loops that all members take together."""
+    """Batches of matrices, and of loops that all members run together."""
     for members, is_called in ((most, True), (most + 1, False)):
         card = jax.jit(jax.vmap(deferred(solve))).trace(jnp.ones(members)).lower(lowering_platforms=("cuda",)).as_text()
         assert bool(targets(card)) == is_called and (word in card) != is_called
@@ -147,7 +147,7 @@ def test_batches_of_loops_one_after_another_do_not():
 
 @pytest.mark.parametrize("name", ["run", "reverse mode", "closing", "rarely reached", "deferred"])
 def test_programs_are_exported_for_graphics_cards(name):
-    """A program for both platforms runs here."""
+    """A program for both platforms also runs here."""
     program, x = jax.jit(deferred(_eigenvalues) if name == "deferred" else PROGRAMS[name]), given(name)
     names = targets(program.trace(x).lower(lowering_platforms=("cpu", "cuda")).as_text())
     assert {x.endswith("_copied") for x in names} == {True, False}
@@ -158,7 +158,7 @@ def test_programs_are_exported_for_graphics_cards(name):
 
 
 def test_other_devices_call_the_host_by_jax():
-    """The CPU stands in for such a device, for which JAX cannot write calls of Python without it."""
+    """The CPU stands in for such a device, for which JAX cannot write calls of Python unless it is present."""
     expected = [np.asarray(jax.jit(PROGRAMS[name])(given(name))) for name in ("run", "reverse mode", "rarely reached")]
     for p, module in LOWERED:
         mlir.register_lowering(p, mlir.lower_fun(module._lower_for_others), platform="cpu")

@@ -1,4 +1,4 @@
-"""Programs as machine code compute the results of JAX, also for non-finite numbers."""
+"""Programs as machine code compute the same as JAX, also for non-finite numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -174,7 +174,7 @@ SLOPED = {name: f for name, f in ONE.items() if name not in ("is_finite", "of co
 
 @pytest.mark.parametrize("name", SLOPED)
 def test_whatever_has_an_instruction_has_derivatives_that_have_one(code, name):
-    """They are taken of the graph, not by JAX, and a run whose derivatives could not be written would have none."""
+    """Derivatives are taken from the graph, not by JAX; a run without a rule for an operation would have none."""
     graph = Graph()
     x = graph.input("x", "state", np.dtype(float))
     given = np.empty((), object)

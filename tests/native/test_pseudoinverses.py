@@ -1,4 +1,4 @@
-"""The pseudoinverses in machine code are those of `udkjax.pinv`: the same ranks, and D^+ b to rounding, in every lane."""
+"""The pseudoinverses in machine code equal those of `udkjax.pinv`: the same ranks, and D^+ b up to rounding, in every lane."""
 
 import ctypes
 from functools import partial
@@ -32,7 +32,7 @@ METHODS = {
 
 
 class Solver(Memory):
-    """One method on (m, n) matrices in so many lanes."""
+    """One method for (m, n) matrices with a number of lanes."""
 
     def __init__(self, method: pinv.Pseudoinverse, m: int, n: int, width: int):
         plan: Any = SimpleNamespace(width=width, vector=machine.lanes())
@@ -64,7 +64,7 @@ class Solver(Memory):
         return memory[start : start + rows * stride].reshape(rows, -1, width)[:, :columns]
 
     def __call__(self, matrices, right, tols, numbers: Any = 0.0, solve="solve"):
-        """x and the ranks, of as many matrices as there are lanes."""
+        """Return x and the ranks, for as many matrices as there are lanes."""
         given, to = ("b", "x") if solve == "solve" else ("x", "b")
         size = self.places.size * self.plan.width
         memory = np.zeros(size + 8)
@@ -79,7 +79,7 @@ class Solver(Memory):
 
 
 def solved(make, matrices, right, tols, width, relative=True, numbers: Any = 0.0):
-    """By machine code, in groups of lanes; the last one is filled up."""
+    """Solve with machine code, in groups of lanes; the last group is padded."""
     method = make(1.0, relative=relative)
     m, n = matrices.shape[1:]
     solver, found, ranks = Solver(method, m, n, width), [], []
@@ -109,7 +109,7 @@ def random_matrices(m, n, ranks, seed=0):
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("m, n, width", [(12, 12, machine.lanes()), (5, 20, 1), (9, 5, machine.lanes()), (3, 1, 1)])
 def test_every_lane_has_a_rank_of_its_own(name, m, n, width):
-    """Right-hand sides are not consistent: where the rank falls these are least-squares solutions of least norm."""
+    """Right-hand sides are inconsistent: where the rank falls, results are least-squares solutions of least norm."""
     ranks = [k % (min(m, n) + 1) for k in range(min(m, n), 2 * min(m, n) + 9)]
     matrices, right = random_matrices(m, n, ranks)
     x, found = solved(METHODS[name], matrices, right, 1e-6, width)
@@ -118,7 +118,7 @@ def test_every_lane_has_a_rank_of_its_own(name, m, n, width):
 
 
 def one(matrix, right, tol, solve="solve"):
-    """By singular values, of one matrix."""
+    """Solve with one matrix, by singular values."""
     D = np.array(matrix, float)
     m, n = D.shape
     solver = Solver(pinv.SVD(1.0), m, n, 1)
@@ -134,7 +134,7 @@ def test_transposed(m, n):
 
 
 def test_small_singular_values_are_exact_to_many_digits():
-    """Rows have very different lengths, for which results from D D^T would have no correct digits."""
+    """The rows have very different lengths; results from D D^T would have no correct digits."""
     (inner,), _ = random_matrices(3, 3, [3])
     D, x = np.diag([1.0, 1e-5, 1e-10]) @ inner, [1.0, 2.0, 3.0]
     assert_allclose(one(D, D @ x, 1e-14), x, rtol=1e-9)
@@ -147,7 +147,7 @@ def test_what_is_scaled_is_solved_alike(scale):
 
 
 def test_zeros_and_numbers_that_are_none():
-    """Zeros have rank zero, and non-finite matrices terminate."""
+    """Zero matrices have rank zero, and non-finite matrices terminate."""
     assert_array_equal(one(np.zeros((3, 4)), np.ones(3), 1e-9), np.zeros(4))
     assert_allclose(one([[0.0, 0.0], [0.0, 2.0], [0.0, 0.0]], [5.0, 1.0, 7.0], 1e-9), [0.0, 0.5])
     for bad in (np.nan, np.inf):
@@ -156,7 +156,7 @@ def test_zeros_and_numbers_that_are_none():
 
 @pytest.mark.parametrize("name", METHODS)
 def test_exact_matrices(name):
-    """Errors of D^+ are those that the plain form promises: eps cond(D), or its square."""
+    """Errors of D^+ are those that the plain form promises: eps cond(D), or eps cond(D)^2."""
     make = METHODS[name]
     power = 2 if name in ("Greville", "GramSchmidt once") else 1
     eps = np.finfo(float).eps
@@ -175,7 +175,7 @@ def test_exact_matrices(name):
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("relative", [True, False])
 def test_thresholds_meet_the_same_scale(name, relative):
-    """Rows have lengths that fall by tenths: the ranks at thresholds in between are those of the plain form."""
+    """Lengths of rows decrease by factors of ten. The ranks at thresholds in between equal those of the plain form."""
     lengths = 10.0 ** -np.arange(5)
     matrices = np.array([np.diag(lengths) * 3.0] * 7)
     right, tols = np.ones((7, 5)), np.array([3e-1, 0.05, 3e-2, 5e-3, 3e-4, 1e-5, 4.0]) * (1.0 if relative else 1.7)
@@ -188,7 +188,7 @@ def test_thresholds_meet_the_same_scale(name, relative):
 
 @pytest.mark.parametrize("width", [1, machine.lanes()])
 def test_each_lane_has_chosen_a_method_of_its_own(width):
-    """Mixed in lanes, in any order, each finds to the bit what the code of its method alone finds."""
+    """Each lane's result is bitwise that of the code of its method alone, in any order of methods."""
     numbers = np.array([3, 0, 4, 1, 1, 2, 0, 4, 2, 3, 0, 2, 4])
     ranks = [12 - k % 3 for k in range(len(numbers))]
     matrices, right = random_matrices(12, 12, ranks)

@@ -1,4 +1,4 @@
-"""Parts of compiled programs that NumPy evaluates where they are reached."""
+"""Parts of compiled programs that NumPy evaluates if they are reached."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from udkjax.native.base.host_function import call_seldom
 
 
 def _roots(x, scale, names):
-    """Return roots by Newton's method, each in a loop of its own length, and a flag."""
+    """Return roots by Newton's method, each in a loop of its own, and a flag."""
 
     def root(x):
         x = jnp.abs(x)
@@ -38,7 +38,7 @@ def test_what_is_seldom_reached_is_right_and_not_compiled():
 
 
 def test_what_is_not_finite_is_so_by_numpy_too():
-    """No call of JAX is made from within a program that runs, neither for a matrix that NumPy refuses to decompose."""
+    """A running program does not call JAX, not even for a matrix that NumPy refuses to decompose."""
     x = jnp.stack([jnp.eye(2), jnp.full((2, 2), jnp.nan)])
     s = jax.jit(lambda x: call_seldom(_singular_values, x))(x)
     assert_allclose(s, [[1.0, 1.0], [np.nan, np.nan]])

@@ -1,4 +1,4 @@
-"""Trajectories by machine code are those that the equations of textbooks give, found in another way."""
+"""Trajectories by machine code equal those of textbook equations, which are solved in another way."""
 
 import inspect
 from importlib import import_module
@@ -23,7 +23,7 @@ FAST = "parallelogram", "slider_crank"
 
 
 def by_scipy(mechanism, ts, state=None, gains=(0.0, 0.0)):
-    """The motion from M a + Psi_q^T lambda = F, Psi_q a = gamma in the sense of least squares, by SciPy."""
+    """The motion from M a + Psi_q^T lambda = F, Psi_q a = gamma in the least-squares sense, by SciPy."""
     state = udk.assemble(mechanism) if state is None else state
     n = state.q.size
 
@@ -59,7 +59,7 @@ def agrees(mechanism, ts, atol=1e-6, **choices):
 
 @pytest.fixture(autouse=True)
 def served(monkeypatch, request):
-    """All of these runs are by machine code, but for those of tests that look themselves."""
+    """Require machine code for all of these runs, except in tests that check this themselves."""
     seen, module = [], import_module("udkjax.integrate.simulate")
     finish = module._finish
 
@@ -90,7 +90,7 @@ TIMES = np.linspace(0.3, 1.5, 9)
 
 @pytest.fixture(scope="module")
 def double():
-    """A double pendulum with a damper, and how it moves."""
+    """A double pendulum with a damper, and its motion."""
     scene = udk.library.double_pendulum()
     damper = udk.TorsionSpring(scene.body_names, stiffness=1.0, damping=0.1)
     mechanism = udk.Mechanism(scene.bodies, scene.joints, forces={"damper": damper})
@@ -126,7 +126,7 @@ def test_explicit_methods(double, solver):
 
 
 def test_errors_follow_the_tolerance():
-    """Also those of outputs between steps."""
+    """This includes outputs between steps."""
     mechanism, ts = udk.library.compound_pendulum(), np.linspace(0, 1, 8)
     q, _ = by_scipy(mechanism, ts)
     for tol in (1e-4, 1e-7, 1e-10):
@@ -134,7 +134,7 @@ def test_errors_follow_the_tolerance():
 
 
 class Pushes(udk.ForceElement):
-    """A torque that jumps at two times, given as one vector."""
+    """A torque that jumps at two times, which are given as one vector."""
 
     times: jax.Array
     height: jax.Array
@@ -155,7 +155,7 @@ def pushed(times=(0.25, 0.6)):
 
 @pytest.mark.parametrize("ts", [[0.1, 0.25, 0.4, 0.55], [0.0, 0.25, 0.6], [0.25, 0.3, 0.9]], ids=str)
 def test_runs_start_anew_behind_breakpoints(ts):
-    """Also where output times are breakpoints, and where the first and the last are; and without a projection."""
+    """Output times may be breakpoints, also the first and the last one; and without a projection."""
     agrees(pushed(), np.array(ts), atol=2e-8, stabilization=udk.Projection() if ts[0] else None)
 
 
@@ -185,7 +185,7 @@ def turned_by_a_cam(lift=0.2):
 
 
 def test_cams():
-    """Also between steps, close to where one cubic of the profile meets the next."""
+    """This includes outputs between steps near the boundary of two cubics of the profile."""
     mechanism, ts = turned_by_a_cam(), np.linspace(0.0, 1.5, 61)
     solution = agrees(mechanism, ts, atol=1e-7)
     batch = jax.jit(jax.vmap(lambda tol: udk.simulate(mechanism, ts, rtol=tol, atol=tol, throw=False)))(jnp.full(8, TOL))
@@ -219,7 +219,7 @@ def test_a_first_step_is_taken_as_given():
 
 
 def test_it_takes_no_less_from_late_times_and_backward_offsets():
-    """The same motion, a million seconds later."""
+    """The motion is the same a million seconds later."""
     mechanism = udk.library.compound_pendulum()
     one, other = (udk.simulate(mechanism, np.linspace(0.0, 1.0, 5) + start, rtol=1e-9, atol=1e-9).q for start in (0.0, 1e6))
     assert_allclose(one, other, atol=1e-8)
@@ -229,7 +229,7 @@ def test_it_takes_no_less_from_late_times_and_backward_offsets():
 
 
 def traced(mechanism, **choices):
-    """A run that is not compiled: which engine it takes is known before."""
+    """A run that is not compiled: its engine is known beforehand."""
     jax.eval_shape(lambda start: udk.simulate(mechanism, [0.0, 0.1], start, **choices).q, udk.State(mechanism.q0, mechanism.v0))
 
 

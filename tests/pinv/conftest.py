@@ -1,4 +1,4 @@
-"""Each method, and matrices with exactly known pseudoinverses."""
+"""A fixture for each method, and for matrices with exactly known pseudoinverses."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The register of methods, where a new one is one line and meets every test."""
+"""The list of methods: a new method is one line, and is used in every test."""
 
 from collections.abc import Callable
 from functools import partial
@@ -30,5 +30,5 @@ METHODS = [
 
 
 def entries(*chosen: str) -> list:
-    """All entries as parameters; those that are not chosen are marked as slow."""
+    """All entries as parameters. Those not chosen are marked as slow."""
     return [pytest.param(e, id=e.name, marks=[] if e.name in chosen else pytest.mark.slow) for e in METHODS]

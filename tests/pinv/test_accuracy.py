@@ -1,4 +1,4 @@
-"""Every method against exact pseudoinverses, in the accuracy that it promises."""
+"""Every method is compared with exact pseudoinverses, within its promised accuracy."""
 
 from itertools import groupby
 
@@ -11,7 +11,7 @@ from tests.pinv.methods import METHODS, entries
 
 
 def rank_tol(entry, matrix, dtype):
-    """A threshold between the kept and the dropped singular values; None where the method knows better."""
+    """A threshold between the kept and the dropped singular values; None if the method has a better default."""
     if entry.own_threshold:
         return None
     if dtype == np.float32:
@@ -33,7 +33,7 @@ def admitted(entry, matrix, dtype):
 
 
 def frame(matrix):
-    """Few shapes for all matrices, to compile fast: zero rows and columns add nothing to a pseudoinverse but zeros."""
+    """Pad all matrices to a few shapes, which compiles faster: zero rows and columns only add zeros to a pseudoinverse."""
     m, n = matrix.a.shape
     return (12, 12) if m == n else (8, 5) if m > n else (m, n)
 
@@ -73,7 +73,7 @@ def penrose_defects(a, x):
 
 
 def wrong(x, matrix, tolerance):
-    """Every way in which x is not the pseudoinverse of the matrix, in words."""
+    """Return every way in which x is not the pseudoinverse of the matrix, in words."""
     measured = {"error": relative_error(x, matrix.plus), **penrose_defects(matrix.a, x)}
     return [f"{matrix.name}: {k}: {v:.1e} > {tolerance:.1e}" for k, v in measured.items() if not v <= tolerance]
 
@@ -135,7 +135,7 @@ def test_shapes_and_degenerate_matrices(entry, shape):
 
 
 def test_scale_invariance(entry):
-    """A relative threshold does not care for units."""
+    """A relative threshold does not depend on units."""
     a = np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 1.0, -1.0]])
     scales = np.array([1e-100, 1e-8, 1.0, 1e100])
     plus = jax.jit(jax.vmap(entry.make()))(scales[:, None, None] * a)

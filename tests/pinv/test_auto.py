@@ -1,4 +1,4 @@
-"""`Auto` of matrices some of whose rows are known to depend on the others."""
+"""`Auto` for matrices in which some rows are known to depend on others."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ METHOD = AutoOfRows(dispensable=(4,))
 
 
 def nearly_dependent(share):
-    """The matrix with its second row turned towards the first: two lines fall together at 1."""
+    """The matrix with its second row turned towards the first; at 1 they are parallel."""
     D = np.array(DEPENDENT)
     D[1] += share * (D[0] - D[1])
     return D
@@ -26,7 +26,7 @@ def test_auto_of_rows_leaves_out_known_rows():
 
 
 def test_auto_of_rows_takes_singular_values_near_dependence():
-    """Some members of a batch need them; each member is what it is alone, and these use all rows."""
+    """Some members of a batch need singular values of all rows. Each member equals its result alone."""
     Ds = np.stack([nearly_dependent(share) for share in (0.0, 0.5, 1.0)])
     inverses, ranks = jax.jit(jax.vmap(lambda D: (METHOD(D), METHOD.rank(D))))(Ds)
     assert list(map(int, ranks)) == [4, 4, 3]
@@ -36,7 +36,7 @@ def test_auto_of_rows_takes_singular_values_near_dependence():
 
 
 def test_singular_values_of_a_batch_are_computed_only_when_needed():
-    """XLA moves what does not change out of a loop: there they would be computed for every matrix."""
+    """XLA moves invariant code out of a loop; singular values would then be computed for every matrix."""
     text = str(jax.jit(jax.vmap(METHOD)).lower(DEPENDENT[None]).compile().as_text())
     entry = text[text.index("\nENTRY") :]
     assert "gesdd" in text and "gesdd" not in entry[: entry.index("\n}")]

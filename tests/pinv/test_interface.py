@@ -1,4 +1,4 @@
-"""Thresholds, dtypes, errors, and D^+ as an operator."""
+"""Thresholds, data types, errors, and D^+ as an operator."""
 
 import equinox as eqx
 import jax

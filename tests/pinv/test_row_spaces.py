@@ -1,4 +1,4 @@
-"""Spaces of rows, and how names and numbers stand in a sentence."""
+"""Row spaces, and names and numbers in sentences."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The one derivative rule: against differences along directions of constant rank, in every mode, to second order and beyond."""
+"""The derivative rule compared with differences along directions of constant rank, in every mode and order."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ B, DB, WEIGHTS = rng.normal(size=SIZE), rng.normal(size=(2, SIZE)), rng.normal(s
 
 @pytest.fixture(scope="session")
 def matrices(exact):
-    """Repeated singular values at every rank, of the linkage and of a partial isometry; a rank of three; one of full rank."""
+    """Repeated singular values at every rank: of the linkage, and of a partial isometry; one of rank three; one of full rank."""
     chosen = {m.name: m.a for m in exact}
     padded = [np.pad(chosen[k], [(0, SIZE - size) for size in chosen[k].shape]) for k in NAMES]
     return jnp.array([*padded, 4 * np.eye(SIZE) + rng.normal(size=(SIZE, SIZE))])
@@ -30,7 +30,7 @@ def make(entry):
 
 
 def moved(a, p):
-    """A matrix of the same rank, two parameters away, and a right-hand side."""
+    """A matrix of the same rank as a function of two parameters, and a right-hand side."""
     one = jnp.eye(SIZE)
     left = (one + p[0] * LEFT[0]) @ (one + p[1] * LEFT[1])
     right = (one + p[0] * RIGHT[0]) @ (one + p[1] * RIGHT[1])
@@ -42,7 +42,7 @@ def solution(method):
 
 
 def differences(f, h):
-    """Gradient and Hessian of f(p), p of two numbers, by central differences of fourth order; along the last axis."""
+    """Gradient and Hessian of f(p) for two numbers p, by central differences of fourth order, along the last axis."""
     stencil = [(-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12)]
     e = h * jnp.eye(2)
     first = [sum(w * f(k * e[i]) for k, w in stencil) / h for i in (0, 1)]
@@ -58,7 +58,7 @@ def triangle(hessian):
 
 
 def close(actual, expected, tol):
-    """Relative to the largest entry of each matrix of the batch."""
+    """Compare relative to the largest entry of each matrix of the batch."""
     actual, expected = np.asarray(actual), np.asarray(expected)
     assert actual.shape == expected.shape
     size = np.abs(expected).max(axis=tuple(range(1, expected.ndim)), keepdims=True)
@@ -134,7 +134,7 @@ def test_second_derivatives_in_every_mode(matrices):
 
 @pytest.mark.slow
 def test_third_derivative():
-    """x(s) = A(s)^+ b with A(s) = u(s) v^T, |u|, |v| = 1, is v (u . b): three derivatives in closed form, at rank one."""
+    """A(s) = u(s) v^T with |u| = |v| = 1 has rank one, and A(s)^+ b = v (u . b) has three derivatives in closed form."""
     v = jnp.array([0.6, 0.8, 0.0])
 
     def f(s):
@@ -147,7 +147,7 @@ def test_third_derivative():
 
 
 def test_no_factorization_is_differentiated_or_repeated():
-    """However many derivatives: one factorization of the value of A."""
+    """However many derivatives are taken, A is factorized once."""
 
     def factorizations(f):
         return str(jax.make_jaxpr(f)(jnp.ones((3, 4)), jnp.ones(3))).count("svd")
@@ -235,7 +235,7 @@ def test_the_rule_serves_any_operator():
 
 
 def test_a_vector_that_a_batch_shares():
-    """The cotangent of one right-hand side for many matrices is the sum of those of each, however batches are nested."""
+    """If many matrices share a right-hand side, its cotangent is the sum of theirs, however batches are nested."""
     many, b, method = jnp.asarray(rng.normal(size=(2, 3, 4, 5))), jnp.arange(4.0), SVD()
     size = lambda a, b: jnp.sum(method.solve(a, b).x ** 2)  # noqa: E731
     total = lambda b: jnp.sum(jax.vmap(jax.vmap(size, (0, None)), (0, None))(many, b))  # noqa: E731

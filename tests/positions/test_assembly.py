@@ -1,4 +1,4 @@
-"""Closing a mechanism: that it closes, keeps its branch, says what stays open, and can be differentiated."""
+"""Assembly of a mechanism: it closes, keeps its branch, names what stays open, and can be differentiated."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from udkjax.positions.assembly import check
 
 @pytest.fixture(scope="module")
 def motor():
-    """A rod, its centre 0.75 m from its pin, turned by a motor at 4 rad/s from 0.3 rad."""
+    """A rod with its centre 0.75 m from its pin, turned by a motor at 4 rad/s from 0.3 rad."""
     rod = udk.library.compound_pendulum(np.pi / 2 + 0.3)
     turn = udk.Driver(["ground", "rod"], "angle", udk.Polynomial([0.3, 4.0]))
     return udk.Mechanism(rod.bodies, rod.joints, {"motor": turn})
@@ -48,7 +48,7 @@ def test_what_is_closed_stays_as_it_is(linkage, placed):
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_keeps_the_branch_of_the_guess(side):
-    """A four-bar closes with its coupler above or below: as it was drawn."""
+    """A four-bar closes with its coupler above or below, as it was drawn."""
     mech = udk.library.four_bar()
     q = mech.q0.at[1:].add(0.15)
     if side < 0:  # the mirror image about the line from the crank's tip to the rocker's pivot
@@ -71,7 +71,7 @@ def _end(pose, half):
 
 
 def test_velocities_follow_the_drivers(motor):
-    """At any time the driver says what the velocities are, whatever the guess was."""
+    """At any time the driver sets the velocities, whatever the guess was."""
     for t in (0.0, 0.9):
         guess = udk.State(motor.q0 + 0.3, jnp.full((1, 3), 5.0))
         state, angle = udk.assemble(motor, t, guess), 0.3 + 4.0 * t
@@ -81,7 +81,7 @@ def test_velocities_follow_the_drivers(motor):
 
 
 def test_velocities_keep_the_free_motion_of_the_guess(linkage, placed):
-    """The least change in the metric of the masses: momentum along the free motion stays as it was."""
+    """The change is the smallest one in the mass metric: momentum along the free motion stays the same."""
     q, direction = placed(-0.8, 1.0)
     random = np.random.default_rng(1).standard_normal((4, 3))
     state = udk.assemble(linkage, state=udk.State(q, random))
@@ -93,7 +93,7 @@ def test_velocities_keep_the_free_motion_of_the_guess(linkage, placed):
 
 
 def apart(mech, by):
-    """With its second ground pivot so far away that no coupler reaches it."""
+    """The mechanism with its second ground pivot so far away that no coupler reaches it."""
     return mech.with_parameters({"joint.D.points[0][0]": by})
 
 
@@ -108,7 +108,7 @@ def test_names_what_stays_open_and_makes_nothing_worse():
 
 
 def test_a_joint_that_is_open_by_itself_is_named_alone():
-    """Two welds that contradict each other, beside a pendulum that closes."""
+    """Two welds that contradict each other, next to a pendulum that closes."""
     o = [[0.0, 0.0], [0.0, 0.0]]
     bodies = {"block": udk.Body(1.0, 1.0), "rod": udk.Body(1.0, 1.0, [0.5, 0.0])}
     joints = {
@@ -129,7 +129,7 @@ def test_a_driver_against_a_joint_leaves_velocities_open():
 
 
 def test_never_worse(linkage):
-    """Also from guesses that are hopeless, and for a mechanism that cannot close at all."""
+    """This includes hopeless guesses, and a mechanism that cannot close at all."""
     stuck = linkage.with_parameters({"joint.A3.points[1][0]": -0.4})
     assemble = jax.jit(lambda q: udk.assemble(stuck, state=udk.State(q, jnp.zeros((4, 3)))).q)
     for seed in range(8):
@@ -139,7 +139,7 @@ def test_never_worse(linkage):
 
 
 def test_not_a_number_is_not_closed():
-    """Known, the door refuses it; traced, it stays what it is."""
+    """A known NaN is refused, and a traced one stays NaN."""
     mech = udk.library.compound_pendulum()
     state = udk.State(jnp.full((1, 3), jnp.nan), jnp.zeros((1, 3)))
     assert not jax.jit(lambda state: assembly.close(mech, state=state).is_closed)(state)
@@ -160,7 +160,7 @@ MORE = [name for name in udk.library.__all__ if name not in SCENES]
 
 @pytest.mark.parametrize("name", [*SCENES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE)])
 def test_concrete_numbers_are_closed_as_traced_ones_are(name):
-    """To the same branch by the same steps, from guesses that are closed, rough and hopeless, and where it cannot close."""
+    """They reach the same branch by the same steps: from closed, rough and hopeless guesses, and if they cannot close."""
     mech = getattr(udk.library, name)()
     random = np.random.default_rng(0)
     traced = jax.jit(lambda mech, state: assembly.close(mech, 0.1, state))
@@ -194,7 +194,7 @@ def test_concrete_numbers_stay_concrete_while_others_are_traced(linkage):
 
 
 def tied(mech, p):
-    """All three cranks of one length, two masses, the guess of one angle."""
+    """A mechanism of three cranks with a common length, two masses, and one guessed angle."""
     lengths = {f"joint.A{k}.points[1][0]": -0.5 * p[0] for k in "123"} | {f"joint.B{k}.points[1][0]": 0.5 * p[0] for k in "123"}
     masses = {"body.link1.mass": p[1], "body.coupler.inertia": p[2]}
     return mech.with_parameters(lengths | masses | {"body.link2.angle": p[3], "body.coupler.angular_velocity": p[4]})
@@ -224,7 +224,7 @@ def central(function, p, step):
 
 @pytest.mark.parametrize("start", STARTS)
 def test_derivatives_of_the_assembled_state(assembled, start):
-    """With redundant rows, of tied lengths, masses and the guess: forward and reverse."""
+    """With redundant rows, with respect to common lengths, masses and the guess: forward and reverse."""
     p = jnp.array(STARTS[start])
     forward = assembled["forward"](p)
     assert_allclose(forward, central(assembled["value"], p, 1e-5), atol=1e-7)  # what differences are good for
@@ -233,7 +233,7 @@ def test_derivatives_of_the_assembled_state(assembled, start):
 
 
 def test_derivatives_with_respect_to_the_guess_alone():
-    """No number of the scene moves. Without redundant rows: those that contradict each other cost a part in a million."""
+    """Nothing else in the scene changes. There are no redundant rows, which would cost accuracy if they contradict each other."""
     mech = udk.library.double_pendulum()
     direction, weights = np.random.default_rng(3).standard_normal((2, 2, 3))
 
@@ -247,7 +247,7 @@ def test_derivatives_with_respect_to_the_guess_alone():
 
 
 def test_derivatives_with_respect_to_drivers(motor):
-    """q follows the first coefficient of the motor's polynomial, v the second; the arm's length changes both."""
+    """q follows the first coefficient of the motor's polynomial, and v the second. The arm's length changes both."""
 
     def outcome(p):
         state = udk.assemble(motor.with_parameters({"driver.motor.motion.coefficients": p[:2], "joint.pin.points[1][0]": -p[2]}))
@@ -305,7 +305,7 @@ ALONG = {
 
 @pytest.mark.parametrize(("make", "start"), ALONG.values(), ids=ALONG)
 def test_what_stays_has_full_rank_elsewhere(make, start):
-    """The rows that stay are as many as the rank, and independent, along the motion; also from a singular start."""
+    """There are as many remaining rows as the rank, and they are independent along the motion, also from a singular start."""
     mech = make(start)
     redundant = list(udk.analyse(mech).redundant_rows or ())
     for angle in (start + 0.35, start + 0.7):

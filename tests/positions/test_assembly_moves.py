@@ -10,7 +10,7 @@ MECH = udk.library.four_bar()
 
 
 def test_a_mistyped_guess_is_said():
-    """The rocker's centre, mistyped by 0.3 m, closes; check names what moved, and the run warns."""
+    """With the rocker's centre mistyped by 0.3 m it closes. `check` names what moved, and the run warns."""
     place = np.asarray(MECH.bodies["rocker"].position) + [0.3, 0.0]
     wrong = MECH.with_parameters({"body.rocker.position": place})
     found = udk.check(wrong)

@@ -1,4 +1,4 @@
-"""Assembly branches against closed forms and against counting."""
+"""Assembly branches compared with closed forms and with counts."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from udkjax.scene.library.posed_bodies import bar_pose
 
 
 def linkage(pins, bars):
-    """A linkage of bars between named points: `pins` their places, `bars` the two ends of each and more points of it."""
+    """A linkage of bars between named points. `pins` are their places, `bars` the two ends of each bar and further points."""
     ground = [name for name in pins if name.isupper()]
     bodies, joints, seen = {}, {}, {}
     for name, ends in bars.items():
@@ -27,7 +27,7 @@ def linkage(pins, bars):
 
 
 def circles(p, r, q, s):
-    """The points at distances r from p and s from q."""
+    """Return the points at distance r from p and s from q."""
     d = np.linalg.norm(q - p)
     x = (d**2 + r**2 - s**2) / (2 * d)
     y = np.sqrt(r**2 - x**2)
@@ -52,7 +52,7 @@ def test_none_where_it_cannot_be_closed():
 
 
 def test_a_six_bar_of_stephenson_has_as_many_as_its_circle_meets_the_coupler_curve():
-    """A coupler point p of a four-bar A-b-c-D, joined by a rod to the end g of a driven crank on H: up to six."""
+    """A rod joins a coupler point p of a four-bar A-b-c-D to the end g of a driven crank on H: up to six branches."""
     pins = {"A": (0, 0), "b": (0.45, 0.3), "c": (1.1, 1.2), "D": (1.0, 0.0), "p": (0.2, 1.3), "g": (0.35, 0.35), "H": (0.3, 0.3)}
     bars = {"left": "Ab", "coupler": "bcp", "right": "Dc", "rod": "pg", "crank": "Hg"}
     mech = linkage(pins, bars)
@@ -62,7 +62,7 @@ def test_a_six_bar_of_stephenson_has_as_many_as_its_circle_meets_the_coupler_cur
     shape = complex(*(far["p"] - far["b"])) / complex(*(far["c"] - far["b"]))
 
     def beyond(angle, sign):
-        """How far p is beyond the rod's reach; not a number where the four-bar does not close."""
+        """Return how far p is beyond the rod's reach; NaN where the four-bar does not close."""
         b = length("A", "b") * np.array([np.cos(angle), np.sin(angle)])
         d = np.linalg.norm(far["D"] - b)
         r, s = length("b", "c"), length("D", "c")

@@ -1,4 +1,4 @@
-"""Positions by NumPy are those that compiled programs find, and nothing is compiled for them."""
+"""Positions computed by NumPy equal those of compiled programs, and need no compilation."""
 
 import jax
 import numpy as np
@@ -39,7 +39,7 @@ def test_limits_of_concrete_and_of_traced_numbers(name):
 
 
 def test_nothing_is_compiled_by_xla(compilations):
-    """But for two constants, where derivatives along a driver are traced for the first time."""
+    """The only exceptions are two constants, when derivatives with respect to a driver are first traced."""
     mechanism = udk.library.n_four_bar(2)
     driver = f"body.{mechanism.body_names[0]}.angle"
 

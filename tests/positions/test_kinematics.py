@@ -1,4 +1,4 @@
-"""Positions over the range of a driver, against closed forms."""
+"""Positions over the range of a driver, compared with closed forms."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ STUCK = (1.0, 1.5, 1.2, 2.2)  # crank, coupler, rocker, ground: not Grashof's
 
 
 def rocker_angle(crank, a, b, c, g, branch):
-    """The angle of the rocker by the diagonal of the four-bar: crank, coupler, rocker and ground are a, b, c, g."""
+    """The angle of the rocker from the diagonal of the four-bar. Crank, coupler, rocker and ground are a, b, c, g."""
     end = a * np.array([np.cos(crank), np.sin(crank)])
     to_ground = np.array([[g], [0.0]]) - end
     d = np.linalg.norm(to_ground, axis=0)
@@ -99,7 +99,7 @@ def test_travel_has_two_ends_and_exact_derivatives():
 
 @pytest.mark.parametrize("stages", fast([3], [1, 2, 3, 4, 5]))
 def test_travel_ends_at_toggles_where_branches_meet(stages):
-    """All bars of a lift are upright there, and each may turn to either side; on the way all are level."""
+    """At the top, all bars of a lift are upright, and each may turn to either side. Before, all platforms are level."""
     found = udk.travel(udk.library.scissor_lift(stages, 0.7, length=2.5), "body.platform.y")
     np.testing.assert_allclose([found.lower, found.upper], 2.5 * stages * np.array([-1, 1]), rtol=4e-15)
     np.testing.assert_allclose(np.abs(found.upper_q[: 2 * stages, 2]), np.pi / 2, atol=1e-12)
@@ -113,7 +113,7 @@ def test_travel_of_traced_lifts_ends_there_too():
 
 
 class Level(udk.Joint):
-    """Two origins at one height: no joint of these two bodies alone, since it does not turn with them."""
+    """Two origins at one height. It is not a joint of these two bodies alone, since it does not turn with them."""
 
     def residual(self, t, *frames):
         return [frames[1].y - frames[0].y]
@@ -124,7 +124,7 @@ def with_bodies(mech, bodies, joints):
 
 
 def with_hung(kind):
-    """The four-bar that stops, and what hangs on its coupler or on the ground; on a pendulum a wheel."""
+    """The four-bar that stops, with something attached to its coupler or the ground; and a pendulum with a wheel."""
     mech = udk.library.four_bar(np.pi / 3, lengths=STUCK[:3], ground=STUCK[3])
     x, y, _ = np.asarray(mech.q0)[mech.body_names.index("coupler")]
     wheel = lambda on, place: ({"wheel": udk.Body(1.0, 0.1, place, 0.2)}, {"axle": udk.Revolute([on, "wheel"], [place, (0, 0)])})  # noqa: E731
@@ -214,7 +214,7 @@ def test_redundant_linkages_keep_their_branch_where_branches_meet(name):
 
 @pytest.mark.parametrize("beside", fast([0.0, -1e-9, 1e-3], [0.0, 1e-12, -1e-9, 1e-7, -1e-5, 1e-3, -1e-2]))
 def test_the_branch_goes_on_where_branches_meet(beside):
-    """At the very value and at any distance from it: positions, velocities, accelerations and efforts."""
+    """Positions, velocities, accelerations and efforts, at the value itself and at any distance from it."""
     values = np.linspace(-0.8, 5.1, 30)
     values[19] = np.pi + beside
     mech = udk.library.parallelogram(-0.8)
@@ -233,7 +233,7 @@ def test_the_branch_goes_on_where_branches_meet(beside):
 
 
 def slider_crank_of_equal_lengths(r):
-    """Where the crank is upright the slider is at its pivot, and may stay there while both turn: x = 2 r cos(s), or 0."""
+    """When the crank is upright, the slider is at its pivot and may stay there: x = 2 r cos(s), or 0."""
     angle, tip = 0.4, r * np.array([np.cos(0.4), np.sin(0.4)])
     at = lambda position, angle: udk.Body(1.0, 0.1 * r**2, position, angle)  # noqa: E731
     bodies = {"crank": at(tip / 2, angle), "rod": at(tip * [1.5, 0.5], -angle), "slider": at([2 * tip[0], 0.0], 0.0)}
@@ -264,7 +264,7 @@ def test_a_slider_passes_the_pivot_of_its_crank(r):
 
 
 def parallelogram_of_one_loop():
-    """Two cranks of 1 m, a coupler and a ground of 2 m: the coupler's centre is at (cos(s) + 1, sin(s)) on the branch."""
+    """Two cranks of 1 m, coupler and ground of 2 m: on the branch the coupler's centre is at (cos(s) + 1, sin(s))."""
     c, d = 0.5 * np.cos(0.5), 0.5 * np.sin(0.5)
     places = {"crank": ([c, d], 0.5), "coupler": ([2 * c + 1.0, 2 * d], 0.0), "rocker": ([2.0 + c, d], 0.5)}
     joints = {
@@ -296,7 +296,7 @@ MEETING = {  # numbers that change, and what that changes of the coupler's x and
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MEETING)
 def test_where_branches_meet_derivatives_are_right_or_not_numbers(name):
-    """They are numbers where the change leaves the branches together; in reverse mode, where each number by itself does."""
+    """They are finite if the change keeps the branches together; in reverse mode, if each number by itself does."""
     numbers, exact = MEETING[name]
     mech = parallelogram_of_one_loop()
 
@@ -331,7 +331,7 @@ def test_where_branches_meet_derivatives_by_the_value_go_to_the_third_of_q():
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12])
 def test_branches_that_come_close_and_do_not_meet_are_no_crossing(gap):
-    """A ground that is longer than the coupler: the crank comes to a toggle before pi, and no value beyond is reached by it."""
+    """The ground is longer than the coupler: the crank reaches a toggle before pi, and cannot go beyond."""
     mech = udk.library.four_bar(0.5, lengths=(1.0, 2.0, 1.0), ground=2.0 + gap)
     found = udk.kinematics(mech, "body.crank.angle", [0.5, 2.0, np.pi, 4.0])
     assert found.status[:2].tolist() == [0, 0]
@@ -378,7 +378,7 @@ DIFFERENTIATED = {
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 @pytest.mark.parametrize("order", [1, 2])
 def test_derivatives_of_positions_by_numbers_of_the_scene(name, order):
-    """Those of a batch, against differences of its members."""
+    """Derivatives of a batch, compared with differences of its members."""
     make, number, driver, values, body = DIFFERENTIATED[name]
     mech = make()
 
@@ -468,7 +468,7 @@ def test_what_is_held_and_what_joints_hold_is_refused():
 
 
 def coupler_pin(a, b, c, d, angle, sign):
-    """The pin of coupler and rocker of a four-bar, by the two circles that it lies on; on one of two branches."""
+    """The pin of coupler and rocker of a four-bar, on one of two branches, as an intersection of two circles."""
     A, C = a * np.stack([np.cos(angle), np.sin(angle)], -1), np.array([d, 0.0])
     D = np.linalg.norm(A - C, axis=-1)
     along, across = (A - C) / D[:, None], np.stack([C[1] - A[:, 1], A[:, 0] - C[0]], -1) / D[:, None]
@@ -478,7 +478,7 @@ def coupler_pin(a, b, c, d, angle, sign):
 
 @pytest.mark.parametrize(("gap", "count", "lengths"), [(1e-3, 13, (2.5, 2.0)), (1e-4, 25, (1.5, 2.2)), (1e-5, 61, (2.5, 2.0))])
 def test_a_motion_stays_on_its_branch_where_another_comes_close(gap, count, lengths):
-    """The transmission angle falls to 2.4, 0.8 and 0.24 degrees, between two values."""
+    """Between two values the transmission angle falls to 2.4, 0.8 and 0.24 degrees."""
     b, c = lengths
     d = b + c - 1.0 - gap
     mech = udk.library.four_bar(angle=1.0, lengths=(1.0, b, c), ground=d)
@@ -491,7 +491,7 @@ def test_a_motion_stays_on_its_branch_where_another_comes_close(gap, count, leng
 
 @pytest.mark.slow
 def test_a_traced_motion_stays_on_its_branch_and_has_derivatives():
-    """Of a batch in reverse mode, of a position, a velocity and an acceleration together, against differences."""
+    """A batch in reverse mode, of a position, a velocity and an acceleration together, compared with differences."""
     gaps, angle = np.array([1e-3, 1e-4, 1e-5]), np.linspace(1.0, 1.0 + 2 * np.pi, 25)
 
     def motion(gap, values=angle):
@@ -520,7 +520,7 @@ def test_a_traced_motion_stays_on_its_branch_and_has_derivatives():
     ],
 )
 def test_the_side_is_the_sign_of_the_determinant_of_independent_rows(name, numbers, driver):
-    """However elimination pivots, in one lane and in several."""
+    """It does not depend on the pivots of elimination, in one lane or several."""
     mech = getattr(udk.library, name)(**numbers)
     driven = drive(mech, driver)
     q = udk.assemble(mech).q.ravel()

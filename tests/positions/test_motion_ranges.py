@@ -1,4 +1,4 @@
-"""Ranges of links and transmission angles along a motion, by hand."""
+"""Ranges of links and transmission angles along a motion, compared with formulas."""
 
 import jax
 import numpy as np
@@ -10,7 +10,7 @@ CRANK_ROCKER = {"lengths": (0.5, 1.2, 0.8), "ground": 1.0}
 
 
 def at_rocker_end(a, b, c, g, reach):
-    """The angles of crank and rocker where crank and coupler are in line, `reach` being b + a or b - a."""
+    """The angles of crank and rocker when crank and coupler are in line, with `reach` = b + a or b - a."""
     crank = np.arccos((reach**2 + g**2 - c**2) / (2 * reach * g)) + (np.pi if reach < b else 0.0)
     rocker = np.pi - np.arccos((c**2 + g**2 - reach**2) / (2 * c * g))
     return crank, rocker

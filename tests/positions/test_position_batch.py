@@ -1,4 +1,4 @@
-"""Positions of batches in lanes, against `kinematics` of each member, and differences."""
+"""Positions of batches in lanes, compared with `kinematics` of each member, and with differences."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_each_member_is_where_kinematics_has_it():
 
 
 def test_derivatives_along_all_pins_are_those_of_differences():
-    """Of fourth order: members beside each other by h and 2 h along each of the ten coordinates."""
+    """Differences of fourth order: members moved by h and 2 h along each of the ten coordinates."""
     given, values, h = members(1, 2e-3), START + np.array([0.4, 2.0]), 2e-5
     found = BATCH(given, values)
     assert found.by_parameters is not None
@@ -100,7 +100,7 @@ def test_wrong_input_is_named():
 
 
 def test_a_member_that_cannot_go_on_does_not_hold_up_the_others():
-    """One member of a register has a rocker that is too short for a turn; the others get around in one value."""
+    """One member of a register has too short a rocker for a full turn; the others get to the end."""
     given = members(8, 0.0)
     given["pin.C"][3] = [0.14, 0.02]
     found = BATCH(given, START + np.array([6.0]))

@@ -1,4 +1,4 @@
-"""Results are cached by the identities of the objects from which they were computed."""
+"""Results are cached by the identities of the objects from which they are computed."""
 
 import gc
 
@@ -54,7 +54,7 @@ def test_a_result_goes_with_its_object(counted):
 
 
 def test_what_cannot_be_watched_is_held(counted):
-    """A list has no weak references: it stays, so that no other gets its identity."""
+    """A list has no weak references, and so the cache keeps it: no other object gets its identity."""
     function, calls = counted
     for k in range(10):
         function([k])
@@ -73,7 +73,7 @@ def test_the_oldest_make_room(counted, monkeypatch):
 
 
 def test_results_of_traced_trees_hold_within_their_trace():
-    """One computation for concrete numbers and one in each trace; a trace inside of another does not store what it computes."""
+    """One computation for concrete numbers, and one in each trace. A trace within another one stores nothing."""
     calls = []
 
     @cached_within_trace

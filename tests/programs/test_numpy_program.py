@@ -1,4 +1,4 @@
-"""Programs of JAX by NumPy: the same as by XLA, operation by operation, in loops, branches and under transformations."""
+"""JAX programs evaluated by NumPy equal XLA's: operation by operation, in loops, branches and under transformations."""
 
 from importlib import import_module
 
@@ -120,7 +120,7 @@ SHAPED = {
 
 
 def _agree(function, *arguments):
-    """Compare with XLA: values to rounding, shapes and types exactly."""
+    """Compare with XLA: values up to rounding, shapes and types exactly."""
     program = jax.jit(function).trace(*arguments).jaxpr
     with np.errstate(all="ignore"):
         found = numpy_program(program)(Meter(10**6), [np.asarray(x) for x in arguments])
@@ -151,7 +151,7 @@ def test_operations_on_shapes_are_those_of_xla(name):
 
 @pytest.fixture
 def programs(monkeypatch):
-    """Count the programs that are compiled because they have been called often."""
+    """Count the programs that are compiled because they have often been called."""
     module = import_module("udkjax.programs.deferred")  # the package's own name is that of the function
     count, compiled = [], module._compiled
     monkeypatch.setattr(module, "_compiled", lambda program: count.append(program) or compiled(program))
@@ -223,7 +223,7 @@ def test_concrete_numbers_among_traced_ones_stay_concrete_and_are_traced_once_fo
 
 
 def test_loops_of_a_batch_end_one_by_one():
-    """Under `vmap` the condition of a loop is one of each member, and one that has ended stays as it is."""
+    """Under `vmap` each member has its own loop condition, and stays the same once its loop has ended."""
 
     def halve(x, y):
         return jax.lax.while_loop(lambda state: state[0] > 1.0, lambda state: (0.5 * state[0], state[1] + x * y), (x, y))

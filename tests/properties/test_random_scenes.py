@@ -1,4 +1,4 @@
-"""A slice of `python -m experiments properties`: another seed, few mechanisms, little input; the same checks."""
+"""A part of `python -m experiments properties`, with another seed, few mechanisms and little input, but the same checks."""
 
 import json
 import math
@@ -24,7 +24,7 @@ SEED = 3
 
 
 def check(tally):
-    """Compare all that was found with the tolerances; a failure says how to draw the mechanism again."""
+    """Compare all results with the tolerances. A failure says how to draw the mechanism again."""
     assert tally.found
     wrong = {n: (f.worst, f.at) for n, f in tally.found.items() if not f.worst <= PROPERTIES[n].tolerance}
     assert not wrong, wrong
@@ -57,7 +57,7 @@ def test_random_scenes_are_closed_and_drawn_again():
 
 @pytest.mark.parametrize("mistake", ["psi_q", "gamma", "force"])
 def test_a_mistake_is_found(mistake):
-    """A term that is wrong by a millionth fails a property."""
+    """A term that is wrong by one millionth violates a property."""
 
     def wrong(*arguments):
         terms = evaluate(*arguments)
@@ -107,7 +107,7 @@ def test_what_is_not_a_number_is_the_worst():
 
 @pytest.mark.parametrize(("kind", "count"), [("files", 120), ("arguments", 60)])
 def test_fuzz(kind, count, tmp_path, monkeypatch):
-    """Whatever is given, the answer is a result or a documented error that names the place."""
+    """For any input the answer is a result, or a documented error that names the place."""
     monkeypatch.chdir(tmp_path)
     draw = cases_of(kind, SEED)
     found = {}
@@ -121,7 +121,7 @@ def test_fuzz(kind, count, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", fuzz_arguments.ELEMENTS)
 def test_every_field_is_named(name):
-    """Whatever is put into a field, the error says which element's, and which field."""
+    """For any value of a field, the error names the element and the field."""
     given = fuzz_arguments.ELEMENTS[name]
     for key in given:
         for wrong in (object(), np.array(["a"]), np.full((2, 5), np.nan), udk.SVD):
@@ -149,7 +149,7 @@ def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, capsys):
 
 
 def test_verdicts():
-    """Errors of other kinds, from elsewhere, or without a place, are faults."""
+    """Errors of other kinds, from other places, or without a place count as faults."""
     assert "no documented error" in verdict(Case("", lambda: {}["x"]))[0]
     assert "from json/decoder.py" in verdict(Case("", lambda: json.loads("{")))[0]
     assert "place" in verdict(Case("", lambda: udk.loads("format = 1"), ["nowhere"]))[0]

@@ -26,7 +26,7 @@ def residual(mechanism, q, t=0.0):
 
 @pytest.fixture
 def psi():
-    """Psi(mechanism, q, t), row by row, straight from the residuals."""
+    """Psi(mechanism, q, t), row by row, directly from the residuals."""
     return residual
 
 

@@ -53,7 +53,7 @@ def test_a_motion_law_of_ones_own():
 @pytest.mark.parametrize("n", [2, 3, 6])
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_a_spline_in_pieces(n, xp):
-    """Between knots and beyond the ends, with two derivatives."""
+    """Values between knots and beyond the ends, with two derivatives."""
     times = np.array([-0.3, 0.1, 0.4, 1.1, 1.5, 2.6])[:n]
     spline = udk.Spline(times, np.cos(3.0 * times))
     pieces = np.asarray(rows_of(spline, xp))

@@ -10,7 +10,7 @@ V = jnp.array([[0.3, -0.2, 1.1], [0.5, 0.4, -0.7], [0.0, 0.1, 0.2]])
 
 
 def total_loads(mechanism, name, at, q, v):
-    """The load on each attached body: what the element states, and -dV/dq of its potential."""
+    """The load on each attached body: the element's own, and -dV/dq of its potential."""
     element = mechanism.forces[name]
     attached = mechanism.frames_of(element)
 
@@ -100,7 +100,7 @@ def held(value):
 
 
 def test_a_number_that_is_held_between_samples(same):
-    """The first and the last hold beyond; it stands in for a number and gives way to one, and comes back from a file."""
+    """The first and the last value hold beyond. It replaces a number, can be replaced by one, and can be stored in a file."""
     mechanism = held(udk.Held([1.0, 2.0, -1.0], 0.1, t0=0.5))
     times = [0.0, 0.5, np.nextafter(0.6, 0.0), 0.6, 0.7, 9.0]
     assert [float(mechanism.forces["motor"].value(t)) for t in times] == [1.0, 1.0, 1.0, 2.0, -1.0, -1.0]

@@ -207,7 +207,7 @@ def test_what_is_given_is_changed_in_place_and_what_follows_is_refused():
 
 
 def test_a_part_of_the_numbers_is_trained():
-    """The usual way to freeze leaves: a tree of booleans, with True for the leaves to train."""
+    """The usual way to freeze leaves: a tree of booleans that is True for the leaves to train."""
     mechanism = four_bar()
     chosen = jax.tree.map(lambda _: False, mechanism)
     chosen = eqx.tree_at(lambda m: (m.drawing.pins["B"], m.bodies["coupler"].mass), chosen, (True, True))
@@ -242,7 +242,7 @@ def test_derivatives_by_leaves(name):
 
 
 def test_invalid_leaves_are_named_where_they_are_used():
-    """A step of an optimizer may make a mass negative, which nothing checks until then."""
+    """A step of an optimizer may make a mass negative, which is not checked before."""
     negative = eqx.tree_at(lambda m: m.drawing.links["coupler"].mass, four_bar(), jnp.asarray(-1.0))
     for use in (end, udk.dumps, udk.assemble):
         with pytest.raises(udk.SceneError, match=r'coupler" \(\w+\[1\]\)\.mass: must be > 0, not -1\.0'):

@@ -231,7 +231,7 @@ def test_a_rod_of_no_length_is_refused_where_rounding_gives_it_one():
 
 
 def _requiring(element):
-    """Iterate over the numbers of an element that must be positive or in order: the element that owns each, and the name."""
+    """Iterate over the numbers of an element that must be positive or in order: the element that owns each, and its name."""
     for field in dataclasses.fields(element):
         value = getattr(element, field.name)
         if isinstance(value, eqx.Module):

@@ -1,4 +1,4 @@
-"""Fields of a user's class that hold functions and names, and a force law that is a neural network."""
+"""Fields of a user-defined class that hold functions and names, and a force law that is a neural network."""
 
 from collections.abc import Callable
 from types import SimpleNamespace

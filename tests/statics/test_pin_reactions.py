@@ -1,4 +1,4 @@
-"""Reactions by pin: all links at one pin, in ground axes, balance each other."""
+"""Reactions by pin: those of all links at one pin, in ground axes, balance."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_the_forces_of_all_links_at_a_pin_balance():
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_a_cam_would_have_to_pull_above_its_jump_speed(share, side):
-    """A follower of weight m g on the profile r + e cos(angle), lifted by -e w^2 cos(w t) at most: it jumps where e w^2 > g."""
+    """A follower of weight m g on the profile r + e cos(angle) accelerates at -e w^2 cos(w t). It jumps if e w^2 > g."""
     r, e, angle = 0.05, 0.01, np.linspace(0.0, 2 * np.pi, 72, endpoint=False)
     speed, pins = share * np.sqrt(9.81 / e), {"O": (0.0, 0.0), "P": (0.0, r)}
     mech = udk.Drawing(
@@ -56,7 +56,7 @@ def test_a_cam_would_have_to_pull_above_its_jump_speed(share, side):
 @pytest.mark.parametrize("follower", ["ground", "post"])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_cam_on_a_fixed_point_presses_with_its_weight_or_hangs_on_it(side, follower):
-    """A disc above or below the point; the point is of the ground, or of a body that the ground holds."""
+    """A disc above or below the point, which belongs to the ground or to a body that is fixed to it."""
     disc, radius = udk.Body(2.0, 0.01, (0.0, side * 0.05)), np.full(8, 0.05)
     joints = {
         "guide": udk.Prismatic(("ground", "disc"), np.zeros((2, 2)), np.pi / 2, 0.0),

@@ -16,9 +16,9 @@ TS = np.linspace(0.0, 2.0, 161)
 
 
 def lowest_load(coupler_mass):
-    """Of the paper's linkage released at -45 degrees, as it passes the lowest point: the largest force at a ground pivot.
+    """The largest force at a ground pivot of the paper's linkage, released at -45 degrees, as it passes the lowest point.
 
-    There m (L/2) theta'^2 + m g of the link and a third of the coupler's, along the link, and nothing across it.
+    It is m (L/2) theta'^2 + m g of the link, and a third of the coupler's, along the link, and nothing across it.
     """
     J, P = 3 * (0.1 + 0.25) + coupler_mass, 1.5 + coupler_mass
     square = 2 * G * P / J * (1 - np.cos(np.pi / 4))
@@ -27,7 +27,7 @@ def lowest_load(coupler_mass):
 
 @pytest.fixture(scope="module")
 def peak_of():
-    """The peaks over the mass of the coupler."""
+    """The peaks as a function of the mass of the coupler."""
     linkage = udk.library.parallelogram()
 
     def peak(mass):
@@ -69,14 +69,14 @@ def test_envelopes_over_a_batch_of_load_cases(peak_of):
 
 
 def uneven(s):
-    """Output times from 0 to 1 that are dense in places, and every second step twice as long as the others."""
+    """Output times from 0 to 1 that are dense in places; every second step is twice as long as the others."""
     s = s + np.where(np.arange(len(s)) % 2, 0.3, 0.0) / len(s)
     return s + (1 - np.cos(2 * np.pi * s)) / (4 * np.pi)
 
 
 @pytest.mark.parametrize(("times", "rtol"), [(lambda s: s, 1e-8), (uneven, 1e-4)])
 def test_root_mean_squares_of_a_turning_rod_are_those_of_integrals(times, rtol):
-    """A rod that a motor turns evenly, weight aside: the pivot pulls with m omega^2 l/2 all the time, and m g on top."""
+    """A motor turns a rod evenly. The pivot constantly pulls with m omega^2 l/2, and with m g in addition."""
     rod = udk.Body(2.0, 0.3, [0.5, 0.0], 0.0, [0.0, 3.0], 6.0)
     mechanism = udk.Mechanism(
         {"rod": rod},
@@ -115,14 +115,14 @@ COUNT = 42  # states in each of the calls below: what is compiled for one serves
 
 
 def still(state, v=None) -> Any:
-    """One state, so many times."""
+    """One state, repeated."""
     q, v = np.asarray(state.q), np.asarray(state.v if v is None else v)
     return SimpleNamespace(ts=np.zeros(COUNT), q=np.tile(q, (COUNT, 1, 1)), v=np.tile(v, (COUNT, 1, 1)))
 
 
 @pytest.fixture(scope="module")
 def machine():
-    """A driven slider-crank with everything that stores or takes energy."""
+    """A driven slider-crank with all kinds of elements that store or dissipate energy."""
     plain = udk.library.slider_crank(0.3, spring=(30.0, 1.5, 0.2))
     forces = {
         **plain.forces,
@@ -135,7 +135,7 @@ def machine():
 
 
 def test_power_is_the_rate_of_energy_and_its_integral_the_energy(machine):
-    """To 1e-9 of the largest power at each instant; by Gauss' quadrature over a second, of the energy that was stored."""
+    """It holds to 1e-9 of the largest power at each instant, and integrates to the stored energy by Gauss' quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(COUNT - 2)
     ts = np.concatenate([[0.0], (nodes + 1) / 2, [1.0]])
     solution = udk.simulate(machine, ts, rtol=1e-12, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Equilibria and vibration, against closed forms and a reduction to one coordinate."""
+"""Equilibria and vibration compared with closed forms and with a reduction to one coordinate."""
 
 import jax
 import jax.numpy as jnp
@@ -107,7 +107,7 @@ def test_a_four_bar_with_a_diagonal_spring_against_its_reduction():
 
 
 def held_up(length):
-    """A body that two forces hold against its weight: all loads vanish, but for rounding."""
+    """A body whose weight is balanced by two forces: all loads vanish up to rounding."""
     weight = 0.1 * length**3 * 9.81
     forces = {"one": udk.Force("b", [0.0, weight / 3]), "two": udk.Force("b", [0.0, weight * (2 / 3)])}
     return udk.Mechanism({"b": udk.Body(0.1 * length**3, 0.1 * length**5)}, {}, {}, forces)
@@ -128,7 +128,7 @@ def see_saw(length):
 @pytest.mark.parametrize("stable", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("scene", [held_up, see_saw])
 def test_rest_where_all_loads_vanish_is_indifferent(scene, stable):
-    """What is left is compared with the scale of forces, not with what is left of them; nothing moves by rounding."""
+    """The remainder is compared with the scale of forces, not with itself. Rounding errors move nothing."""
     for length in (1e-6, 1e3):
         mech = scene(length)
         rest = udk.equilibrium(mech, stable=stable)
@@ -207,7 +207,7 @@ VIBRATING = {"rod": (spring_rod, "rod", 0.0), "four-bar": (spring_four_bar, "cou
 
 @pytest.mark.parametrize("name", fast(["rod"], VIBRATING))
 def test_frequencies_have_exact_derivatives(name):
-    """Through the equilibrium, which moves: against differences."""
+    """Derivatives through the moving equilibrium agree with differences."""
     make, body, place = VIBRATING[name]
     mech = make()
 

@@ -17,7 +17,7 @@ MOST_LINES = 300
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
 def test_modules_that_need_no_browser(tmp_path):
-    """As the server has them: those of the player in a folder of their own, and the sizes of units from the package's table."""
+    """They are arranged as on the server: the player's in a folder of their own, and unit sizes from the package's table."""
     (tmp_path / "player").mkdir()
     for name, (content, _) in page_files().items():
         (tmp_path / name).write_bytes(content)

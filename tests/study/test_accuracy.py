@@ -22,7 +22,7 @@ def test_the_largest_violation_is_that_of_any_row():
 
 
 def test_what_is_put_in_is_found():
-    """The exact motion, with one body moved by 1e-3 m and a fall that misses its energy; after a failure there is nothing."""
+    """The exact motion with one body moved by 1e-3 m, and a fall with a wrong energy; after a failure there is nothing."""
     mech = udk.library.parallelogram()
     ts = jnp.linspace(0.0, 1.0, 11)
     q = np.array(exact_coordinates(mech, ts, mech.q0, mech.v0))
@@ -61,7 +61,7 @@ def test_work_is_told_from_errors_of_the_energy():
 
 
 def held(motion: udk.Motion, *forces: udk.ForceElement) -> udk.Mechanism:
-    """A body on a pin, held by a driver, with forces."""
+    """A body on a pin, turned by a driver, with forces."""
     bodies = {"a": udk.Body(1.0, 0.1, angle=0.1)}
     pin = udk.Revolute(["ground", "a"], [[0.0, 0.0], [0.0, 0.0]])
     return udk.Mechanism(bodies, {"A": pin}, {"hold": udk.Driver(["ground", "a"], "angle", motion)}, list(forces))

@@ -57,7 +57,7 @@ def crank():
 
 
 def slope(x: np.ndarray) -> np.ndarray:
-    """The rate of a channel, by central differences of fourth order."""
+    """The rate of a channel by central differences of fourth order."""
     return (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * STEP)
 
 
@@ -203,7 +203,7 @@ def test_what_only_looks_at_states_solves_nothing(crank):
 
 @pytest.fixture(scope="module")
 def linkage():
-    """Channels of the redundant linkage, their values (C,), and derivatives along changes of five numbers that make it."""
+    """Channels of the redundant linkage, their values (C,), and derivatives along changes of five numbers that define it."""
     mech = udk.library.parallelogram()
     channels = tuple(channel_of(mech, text) for text in channels_of(mech))
     spare = jnp.full((4, 3), jnp.nan)

@@ -1,4 +1,4 @@
-"""Mobility, redundancy, branches and rank changes, against closed forms, exact arithmetic and Jacobians written by hand."""
+"""Mobility, redundancy, branches and rank changes, compared with closed forms, exact arithmetic and hand-written Jacobians."""
 
 import json
 from fractions import Fraction
@@ -31,7 +31,7 @@ def psi_q(mechanism, q):
 
 
 def exact_rank(matrix: list[list[Fraction]]) -> int:
-    """By elimination in rational numbers."""
+    """The rank by elimination with rational numbers."""
     rows, rank = [list(row) for row in matrix], 0
     for column in range(len(rows[0])):
         pivot = next((k for k in range(rank, len(rows)) if rows[k][column]), None)
@@ -46,7 +46,7 @@ def exact_rank(matrix: list[list[Fraction]]) -> int:
 
 
 def exact_jacobian(mechanism, rotations: dict[str, tuple[Fraction, Fraction]], names=None) -> list[list[Fraction]]:
-    """Psi_q of revolutes in rational numbers; `rotations` are cos and sin of each body."""
+    """Psi_q of revolute joints in rational numbers. `rotations` are cos and sin of each body's angle."""
     places = {name: k for k, name in enumerate(mechanism.body_names)}
     rational = lambda x: Fraction(round(float(x) * 10**6), 10**6)  # noqa: E731
     matrix = []
@@ -116,7 +116,7 @@ def test_every_fix_of_the_paper_s_linkage_leaves_its_motion_and_takes_the_redund
 
 
 def test_the_next_rank_change_of_the_paper_s_linkage_is_where_its_links_lie_in_line(found):
-    """From -45 degrees to 0: three links turn, their centres go on half circles' arcs, the coupler's on one."""
+    """From -45 degrees to 0 three links turn: their centres and the coupler's move on arcs."""
     nearest = found.clearance.nearest
     assert nearest is not None and nearest.rank == 10
     assert_allclose(nearest.q[:, 2], 0.0, atol=1e-8)
@@ -125,7 +125,7 @@ def test_the_next_rank_change_of_the_paper_s_linkage_is_where_its_links_lie_in_l
 
 
 def test_the_estimate_is_sigma_over_its_slope_along_the_motion(linkage, found, placed):
-    """By differences of an SVD of NumPy's along theta."""
+    """The slope is a difference of NumPy's singular values along theta."""
     h, scale = 1e-4, np.sqrt(3 * 1.25 + 1)
 
     def sigma(theta):
@@ -137,7 +137,7 @@ def test_the_estimate_is_sigma_over_its_slope_along_the_motion(linkage, found, p
 
 
 def test_in_line_the_paper_s_linkage_has_one_branch_and_two_mobilities():
-    """To second order (1, 0, -1) of the links is excluded: one motion goes through, (1, 1, 1)."""
+    """The second order excludes the direction (1, 0, -1) of the links; one motion, (1, 1, 1), remains."""
     found = udk.diagnose(udk.library.parallelogram(0.0), fixes=False)
     assert (found.rank, found.ordinary_rank, found.mobility, found.degrees_of_freedom) == (10, 11, 2, 1)
     assert found.is_singular and [r.permanent for r in found.redundancies] == [True, False]
@@ -222,7 +222,7 @@ def exact_crossings(linkage, start, end):
 
 
 def test_rank_changes_along_a_motion_are_bracketed_at_their_exact_times():
-    """Released at +45 degrees the linkage passes 0 and pi; 40 outputs are a tenth of a second apart."""
+    """Released at +45 degrees the linkage passes 0 and pi. The 40 outputs are a tenth of a second apart."""
     mechanism = udk.library.parallelogram(np.pi / 4)
     solution = udk.simulate(mechanism, np.linspace(0.0, 4.0, 41), rtol=1e-11, atol=1e-11)
     line = udk.diagnose(mechanism, solution=solution, fixes=False, walk=False).timeline
@@ -235,7 +235,7 @@ def test_rank_changes_along_a_motion_are_bracketed_at_their_exact_times():
 
 
 def test_a_trajectory_that_stays_clear_has_no_rank_change(linkage):
-    """Swinging from -45 degrees the links come no nearer to in line than at the start; states of any origin will do."""
+    """Swinging from -45 degrees the links come no nearer to being in line than at the start. Any states will do."""
     ts = np.linspace(0.0, 3.0, 61)
     solution = udk.simulate(linkage, ts, rtol=1e-9, atol=1e-9)
     states: Any = SimpleNamespace(ts=ts, q=solution.q, v=solution.v)
@@ -253,7 +253,7 @@ def test_a_shaky_structure_moves_to_first_order_only():
 
 
 def test_drivers_that_ask_for_the_same_are_found():
-    """Two motors that turn one crank: either of them is enough; and the degrees of freedom that drivers control are printed."""
+    """Two motors turn one crank, and one would be enough. The degrees of freedom that drivers control are printed."""
     plain = udk.library.slider_crank(0.7)
     mechanism = udk.Mechanism(plain.bodies, plain.joints, {**plain.drivers, "second": plain.drivers["motor"]})
     found = udk.diagnose(mechanism, walk=False)
@@ -264,7 +264,7 @@ def test_drivers_that_ask_for_the_same_are_found():
 
 
 def test_a_linkage_with_its_own_rank_change_between_limits():
-    """Peaucellier's arms and sides fall in line at 2 acos((arm - side) / (2 crank)): the walk finds it, past it and not on it."""
+    """Peaucellier's arms and sides are in line at 2 acos((arm - side) / (2 crank)). The walk passes this angle and finds it."""
     found = udk.diagnose(udk.library.peaucellier())
     nearest = found.clearance.nearest
     assert nearest is not None
@@ -304,7 +304,7 @@ def test_traced_numbers_are_refused():
 
 
 def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
-    """Two braced cells of six bars: each bar has a fix; of the second step of the cure the best one alone is verified."""
+    """Two braced cells of six bars: each bar has a fix. Of the second step only the best one is verified."""
     bodies = {f"{k}{i}": udk.Body(1.0, 0.01, [float(k), float(i)]) for k in range(3) for i in (0, 1)}
     pairs = [(f"{k}{i}", f"{k + 1}{j}") for k in (0, 1) for i in (0, 1) for j in (0, 1)] + [(f"{k}0", f"{k}1") for k in range(3)]
     joints: dict[str, Any] = {f"{a} {b}": udk.Distance([a, b], [[0.0, 0.0]] * 2) for a, b in pairs}
@@ -318,7 +318,7 @@ def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
 
 
 def test_positions_of_a_large_scene_are_closed_and_ranked_without_dense_decompositions(monkeypatch):
-    """The walk to the next rank change takes hundreds of positions, each kept; their Jacobians are sparse."""
+    """The walk to the next rank change takes hundreds of positions, which are all kept; their Jacobians are sparse."""
     mech, decompose, found = udk.library.n_four_bar(20), np.linalg.svd, []
     positions = RankedPositions(mech, 1e-6)
     start = positions.at(0.0, np.ravel(udk.assemble(mech).q))

@@ -1,4 +1,4 @@
-"""Differences and their errors, of functions whose derivatives are known."""
+"""Differences and their errors, for functions with known derivatives."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ SLOPE = -TS * np.sin(TS)
 
 
 def seen(h):
-    """cos((1 + h) t), at all steps of the ladder."""
+    """The values of cos((1 + h) t) at all steps of the ladder."""
     return np.cos((1.0 + h[:, None]) * TS)
 
 

@@ -1,4 +1,4 @@
-"""The derivation for one state, against NumPy, the paper's closed form and Gauss's principle."""
+"""The derivation for one state, compared with NumPy, the paper's closed form and Gauss's principle."""
 
 import json
 
@@ -42,7 +42,7 @@ def test_every_symbol_is_what_numpy_makes_of_the_ones_before(found):
 
 
 def test_gauss_s_principle_is_shown_by_what_is_feasible(found):
-    """G grows by half the square of any feasible deviation: by hand, along the linkage's one motion."""
+    """G grows by half the square of any feasible deviation, as computed by hand along the linkage's only motion."""
     along = np.array([0.5 * np.sqrt(0.5), 0.5 * np.sqrt(0.5), 1.0] * 3 + [np.sqrt(0.5), np.sqrt(0.5), 0.0])
     assert_allclose(found.psi_q @ along, 0.0, atol=1e-15)
 
@@ -77,7 +77,7 @@ def test_the_text_reads_line_by_line(found):
 
 
 def test_a_driven_mechanism_with_rows_in_radians():
-    """Everything is decided: one feasible acceleration, all multipliers unique; Baumgarte's terms go into b."""
+    """There is only one feasible acceleration, and all multipliers are unique. Baumgarte's terms go into b."""
     mechanism = udk.library.slider_crank(0.7)
     found = udk.explain(mechanism)
     assert found.rank == 9 and found.unique.all() and found.gauss.free == 0

@@ -1,4 +1,4 @@
-"""Efforts of drivers, against closed forms, power and forward dynamics."""
+"""Efforts of drivers compared with closed forms, power and forward dynamics."""
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ def test_the_coordinate_of_a_driver_is_what_its_row_holds(name):
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, np.pi / 2, -2.0])
 def test_a_slide_is_pushed_along_its_own_line(angle):
-    """A slide of mass m on an incline: m (a + g sin(angle)) along it, and m g cos(angle) across; the motion from zero on."""
+    """A slide of mass m on an incline: m (a + g sin(angle)) along it, and m g cos(angle) across. The motion starts at zero."""
     along, ts, half = np.array([np.cos(angle), np.sin(angle)]), np.array([0.0, 0.5]), 1.5
     ramp = udk.Drawing(
         pins={"P": (0.3, 0.1)},
@@ -63,7 +63,7 @@ def test_a_slide_is_pushed_along_its_own_line(angle):
 
 
 def test_work_and_swing_of_a_weight_that_a_motor_turns():
-    """Torque m g r cos(w t): no work in a turn, and a swing of 2 m g r; with a brake the work 2 pi c w."""
+    """The torque m g r cos(w t) does no work in a turn, and its energy swings by 2 m g r; with a brake the work is 2 pi c w."""
     rod = udk.Body(2.0, 0.1, position=[0.5, 0.0])
     pin = udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])
     motor = udk.Driver(["ground", "rod"], "angle", udk.Polynomial([0.0, 3.0]))
@@ -77,7 +77,7 @@ def test_work_and_swing_of_a_weight_that_a_motor_turns():
 
 
 def test_redundant_joints_and_redundant_drivers():
-    """Three links of a parallelogram driven alike: by symmetry of the weights, equal shares; by weights, shares as 1/w."""
+    """Three links of a parallelogram driven alike have equal shares by symmetry; with weights w, shares as 1/w."""
     mech = udk.library.parallelogram(-0.8)
     motion = udk.kinematics(mech, "body.link1.angle", [-0.8, -0.5, 0.6], rate=2.0, acceleration=1.0)
     links = [f"body.link{k}.angle" for k in (1, 2, 3)]
@@ -93,7 +93,7 @@ def test_redundant_joints_and_redundant_drivers():
 
 
 def test_derivatives_of_a_torque_are_those_of_its_closed_form():
-    """(I + m r^2) theta'' + m g r cos(theta) of a driven pendulum on its motion, by the mass and by gravity."""
+    """The torque (I + m r^2) theta'' + m g r cos(theta) of a driven pendulum, differentiated by the mass and by gravity."""
     mech, ts = udk.library.driven_pendulum(), np.array([0.2])
     motion = udk.inverse_dynamics(mech, ts).motion
 

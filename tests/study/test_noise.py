@@ -9,7 +9,7 @@ SEEDS = 300
 
 
 def left(kind, samples, unknowns, correlation, seed):
-    """Times, residuals of a fit of cosines to noise, and the fit's projection. `correlation` is that of neighbours."""
+    """Times, residuals of a fit of cosines to noise, and the fit's projection. `correlation` is that of neighbouring samples."""
     random = np.random.default_rng(seed)
     t = np.sort(random.uniform(0.0, 10.0, samples)) if kind == "irregular" else np.linspace(0.0, 10.0, samples)
     if kind == "gaps":
@@ -31,7 +31,7 @@ def test_white_noise_is_told_as_often_as_it_should_be(kind):
 
 
 def test_what_a_fit_takes_away_is_allowed_for():
-    """Ten unknowns make neighbours of white noise differ: without the hat matrix that looks like a correlation."""
+    """A fit of ten unknowns makes neighbours of white noise differ: without the hat matrix this looks like a correlation."""
     with_it, without = [], []
     for seed in range(SEEDS):
         t, e, U = left("regular", 100, 10, 0.0, seed)

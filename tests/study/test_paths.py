@@ -24,7 +24,7 @@ def linkage():
 
 
 def slope(x, step=TS[1]):
-    """The rate of a path, by central differences of fourth order."""
+    """The rate of a path by central differences of fourth order."""
     return (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * step)
 
 
@@ -153,7 +153,7 @@ def test_a_pin_is_driven_along_a_coordinate(linkage):
 
 
 def test_at_a_toggle_places_are_known_and_velocities_are_not():
-    """A slide pulls two links of 1 m straight: there its pin is 2 m away and their angle is 0, however fast it goes."""
+    """A slide pulls two links of 1 m straight: then its pin is 2 m away and their angle is 0, whatever the slide's speed."""
     pins = {"O": (0.0, 0.0), "A": (0.6, 0.8), "B": (1.2, 0.0)}
     links = {
         "crank": udk.Link(["O", "A"], mass=1.0),

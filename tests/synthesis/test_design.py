@@ -1,4 +1,4 @@
-"""Designs by gradient: known mechanisms are found again, limits hold, and what is found moves as it should."""
+"""Designs by gradient: known mechanisms are found again, limits hold, and the result moves as it should."""
 
 import json
 from pathlib import Path
@@ -46,7 +46,7 @@ PARALLELOGRAM = udk.Drawing(
 
 
 def motion(mechanism, count, span=1.8):
-    """Values of the first driver, from where it is drawn on, and a motion over these."""
+    """Values of the first driver, starting from the drawn one, and the motion for these values."""
     from udkjax.positions.drive import drive
 
     name = mechanism.driver_names[0]
@@ -55,14 +55,14 @@ def motion(mechanism, count, span=1.8):
 
 
 def path_errors(found, point, targets):
-    """By how much the point of a design misses its targets, along a motion of its own."""
+    """Return by how much the point of a design misses its targets in a motion computed separately."""
     moved = udk.kinematics(found.mechanism, found.driver, found.values)
     assert np.all(moved.reached)
     return np.linalg.norm(np.asarray(udk.path(found.mechanism, moved, point)) - targets, axis=1)
 
 
 def search(number):
-    """One of the five classic cases, with its side conditions."""
+    """One of the five classic cases, with its additional conditions."""
     case = DATA[number]
     targets, most, area = np.array(case["targets"]), case["bounds"]["r"][1], case["bounds"]["others"][1]
     angles = np.deg2rad(case["crank_angles_deg"]) if number in (1, 3) else None
@@ -84,7 +84,7 @@ def published(case):
 
 
 def within_its_bounds(case, found):
-    """Lengths and coordinates of the parametrization in which the case was published, and whether the crank turns."""
+    """Check lengths and coordinates in the parametrization of the publication, and whether the crank turns."""
     ground, A, B, P, C = (np.asarray(found.pins[name]) for name in "OABPC")
     r, others = case["bounds"]["r"][1], case["bounds"]["others"][1]
     lengths = [np.linalg.norm(b - a) for a, b in ((ground, C), (ground, A), (A, B), (C, B))]
@@ -200,7 +200,7 @@ def test_the_loss_moves_when_any_parameter_does(kind):
 
 
 def require_slopes(problem, s):
-    """The slopes of the loss by all unknowns are not zero, and those of differences."""
+    """Require that the derivatives of the loss by all unknowns are not zero, and agree with differences."""
     x = np.append(problem.free.vector, np.full(problem.unknowns - problem.free.count, 0.1))[None]
     q, reached = problem.march(x, s)
     assert reached.all()
@@ -290,7 +290,7 @@ def test_mistakes_are_named():
 
 @pytest.mark.slow
 def test_a_curve_that_wants_dead_points_has_designs_and_failures_say_why():
-    """A heart's best four-bars pass dead points; what is found stays away from them, and its motion bears it out."""
+    """The best four-bars for a heart pass dead points. The design stays away from them, as its motion confirms."""
     a = np.linspace(0.0, 2.0 * np.pi, 17)
     heart = np.stack([16 * np.sin(a) ** 3, 13 * np.cos(a) - 5 * np.cos(2 * a) - 2 * np.cos(3 * a) - np.cos(4 * a)], 1)
     found = udk.design(FOUR_BAR, udk.PathGoal("P", heart), starts=60, results=2)

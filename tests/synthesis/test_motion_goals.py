@@ -1,4 +1,4 @@
-"""Goals about the motion: measures against inverse dynamics, reactions and modes; exact derivatives; designs within them."""
+"""Goals about the motion: measures compared with inverse dynamics, reactions and modes; derivatives; designs."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def problem():
 
 
 def motion_of(problem, term):
-    """The motion of the motor from the drawn position, at the times of a term's samples."""
+    """The motion of the motor from the drawn position, at the sample times of a term."""
     mechanism, n = FOUR_BAR.mechanism(), term.goal.samples
     step, start = 2 * np.pi / n, np.arctan2(4, 3)
     ts = (step * (np.ceil(start / step) + np.arange(n)) - start) / 3.0

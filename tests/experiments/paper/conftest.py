@@ -41,7 +41,7 @@ def study_data():
 
 
 def made_up(case: Case, number: int, rate: float) -> dict:
-    """One run; every number of it is another one than that of every other run."""
+    """One run. All its numbers differ from those of the other runs."""
     ts = np.linspace(0.0, case.end, INSTANTS)
     drifts = case.alpha < 2 and case.group in ("paper", "other integrators", "rank held", "start", "law")
     sigma = 1e-15 * np.exp((rate - case.alpha) * ts) if drifts else np.full(INSTANTS, 1e-15)

@@ -1,4 +1,4 @@
-"""`udkjax report`, and that what it runs can be installed with the package."""
+"""`udkjax report`, and whether everything that it runs can be installed with the package."""
 
 import ast
 import json

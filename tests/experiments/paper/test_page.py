@@ -14,7 +14,7 @@ VOID = {"meta", "img", "br", "link"}
 
 
 class Outline(HTMLParser):
-    """The tags of a page, with their attributes; fails where one is not closed."""
+    """The tags of a page with their attributes. It fails if a tag is not closed."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -44,7 +44,7 @@ def cells(html: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def page(study_data, tmp_path_factory):
-    """The page, from nothing but the file."""
+    """The page, made from the file alone."""
     file = tmp_path_factory.mktemp("report") / "report.nc"
     save(study_data, file)
     return report.page(read(file))

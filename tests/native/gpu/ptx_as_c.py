@@ -187,7 +187,7 @@ def as_c(code: str) -> str:
 
 
 def compiled(code: str, folder: Path):
-    """A function of the address of a call record and the number of members."""
+    """A C function of the address of a call record and the number of members."""
     (folder / "kernel.c").write_text(as_c(code))
     options = ["-O1", "-w", "-mfma", "-ffp-contract=off", "-fno-strict-aliasing", "-shared", "-fPIC"]
     subprocess.run(["cc", *options, str(folder / "kernel.c"), "-o", str(folder / "kernel.so"), "-lm"], check=True)

@@ -1,4 +1,4 @@
-"""The driver of the graphics card, with functions of ctypes in its place."""
+"""The driver of the graphics card, with ctypes functions in place of the real ones."""
 
 import ctypes
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ NO_DEVICE = 100
 
 
 def stand_in(calls, **answers):
-    """Functions of the driver that note their calls, write what they are asked for, and return the given errors."""
+    """Functions of the driver that record their calls, write requested values, and return given errors."""
     functions = SimpleNamespace()
 
     def add(name, arguments, writes=None):

@@ -32,7 +32,7 @@ ADDRESS = ctypes.c_uint64
 
 
 class Card:
-    """A driver that copies within the host. It notes its calls, fails where `failing` says so, and counts running threads."""
+    """A driver that copies within the host. It records its calls, fails on `failing`, and counts running threads."""
 
     def __init__(self):
         self.calls, self.failing, self._functions, self._frames = [], {}, {}, itertools.count()
@@ -205,7 +205,7 @@ def test_functions_of_python_are_called(card):
 
 
 def test_small_calls_use_pinned_memory_one_at_a_time(card):
-    """A call that finds it in use, or too small, uses other memory."""
+    """A call uses other memory if the pinned memory is in use or too small."""
 
     def places(rows):
         card.calls.clear()
@@ -261,7 +261,7 @@ def test_without_words_the_error_says_so(card):
 
 
 def test_an_operation_finds_threads_in_its_frame(card):
-    """Their number, and one for each task, beside the thread of the caller."""
+    """It finds their number, and runs one task on each besides the caller's thread."""
     found, done = [], threading.Event()
 
     @ctypes.CFUNCTYPE(None, ctypes.c_void_p)
@@ -292,7 +292,7 @@ def test_an_operation_finds_threads_in_its_frame(card):
 
 
 def test_calls_of_several_threads_do_not_mix(card):
-    """Some use the pinned memory, the others find it in use."""
+    """Some use the pinned memory; the others find it in use."""
     run = jax.jit(norms)
     given = [jnp.full((3, 2), float(k)) for k in range(40)]
     run(given[0])
@@ -308,7 +308,7 @@ TABLE = jnp.array([2, 3, 5])
 
 @deferred
 def root(x, first=3, large=2**62 + 1):
-    """The square root by Newton's method, and other kinds of numbers."""
+    """The square root by Newton's method, and numbers of other types."""
 
     def step(state):
         r, k = state
@@ -359,7 +359,7 @@ def test_a_program_with_loops_or_factorizations_is_one_call(request, name):
 
 @needs_deferred
 def test_such_a_program_is_compiled_once_and_runs_under_strict_settings(card, monkeypatch):
-    """It has NaN in places that the program around it discards."""
+    """It produces NaN in places that the surrounding program discards."""
 
     @deferred
     def undefined(x):
@@ -389,7 +389,7 @@ def moved(gravity):
 @pytest.mark.slow  # their programs take XLA seconds
 @pytest.mark.parametrize(("solve", "x", "calls"), [(rest, 2.0, 3), (moved, -9.81, 4)])
 def test_a_solve_is_one_call(request, solve, x, calls):
-    """The scales, the assembly, and the solve itself; within that of `kinematics` another, as all are copied here."""
+    """The scales, the assembly and the solve are one call each; `kinematics` adds another one, since all data are copied here."""
     expected = np.asarray(jax.jit(solve)(x))
     card = request.getfixturevalue("card")
     assert_allclose(jax.jit(solve)(x), expected, rtol=1e-12, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Kernels without a graphics card: their threads one after another, equal to the engine in all bits, also in programs of JAX."""
+"""Kernels without a graphics card: their threads run one after another, bitwise equal to the engine, also in JAX programs."""
 
 import itertools
 import platform
@@ -34,7 +34,7 @@ FLOOR = udk.Contact("ball", restitution=0.8, name="floor")
 
 
 def last(mechanism, name, times=2, end=0.5, **options):
-    """A function of a parameter: the last positions."""
+    """The last positions as a function of a parameter."""
     ts = np.linspace(0.0, end, times)
 
     def run(x):
@@ -85,7 +85,7 @@ def test_threads_compute_what_the_engine_computes(name):
 
 
 def test_constants_that_all_members_share_are_in_the_memory_of_the_block(tmp_path):
-    """Members that differ by their starts alone: the threads, and where there is a C compiler, LLVM's PTX for them."""
+    """Members that differ only by their starts: with threads, and with LLVM's PTX if there is a C compiler."""
     run = gpu.ours(LINKAGE, np.linspace(0.0, 0.5, 4))
     (call,) = emulation.calls_of(run, gpu.states(gpu.angles(-45.0, 5)), 1e-7)
     assert call.kernel.constants > 0 and "@block_memory" in call.kernel.text
@@ -174,7 +174,7 @@ def card(monkeypatch):
 
 
 def as_for_a_card(*inputs, operation, times):
-    """A kernel, or else what the CPU does."""
+    """A kernel if the batch would have one on a card, or else the CPU's code."""
     name = launch.kernel_target(operation, inputs)
     if name is None:
         return primitive._lower(*inputs, operation=operation, times=times)
@@ -265,7 +265,7 @@ def test_kernels_are_assembled(name):
 @pytest.mark.skipif(shutil.which("cc") is None or platform.machine() != "x86_64", reason="no C compiler for this processor")
 @pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "elementary functions", "tangent"])
 def test_ptx_computes_what_the_engine_computes(name, tmp_path):
-    """LLVM's text for a graphics card, transliterated to C: all bits, and the address spaces of its pointers."""
+    """LLVM's PTX, transliterated to C, is bitwise right, and so are the address spaces of its pointers."""
     for k, call in enumerate(emulation.calls_of(jax.vmap(RUNS[name]), MASSES)):
         if call.operation.is_reverse:
             continue
@@ -279,7 +279,7 @@ def test_ptx_computes_what_the_engine_computes(name, tmp_path):
 
 
 class Loading:
-    """A driver of some devices that loads kernels of some kinds."""
+    """A driver with several devices that loads only certain kinds of kernels."""
 
     def __init__(self, capabilities, accepted=(b"\x7fELF", b"//\n/")):
         self.capabilities, self.accepted, self.images = capabilities, accepted, []

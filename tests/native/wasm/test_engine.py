@@ -1,4 +1,4 @@
-"""The engine's modules as WebAssembly do what they do as code of this processor without fused multiply-add, to the bit."""
+"""The engine's modules as WebAssembly equal the code of this processor without fused multiply-add, to the last bit."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ SPANS = {"andrews_squeezer": 0.015}  # of it, for what moves in milliseconds
 
 
 def both(operation, inputs, times):
-    """The outputs of an operation as WebAssembly, and by this processor without fused multiply-add."""
+    """The outputs of an operation as WebAssembly, and as code of this processor without fused multiply-add."""
     made, inputs = wasm_module(operation), [np.ascontiguousarray(x, float) for x in inputs]
     shapes = operation.shapes(inputs, times)
     host = Host(made.linked.code, made.linked.data_end)
@@ -27,7 +27,7 @@ def both(operation, inputs, times):
 
 
 def concrete_call(monkeypatch, module, do):
-    """The operation and the inputs with which `do()` first calls machine code, by way of a module of the package."""
+    """The operation and the inputs of the first call of machine code by `do()` through a module of the package."""
     seen = []
 
     def call(operation, inputs, times):

@@ -1,4 +1,4 @@
-"""Modules out of LLVM's object code: exports, imports and constants, and refusal of other bytes."""
+"""Modules made from LLVM's object code: exports, imports and constants, and refusal of other bytes."""
 
 import math
 

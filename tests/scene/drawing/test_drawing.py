@@ -1,4 +1,4 @@
-"""Drawings against the same mechanisms written by hand, and their pins as parameters."""
+"""Drawings compared with the same mechanisms written by hand, and their pins as parameters."""
 
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ def four_bar(**more):
 
 
 def by_hand(pins, links, ground, motor):
-    """A mechanism of bars (two pins) and triangles, each with its density per area, written with bodies and revolutes."""
+    """A mechanism of bars (two pins) and triangles with densities per area, written with bodies and revolute joints."""
     bodies, places = {}, {}
     for name, (through, density, width) in links.items():
         p = np.array([pins[pin] for pin in through], float)
@@ -86,7 +86,7 @@ def test_links_meet_at_pins():
 
 
 def test_elements_act_where_they_are_drawn():
-    """Springs are unloaded, motions start, and everything is closed in the drawn position."""
+    """In the drawn position springs are unloaded, motions start, and everything is closed."""
     pins = {"O": (0, 0), "A": (3, 4), "S": (6, 8), "T": (10, 0), "B": (7, 0), "C": (13, 0)}
     links = {
         "arm": udk.Link(["O", "A", "S"], mass=1.0, width=0.1),
@@ -128,7 +128,7 @@ def test_elements_act_where_they_are_drawn():
 
 
 def test_a_cylinder_lifts_a_boom_as_levers_say():
-    """The force of a cylinder from C to A has the arm of O to the line C A, the weight that of the centre of the boom."""
+    """The cylinder's lever arm is the distance from O to the line C A, the weight's that of the boom's centre."""
     pins = {"O": (0.0, 0.0), "C": (0.3, -0.2), "A": (0.5, 0.15), "T": (1.5, 0.45)}
     boom = udk.Drawing(
         pins,
@@ -198,7 +198,7 @@ def test_a_cam_turns_its_drawn_profile():
 
 
 def test_velocities_of_pins():
-    """A link moves as its pins do: about O at 2 rad/s, so does its centre, and a force-free motion keeps it."""
+    """A link moves with its pins: its centre turns about O at 2 rad/s, and goes on without forces."""
     pins, links = {"O": (0, 0), "A": (3, 4)}, {"bar": udk.Link(["O", "A"], mass=1.0)}
     mech = udk.Drawing(pins, links, ground=["O"], velocities={"A": (-8, 6)}, gravity=(0, 0)).mechanism()
     assert_allclose(mech.v0, [[-4, 3, 2]])
@@ -232,7 +232,7 @@ def test_what_was_changed_by_hand_stays_when_pins_move():
 
 
 def test_mechanisms_with_the_same_numbers_given_directly_are_stacked():
-    """Numbers given directly are leaves of their own: two copies share a program, and each keeps its own when a pin moves."""
+    """Numbers given directly are separate leaves: two copies share a program, and each keeps its own when a pin moves."""
     given = [{"body.coupler.mass": mass, "joint.B.points[0][0]": x} for mass, x in ((4.0, 0.6), (9.0, 0.7))]
     plain, heavy = (four_bar().mechanism().with_parameters(values) for values in given)
     traces = []
@@ -255,7 +255,7 @@ def test_mechanisms_with_the_same_numbers_given_directly_are_stacked():
 
 
 def test_pins_are_differentiated_and_batched():
-    """A coupler point's error by all pins against differences; under vmap each member equals its own run."""
+    """A coupler point's error with respect to all pins agrees with differences. Under vmap each member equals its own run."""
     drawing = four_bar(motors=[{"pin": "O", "speed": 2.0}])
     mech, ts = drawing.mechanism(), np.linspace(0.0, 1.0, 3)
     names, target = list(FOUR_BAR), np.array([1.0, 2.0])
@@ -293,7 +293,7 @@ def test_a_traced_pin_keeps_machine_code_and_concrete_numbers():
 
 
 def test_a_pin_that_makes_a_redundant_row_independent_is_noticed():
-    """A parallelogram with three cranks moves; with one of another length it is stiff, traced or not."""
+    """A parallelogram with three equal cranks moves; if one has another length it is stiff, traced or not."""
     pins = {f"O{k}": (k, 0.0) for k in range(3)} | {f"A{k}": (k + 0.6, 0.8) for k in range(3)}
     links = {f"link{k}": udk.Link([f"O{k}", f"A{k}"], mass=1.0) for k in range(3)}
     links["coupler"] = udk.Link(["A0", "A1", "A2"], mass=2.0, width=0.0)

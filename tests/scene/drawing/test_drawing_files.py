@@ -146,7 +146,7 @@ def test_what_a_drawing_no_longer_says_is_written_by_hand():
 
 
 def test_numbers_of_numpy_and_jax_are_plain_numbers():
-    """Whole arrays, single numbers of them, and those that are traced, in the units of the others."""
+    """Whole arrays, entries of arrays, and traced numbers, in the same units as others."""
     link = {"link": {"pins": ["O", "A"], "mass": 1}}
 
     def length(pin):
@@ -178,7 +178,7 @@ def test_quantities(text, unit, value):
 
 
 def drawn(old="", new="", *, head=HEAD, pins="", end=""):
-    """The text of a four-bar, with more of everything, and `new` in place of `old`."""
+    """The text of a four-bar with further elements, and `new` in place of `old`."""
     text = head + GROUND + PINS + pins + LINKS + end
     return text.replace(old, new) if old else text
 

@@ -1,4 +1,4 @@
-"""Areas, centres and radii of gyration against integrals of slices, and against shapes put together of others."""
+"""Areas, centres and radii of gyration compared with integrals over slices and with composite shapes."""
 
 from itertools import pairwise
 
@@ -44,7 +44,7 @@ def test_a_bar_is_between_a_rod_and_a_disc():
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_a_polygon_that_is_not_convex(backwards):
-    """An L of two rectangles, turned and far from the origin."""
+    """An L made of two rectangles, turned, and far from the origin."""
     corners = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 4], [0, 4]], float)
     areas, centres = np.array([3.0, 3.0]), np.array([[1.5, 0.5], [0.5, 2.5]])
     own = areas * np.array([3**2 + 1, 1 + 3**2]) / 12

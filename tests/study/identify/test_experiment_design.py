@@ -1,4 +1,4 @@
-"""Ranking of experiments, against differences and well-known properties of pendulums."""
+"""Ranking of experiments, compared with differences and well-known properties of pendulums."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Derivatives against differences: right ones agree at any tolerance, wrong ones are found, with their place."""
+"""Derivatives compared with differences: right ones agree at any tolerance; wrong ones are found and located."""
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ FIRST = 0.5, 0.15
 
 
 def exact():
-    """The derivatives of the pendulum's angle, as exact as they can be integrated."""
+    """The derivatives of the pendulum's angle, as exact as integration allows."""
     mech = pendulum(*FIRST)
     problem = FitProblem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
     return problem.evaluate(np.zeros((1, 2)), (1e-13, 1e-13)).J[0]
@@ -121,7 +121,7 @@ def test_wrong_derivatives_are_found(wrong_problem):
 
 
 def test_what_is_wrong_is_told_with_its_place(wrong_problem, monkeypatch):
-    """The place is that of the series with the worst agreement, here of two."""
+    """The place is in the series with the worst agreement, here one of two."""
     series = wrong_problem.series()[:2]
     monkeypatch.setattr(wrong_problem, "series", lambda: series)
     check = compare_gradients(wrong_problem, np.zeros(2), (1e-11, 1e-11))

@@ -170,7 +170,7 @@ def test_a_common_factor_of_masses_is_not_known(measured):
 
 @pytest.fixture(scope="module")
 def two_records(measured):
-    """A record from an estimated start, and a shorter one from the scene's with another spring."""
+    """A record from an estimated start, and a shorter one from the scene's start with another spring."""
     stiffer = measured[0].with_parameters({"force.spring.stiffness": 4.0})
     records = [
         udk.Record(TS[3:], {ANGLE: measured[1][3:]}, noise=0.01, t0=0.0, initial_state=udk.Start(estimate="both")),

@@ -13,7 +13,7 @@ from udkjax.study.identify.loop_consistency import loop_problems, tie_text
 
 
 def lengths(*groups):
-    """Each value the common length of a group of bodies."""
+    """Make each value the common length of a group of bodies."""
 
     def apply(mechanism, x):
         for k, bodies in enumerate(groups):
@@ -28,7 +28,7 @@ def numbers(*names):
 
 
 def asked(mechanism, *names):
-    """Return the problems of varying some numbers of a scene."""
+    """Return the problems found if these numbers of a scene may vary."""
     return loop_problems(mechanism, numbers(*names), [entry(mechanism.parameters(), name) for name in names], names)
 
 
@@ -45,7 +45,7 @@ CHOICES = [lengths("link1", "link2", "link3"), lengths(("link1", "link2", "link3
 
 @pytest.fixture(scope="module")
 def problems(linkage):
-    """Return the problems of three free cranks, and of three tied ones."""
+    """Return the problems of three separate cranks, and of three with a common length."""
     return [loop_problems(linkage, apply, [1.0] * n, "abc"[:n]) for apply, n in zip(CHOICES, (3, 1), strict=True)]
 
 
@@ -91,7 +91,7 @@ def test_first_guesses_that_open_a_loop_are_refused(linkage):
 
 
 def test_legal_to_first_order_is_not_enough(linkage):
-    """Cranks of l + d, l and l - d: Psi along the left null space changes by d^2, at every position."""
+    """Cranks of l + d, l and l - d change Psi along the left null space by d^2, at every position."""
 
     def apply(mechanism, x):
         return lengths("link1", "link3")(mechanism, [1.0 + x[0], 1.0 - x[0]])
@@ -106,7 +106,7 @@ def test_legal_to_first_order_is_not_enough(linkage):
 
 
 def triangle():
-    """Three equal cranks on the corners of a triangle carry one that is as large: closed along all of the motion."""
+    """Three equal cranks on the corners of a triangle carry a triangle of the same size, which closes along all of the motion."""
     corners, angle = [(0.0, 0.0), (1.0, 0.8), (2.0, 0.0)], 0.9
     e = jnp.array([np.cos(angle), np.sin(angle)])
     bodies = {f"link{i}": udk.Body(1.0, 0.1, jnp.array(c) + 0.5 * e, angle) for i, c in enumerate(corners)}
@@ -176,7 +176,7 @@ def test_bars_of_a_scissor_lift_stay_equal_in_pairs():
 
 
 def test_loops_of_which_none_is_overconstrained_move_freely(compilations):
-    """Four-bars in a row have dependent rows in singular configurations only: nothing is checked."""
+    """Four-bars in series have dependent rows only in singular configurations: nothing is checked."""
     bars = udk.library.n_four_bar(3)
     assert udk.analyse(bars).redundant_rows == ()
     apply = lengths("link0", "link1", "coupler2")

@@ -1,4 +1,4 @@
-"""Fits by optimizers of optax: the minimum of least squares, and those of other losses."""
+"""Fits by optax's optimizers: the minimum of least squares, and of other losses."""
 
 from functools import partial
 from typing import Any

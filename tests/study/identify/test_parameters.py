@@ -1,4 +1,4 @@
-"""Targets, texts and allowed values of parameters."""
+"""Targets, text forms and allowed values of parameters."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Profile likelihoods, against linear regression and known curves."""
+"""Profile likelihoods compared with linear regression and known curves."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ def linear(J, r0):
 
 
 def curve(cost):
-    """Fits of one unknown, whose costs are a function of it."""
+    """Fits of one unknown whose cost is a given function of it."""
     return lambda index, held, z0: (np.array([held]), cost(held))
 
 
@@ -79,7 +79,7 @@ def test_a_flat_direction_is_open():
 
 
 def test_one_end_may_be_open():
-    """A very small friction: in its logarithm the curve falls off to a level below the quantile."""
+    """For a very small friction, the curve over its logarithm falls off to a level below the quantile."""
     found = trace_profile(
         curve(lambda z: 1.0 * (np.exp(z) - 1.0) ** 2), 0, np.zeros(1), 0.0, 0.5, value=np.exp, name="b", units="N s/m"
     )
@@ -112,7 +112,7 @@ def test_few_steps_leave_it_open():
 
 
 def test_a_better_fit_on_the_way_is_said():
-    """A second, lower minimum at 1."""
+    """There is a second, lower minimum at 1."""
 
     def cost(z):
         return 4.0 * z**2 * (z - 1.0) ** 2 - 0.2 * z**2

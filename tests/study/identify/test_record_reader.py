@@ -42,7 +42,7 @@ def problems(mech, data, **settings) -> list[str]:
 
 
 def sigma(record: Record, channel: str | Quantity) -> np.ndarray:
-    """Return the given standard deviation of a channel."""
+    """Return the standard deviation given for a channel."""
     found = record.noise[channel]
     assert found is not None
     return found

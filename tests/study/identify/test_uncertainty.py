@@ -1,4 +1,4 @@
-"""Uncertainty from residuals and their Jacobian, against linear regression."""
+"""Uncertainty from residuals and their Jacobian, compared with linear regression."""
 
 import numpy as np
 import pytest
@@ -119,7 +119,7 @@ def test_two_flat_directions_are_told_apart():
 
 
 def test_priors_alone_show_a_direction_in_the_residuals_and_in_the_errors():
-    """Measured 1e12 times better than by priors: b = -a in z, and so a common factor by two priors of it, 2 and 1."""
+    """Measurements are 1e12 times better than priors: b = -a in z, so that two priors, 2 and 1, determine the common factor."""
     J, r = problem()
     J[:, 1] = -J[:, 0]
     priors = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

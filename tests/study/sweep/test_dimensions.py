@@ -1,4 +1,4 @@
-"""Axes become dimensions; every mistake is named, with its cure."""
+"""Axes become dimensions. Every mistake is named, with a suggestion how to correct it."""
 
 from itertools import pairwise
 

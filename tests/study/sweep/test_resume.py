@@ -97,7 +97,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(tmp_path, monkeypatch, whole
 
 @pytest.mark.slow
 def test_a_worker_that_is_killed_costs_nothing_but_time(tmp_path, whole):
-    """Worker processes and a scheduler as on a cluster; one is killed in the middle of a chunk, another between two."""
+    """Worker processes and a scheduler as on a cluster; one is killed in the middle of a chunk, another between two chunks."""
     distributed = pytest.importorskip("distributed", reason="dask is not installed: pip install '.[dask]'")
     flag, here = str(tmp_path / "killed"), os.getpid()
 

@@ -32,7 +32,7 @@ def not_done(stored):
 
 
 def collected(stored):
-    """Everything that is finished, by member."""
+    """Return everything that is finished, by member."""
     return {int(m): d["q"][k].tolist() for members, d in stored.read_chunks() for k, m in enumerate(members)}
 
 

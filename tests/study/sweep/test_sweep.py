@@ -108,7 +108,7 @@ def test_what_is_not_finished_is_marked(plan, finished):
 
 
 def test_other_values_take_the_same_program(pendulum, compilations):
-    """A sweep that differs in more than the values of its axes needs another program: here in output times, its constants."""
+    """Only other values of the axes share a program; other output times, for example, are other constants."""
     ends = lambda masses, ts: udk.sweep(pendulum, {"body.rod.mass": masses}, ts, progress=False).q_end.values  # noqa: E731
     ends([1.0, 2.0], TS)
     found = []
@@ -145,7 +145,7 @@ def test_chunks_are_cut_by_work_and_by_memory():
 
 @pytest.mark.parametrize(("pace", "memory", "fewest"), [(1e-9, 2**30, 1), (100.0, 2**30, 2), (1e-9, 1, 2)])
 def test_members_that_are_not_done_are_computed_once(pendulum, pace, memory, fewest):
-    """For any time that the first took, and any members that an earlier run has finished."""
+    """This holds for any duration of the first sweep, and for any members that it has finished."""
     axes = {"body.rod.mass": np.linspace(1.0, 2.0, 300), "t1": [0.1, 0.2]}
     plan, expected, done = make_plan(pendulum, axes, [0.0, 1.0]), [], np.arange(7, 70)
 

@@ -1,4 +1,4 @@
-"""Sweeps on several devices, in lanes, through other redundant rows, and with methods as numbers of one program."""
+"""Sweeps on several devices, in lanes, with changing redundant rows, and with several methods in one program."""
 
 import os
 import subprocess
@@ -58,7 +58,7 @@ def test_eight_devices_give_what_one_gives_bit_by_bit(tmp_path):
 
 @pytest.fixture(scope="module")
 def cart():
-    """A cart in three guides, of which two are enough as long as they are parallel, and a bob on it."""
+    """A cart in three guides, two of which are enough if they are parallel, and a bob on it."""
     return udk.Mechanism(
         {"cart": udk.Body(1.0, 0.5), "bob": udk.Body(1.0, 0.1, (0.3, -1.0))},
         {
@@ -83,7 +83,7 @@ def test_rows_that_become_independent_count_again(cart):
 
 
 def test_members_that_drift_are_asked_for_their_own_redundant_rows(cart):
-    """Before any of them runs: of three that are said to have drifted, the guides of one are not parallel."""
+    """The analysis comes before the runs: of three members reported to drift, one has guides that are not parallel."""
     plan = make_plan(cart, {"axis": udk.Axis([0.0, 0.3, 0.0], of="joint.c.axis")}, [0.0, 0.5])
     drifted = np.full(3, udk.Result.drift)
     (rows, which), *others = other_redundant_rows(group_run(plan, 0), np.arange(3), drifted).items()
@@ -105,7 +105,7 @@ def test_guesses_that_open_are_closed_and_what_cannot_be_is_data():
 
 @pytest.fixture(scope="module")
 def spread():
-    """Ten seconds of the paper's linkage over mass, length, initial angle and tolerance."""
+    """Ten seconds of the paper's linkage for various masses, lengths, initial angles and tolerances."""
     axes = {
         "mass": udk.Axis((0.5, 3.0), of="body.coupler.mass"),
         "length": udk.Axis((0.7, 1.3), of=lambda m, x: udk.with_length(m, LINKS, x)),
@@ -117,7 +117,7 @@ def spread():
 
 @pytest.mark.slow
 def test_a_sweep_takes_what_a_plain_batch_takes(spread):
-    """A sweep assembles each member, and so does the plain batch, which is given no states: in twice the time."""
+    """Both assemble each member, since the batch is given no states. The limit is twice the time."""
     group, members = group_run(spread, 0), members_to_compute(spread)[0]
     chunks = [Chunk(k, 0, members[at : at + 512], 1.0) for k, at in enumerate(range(0, len(members), 512))]
     numbers = group.own(members)
@@ -163,7 +163,7 @@ def test_mechanisms_with_other_bodies_states_and_formulations_beside_each_other(
 
 
 def test_methods_gains_tolerances_and_thresholds_are_one_program(compilations):
-    """Five pseudoinverses, by a number of one program, with all other varied numbers: each member equals a separate run."""
+    """Five pseudoinverses in one program, with all other numbers varied as well: each member equals a separate run."""
     linkage, ts = udk.library.parallelogram(), np.linspace(0.0, 0.5, 3)
     methods = [udk.SVD(1e-3), udk.Varga(1e-3), udk.Greville(1e-3), udk.Householder(1e-3), udk.GramSchmidt(1e-3)]
     axes = {

@@ -1,4 +1,4 @@
-"""Certificates: exact roots are held, and what is no root, a double root, or too near to one is not proven."""
+"""Certificates: exact roots are proven; points that are not roots, double roots, or points too near to one are not."""
 
 import operator
 from fractions import Fraction
@@ -12,7 +12,7 @@ from udkjax.synthesis.complete.five_poses import find_real_dyads
 
 
 def circle_and_line(level):
-    """x^2 + y^2 = 1 and y = level, by Ball."""
+    """The equations x^2 + y^2 = 1 and y = level, in ball arithmetic."""
 
     def system(u):
         x, y = u.part(0), u.part(1)
@@ -46,7 +46,7 @@ def test_two_roots_close_together_are_told_apart_or_not_proven():
 
 
 def test_balls_hold_exact_results():
-    """Random sums, products and quotients of exact fractions lie in the balls that are computed from rounded ones."""
+    """Random sums, products and quotients of exact fractions lie in the balls computed from rounded ones."""
     rng = np.random.default_rng(0)
     for _ in range(200):
         numbers = [Fraction(int(n), int(d)) for n, d in zip(rng.integers(-999, 999, 4), rng.integers(1, 999, 4), strict=True)]
@@ -67,7 +67,7 @@ def test_balls_hold_exact_results():
 
 @pytest.mark.parametrize("operate", [operator.mul, operator.add, operator.sub, operator.truediv])
 def test_balls_of_exact_numbers_hold_results_that_are_rounded(operate):
-    """Radii of exact inputs are zero: what the result's radius holds is the rounding of this operation."""
+    """Exact inputs have radius zero, and the result's radius covers the rounding of this operation."""
     numbers = [(0.1, 0.1), (0.1, 0.3e-7), (1 / 3, 0.7), (1e5, 0.1)]
     off = []
     for a, b in numbers:
@@ -82,7 +82,7 @@ def test_dividing_by_what_may_be_zero_says_nothing():
 
 
 def test_dyads_of_random_circles_are_found():
-    """A joint goes around a pivot by five angles while the link turns by five others: that dyad is one of those found."""
+    """A joint turns about a pivot by five angles while the link turns by five others. That dyad is among those found."""
     rng = np.random.default_rng(1)
     for _ in range(40):
         pivot, joint = rng.normal(size=2) @ [1, 1j], rng.normal(size=2) @ [1, 1j]

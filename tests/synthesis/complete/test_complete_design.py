@@ -1,4 +1,4 @@
-"""All four-bars through nine places, or five poses: published counts, known mechanisms, identities, and what is refused."""
+"""All four-bars through nine points or five poses: published counts, known mechanisms, identities, and refused input."""
 
 import json
 from pathlib import Path
@@ -26,7 +26,7 @@ def places_of(frame, crank, coupler, rocker, point, angles):
 
 
 def crank_error(places, a, A, B, b):
-    """By how much the crank b B changes its length at most, where the coupler goes through places and a A keeps its own."""
+    """The largest change of the length of crank b B as the coupler goes through the places with a A of constant length."""
     x, y, worst = A - places[0], B - places[0], 0.0
     for place in places[1:]:
         # |place + t x - a| = |A - a|: t x (place - a)* has a known real part; of both roots one keeps the other crank, too.
@@ -64,7 +64,7 @@ def test_limits_leave_out_what_is_beyond_them(published):
 
 @pytest.mark.slow
 def test_other_ends_are_listed():
-    """Of places that repeat in one coordinate some solutions meet, and others go to infinity: each is counted and listed."""
+    """If places share a coordinate, some solutions coincide and others go to infinity. Each is counted and listed."""
     y = [1, 2, -1, 0.5, 3, 0.5, -1, 2, 1]
     found = udk.design_all(FOUR_BAR, udk.PathGoal("P", np.stack([np.arange(9.0) - 4.0, y], 1)))
     kinds = [other.kind for other in found.others]
@@ -75,13 +75,13 @@ def test_other_ends_are_listed():
 
 
 def test_places_whose_solutions_are_far_away_have_all_of_them():
-    """One class of these places has a pivot 1e8 units away, and is no solution at infinity."""
+    """One class of solutions for these places has a pivot 1e8 units away, and is not at infinity."""
     found = udk.design_all(FOUR_BAR, udk.PathGoal("P", np.random.default_rng(1028).normal(size=(9, 2))))
     assert found.paths == {"tracked": 1442, "regular": 1442} and not found.others
 
 
 def test_pins_hold_their_links_in_all_positions(published):
-    """Each four-bar, its coupler turned by the angle that keeps one crank as long as it was, keeps the other one as well."""
+    """If the coupler of a four-bar turns so that one crank keeps its length, the other one keeps its length as well."""
     pivot, joint, other, traced, end = ([1, 1j] @ published.pins[f"pin.{name}"].T for name in "OABPC")
     places = np.array(DATA["points"]) @ [1, 1j]
     for k in range(0, len(published), 7):
@@ -103,7 +103,7 @@ def test_motions_confirm_what_has_no_defect(published):
 
 
 def test_circuits_are_those_that_motions_meet(published):
-    """Of cranks that turn: a whole turn from the first position meets exactly the places of its circuit."""
+    """For cranks that turn, a whole turn from the first position passes exactly the places of its circuit."""
     places = np.array(DATA["points"])
     for k in np.flatnonzero(published.turns)[::30]:
         one = published[int(k)]
@@ -119,7 +119,7 @@ def test_circuits_are_those_that_motions_meet(published):
 
 
 def test_a_known_mechanism_is_among_those_found():
-    """Random four-bars, turned, moved and scaled: of cranks that turn the nine places are in order, with no defect."""
+    """Random four-bars, turned, moved and scaled. If the crank turns, the nine places are in order, without defects."""
     rng = np.random.default_rng(3)
     angles = np.sort(rng.uniform(0, 2 * np.pi, 9))
     A, B, P, _ = places_of(4.0, 1.0, 3.5, 3.0, 2.0 + 1.5j, angles)
