@@ -120,7 +120,7 @@ def test_a_number_that_is_held_between_samples(same):
         (udk.Held([1.0], "fast"), "value.dt: must be a number"),  # pyright: ignore[reportArgumentType]
         (udk.Held([], 0.1), "value.values: needs at least 1"),
         (udk.Held([1.0, np.nan], 0.1), r"value.values\[1\]: must be finite"),
-        (udk.Held([[1.0, 2.0]], 0.1), "value.values: each sample must be a number, has the shape"),
+        (udk.Held([[1.0, 2.0]], 0.1), "value.values: each sample must be a number, but has the shape"),
     ],
 )
 def test_wrong_samples_are_refused(value, said):

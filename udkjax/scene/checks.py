@@ -206,7 +206,7 @@ def _check_held(path: str, dims: Sequence[str], value: Any) -> Iterator[str]:
     yield from problems
     if not problems and (shape := np.shape(table["values"])[1:]) != tuple(map(int, dims)):  # pyright: ignore[reportArgumentType]
         sample = f"{' x '.join(dims)} numbers" if dims else "a number"
-        yield f"{path}.values: each sample must be {sample}, has the shape {shape}"
+        yield f"{path}.values: each sample must be {sample}, but has the shape {shape}"
 
 
 def find_class(path: str, choices: Mapping[str, type], table: TomlTable) -> tuple[type | None, str]:

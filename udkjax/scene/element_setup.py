@@ -121,7 +121,7 @@ def constants_of(cls: type) -> tuple[str, ...]:
 
 
 def _made(cls: type) -> Iterator[dataclasses.Field]:
-    """Iterate over the fields of a class that are leaves, but no arguments of its constructor."""
+    """Iterate over the fields of a class that are leaves, but not arguments of its constructor."""
     yield from (field for field in dataclasses.fields(cls) if not field.init and not field.metadata.get("static"))
 
 

@@ -164,7 +164,7 @@ def _fit(
     if shape is not None and (len(index) > len(shape) or any(i >= n for i, n in zip(index, shape, strict=False))):
         return None, f"{given}: {name} has the shape {shape}"
     if shape is not None and new.shape != shape[len(index) :]:
-        return None, f"{given}: must have the shape {shape[len(index) :]}, has {new.shape}"
+        return None, f"{given}: must have the shape {shape[len(index) :]}, not {new.shape}"
     return (new if old is None or not index else old.at[index].set(new)), ""
 
 

@@ -249,7 +249,7 @@ class DesignProblem:
         threads: int | None = None,
         worth: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     ) -> TrialResiduals:
-        """Evaluate residuals and limits of trials; positions are closed from those of the trial.
+        """Evaluate residuals and limits of trials. Closing of positions starts from the positions stored in the trials.
 
         `worth` selects trials by residuals and limits of lengths before their turns are computed; the others are marked as not
         existing.

@@ -79,7 +79,7 @@ def test_a_latin_hypercube_has_one_member_in_each_part():
         ({"body.lnik1.mass": [1.0]}, {}, 'is neither a parameter of the mechanism nor a setting; did you mean "body.link1.mass"'),
         ({"rtool": [1.0]}, {}, 'did you mean "rtol"'),
         ({"body.link1.mass": [1.0, -1.0]}, {}, "mass: must be > 0, not -1.0"),
-        ({"gravity": [1.0, 2.0]}, {}, "gravity: must have the shape (2,), has ()"),
+        ({"gravity": [1.0, 2.0]}, {}, "gravity: must have the shape (2,), not ()"),
         ({"rtol": [1e-4, np.nan]}, {}, "must be finite numbers"),
         ({"rtol": []}, {}, "needs at least one value"),
         ({"alpha": [1.0]}, {"stabilization": None}, "alpha belongs to stabilization=Baumgarte()"),

@@ -239,8 +239,8 @@ def _apply_at_fixed_time(
         found: the run.
         j: the index of the event in the run.
         state: the state before the event.
-        shift: the change d of the time of the event before.
-        again: whether no time has passed since the event before.
+        shift: the change d of the time of the previous event.
+        again: whether no time has passed since the previous event.
 
     Returns:
         The state after the event at the fixed time, the change d of the event's time, and time and states at the event.

@@ -41,7 +41,7 @@ class EventRun(NamedTuple):
     event_v: Float[Any, "*m K 2 n"]
     event_index: Int[Any, "*m K"]  # index of the event; plus E if a contact opens, plus 2 E if it comes to rest
     event_phase: Int[Any, "*m K"]  # phase after the event
-    together: Bool[Any, "*m K"]  # whether it is simultaneous with the event before, as one event
+    together: Bool[Any, "*m K"]  # whether it is simultaneous with the previous event, as one event
     closed: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
     sides: Float[Any, "*m K S"]  # the sides of comparisons after the event
     count: Int[Any, "*m"]

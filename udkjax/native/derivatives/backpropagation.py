@@ -7,8 +7,8 @@ step before it, and through the sums
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
-of the stages of this step, the last first, to the point before. The stages are evaluated again with the intermediate results that
-derivatives need; the transposed programs are those of expressions/differential.py.
+of the stages of this step, the last first, to the previous point. The stages are evaluated again with the intermediate results
+that derivatives need; the transposed programs are those of expressions/differential.py.
 
 Members in lanes are backpropagated together; the next ones are loaded when all are complete.
 """

@@ -3,7 +3,7 @@
 from udkjax.native.base.elementary.parts import INFINITY, NAN, copy_sign, upper_half
 from udkjax.native.base.ir import Function, Value
 
-# A division by a multiple 2^k y leaves a smaller remainder of the division by y, whose quotient may have more than 53 digits.
+# The quotient x / y may have more than 53 digits. The remainder of x / (2^k y) is smaller, and has the same remainder as x.
 DIGITS = 50
 
 
