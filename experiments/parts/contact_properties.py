@@ -100,7 +100,7 @@ class _RoundGap(eqx.Module):
 
 
 def _wheels(rng: np.random.Generator) -> Throw:
-    """Two wheels into a wedge: conditions of one's own, four of walls, one of the wheels."""
+    """Two wheels into a wedge: user-defined conditions, four for the walls and one for the wheels."""
     length, mass, speed = _size(rng)
     radii = length * rng.uniform(0.2, 0.4, 2)
     places = length * np.array([[rng.uniform(-0.2, 0.2), 1.5], [rng.uniform(-0.2, 0.2), 3.0]])
