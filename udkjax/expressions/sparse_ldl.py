@@ -52,7 +52,7 @@ def factorize(
         graph: The graph of its entries.
         matrix: Its rows by column, of which the lower triangle is used.
         order: The order of elimination.
-        invert: From the index of a row, its pivot and its entry on the diagonal to the reciprocal of the pivot.
+        invert: Returns the reciprocal of a pivot, given the index of its row, the pivot, and the diagonal entry of the row.
 
     Returns:
         The factors.

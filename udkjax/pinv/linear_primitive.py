@@ -22,7 +22,7 @@ def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Ca
     Args:
         name: The name in printed JAX programs.
         apply: (operator, vector) -> vector.
-        shape: The same for the types of arrays: returns the type of the result.
+        shape: Returns the type of the result from the types of the operator and the vector.
         derivative: The forward-mode rule.
         transpose: The reverse-mode rule for the vector.
 

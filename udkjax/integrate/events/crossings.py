@@ -94,5 +94,5 @@ def cubic_root(cubic: Cubic, side: Array) -> Array:
         low = low + width * jnp.sum(cubic_value(cubic, x) * side > 0, axis=0)
     middle = low + width / 2
     slope = cubic_slope(cubic, middle)
-    step = cubic_value(cubic, middle) / jnp.where(slope == 0, 1.0, slope)  # Newton's: the part is so short that one is enough
+    step = cubic_value(cubic, middle) / jnp.where(slope == 0, 1.0, slope)  # one Newton step is enough for so short a part
     return jnp.clip(middle - step, low, low + width)

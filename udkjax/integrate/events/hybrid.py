@@ -40,7 +40,7 @@ class Hybrid(eqx.Module):
     phases: Phases
     events: tuple[Event, ...]
     ts: Float[Array, "T"]  # output times (s)
-    sides: Float[Array, "S"]  # of comparisons in forces, at the start
+    sides: Float[Array, "S"]  # sides of the comparisons in forces, at the start
     q: Float[Array, "n"]  # initial positions
     v: Float[Array, "n"]  # initial velocities
     code: Int[Array, ""]  # a `Result` that is known before the run

@@ -33,7 +33,7 @@ LINEAR_PART = 0.3
 LEAST_GROWTH, MOST_GROWTH = 1.3, 30.0  # ratio of successive parts
 MOST_PARTS = 30  # at the least growth, these reach two thousand times the first part
 HUBER_LIMIT = 4.0  # residuals of parts above this, in standard deviations, are weighted by Huber's loss
-LOST_RATIO = 3.0  # growth of the root mean square of residuals from which a larger part has led to another minimum
+LOST_RATIO = 3.0  # if the root mean square of residuals grows by more, a larger part has led to another minimum
 SAME_BEGINNING_DISTANCE = 0.02  # fits of the first part whose unknowns differ by less lead to the same fit of the whole
 LEAST_USED_NOISE = 1e-4  # least noise, relative to a channel's scale; otherwise an incomplete model would not fit
 
