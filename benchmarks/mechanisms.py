@@ -81,7 +81,7 @@ def timed(run: Callable[[], Any], least: float = 0.05) -> Callable[[], float]:
 
 
 def positions(smoke: bool) -> list[dict[str, Any]]:
-    """Measure closed positions a second and core: of a batch of four-bars with other grounds, and of one."""
+    """Measure closed positions per second and core: of a batch of four-bars with other grounds, and of one."""
     members, rounds = (16, 1) if smoke else (MEMBERS, ROUNDS)
     mech, values = linkage(), START + np.linspace(0.0, TURN, VALUES)
     grounds = jnp.linspace(0.95, 1.05, members)
@@ -111,7 +111,7 @@ def positions(smoke: bool) -> list[dict[str, Any]]:
     assert np.max(np.abs(np.sin((lone(given, values).q[:, :, 2, 2] - exact) / 2))) < TOLERANCE
     candidates = {
         "udkjax: PositionBatch": (lambda: lone(given, values, threads=1), members * VALUES),
-        "udkjax: PositionBatch, derivatives by all pins": (lambda: along(pins, values, threads=1), few * VALUES),
+        "udkjax: PositionBatch, derivatives with respect to all pins": (lambda: along(pins, values, threads=1), few * VALUES),
         "udkjax: q, q', q'' in a batch": (lambda: batch(grounds), members * VALUES),
         "udkjax: kinematics() in a batch": (lambda: whole(grounds), members * VALUES),
         "udkjax: and a derivative by a length": (lambda: moved(grounds), members * VALUES),
@@ -125,7 +125,7 @@ def positions(smoke: bool) -> list[dict[str, Any]]:
     if other is not None:
         rates["pylinkage, one"] = 1 / other
     for name, rate in rates.items():
-        print(f"{name:40} {rate:14,.0f} closed positions a second and core")
+        print(f"{name:40} {rate:14,.0f} closed positions per second and core")
     return [{"name": name, "per_second": rate} for name, rate in rates.items()]
 
 

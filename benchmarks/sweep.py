@@ -95,7 +95,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
         "identical": int(identical),
     }
     rate, share = row["per_second"], row["throughput"]
-    print(f"{count} members of {end:g} s: {rate:.0f} a second and core, {row['wall_s']:.1f} s in all on {thread_count()} cores")
+    print(f"{count} members of {end:g} s: {rate:.0f} per second and core, {row['wall_s']:.1f} s in all on {thread_count()} cores")
     print(f"by vmap alone {alone['per_second']:.0f}: {share:.2f} of that, {row['throughput_of_steps']:.2f} by steps")
     print(f"{row['gib']:.2f} GiB at most")
     print(f"killed with {len(kept)} chunks finished; resumed with {resumed['members']} members left; the same, bit by bit")

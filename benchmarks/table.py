@@ -73,19 +73,21 @@ def _claims() -> Iterable[Claim]:
         for target in (1e-6, 1e-8, 1e-10):
             at: dict[str, Any] = {"start": start, "target": target}
             against = _reciprocal(value("times_ours", name="C++", **at))
-            yield Claim(f"20 s, {motion}, error {target:.0e}: time, in times C++", "trajectory", 1.0, against)
+            yield Claim(f"20 s, {motion}, error {target:.0e}: time relative to C++", "trajectory", 1.0, against)
             against = _least("times_ours", scripts, **at)
-            yield Claim(f"20 s, {motion}, error {target:.0e}: a script's time, in times ours", "trajectory", 20.0, against, True)
+            yield Claim(
+                f"20 s, {motion}, error {target:.0e}: a script's time relative to ours", "trajectory", 20.0, against, True
+            )
     batch: dict[str, Any] = {"start": -45.0, "outputs": "end only"}
     for target, most in ((1e-6, 18_000.0), (1e-8, 11_000.0)):
         rate = value("per_second", name="udkjax", target=target, **batch)
-        yield Claim(f"batch, 10 s, hanging, error {target:.0e}: trajectories a second and core", "batch", most, rate, True)
+        yield Claim(f"batch, 10 s, hanging, error {target:.0e}: trajectories per second and core", "batch", most, rate, True)
     against = _least("times_ours", ("script",), target=1e-6, **batch)
-    yield Claim("batch, 10 s, hanging, error 1e-06: in times the script by vmap", "batch", 50.0, against, True)
-    yield Claim("batch on two cores, in times one", "batch", 1.9, value("speedup", name="two cores"), True)
+    yield Claim("batch, 10 s, hanging, error 1e-06: rate relative to the script by vmap", "batch", 50.0, against, True)
+    yield Claim("batch on two cores, rate relative to one core", "batch", 1.9, value("speedup", name="two cores"), True)
     yield Claim("batch: tracing and compiling, s", "batch", 8.0, value("compile_seconds", name="compiled", **batch))
     share = value("throughput", name="sweep")
-    yield Claim("sweep of 100,000: throughput of a core, beside the batch's", "sweep", 0.8, share, True)
+    yield Claim("sweep of 100,000: throughput of a core, relative to the batch's", "sweep", 0.8, share, True)
     yield Claim("sweep of 100,000: memory, GiB", "sweep", 2.0, value("gib", name="sweep"))
     grows = value("us", name="exponents, N-four-bar")
     yield Claim("N-four-bar, N = 10 to 1000: power of N of a right-hand side's time", "scaling", 1.05, grows)
@@ -93,9 +95,9 @@ def _claims() -> Iterable[Claim]:
     yield Claim("N-four-bar, N = 1000: until the first run, s", "scaling", 10.0, waits)
     for count in (1, 2, 4, 8):
         forward = value("times_run", name="udkjax", mode="forward", parameters=count)
-        yield Claim(f"gradient, {count} parameters, forward, in times the run", "gradients", 1.4 + 0.2 * count, forward)
+        yield Claim(f"gradient, {count} parameters, forward, time relative to the run", "gradients", 1.4 + 0.2 * count, forward)
     reverse = value("times_run", name="udkjax", mode="reverse", parameters=8)
-    yield Claim("gradient, 8 parameters, reverse, in times the run", "gradients", 4.0, reverse)
+    yield Claim("gradient, 8 parameters, reverse, time relative to the run", "gradients", 4.0, reverse)
     for case in IDENTIFIED:
         reached = value("reached", name=case, protocol="without noise")
         yield Claim(f"identified from within 50 %, {case}: share right to 1e-8", "identification", 0.95, reached, True)
@@ -103,10 +105,10 @@ def _claims() -> Iterable[Claim]:
         yield Claim(f"identified with 1 % noise, {case}: share within two errors", "identification", 0.93, covered, True)
     for name in ("udkjax: q, q', q'' in a batch", "udkjax: kinematics() in a batch"):
         rate = value("per_second", name=name)
-        yield Claim(f"{name}: closed positions of a four-bar a second and core", "mechanisms", 1e6, rate, True)
-    for name, least in (("udkjax: PositionBatch", 5e6), ("udkjax: PositionBatch, derivatives by all pins", 1e6)):
+        yield Claim(f"{name}: closed positions of a four-bar per second and core", "mechanisms", 1e6, rate, True)
+    for name, least in (("udkjax: PositionBatch", 5e6), ("udkjax: PositionBatch, derivatives with respect to all pins", 1e6)):
         rate = value("per_second", name=name)
-        yield Claim(f"{name}: closed positions of a four-bar a second and core", "mechanisms", least, rate, True)
+        yield Claim(f"{name}: closed positions of a four-bar per second and core", "mechanisms", least, rate, True)
     for name, target in STARTS.items():
         yield Claim(f"start: {name}, s", "startup", target, value("seconds", name=name))
     for name, target in WAITS.items():

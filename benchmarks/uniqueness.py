@@ -45,7 +45,7 @@ def hand_written(q: np.ndarray) -> np.ndarray:
 
 
 def share(u: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Return the length of each row of the left null space."""
+    """Return the norm of each row of a basis of the left null space."""
     return np.sqrt(np.sum(np.where((sigma <= TOL * sigma[..., :1])[..., None, :], u, 0.0) ** 2, axis=-1))
 
 

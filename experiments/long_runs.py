@@ -53,9 +53,9 @@ RUNGE_KUTTA = ("Dopri8", "Dopri5", "Tsit5", "Verner65")
 TOLERANCES = (1e-6, 1e-8, 1e-10)
 REFERENCE = Path(__file__).parents[1] / "tests" / "data" / "iftomm_A01_simple_pendulum.json"
 MAX_STEPS, EVERY = 2**23, 64  # each 64th step is looked at
-KEPT = 96  # of them, spread evenly over the logarithm of time, the file keeps
-SETTLED = 0.05  # of the span, from which on a law is fitted
-BUDGET_TOL, BUDGET_END = 1e-9, 20.0  # of the short run whose energy is taken apart; s
+KEPT = 96  # number of steps kept in the file, spread evenly over the logarithm of time
+SETTLED = 0.05  # fraction of the span after which a law is fitted
+BUDGET_TOL, BUDGET_END = 1e-9, 20.0  # tolerance and end (s) of the short run whose energy is split into its parts
 
 
 class Orbit(NamedTuple):

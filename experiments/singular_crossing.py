@@ -33,9 +33,9 @@ from udkjax.show.style import COLOURS
 
 GROUPS = {"+60 at rest": (60.0, 0.0), "+45 at rest": (45.0, 0.0), "in line at rest": (0.0, 0.0), "up, -1 rad/s": (90.0, -1.0)}
 SPREAD, MEMBERS, SEED = 5.0, 64, 0  # degrees; the first of each group is its centre
-THRESHOLDS = (1e-2, 1e-4, 1e-6)  # of the rank, relative to the largest singular value or what stands for it
+THRESHOLDS = (1e-2, 1e-4, 1e-6)  # thresholds of the rank, relative to the largest singular value or a substitute
 TOL, END, OUTPUTS, LOST = 1e-9, 20.0, 81, 0.1
-MAX_STEPS = 1_000  # two to three times what a run takes that crosses well
+MAX_STEPS = 1_000  # two to three times the number of steps of a run that crosses well
 DENSE = {"Varga": udk.Varga, "Householder": udk.Householder, "Gram-Schmidt": udk.GramSchmidt, "Greville": udk.Greville}
 STABILIZATIONS = {
     "projection": udk.Projection(),

@@ -194,7 +194,7 @@ def _range(values) -> str:
 
 
 def _printed(data) -> dict[str, list]:
-    """The paper's lines, each with our run, without and with stabilization."""
+    """Return the paper's lines, each with the run of this package, without and with stabilization."""
     pairs: dict[str, list] = {"without stabilization": [], "with it": []}
     for table in json.loads(data.attrs["published"]):
         rows = {row["method"]: Row(**row) for row in table["rows"]}

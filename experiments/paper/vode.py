@@ -19,7 +19,7 @@ from udkjax.scene import Mechanism
 
 NAME = "VODE"
 ACCEPTED = 10  # in VODE's counters: steps taken
-GIVE_UP = 20  # of the steps allowed for a run, the part that is allowed between two instants
+GIVE_UP = 20  # number of allowed steps per run, relative to the number between two instants
 CAUSES = {-1: Result.step_limit, -4: Result.step_too_small, -5: Result.step_too_small}  # work, error tests, corrector
 
 

@@ -128,7 +128,7 @@ THROWN: dict[str, Callable[[np.random.Generator], Throw]] = {
 
 
 def _size(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Draw a length and a mass; a speed belongs to them."""
+    """Draw a length and a mass; return them and the speed that belongs to the length."""
     length = 10 ** rng.uniform(-4, 2)
     return length, 10 ** rng.uniform(-3, 3), np.sqrt(9.81 * length)
 

@@ -147,7 +147,7 @@ class Programs:
         return found["a"], found["safe"][:, 0] > 0
 
     def impulse_response(self, q: np.ndarray, v: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """The change of the velocities that constraints leave of one."""
+        """Return the part of a change of the velocities that the constraints allow."""
         return self.run("tangent_part", q, v, change)["dv1"]
 
     def terms(self, q: np.ndarray, v: np.ndarray) -> list[dict[str, np.ndarray]]:

@@ -107,7 +107,7 @@ def test_the_command_writes_figures_table_and_page(tmp_path):
     assert 0 < seconds["python"] < seconds["import jax"]
     table = {row["claim"]: row for row in json.loads((tmp_path / "table.json").read_text())["figures"]}
     assert table["start: import udkjax and simulate, s"]["figure"] == seconds["import udkjax and simulate"]
-    assert table["batch, 10 s, hanging, error 1e-06: trajectories a second and core"]["holds"] is False
+    assert table["batch, 10 s, hanging, error 1e-06: trajectories per second and core"]["holds"] is False
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "Not measured here: right_hand_side, methods, integrators, trajectory" in page
 

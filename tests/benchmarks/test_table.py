@@ -29,14 +29,14 @@ FIGURES = {
 def test_claims_are_judged():
     judged = {row["claim"]: row for row in table.judge(FIGURES)}
     assert len(judged) == len(table.CLAIMS)
-    against = judged["20 s, hanging, error 1e-06: time, in times C++"]
+    against = judged["20 s, hanging, error 1e-06: time relative to C++"]
     assert (against["figure"], against["holds"], against["target"]) == (0.5, True, "≤ 1")
-    script = judged["20 s, hanging, error 1e-06: a script's time, in times ours"]
+    script = judged["20 s, hanging, error 1e-06: a script's time relative to ours"]
     assert (script["figure"], script["holds"], script["target"]) == (10.0, False, "≥ 20")
-    never = judged["20 s, crossing, error 1e-08: a script's time, in times ours"]
+    never = judged["20 s, crossing, error 1e-08: a script's time relative to ours"]
     assert (never["figure"], never["holds"]) == (float("inf"), True)  # it does not get there at all
-    assert judged["20 s, crossing, error 1e-06: time, in times C++"]["holds"] is None
-    assert judged["gradient, 2 parameters, forward, in times the run"]["figure"] is None
+    assert judged["20 s, crossing, error 1e-06: time relative to C++"]["holds"] is None
+    assert judged["gradient, 2 parameters, forward, time relative to the run"]["figure"] is None
     assert all(row["holds"] is None for row in judged.values() if row["benchmark"] not in FIGURES)
 
 

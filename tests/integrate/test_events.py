@@ -218,7 +218,7 @@ def test_pendulums_of_a_batch_have_events_of_their_own():
     assert np.array_equal(again.events.time, np.asarray(all_of_them.events.time)[chosen], equal_nan=True)
     for k in chosen[:3]:
         assert np.isinf(all_of_them.events.time[k, counts[k] :]).all()
-    # Those that turn over do so where energy and an elliptic integral say.
+    # Energy and an elliptic integral determine where members turn over.
     fast = np.flatnonzero(codes == udk.Result.event_stop)
     assert np.abs(all_of_them.events.q_before[fast, counts[fast] - 1, 0, 2] - 1.0).max() < 1e-11
 

@@ -82,7 +82,7 @@ def evaluated():
 
 @pytest.mark.parametrize("scene", ["slider_crank", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
 def test_accelerations_energies_and_efforts_are_those_of_the_textbook(evaluated, scene):
-    if scene == "door_closer":  # springs with dampers, a friction and a torque
+    if scene == "door_closer":  # springs with dampers, friction and a torque
         mechanism = udk.Mechanism(
             {"door": udk.Body(mass=20.0, inertia=4.0, position=(0.4, 0.0), angular_velocity=0.3)},
             {"hinge": udk.Revolute(bodies=("ground", "door"), points=((0.0, 0.0), (-0.4, 0.0)))},

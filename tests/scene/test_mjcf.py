@@ -193,7 +193,7 @@ def is_there_and_back(mech, q, v):
     for name, joint in mech.joints.items():
         one, two = (each.residual(0.0, *(frames[body] for body in each.frame_names)) for each in (joint, found.joints[name]))
         assert_allclose(np.abs(one), np.abs(two), atol=1e-13, err_msg=name)  # signs follow the order of bodies
-    # And without joints, which may hold what a force would move.
+    # Accelerations also agree without joints, which could prevent what a force would cause.
     for one, other in ((mech, found), [udk.Mechanism(m.bodies, {}, {}, m.forces, m.gravity) for m in (mech, found)]):
         a = np.asarray(udk.accelerations(one, 0.0, q, v, method=udk.SVD()))
         b = np.asarray(udk.accelerations(other, 0.0, q[order], v[order], method=udk.SVD()))

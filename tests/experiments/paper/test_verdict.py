@@ -15,7 +15,7 @@ def grown(rate: float, seed: float = 1e-12) -> np.ndarray:
     [
         (grown(0.5), 20.0, True, "correct"),
         (grown(1.5), 20.0, True, "correct up to 15.35 s"),  # log(1e10) / 1.5 = 15.351
-        (grown(1.5), 15.36, False, "fails at 15.36 s"),  # before an instant at which it would have been seen to be lost
+        (grown(1.5), 15.36, False, "fails at 15.36 s"),  # it ends before the instant at which the loss would be noticed
         (grown(1.5), 18.017, False, "correct up to 15.35 s, fails at 18.02 s"),
         (np.where(TS <= 9.1, grown(0.5), np.nan), 9.13, False, "fails at 9.13 s"),
         (np.where(TS == 12.0, np.nan, grown(0.5)), 20.0, True, "correct up to 11.95 s"),
