@@ -45,7 +45,7 @@ class Compiled:
         return time.perf_counter() - start
 
     def cpu_seconds(self, *arguments: Any, at_least: float = 0.02) -> float:
-        """CPU time of a run, as `cpu_seconds` takes it."""
+        """Return the CPU time (s) of a run, measured by the function `cpu_seconds`."""
         return cpu_seconds(lambda: self(*arguments), at_least)
 
 

@@ -1,4 +1,4 @@
-"""Drift by gains: by equal steps, as residuals of least squares in the logarithms of alpha and beta, and by controlled ones."""
+"""Drift as a function of the gains: with equal steps, as residuals of a least-squares fit, and with controlled steps."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -235,7 +235,7 @@ def test_the_error_of_an_operation_is_that_of_the_program(card):
     assert "cuMemcpyHtoDAsync_v2" not in card.names and card.names[-1] == "cuCtxPopCurrent_v2"
 
 
-FAILING = {  # the number of the call that fails, and the last function that is called before the words of the error
+FAILING = {  # which call of a function fails, and the last function called before the error is reported
     "cuStreamGetCtx": (1, "cuStreamGetCtx"),
     "cuCtxPushCurrent_v2": (1, "cuCtxPushCurrent_v2"),
     "cuMemcpyDtoHAsync_v2": (1, "cuCtxPopCurrent_v2"),

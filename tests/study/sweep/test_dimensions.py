@@ -1,4 +1,4 @@
-"""Axes become dimensions. Every mistake is named, with a suggestion how to correct it."""
+"""Axes become dimensions. Every mistake is named, with a suggested correction."""
 
 from itertools import pairwise
 
