@@ -26,7 +26,7 @@ def test_it_is_one_program(name, compilations):
     udk.analyse(MECH)
     other = MECH.with_parameters({"body.rod.mass": 3.0})
     udk.analyse(other)
-    given = [jnp.asarray(x, float) for x in arguments(name)]  # JAX has compiled the conversion of numbers to arrays
+    given = [jnp.asarray(x, float) for x in arguments(name)]  # JAX compiles this conversion
     assert len(compilations(lambda: function(MECH, *given))) <= 1  # none where another test has called it
     assert not compilations(lambda: function(other, *arguments(name, 0.2)))  # numbers are not part of it
     plain = jax.jit(lambda *state: PLAIN[name](MECH, *state))(*given)

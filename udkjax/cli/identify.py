@@ -54,7 +54,7 @@ def identify(
     """Identify parameters of a scene from measured motion: values, standard errors, and parameters that are undetermined.
 
     Columns of the data are `time` and channels, such as `body.crank.angle [deg]`, `body.rod(0.5, 0).x [mm]`, `joint.A.fx` or
-    `driver.motor.load`. Empty cells are gaps. Each file is a separate run, or several, named by a column `record`.
+    `driver.motor.load`. Empty cells are gaps. Each file is a separate run, or several runs, named by a column `record`.
 
     The folder gets the scene with the identified values (identified.toml), the results (estimate.json, estimate.csv), the
     measurements and predictions (fit.nc), and pictures. The exit code is 1 if the fit does not converge or the measurements do

@@ -8,7 +8,7 @@ const INSTANTS = 401;
 const PULLS = 12;  // closures per frame, each nearer to the pointer
 const LONGEST_PULL = 0.08;  // characteristic lengths per closure, so that the pull cannot jump to another branch
 const STILL = 1e-9;  // characteristic lengths, or rad: a smaller motion is rounding
-const NEAR = 1e-4;  // characteristic lengths: the pointer is reached
+const NEAR = 1e-4;  // characteristic lengths: at this distance the pointer counts as reached
 
 /** Motions p -> t + R p of the ground frame that bring bodies from the frames `drawn` (x, y, angle) to the frames `q`. */
 export function motionsOf(q, drawn, order) {
