@@ -23,6 +23,7 @@ from udkjax.integrate.events.host_run import concrete_plan, event_arrays
 from udkjax.integrate.events.impacts import contact_rows, rows_of_directions
 from udkjax.integrate.events.phase_code import PhaseCode
 from udkjax.integrate.events.phases import phases_of
+from udkjax.integrate.events.runs import RunState
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.projection import Projection
 from udkjax.pinv import SVD
@@ -130,7 +131,7 @@ def phase_codes(mechanism, events):
         arrays = event_arrays(plan, listed, phases, problems, np.zeros(()), np.asarray(1e-6), np)
     numbers, inverse_mass, rest, codes = arrays[5], arrays[7], arrays[9:], []
     for of_phase in plan.phases:
-        codes.append(PhaseCode(of_phase, rest[: of_phase.count], numbers, inverse_mass, 3, []))
+        codes.append(PhaseCode(of_phase, phases.switches, rest[: of_phase.count], numbers, inverse_mass, 3, []))
         rest = rest[of_phase.count :]
     return codes, inverse_mass
 
@@ -143,7 +144,7 @@ def test_machine_code_knows_of_states_what_the_textbook_does():
     start = udk.assemble(mechanism)
     moved = udk.simulate(mechanism, [0.0, 0.3, 0.7, 1.1], start)
     t, q, v = np.array([0.3, 0.7, 1.1]), np.asarray(moved.q)[1:].reshape(3, -1), np.asarray(moved.v)[1:].reshape(3, -1)
-    found = code.at(np.arange(3), t, q, v)
+    found = code.at(np.arange(3), RunState(t, q, v, np.zeros((3, 1), bool), []))
     textbook = prepare(mechanism, SVD(), None, analyse(mechanism))
 
     def conditions(t, q, v):

@@ -62,7 +62,7 @@ from udkjax.equations.redundancy import kinematic_rows as kinematic_rows
 from udkjax.equations.run_programs import RunPrograms as RunPrograms
 from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales
-from udkjax.equations.scales import concrete_scales as concrete_scales
+from udkjax.equations.scales import scales_of as scales_of
 from udkjax.equations.scales import scales_p as scales_p
 from udkjax.equations.scene_programs import scene_programs as scene_programs
 from udkjax.equations.sparse_rows import SparseRows as SparseRows

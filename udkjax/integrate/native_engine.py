@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.formulations import FormulatedSystem
+from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -209,19 +210,29 @@ def _concrete_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
     return inputs._replace(numbers=[numbers_as_vector(inputs.numbers)])
 
 
-def mark_rows(compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp) -> Any:
-    """Return a mark for each row of Psi, 1 if it is independent near a state; None if the compiled code contains the marks."""
+def marking(mechanism: Mechanism) -> MarkRows:
+    """Return the operation that marks the independent rows of a mechanism, without samples or at a given time."""
+    return MarkRows(scene_programs(mechanism, None, policy=RankPolicy.FALL_BACK))
+
+
+def mark_rows(
+    compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp, among: Any = None
+) -> Any:
+    """Return a mark for each row of Psi, 1 if it is independent near a state; None if the compiled code contains the marks.
+
+    `among` is a mask of the rows that may be independent, by default all.
+    """
     if not compiled.plan.marks_rows:
         return None
     equations = compiled.textbook
     mechanism = equations.mechanism.at(t)
-    operation = MarkRows(equations.programs_of_rows)
+    operation = MarkRows(equations.programs_of_rows) if among is None else marking(mechanism)
     tol = equations.scales.rank_tol
     settings = {"length": 1.0 if length is None else length, "omega": rate}
-    numbers = [*mechanism.numbers, tol**2, 0.0]
+    numbers = [*mechanism.numbers, *([] if among is None else [xp.asarray(among, float)]), tol**2, 0.0]
     inputs = operation.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)
     results = call_concrete(operation, inputs, 2) if xp is np else native_p.bind(*inputs, operation=operation, times=2)
-    return results[0][0]
+    return results[0][0] if among is None else results[0][0] * among
 
 
 def _output(results: Sequence[Any]) -> IntegratorOutput:

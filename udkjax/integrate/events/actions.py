@@ -18,7 +18,6 @@ from udkjax.requirements import describe
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Angle, Joint, fill
 from udkjax.scene.mechanism import Mechanism
-from udkjax.wording import quote
 
 
 class Action(PrintsLine):
@@ -122,7 +121,7 @@ class Impact(Action):
 
 
 class Release(Action):
-    """Remove a joint or driver for the rest of the run: one of the scene, or a joint that `Attach` or `Lock` has added.
+    """Remove a joint or driver, and the friction in it: one of the scene, or a joint that `Attach` or `Lock` has added.
 
     Args:
         name: name of the joint or driver.
@@ -139,9 +138,11 @@ class Release(Action):
 
 
 class Attach(Action):
-    """Add a joint for the rest of the run. Numbers that default to the initial guess are taken from the state at the event.
+    """Add a joint. Numbers that default to the initial guess are taken from the state at the event.
 
-    Velocities jump as in an inelastic impact: the smallest change in the metric of M that the new constraints allow.
+    It replaces a joint of its name that events have added before. The name may be that of a joint of the scene which an event
+    releases: the added joint then takes its place. Velocities jump as in an inelastic impact: the smallest change in the metric
+    of M that the new constraints allow.
 
     Args:
         joint: such as `Revolute(...)`.
@@ -159,8 +160,6 @@ class Attach(Action):
     def check(self, mechanism, where):
         require_name_text(f"{where}: the name of Attach", self.name)
         require_joint(f"{where}: the joint of Attach", self.joint)
-        if self.name in mechanism.constraints:
-            raise ValueError(f"{where}: {quote(self.name)} is in the scene already; attach the joint under another name")
         for body in self.joint.bodies:
             require_name(body, [*mechanism.body_names, GROUND], where, "body")
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.expressions import Graph, ScalarProgram, read_jaxpr
 from udkjax.integrate.events.condition_program import input_array
 from udkjax.integrate.events.conditions import frames_of
-from udkjax.integrate.events.phases import Phases
+from udkjax.integrate.events.phases import SCENE, Phases
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -35,7 +35,7 @@ def joint_numbers(phases: Phases) -> list[Array]:
 
 def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
     """Return the joints that events add."""
-    names, joints = phases.mechanisms[0].body_names, []
+    names, joints = phases.mechanisms[SCENE].body_names, []
     for (event, _), joint in zip(phases.added_by, phases.added, strict=True):
         arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten(arrays)
@@ -53,12 +53,9 @@ def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
 
 
 def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Return the places of the numbers of joints among all numbers of a mechanism; empty for joints that the mechanism lacks."""
+    """Return the places of the numbers of switched joints among all numbers of a mechanism, without those that switch them."""
     result = []
     for name in names:
-        if name not in mechanism.joint_names:
-            result.append(())
-            continue
         k = mechanism.joint_names.index(name)
         sizes = jax.tree.map(lambda x: NumberOf(np.size(x)), mechanism._joints[k])
         marked = eqx.tree_at(lambda m, k=k: m._joints[k], mechanism, sizes)
@@ -66,7 +63,7 @@ def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[
         counts = [x.size if isinstance(x, NumberOf) else np.size(x) for x in leaves]
         starts = np.cumsum([0, *counts])
         of_joint = [range(a, a + x.size) for a, x in zip(starts, leaves, strict=False) if isinstance(x, NumberOf)]
-        result.append(tuple(int(i) for places in of_joint for i in places))
+        result.append(tuple(int(i) for places in of_joint[:-1] for i in places))  # `active` is the last field
     return tuple(result)
 
 

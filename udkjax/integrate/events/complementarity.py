@@ -55,12 +55,23 @@ def solve_complementarity(
     Returns:
         x and y, with derivatives for the final passive set.
     """
-    size = xp.sqrt(xp.where(allowed, diagonal(W, xp), 1.0))
-    scaled, rhs = W / size[..., None, :] / size[..., :, None], b / size
+    size, scaled, rhs = _unit_rows(W, b, allowed, xp)
     given = scaled, rhs, allowed, floor / size
     passive = _passive_set(*(given if xp is np else stop_gradients(given)), xp)
     x = _solve_passive(scaled, rhs, passive, xp) / size
     return Complementary(x, times(W, x) + b, passive)
+
+
+def solve_rows(W: Float[Any, "*m E E"], b: Float[Any, "*m E"], rows: Bool[Any, "*m E"], xp: ModuleType) -> Float[Any, "*m E"]:
+    """Return x with W x + b = 0 in the given independent rows, and x = 0 elsewhere."""
+    size, scaled, rhs = _unit_rows(W, b, rows, xp)
+    return _solve_passive(scaled, rhs, rows, xp) / size
+
+
+def _unit_rows(W: Any, b: Any, rows: Any, xp: ModuleType) -> tuple[Any, Any, Any]:
+    """Return the sizes of the given rows, and W and b with rows of unit size."""
+    size = xp.sqrt(xp.where(rows, diagonal(W, xp), 1.0))
+    return size, W / size[..., None, :] / size[..., :, None], b / size
 
 
 def diagonal(W: Any, xp: ModuleType) -> Any:

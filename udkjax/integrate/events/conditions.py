@@ -1,7 +1,9 @@
 """Conditions of events: frames, the coordinate of a joint, the gap of a contact."""
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -43,7 +45,19 @@ class JointCoordinate(eqx.Module):
         return one.vector((jnp.cos(self.axis), jnp.sin(self.axis))).dot(between(self.points, one, two))
 
 
-class WithinLimit(eqx.Module):
+class BodyCondition(eqx.Module):
+    """A condition that sees the frames of its `bodies` alone."""
+
+    @abstractmethod
+    def of_bodies(self, names: tuple[str, ...]) -> Self:
+        """Return the condition of bodies with other names."""
+
+    @abstractmethod
+    def __call__(self, t: Number, frames: Frames) -> Number:
+        """Return the value of the condition."""
+
+
+class WithinLimit(BodyCondition):
     """The condition of a joint limit: the distance of the joint from its limit."""
 
     coordinate: JointCoordinate
@@ -54,17 +68,23 @@ class WithinLimit(eqx.Module):
     def bodies(self) -> tuple[str, ...]:
         return self.coordinate.bodies
 
+    def of_bodies(self, names):
+        return WithinLimit(replace(self.coordinate, bodies=names), self.limit, self.sign)
+
     def __call__(self, t: Number, frames: Frames) -> Number:
         return self.sign * (self.coordinate.of(*(frames[name] for name in self.bodies)) - self.limit)
 
 
-class Gap(eqx.Module):
+class Gap(BodyCondition):
     """The condition of a contact: the distance of a point from a line (m)."""
 
     bodies: tuple[str, ...] = eqx.field(static=True)
     point: Float[Array, "2"]
     through: Float[Array, "2"]
     normal: Float[Array, "2"]
+
+    def of_bodies(self, names):
+        return replace(self, bodies=names)
 
     def __call__(self, t: Number, frames: Frames) -> Number:
         one, two = (frames[name] for name in self.bodies)

@@ -1,4 +1,4 @@
-"""The part of runs with events that does not depend on numbers: tables of the phases, and kinds of the events."""
+"""The part of runs with events that does not depend on numbers: what they do to the phases, and kinds of the events."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from udkjax.integrate.events.actions import Action
 from udkjax.integrate.events.conditions import sees_velocity
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import MOST_KINKS
-from udkjax.integrate.events.phases import Phases, Tables
+from udkjax.integrate.events.phases import Phases, Switches
 
 
 @dataclass(frozen=True)
 class EventPlan:
     """The part of a run's events and phases that does not depend on numbers; runs with equal plans share their code."""
 
-    tables: Tables
+    switches: Switches
     directions: tuple[int, ...]  # for each event
     by_velocity: tuple[bool, ...]  # whether its condition depends on velocities
     actions: tuple[type[Action], ...]
@@ -94,34 +94,52 @@ class EventPlan:
         """Mask of the impacts that end the run where they come to rest."""
         return np.array([x == "stop" for x in self.at_rest])
 
-    @cached_property
-    def held(self) -> Bool[np.ndarray, "phases E"]:
-        """Mask of the contacts at rest in each phase."""
-        return np.array(self.tables.held) >= 0
+    # Phases are masks of the switches (*m, C).
 
     @cached_property
-    def after(self) -> Int[np.ndarray, "phases E"]:
-        """The phase that follows an event."""
-        return np.array(self.tables.after)
+    def first(self) -> Bool[np.ndarray, "C"]:
+        """The phase in which runs begin."""
+        return np.array(self.switches.first, bool)
 
     @cached_property
-    def free(self) -> Int[np.ndarray, "phases"]:
-        """The phase that follows when all contacts at rest open."""
-        free = np.arange(len(self.tables.held))
-        for k in np.flatnonzero(self.impacts):
-            free = np.array(self.tables.freed)[free, k]
-        return free
+    def _changes(self) -> Bool[np.ndarray, "2 E C"]:
+        """The switches that an event turns off, and those that it turns on."""
+        return np.array([self.switches.removed, self.switches.added], bool).reshape(2, self.count, len(self.first))
 
-    def with_contacts(self, phase: Int[Any, "*m"], held: Bool[Any, "*m E"], xp: ModuleType) -> Int[Any, "*m"]:
+    @cached_property
+    def _contacts(self) -> Bool[np.ndarray, "E C"]:
+        """The switch of each contact that may be held."""
+        return np.array(self.switches.contacts, int)[:, None] == np.arange(len(self.first))
+
+    @cached_property
+    def has_only_contacts(self) -> bool:
+        """True if all switches are those of contacts."""
+        return bool(self._contacts.any(axis=0).all())
+
+    def is_first(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m"]:
+        """Return whether a phase is that in which runs begin."""
+        return (phase == self.first).all(axis=-1)
+
+    def held(self, phase: Bool[Any, "*m C"], xp: ModuleType) -> Bool[Any, "*m E"]:
+        """Return a mask of the contacts at rest in a phase."""
+        return xp.any(phase[..., None, :] & self._contacts, axis=-1)
+
+    def after(self, phase: Bool[Any, "*m C"], k: Int[Any, "*m"], xp: ModuleType) -> Bool[Any, "*m C"]:
+        """Return the phase that follows event k."""
+        off, on = xp.asarray(self._changes)[:, k]
+        return (phase & ~off) | on
+
+    def free(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m C"]:
+        """Return the phase that follows when all contacts at rest open."""
+        return phase & ~self._contacts.any(axis=0)
+
+    def with_contacts(self, phase: Bool[Any, "*m C"], held: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m C"]:
         """Return the phase that follows when contacts come to rest."""
-        resting = xp.asarray(np.array(self.tables.resting))
-        for k in np.flatnonzero(self.held_at_rest):
-            phase = xp.where(held[..., k], resting[phase, k], phase)
-        return phase
+        return phase | xp.any(held[..., None] & self._contacts, axis=-2)
 
-    def watched(self, phase: Int[Any, "*m"], carried: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m 2E"]:
+    def watched(self, phase: Bool[Any, "*m C"], carried: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m 2E"]:
         """Return a mask of the conditions, and of the contact forces, that count."""
-        held = xp.asarray(self.held)[phase]
+        held = self.held(phase, xp)
         return xp.concatenate([~held & ~carried, held], axis=-1)
 
 
@@ -135,7 +153,7 @@ def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_even
         max_events: the largest number of events.
     """
     return EventPlan(
-        tables=phases.tables,
+        switches=phases.switches,
         directions=tuple(e.direction for e in events),
         by_velocity=tuple(sees_velocity(e.condition, phases.mechanisms[0]) for e in events),
         actions=tuple(type(e.action) for e in events),

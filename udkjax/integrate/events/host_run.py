@@ -24,7 +24,7 @@ from udkjax.integrate.events.kinks import FREE, places_of_kinks
 from udkjax.integrate.events.loop import run_loop
 from udkjax.integrate.events.machine_system import MachinePlan, MachineSystem, MemberUnits
 from udkjax.integrate.events.phase_code import PhaseCode, phase_arrays, phase_plan
-from udkjax.integrate.events.phases import Phases
+from udkjax.integrate.events.phases import SCENE, Phases
 from udkjax.integrate.events.plain_system import run_plain
 from udkjax.integrate.events.runs import EventRun, RunState, results, runs_before, shapes_of_run
 from udkjax.integrate.problem import Problem
@@ -75,9 +75,9 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
         *(x[None] for x in arrays),
     ]
     run = EventRun(*(x[0] for x in call_host(HostRun(plan, len(hybrid.ts), len(hybrid.q), plain), stop_gradients(inputs))))
-    integers = ("event_index", "event_phase", "closed", "count", "code", "totals")
+    integers, masks = ("event_index", "closed", "count", "code", "totals"), ("event_phase", "together", "undefined")
     run = run._replace(**{name: getattr(run, name).astype(int) for name in integers})
-    return run._replace(together=run.together > 0.5, undefined=run.undefined > 0.5)
+    return run._replace(**{name: getattr(run, name) > 0.5 for name in masks})
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,10 @@ class HostRun:
         shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED])
         ts, q, v, code, units, _, restitution, inverse_mass, of_joints = shared
         for phase in plan.phases:
-            phases.append(PhaseCode(phase, further[: phase.count], numbers, inverse_mass, B, joints))
+            phases.append(PhaseCode(phase, plan.events.switches, further[: phase.count], numbers, inverse_mass, B, joints))
             further = further[phase.count :]
         system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), restitution, inverse_mass, of_joints, numbers)
-        state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.zeros(B, int), joints)
+        state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.tile(plan.events.first, (B, 1)), joints)
         joints[-1][:] = system.first_sides(state)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))
         unresolved = np.where(plan.events.kinks, system.lost_kinks[:, None], np.inf)
@@ -135,21 +135,18 @@ def machine_plan(
         plan: the events and phases.
         phases: the phases.
         events: all events.
-        compiled: the mechanism of each phase.
+        compiled: the mechanisms of the phases.
         conditions: conditions of all events.
     """
-    impacts, added = [int(k) for k in np.flatnonzero(plan.impacts)], [name for _, name in phases.added_by]
+    impacts = [int(k) for k in np.flatnonzero(plan.impacts)]
     of_kinks = places_of_kinks(events, phases.held)
-    plans = [
-        phase_plan(m, conditions, held, impacts, added, phases.held, of_kinks.sides)
-        for m, held in zip(compiled, phases.tables.held, strict=True)
-    ]
+    plans = [phase_plan(which, phases, m, conditions, impacts, of_kinks.sides) for which, m in enumerate(compiled)]
     return MachinePlan(plan, tuple(plans), added_joints(phases), tuple(zip(phases.held, of_kinks.elements, strict=True)))
 
 
 @cached_by_identity
 def concrete_plan(phases: Phases, conditions: Conditions, max_steps: int, max_events: int, *others: Any) -> MachinePlan:
-    """Return the plan from all events, then the compiled mechanism of each phase; their numbers are concrete."""
+    """Return the plan from all events, then the compiled mechanisms; their numbers are concrete."""
     count = len(others) - len(phases.mechanisms)
     plan = event_plan(phases, others[:count], max_steps, max_events)
     return machine_plan(plan, phases, others[:count], others[count:], conditions)
@@ -170,7 +167,7 @@ def event_arrays(
         plan: common part of all runs.
         events: all events.
         phases: the phases.
-        problems: the run in each phase.
+        problems: the run of each mechanism.
         code: the `Result` before the run.
         drift_tol: the violation of the constraints that ends the run.
         xp: jax.numpy, or NumPy.
@@ -193,10 +190,8 @@ def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
         xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in numbers), xp.zeros(0)])
         for numbers in (condition_numbers(events), joint_numbers(phases))
     )
-    return [
-        x[None]
-        for x in (of_conditions, _stack([e.action.rebound for e in events], xp), 1 / mass_of(phases.mechanisms[0], xp), of_joints)
-    ]
+    inverse_mass = 1 / mass_of(phases.mechanisms[SCENE], xp)
+    return [x[None] for x in (of_conditions, _stack([e.action.rebound for e in events], xp), inverse_mass, of_joints)]
 
 
 _concrete_numbers = cached_by_identity(_numbers)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.quantities import equations_of
@@ -23,7 +23,7 @@ from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import contact_rows
 from udkjax.integrate.events.kinks import renewed_sides, with_sides
-from udkjax.integrate.events.phases import Added, Phases
+from udkjax.integrate.events.phases import SCENE, SWITCHED, Added, Phases
 from udkjax.integrate.events.runs import RunState
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -55,7 +55,7 @@ class Hybrid(eqx.Module):
     baumgarte: Baumgarte | None
     formulation: Formulation | None
     plan: EventPlan = eqx.field(static=True)
-    plans: tuple[RunPlan, ...] = eqx.field(static=True)  # for each phase
+    plans: tuple[RunPlan, ...] = eqx.field(static=True)  # for each mechanism
 
     # --- events
 
@@ -67,7 +67,7 @@ class Hybrid(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the bodies."""
-        return self.phases.mechanisms[0].body_names
+        return self.phases.mechanisms[SCENE].body_names
 
     @property
     def projects(self) -> bool:
@@ -77,7 +77,7 @@ class Hybrid(eqx.Module):
     @property
     def scales(self) -> Scales:
         """The characteristic length, time and mass of the scene."""
-        return self.phases.analyses[0].scales
+        return self.phases.analyses[SCENE].scales
 
     @property
     def force(self) -> Float[Array, ""]:
@@ -88,14 +88,15 @@ class Hybrid(eqx.Module):
 
     def first_state(self) -> RunState:
         """Return the state in which the run begins."""
-        return RunState(self.ts[0], self.q, self.v, jnp.array(0), (*self.phases.first_added(), self.sides))
+        return RunState(self.ts[0], self.q, self.v, jnp.array(self.plan.first), (*self.phases.first_added(), self.sides))
 
-    def problem(self, phase: int, ts: Float[Array, "T"], start: RunState) -> Problem:
-        """Return the problem to integrate from a state, in a phase given as a Python int."""
-        _, q, v, _, added = start
-        mechanism, analysis = self.phases.with_added(phase, added), self.phases.analyses[phase]
+    def problem(self, which: int, ts: Float[Array, "T"], start: RunState) -> Problem:
+        """Return the problem to integrate from a state, of the mechanism `which`."""
+        _, q, v, phase, added = start
+        mechanism, analysis = self.phases.mechanism(which, phase, added), self.phases.analyses[which]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
-        compiled = CompiledMechanism(equations, mechanism.breakpoints, self.plans[phase])
+        compiled = CompiledMechanism(equations, mechanism.breakpoints, self.plans[which])
+        may_be_independent = self.plan.switches.independent(phase, jnp) if which == SWITCHED else None
         return Problem(
             compiled=compiled,
             ts=ts,
@@ -109,24 +110,24 @@ class Hybrid(eqx.Module):
             rate=self.rate,
             max_steps=self.plan.max_steps,
             drift_tol=self.drift_tol,
-            marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate),
+            marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate, among=may_be_independent),
         )
 
     def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
         """Integrate from a state over the times `ts`, which begin with the time of the state."""
 
-        def of_phase(phase: int, ts: Array, state: RunState) -> IntegratorOutput:
-            problem = self.problem(phase, ts, state)
+        def of_mechanism(which: int, ts: Array, state: RunState) -> IntegratorOutput:
+            problem = self.problem(which, ts, state)
             if derivatives:  # the run is known to continue, whatever its drift
                 return differentiable(replace(problem, drift_tol=jnp.inf))
-            if not self.plans[phase].is_native:
+            if not self.plans[which].is_native:
                 return differentiable(problem)
             return native_engine.integrate(problem)
 
-        return self.in_phase(state.phase, of_phase, ts, state)
+        return self.in_phase(state.phase, of_mechanism, ts, state)
 
-    def in_phase(self, phase: Int[Array, ""], function: Callable[..., T], *arguments: object, is_free: bool = False) -> T:
-        """Return `function(phase, *arguments)`, with the phase as a Python int for each branch.
+    def in_phase(self, phase: Bool[Array, "C"], function: Callable[..., T], *arguments: object, is_free: bool = False) -> T:
+        """Return `function(which, *arguments)`, with the mechanism of a phase, SCENE or SWITCHED, as `which`.
 
         Args:
             phase: the phase.
@@ -134,16 +135,15 @@ class Hybrid(eqx.Module):
             *arguments: its arrays.
             is_free: whether the phase is known to have no contact at rest.
         """
-        held = self.phases.tables.held
-        candidates = [k for k, rows in enumerate(held) if not is_free or max(rows) < 0]
-        if len(candidates) == 1:
-            return function(candidates[0], *arguments)
-        branches = [lambda *x, k=k: function(k, *x) for k in candidates]
-        return jax.lax.switch(jnp.searchsorted(np.array(candidates), phase), branches, *arguments)
+        if len(self.phases.mechanisms) == 1 or (is_free and self.plan.has_only_contacts):
+            return function(SCENE, *arguments)
+        branches = [lambda *x, which=which: function(which, *x) for which in (SWITCHED, SCENE)]
+        return jax.lax.switch(self.plan.is_first(phase).astype(int), branches, *arguments)
 
-    def textbook(self, phase: int, added: Added) -> TextbookEquations:
-        """Return the equations of a phase, solved by SVD."""
-        return prepare(self.phases.with_added(phase, added), SVD(), self.baumgarte, self.phases.analyses[phase])
+    def textbook(self, which: int, at: RunState) -> TextbookEquations:
+        """Return the equations of a phase, of the mechanism `which`, solved by SVD."""
+        mechanism = self.phases.mechanism(which, at.phase, at.joints)
+        return prepare(mechanism, SVD(), self.baumgarte, self.phases.analyses[which])
 
     # --- conditions
 
@@ -161,20 +161,20 @@ class Hybrid(eqx.Module):
         """Return the sides after event k at a state."""
         factor, shift = (jnp.asarray(x)[k] for x in self.plan.side_changes)
         sides = at.joints[-1] * factor + shift
-        return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[0]._forces, at.t, at.q, at.v, sides))
+        return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[SCENE]._forces, at.t, at.q, at.v, sides))
 
     def values(self, at: RunState, is_free: bool = False) -> StateValues:
         """Return conditions and their derivatives in a state; with `is_free` (no contact at rest) also directions of impulses."""
-        t, q, v, phase, added = at
+        t, q, v, _, added = at
         conditions = self.conditions(added)
         by_t, by_q, by_v = jax.jacfwd(conditions, (0, 1, 2))(t, q, v)
 
-        def of_phase(p: int, t: Array, q: Array, v: Array, normals: Array, added: Added) -> tuple[Array, Array]:
-            equations = self.textbook(p, added)
+        def of_mechanism(which: int, normals: Array, at: RunState) -> tuple[Array, Array]:
+            (t, q, v, *_), equations = at, self.textbook(which, at)
             directions = contact_rows(equations, t, q, normals).directions if is_free else jnp.zeros_like(normals)
             return equations.accelerations(t, q, v), directions
 
-        a, directions = self.in_phase(phase, of_phase, t, q, v, by_q, added, is_free=is_free)
+        a, directions = self.in_phase(at.phase, of_mechanism, by_q, at, is_free=is_free)
         g, rate = rate_along(conditions, t, q, v, a)
         rates = lambda t, q, v: self.conditions_and_rates(added)(t, q, v)[1]  # noqa: E731
         rate_2 = jnp.where(np.array(self.plan.by_velocity), 0.0, rate_along(rates, t, q, v, a)[1])
@@ -186,7 +186,8 @@ class Hybrid(eqx.Module):
         conditions = self.conditions(added)
 
         def accelerations(t: Array, q: Array, v: Array) -> Array:
-            return self.in_phase(phase, lambda p, *x: self.textbook(p, added).accelerations(*x), t, q, v)
+            state = at._replace(t=t, q=q, v=v)
+            return self.in_phase(phase, lambda which, x: self.textbook(which, x).accelerations(*x[:3]), state)
 
         def rates(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
             a = accelerations(t, q, v)
@@ -196,15 +197,15 @@ class Hybrid(eqx.Module):
 
     def forces(self, at: RunState) -> Float[Array, "E"]:
         """Return the contact forces in a state, minus the multipliers of the contacts at rest; 1 for all other events."""
-        t, q, v, phase, added = at
+        rows, ones = np.array(self.plan.switches.rows, int), jnp.ones(self.count)
 
-        def of_phase(p: int, t: Array, q: Array, v: Array, added: Added) -> Array:
-            held, ones = np.array(self.phases.tables.held[p]), jnp.ones(self.count)
-            if not np.any(held >= 0):
+        def of_mechanism(which: int, at: RunState) -> Array:
+            if which == SCENE or not np.any(rows >= 0):
                 return ones
-            return jnp.where(held >= 0, -self.textbook(p, added).multipliers(t, q, v)[np.maximum(held, 0)], ones)
+            forces = -self.textbook(which, at).multipliers(*at[:3])[np.maximum(rows, 0)]
+            return jnp.where(self.plan.held(at.phase, jnp), forces, ones)
 
-        return self.in_phase(phase, of_phase, t, q, v, added)
+        return self.in_phase(at.phase, of_mechanism, at)
 
 
 def rate_along(f: Condition, t: Array, q: Array, v: Array, a: Array) -> tuple[Float[Array, "k"], Float[Array, "k"]]:

@@ -38,7 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.textbook import TextbookEquations
-from udkjax.integrate.events.complementarity import diagonal, solve_complementarity, times
+from udkjax.integrate.events.complementarity import diagonal, solve_complementarity, solve_rows, times
 from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2, ConditionValues
 from udkjax.transforms.gradients import stop_gradients
 
@@ -53,8 +53,8 @@ CLOSED = STILL = 1e-9
 # Bound on the squared sine of the angle between the row of a contact and those of held contacts: below it, they hold this
 # contact, too. A dependent row has a sine of about CLOSED over the distance of the contacts, here down to a thousandth of L.
 CARRIED = (1e3 * CLOSED) ** 2
-# Speed of impact, relative to a condition's scale per T: a pressed contact that is slower is at rest. Its rebound would rise by
-# 1e-10 of that scale, a hundredth of the accuracy at usual tolerances.
+# Speed before or after an impact, relative to a condition's scale per T: a pressed contact that is slower is at rest. Its rebound
+# would rise by 1e-10 of that scale, a hundredth of the accuracy at usual tolerances.
 REST = 1e-5
 # Bound on W_ij, relative to |u_i| |u_j|: below it, contacts i and j do not act on one another, and each has its own event. This
 # ratio is a cosine, with rounding errors of 1e-15 times the condition number of the constraints, up to a thousand.
@@ -214,22 +214,27 @@ def hit_contacts(
     impact = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
     v = v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
 
-    # No derivatives from here on: the set of held contacts is discrete.
-    rows, rate, impact = stop((rows, rate, impact))
-    fastest = _largest(rate, closed > OPEN, xp)
-    stays = (closed > OPEN) & rows.free & (impact.rate <= xp.maximum(floor, STILL * fastest))
-    # If a slow, pressed contact that has fallen to zero rises, it rises by rounding.
-    stays = stays | ((np.arange(rate.shape[-1]) == k[..., None]) & (closed == SLOW) & (rate > 0))
+    # The set of held contacts is discrete, and has no derivatives.
+    W, of_rest, fixed_rate = stop(rows.W), impact.rate, stop(rate)
+    fastest = _largest(fixed_rate, closed > OPEN, xp)
+    still = xp.maximum(floor, STILL * fastest)
+    slow = xp.maximum(still, REST * scale * system)
+    stays = (closed > OPEN) & rows.free & (stop(of_rest) <= slow)
     stays = stays & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
     is_held, ends, carried = xp.where(closed > OPEN, False, held), xp.zeros_like(stays), xp.zeros_like(stays)
     if xp is not np or stays.any():
         pull, pressed = second_rates(stop(v)), ZERO_RATE_2 * scale * system**2
-        solution = solve_complementarity(rows.W, pull, stays, pressed, xp)
+        solution = solve_complementarity(W, pull, stays, pressed, xp)
         presses = solution.passive & (solution.x > 0)
+        # Pressed contacts that rise as slowly are at rest, too: feet that take turns would do so without end.
+        rises = xp.any(presses & (stop(of_rest) > still), axis=-1, keepdims=True)
+        if xp is not np or rises.any():
+            caught = solve_rows(rows.W, of_rest, presses & rises, xp)
+            v = v + (caught[..., None, :] @ rows.directions)[..., 0, :]
         is_held = xp.where(closed > OPEN, presses & contacts.hold, held)
         resting = stays & ~is_held & (xp.abs(solution.y) <= xp.maximum(pressed, STILL * _largest(pull, stays, xp)))
-        ends, carried = presses & contacts.stop, resting & _depends(rows.W, is_held, xp)
-    hits = (closed == TOUCHES) & ~held & (rate < -floor)
+        ends, carried = presses & contacts.stop, resting & _depends(W, is_held, xp)
+    hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
     return ContactChanges(v, closed, hits, is_held, ends, carried, impact.remaining)
 
 

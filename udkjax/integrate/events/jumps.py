@@ -49,13 +49,13 @@ def apply_event(
     t, q, v, phase, joints = before
     if plan.kinks.any():
         joints = system.with_sides(members, joints, system.turned(members, k, before))
-    after = xp.where(releases, phase, xp.asarray(plan.after)[phase, e])
+    after = xp.where(releases[:, None], phase, plan.after(phase, e, xp))
     blocked, adds = xp.zeros_like(releases), ~releases & xp.asarray(plan.adds)[e]
     if plan.adds.any() and (xp is not np or adds.any()):
         joints = system.add_joints(members, xp.where(adds, e, -1), q, joints)
         # The new velocities satisfy the phase without its contacts at rest, since these contacts may open.
         q1, _ = system.project(members, RunState(t, q, v, after, joints))
-        _, v1 = system.project(members, RunState(t, q1, v, xp.asarray(plan.free)[after], joints), is_free=True)
+        _, v1 = system.project(members, RunState(t, q1, v, plan.free(after), joints), is_free=True)
         moved = xp.abs(q1 - q) / take(system.coordinates, members)
         moved = moved if xp is np else stop_gradients(moved)
         blocked = adds & (xp.max(moved, axis=-1) > ATTACHABLE)
@@ -64,7 +64,7 @@ def apply_event(
     if not plan.impacts.any() or (xp is np and not acts.any()):
         return JumpResult(state, None, blocked)
 
-    free, held = state._replace(phase=xp.asarray(plan.free)[after]), xp.asarray(plan.held)[phase]
+    free, held = state._replace(phase=plan.free(after)), plan.held(phase, xp)
     is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
     state_values = state_values if is_evaluated else system.look(members, free, is_free=True)
     rows = rows_of_directions(state_values.by_q, state_values.directions, take(system.inverse_mass, members))

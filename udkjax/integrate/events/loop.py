@@ -46,7 +46,8 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     after = xp.where(known, xp.sign(values.h).astype(int), sides[:, :E])
     code = xp.where(take(runs.totals, members)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
     unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
-    if xp is not np or unknown.any():
+    hits = (event >= 0) & (event < E) & xp.asarray(plan.impacts)[event % E]
+    if xp is not np or (unknown | hits).any():
         begins, falling = event == BEGIN, plan.impacts | plan.kinks
         is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
         # Contacts are approached from the allowed side: an impact whose condition is zero at the start and falls happens at once.
@@ -54,10 +55,13 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
         watched = plan.watched(state.phase, carried, xp)[:, :E]
         watched = watched & ~((event == AGAIN)[:, None] & _settled(system, runs, members))
         crossing = first_crossing(plan.both_directions[:E], watched, before, now, xp)
+        # A condition that an impact turns back at zero has reached zero before: its event comes first.
+        others = first_crossing(plan.both_directions[:E], watched & is_zero & ~plan.impacts, before, now, xp)
+        crossing = xp.where(others != NO_EVENT, others, crossing)
         after = xp.where(begins[:, None], before, after)
         beyond = begins & xp.any(plan.impacts & (values.h < 0) & ~is_zero, -1)
         code = xp.where(beyond, Result.beyond_contact, xp.where(begins, Result.successful, code))
-        event = xp.where(unknown, crossing, event)
+        event = xp.where(unknown, crossing, xp.where(hits & (others != NO_EVENT), others, event))
     goes_on = (event >= 0) | ~ends
     code = xp.where(goes_on | (code != Result.step_limit), code, Result.successful)
     code = xp.where(xp.any(undefined, -1), Result.undefined_condition, code)
@@ -112,7 +116,7 @@ def _jump(
     k, before = take(runs.event, members), runs.state(members)
     sides, carried = take(runs.sides, members), take(runs.carried, members)
     releases, e = k >= E, k % E
-    held, acts = xp.asarray(plan.held)[before.phase], releases | xp.asarray(plan.changes)[e]
+    held, acts = plan.held(before.phase, xp), releases | xp.asarray(plan.changes)[e]
     after, contacts, blocked = apply_event(system, members, k, before, values, state_values)
     code = xp.where(xp.asarray(plan.stops)[e] & ~releases, Result.event_stop, Result.successful)
     is_current = np.arange(2 * E) == e[:, None]
@@ -129,7 +133,9 @@ def _jump(
         noted = xp.concatenate([first, xp.zeros_like(first) + np.arange(3 * E)], axis=1)
         carried = xp.where(closed > OPEN, contacts.carried, carried)
         code = xp.where(xp.any(contacts.ends, -1), Result.at_rest, code)
-        sides = xp.where(xp.concatenate([closed, closed], axis=1) > OPEN, 1, sides)
+        turned_back = ~plan.impacts & (xp.abs(values.h) <= ZERO * values.scale) & xp.any(closed > OPEN, -1)[:, None]
+        is_closed = xp.concatenate([closed, closed], axis=1) > OPEN
+        sides = xp.where(is_closed, 1, xp.where(xp.concatenate([turned_back, xp.zeros_like(turned_back)], axis=1), 0, sides))
     code = xp.where(blocked, Result.event_impossible, code)
 
     count = take(runs.count, members)
@@ -166,7 +172,7 @@ def _jump(
         members,
         q=q,
         v=v,
-        phase=xp.where(stays[:, 0], before.phase, after.phase),
+        phase=xp.where(stays, before.phase, after.phase),
         event=xp.where(follows, AGAIN, NO_EVENT),
         sides=sides,
         carried=carried,

@@ -4,7 +4,7 @@ Members whose conditions vary too quickly for machine code, or are NaN, are `unr
 runs them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.kinks import FREE, HeldElement
 from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
+from udkjax.integrate.events.phases import SCENE, SWITCHED
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.outcome import failure
@@ -51,7 +52,7 @@ class MachineSystem:
 
     Args:
         plan: common part of all runs.
-        phases: the machine code of each phase.
+        phases: the machine code of the phases of each mechanism.
         ts: output times (B, T).
         units: numbers of each member.
         restitution: of all events (B, E).
@@ -82,7 +83,8 @@ class MachineSystem:
         self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
         self.coordinates = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
         E = self.plan.count
-        self._watched = [np.append(np.arange(E), E + np.flatnonzero(held)) for held in self.plan.held]
+        contacts = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
+        self._watched = [np.append(np.arange(E), E + contacts[: x.contact_count]) for x in plan.phases]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
     def contacts(self, members: MemberIndices) -> Contacts:
@@ -104,15 +106,19 @@ class MachineSystem:
         self, members: MemberIndices, at: RunState, function: Callable[..., Sequence[np.ndarray]]
     ) -> Sequence[np.ndarray]:
         indices, results = self._all if members is None else members, []
-        for phase in set(at.phase.tolist()):
-            of_phase = at.phase == phase
-            if of_phase.all():
-                return function(self._phases[phase], indices, *at[:3])
-            values = function(self._phases[phase], indices[of_phase], *(x[of_phase] for x in at[:3]))
+        for which, here in self._mechanisms(at.phase):
+            if here.all():
+                return function(self._phases[which], indices, at)
+            values = function(self._phases[which], indices[here], at.where(here))
             results = results or [np.empty((len(indices), *x.shape[1:])) for x in values]
             for array, x in zip(results, values, strict=True):
-                array[of_phase] = x
+                array[here] = x
         return results
+
+    def _mechanisms(self, phase: Bool[np.ndarray, "b C"]) -> Iterator[tuple[int, Bool[np.ndarray, "b"]]]:
+        """Iterate over the mechanisms of phases, each with a mask of its phases."""
+        is_first = self.plan.is_first(phase)
+        yield from ((which, here) for which, here in ((SCENE, is_first), (SWITCHED, ~is_first)) if here.any())
 
     def add_joints(self, members: MemberIndices, event: Int[np.ndarray, "b"], q: np.ndarray, joints: Any) -> Any:
         """Return the numbers of the joints that events have added, with those that `event` adds at q; -1: no event."""
@@ -174,14 +180,13 @@ class MachineSystem:
         return runs
 
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-        """Take members to their next crossings, or to their ends, by one call of machine code for each phase."""
+        """Take members to their next crossings, or to their ends, by one call of machine code for each mechanism."""
         indices = self._all if members is None else members
-        phases = runs.phase[indices]
-        for phase in set(phases.tolist()):
-            self._run_phase(runs, phase, indices[phases == phase])
+        for which, here in self._mechanisms(runs.phase[indices]):
+            self._run_mechanism(runs, which, indices[here])
         return runs
 
-    def _run_phase(self, runs: MemberRuns, phase: int, members: Int[np.ndarray, "b"]):
+    def _run_mechanism(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"]):
         ts, start, tol = self.ts[members], runs.t[members], self._units.drift_tol[members, None]
         # The state after an event may itself be a requested output. Machine code writes the later outputs, up to the first
         # infinite time, and then the end.
@@ -193,7 +198,7 @@ class MachineSystem:
         times = np.empty((count, output.shape[1] + 2))
         times[:, 0], times[:, -1] = start, ts[:, -1]
         times[:, 1:-1] = np.where(output < T - 1, ts[np.arange(count)[:, None], np.minimum(output, T - 1)], np.inf)
-        stretch = self._phases[phase].run(members, times, runs.q[members], runs.v[members], self._watch(runs, phase, members))
+        stretch = self._phases[which].run(members, times, runs.state(members), self._watch(runs, which, members))
         status, counts = stretch.info[:, STATUS], stretch.info[:, COUNTS].astype(int)
         rows = (np.arange(times.shape[1]) <= stretch.info[:, WRITTEN, None]) & (times <= stretch.t[:, None])
         rows[:, -1] = status == Status.DONE
@@ -205,9 +210,9 @@ class MachineSystem:
             places = members[b], output[b, k]
             runs.qs[places], runs.vs[places] = stretch.q[b, k + 1], stretch.v[b, k + 1]
         runs.totals[members, :3] += counts
-        if self._is_projected[phase]:
+        if self._is_projected[which]:
             runs.totals[members, 3] += counts[:, 0] + 2 * (rows.sum(1) - 1)
-        known, watched = ((status == Status.CROSSED) | (status == Status.DONE)) & ~drifts, self._watched[phase]
+        known, watched = ((status == Status.CROSSED) | (status == Status.DONE)) & ~drifts, self._watched[which]
         event = np.where(stretch.event >= 0, watched[stretch.event.astype(int)], NO_EVENT)
         runs.put(members, t=stretch.t, q=stretch.q_end, v=stretch.v_end, event=event, running=known)
         if known.all():
@@ -243,9 +248,9 @@ class MachineSystem:
         runs.code[members[fails]] = code[fails]
         runs.t[members[fails]], runs.q[members[fails]], runs.v[members[fails]] = last
 
-    def _watch(self, runs: MemberRuns, phase: int, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b K"]:
+    def _watch(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b K"]:
         """Return the input that describes watched conditions: room for numbers, sides, masks, tolerances, directions."""
-        where, E, watch = self._watched[phase], self.plan.count, self._watches[phase][members]
+        where, E, watch = self._watched[which], self.plan.count, self._watches[which][members]
         room, C = watch.shape[1] - 1 - 4 * len(where), len(where)
         watch[:, room : room + C] = runs.sides[members[:, None], where]
         watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, where]

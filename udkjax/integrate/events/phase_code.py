@@ -8,14 +8,16 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import places_of_joints
-from udkjax.integrate.events.kinks import HeldElement, places_of_sides
+from udkjax.integrate.events.kinks import places_of_sides
+from udkjax.integrate.events.phases import SWITCHED, Phases, Switches
+from udkjax.integrate.events.runs import RunState
+from udkjax.integrate.events.switched import places_of_switches
 from udkjax.integrate.events.system import StateValues
-from udkjax.integrate.native_engine import run_inputs
+from udkjax.integrate.native_engine import marking, run_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.primitive import call_members
@@ -28,58 +30,61 @@ PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a pha
 
 
 class PhasePlan(NamedTuple):
-    """The operations of a phase; hashable."""
+    """The operations of the phases of one mechanism; hashable."""
 
     run: RunWatched
     states: EvaluateEvents
     marking: MarkRows | None  # marks independent rows; None if this is not needed
     projected: bool
     project: StateOperation | None  # projects to the joints that events add; None without any
-    # For each such joint the places of its numbers, empty if the phase lacks it; then those of the sides of comparisons.
-    joints: tuple[tuple[int, ...], ...]
+    joints: tuple[tuple[int, ...], ...]  # places of the numbers of each such joint, then of the sides of comparisons
+    active: tuple[tuple[int, int], ...]  # places of the numbers that switch constraints on, each with the index of the switch
     sides_of_events: tuple[tuple[int, int], ...]  # places of sides among the numbers of events, with the index of the side
 
     @property
+    def contact_count(self) -> int:
+        """The number of contacts whose forces are watched."""
+        return 0 if self.run.conditions is None else len(self.run.conditions.rows)
+
+    @property
     def count(self) -> int:
-        """The number of arrays of the phase."""
+        """The number of arrays of the phases."""
         return len(PARTS) + bool(self.run.sampled)
 
 
 def phase_plan(
+    which: int,
+    phases: Phases,
     compiled: CompiledMechanism,
     conditions: Conditions,
-    held: Sequence[int],
     impacts: Sequence[int],
-    added: Sequence[str],
-    forces: Sequence[HeldElement],
     of_kinks: tuple[tuple[int, int], ...],
 ) -> PhasePlan:
-    """Return the operations of a phase.
+    """Return the operations of the phases of the mechanism `which`, SCENE or SWITCHED.
 
     Args:
-        compiled: the mechanism of the phase.
+        which: the mechanism.
+        phases: all phases.
+        compiled: the mechanism, compiled.
         conditions: conditions of all events.
-        held: for each event the row of Psi that holds its contact; -1: none.
         impacts: the events that are impacts.
-        added: the names of joints that events add.
-        forces: the forces with held sides.
         of_kinks: the places of sides among the numbers of events, each with the index of its side.
     """
-    run = compiled.plan.operation
+    run, added, active = compiled.plan.operation, [name for _, name in phases.added_by], ()
     assert run is not None  # checked by the caller
-    rows = tuple(row for row in held if row >= 0)
-    states = run.accelerations.of_events(conditions, tuple(impacts))
-    marking = None
-    if run.code.marks_rows:
-        marking = MarkRows(scene_programs(compiled.textbook.mechanism.at(0.0)).with_all_rows)
-    project = run.accelerations.projection if added else None
-    joints = places_of_joints(compiled.textbook.mechanism, added)
-    if forces:
-        joints = (*joints, places_of_sides(compiled.samples.stand_in(compiled.textbook.mechanism), forces))
-    else:
-        joints = (*joints, ())
+    mechanism, joints, rows = compiled.samples.stand_in(compiled.textbook.mechanism), [()] * len(added), ()
+    if which == SWITCHED:
+        active = places_of_switches(mechanism, phases.switches.names)
+        joints, rows = places_of_joints(mechanism, added), tuple(row for row in phases.switches.rows if row >= 0)
     return PhasePlan(
-        run.watching(replace(conditions, rows=rows)), states, marking, compiled.plan.projected, project, joints, of_kinks
+        run=run.watching(replace(conditions, rows=rows)),
+        states=run.accelerations.of_events(conditions, tuple(impacts)),
+        marking=marking(compiled.textbook.mechanism.at(0.0)) if run.code.marks_rows else None,
+        projected=compiled.plan.projected,
+        project=run.accelerations.projection if added else None,
+        joints=(*joints, places_of_sides(mechanism, phases.held) if phases.held else ()),
+        active=active,
+        sides_of_events=of_kinks,
     )
 
 
@@ -113,10 +118,11 @@ class StretchEnd(NamedTuple):
 
 
 class PhaseCode:
-    """The machine code of a phase, with the numbers of all members of a batch.
+    """The machine code of the phases of one mechanism, with the numbers of all members of a batch.
 
     Args:
-        plan: the operations of the phase.
+        plan: the operations of the phases.
+        switches: the switches of the phases.
         arrays: arrays from `phase_arrays`, for one member or for all.
         event_numbers: the numbers of all events.
         inverse_mass: one over the mass of each coordinate.
@@ -127,6 +133,7 @@ class PhaseCode:
     def __init__(
         self,
         plan: PhasePlan,
+        switches: Switches,
         arrays: Sequence[np.ndarray],
         event_numbers: np.ndarray,
         inverse_mass: np.ndarray,
@@ -146,13 +153,16 @@ class PhaseCode:
         for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues`
             self._places.append((slice(start, start + math.prod(shape)), shape))
             start += math.prod(shape)
-        self._marks = np.full((members, plan.run.code.row_count), np.nan)
+        self._switches = switches
+        self._marks: dict[bytes, np.ndarray] = {}  # by the phase, of all members; NaN: not known yet
+        self._no_marks = np.full((members, plan.run.code.row_count), np.nan)
 
-    def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, q: np.ndarray, v: np.ndarray, watch: np.ndarray) -> StretchEnd:
+    def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray) -> StretchEnd:
         """Run members over times (b, T) to the first crossing; `watch` describes the conditions, with room for their numbers."""
+        _, q, v, *_ = state
         operation, conditions = self.plan.run, self.plan.run.conditions
         assert conditions is not None  # this code has conditions
-        numbers = self._with_marks(members, ts[:, 0], q, v)
+        numbers = self._with_marks(members, state)
         further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
         watch[:, : conditions.number_count] = _of(self._event_numbers, members)
         self._put_sides(watch, members)
@@ -163,11 +173,12 @@ class PhaseCode:
         q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
         return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end)
 
-    def at(self, members: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> StateValues:
+    def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:
         """Evaluate the conditions of members at states."""
+        t, q, v, *_ = state
         operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
         assert conditions is not None  # this code has conditions
-        numbers = self._with_marks(members, t, q, v)
+        numbers = self._with_marks(members, state)
         if self._samples:
             numbers = _spread(numbers, b).copy()
             row = np.sum(_of(self._breaks, members) <= t[:, None], axis=1)
@@ -185,14 +196,13 @@ class PhaseCode:
             directions[:, list(operation.impacts)] = results[:, self._places[-1][0].stop :].reshape(b, -1, n)
         return StateValues._make([*values, directions])
 
-    def project(
-        self, members: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and velocities of members, projected to the constraints of the phase."""
+    def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities of members, projected to the constraints of their phases."""
+        t, q, v, *_ = state
         operation, n = self.plan.project, q.shape[1]
         assert operation is not None  # events add joints
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
-        inputs = self._with_marks(members, t, q, v), np.stack([t, t], axis=1), q, v
+        inputs = self._with_marks(members, state), np.stack([t, t], axis=1), q, v
         (results,) = call_members(*inputs, *further, operation=operation, times=2)
         return results[:, :n], results[:, n:]
 
@@ -201,31 +211,45 @@ class PhaseCode:
         for place, side in self.plan.sides_of_events:
             numbers[:, place] = self._joints[-1][members, side]
 
-    def _numbers_of(self, members: Int[np.ndarray, "b"]) -> np.ndarray:
-        """Return the numbers of members, with those of the joints that events have added."""
+    def _numbers_of(self, members: Int[np.ndarray, "b"], phase: Bool[np.ndarray, "b C"]) -> np.ndarray:
+        """Return the numbers of members in their phases, with those of the joints that events have added."""
         numbers = _of(self._numbers, members)
-        if any(self.plan.joints):
+        if any(self.plan.joints) or self.plan.active:
             numbers = _spread(numbers, len(members)).copy()
             for places, joint in zip(self.plan.joints, self._joints, strict=True):
                 if places:
                     numbers[:, list(places)] = joint[members]
+            for place, k in self.plan.active:
+                numbers[:, place] = phase[:, k]
         return numbers
 
-    def _with_marks(self, members: Int[np.ndarray, "b"], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the numbers of members, with marks of independent rows, determined where each member enters the phase first."""
-        numbers, marking = self._numbers_of(members), self.plan.marking
-        if marking is None:
+    def _with_marks(self, members: Int[np.ndarray, "b"], state: RunState) -> np.ndarray:
+        """Return the numbers of members, with marks of independent rows, determined where each member enters its phase first."""
+        numbers, m = self._numbers_of(members, state.phase), self.plan.run.code.row_count
+        if self.plan.marking is None:
             return numbers
-        m = self.plan.run.code.row_count
-        if np.isnan(self._marks[members]).any():
-            scene_numbers = numbers[:, : marking.code.number_count - 2]
-            tol = _spread(_of(self._tol, members), len(numbers))
-            inputs = np.concatenate([scene_numbers, tol, np.zeros((len(numbers), 1))], axis=1), np.stack([t, t], axis=1), q, v
-            further = _of(self._settings, members)[:, self._of_marking], _of(self._rows, members), np.zeros((1, 0))
-            (self._marks[members],) = call_members(*inputs, *further, operation=marking, times=2)
         numbers = _spread(numbers, len(members)).copy()
-        numbers[:, -2 - m : -2] = self._marks[members]
+        for phase in np.unique(state.phase, axis=0):
+            marks, here = self._marks.setdefault(phase.tobytes(), self._no_marks.copy()), (state.phase == phase).all(axis=1)
+            unknown = here & np.isnan(marks[members]).any(axis=1)
+            if unknown.any():
+                found = self._mark(members[unknown], numbers[unknown], state.where(unknown))
+                marks[members[unknown]] = found
+            numbers[here, -2 - m : -2] = marks[members[here]]
         return numbers
+
+    def _mark(self, members: Int[np.ndarray, "b"], numbers: np.ndarray, state: RunState) -> np.ndarray:
+        """Return the marks of independent rows of members at their states."""
+        marking, (t, q, v, phase, _), m = self.plan.marking, state, self.plan.run.code.row_count
+        assert marking is not None  # checked by the caller
+        scene_numbers, tol = numbers[:, : marking.code.number_count - 2 - m], _spread(_of(self._tol, members), len(numbers))
+        among = np.ones((len(numbers), m))
+        if self.plan.active:
+            among = self._switches.independent(phase, np).astype(float)
+        inputs = np.concatenate([scene_numbers, among, tol, np.zeros((len(numbers), 1))], axis=1), np.stack([t, t], axis=1), q, v
+        further = _of(self._settings, members)[:, self._of_marking], _of(self._rows, members), np.zeros((1, 0))
+        (marks,) = call_members(*inputs, *further, operation=marking, times=2)
+        return marks * among
 
 
 def _of(x: np.ndarray, members: Int[np.ndarray, "b"]) -> np.ndarray:

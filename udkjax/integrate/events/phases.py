@@ -1,192 +1,214 @@
-"""Phases: the mechanisms that a scene turns into as events release or add constraints, and as contacts come to rest.
+"""Phases: the sets of constraints that hold one after another, as events release or add some and contacts come to rest.
 
-All phases have the bodies of the scene, hence the same coordinates. Before the run, every event is followed from every phase to
-determine which phases can be reached. Each phase has its own equations and machine code.
+A phase is a mask of the *switches*: the constraints that events release or add, and the contacts that are held at rest. A run
+begins with the mechanism of the scene. In all other phases it has the mechanism with all switches, whose constraints numbers
+switch on and off (switched.py), so that no phase needs equations or code of its own.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-from jax.core import Tracer
-from jaxtyping import Array, ArrayLike
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool
 
 from udkjax.annotations import Number
-from udkjax.arrays import number
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.integrate.events.conditions import Frames, frames_of
+from udkjax.arrays import is_traced, number
+from udkjax.equations.analysis import Analysis
+from udkjax.equations.scales import scales_of
+from udkjax.equations.scene_programs import scene_programs
+from udkjax.integrate.events.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import HeldElement
+from udkjax.integrate.events.switched import switch, switched, with_switched_friction
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
-from udkjax.scene.joints import Joint
+from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.origin import Origin
 from udkjax.wording import quote, suggestion
 
 Added = tuple[Any, ...]  # the joints that events add, with their current numbers, and the sides of comparisons
-MOST_PHASES = 32  # each is compiled
+SCENE, SWITCHED = 0, 1  # the mechanisms of a run
 
 
-class Tables(NamedTuple):
-    """Phase transitions as [phase][event]; hashable, so programs compiled for them are reused."""
+class Switches(NamedTuple):
+    """The switches, C, what the events, E, do to them, and the rows of Psi with all switches, m; hashable."""
 
-    after: tuple[tuple[int, ...], ...]  # the phase that follows an event
-    resting: tuple[tuple[int, ...], ...]  # the phase after a contact has come to rest
-    freed: tuple[tuple[int, ...], ...]  # the phase after a contact at rest has opened
-    held: tuple[tuple[int, ...], ...]  # the row of Psi that holds a contact; -1: none
+    names: tuple[str, ...] = ()  # their constraints in the mechanism with all switches
+    first: tuple[bool, ...] = ()  # the phase in which a run begins: constraints of the scene are on, all others are off
+    removed: tuple[tuple[bool, ...], ...] = ()  # (E, C)
+    added: tuple[tuple[bool, ...], ...] = ()  # (E, C)
+    contacts: tuple[int, ...] = ()  # the switch that holds the contact of an event; -1: none
+    rows: tuple[int, ...] = ()  # the row of Psi of that switch; -1: none
+    switch_of_row: tuple[int, ...] = ()  # -1: a row of the scene that no event changes
+    redundant: tuple[bool, ...] = ()  # rows of the scene that depend on others while all constraints of the scene hold
+
+    def independent(self, phase: Bool[Any, "*m C"], xp: ModuleType) -> Bool[Any, "*m m"]:
+        """Return a mask of the rows of Psi that may be independent in a phase."""
+        switch, first = np.array(self.switch_of_row, int), np.array(self.first, bool)
+        is_on = (switch < 0) | phase[..., np.maximum(switch, 0)]
+        is_whole = xp.all(phase | ~first, axis=-1, keepdims=True)
+        return is_on & ~(np.array(self.redundant, bool) & is_whole)
 
 
 class Phases(eqx.Module):
-    """The mechanisms of all phases, their analyses, and the transitions between them. Runs start in the first phase."""
+    """The mechanism of the scene, and the one with all switches if there are any; their analyses, and the switches."""
 
     mechanisms: tuple[Mechanism, ...]
     analyses: tuple[Analysis, ...]
     added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, without the numbers that depend on the state at the event
-    added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # for each added joint its event and its name
-    tables: Tables = eqx.field(static=True)
+    added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # for each added joint its event and its switch
+    switches: Switches = eqx.field(static=True)
     held: tuple[HeldElement, ...] = eqx.field(static=True, default=())  # the forces with held sides
 
-    def with_added(self, phase: int, added: Added) -> Mechanism:
-        """Return the mechanism of a phase, with the joints that events have added and the sides of its comparisons."""
-        mechanism, (*joints, sides) = self.mechanisms[phase], added
+    def mechanism(self, which: int, phase: Bool[Array, "C"], added: Added) -> Mechanism:
+        """Return the mechanism of a phase, with the joints that events have added and the sides of its comparisons.
+
+        Args:
+            which: SCENE, in the phase in which a run begins, or SWITCHED.
+            phase: the phase.
+            added: the joints and the sides.
+        """
+        mechanism, (*joints, sides) = self.mechanisms[which], added
         for held in self.held:
             at = lambda m, k=held.force: m._forces[k].sides  # noqa: E731
             mechanism = eqx.tree_at(at, mechanism, sides[held.sides])
+        if which == SCENE:
+            return mechanism
         for (_, name), joint in zip(self.added_by, joints, strict=True):
-            if name in mechanism.joint_names:
-                index = mechanism.joint_names.index(name)
-                mechanism = eqx.tree_at(lambda m, index=index: m._joints[index], mechanism, joint)
-        return mechanism
+            index = mechanism.joint_names.index(name)
+            mechanism = eqx.tree_at(lambda m, index=index: m._joints[index], mechanism, switched(joint))
+        return switch(mechanism, self.switches.names, list(jnp.asarray(phase, float)))
 
     def first_added(self) -> tuple[Joint, ...]:
         """Return the joints that events add, as they would be at the initial guess."""
-        return tuple(self.joint_at(k, self.mechanisms[0].q0.ravel()) for k in range(len(self.added)))
+        return tuple(self.joint_at(k, self.mechanisms[SCENE].q0.ravel()) for k in range(len(self.added)))
 
     def with_kinks(self, mechanism: Mechanism, held: tuple[HeldElement, ...], count: int) -> "Phases":
         """Return the phases with the forces of a mechanism some of which are held, and with events at `count` kinks."""
-        *transitions, rows = self.tables
-        stay = [[(*row, *[phase] * count) for phase, row in enumerate(table)] for table in transitions]
-        after, resting, freed = map(tuple, stay)
-        tables = Tables(after, resting, freed, tuple((*row, *[-1] * count) for row in rows))
-        found = replace(self, held=held, tables=tables)
-        return eqx.tree_at(lambda p: [m._forces for m in p.mechanisms], found, [mechanism._forces] * len(self.mechanisms))
+        switches, none = self.switches, (False,) * len(self.switches.names)
+        more = {name: (*getattr(switches, name), *[none] * count) for name in ("removed", "added")}
+        more |= {name: (*getattr(switches, name), *[-1] * count) for name in ("contacts", "rows")}
+        found = replace(self, held=held, switches=switches._replace(**more))
+        forces = [mechanism._forces[x.force] for _ in self.mechanisms for x in held]
+        return eqx.tree_at(lambda p: [m._forces[x.force] for m in p.mechanisms for x in held], found, forces)
 
     def joint_at(self, k: int, q: Array) -> Joint:
         """Return the k-th joint that events add, added at q."""
-        joint, frames = self.added[k], frames_of(self.mechanisms[0].body_names, q)
+        joint, frames = self.added[k], frames_of(self.mechanisms[SCENE].body_names, q)
         return jax.tree.map(number, joint.complete(*(frames[name] for name in joint.frame_names)))
 
 
+class _Switch(NamedTuple):
+    """A constraint that events switch on or off."""
+
+    name: str  # in the mechanism with all switches
+    public: str  # the name by which events release it; "" for contacts
+    constraint: Constraint
+    event: int  # the event that adds it, or whose contact it holds; -1: it is a constraint of the scene
+
+
 def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis) -> Phases:
-    """Return the phases of a mechanism with events. Raises `ValueError` if there are too many."""
-    added, added_by = _additions(mechanism, events)
-    names = [name for _, name in added_by]
-    known = [*mechanism.constraints, *names]
+    """Return the phases of a mechanism with events."""
+    switches, E = _switches(mechanism, events), len(events)
+    if not switches:
+        none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E)
+        return Phases((mechanism.without_origin,), (analysis,), (), (), none)
+    whole = _with(mechanism, switches)
+    with_all = _analysis(whole, analysis)
+    row_names, names = [name for name, _ in with_all.row_names], [x.name for x in switches]
+    contacts = {x.event: k for k, x in enumerate(switches) if not x.public}
+    table = Switches(
+        names=tuple(names),
+        first=tuple(x.event < 0 for x in switches),
+        removed=tuple(tuple(x.public != "" and x.public in _names_removed(mechanism, e) for x in switches) for e in events),
+        added=tuple(tuple(x.public != "" and x.event == k for x in switches) for k in range(E)),
+        contacts=tuple(contacts.get(k, -1) for k in range(E)),
+        rows=tuple(row_names.index(names[contacts[k]]) if k in contacts else -1 for k in range(E)),
+        switch_of_row=tuple(names.index(name) if name in names else -1 for name in row_names),
+        redundant=tuple(row in analysis.redundant for row in with_all.row_names),
+    )
+    added = [x for x in switches if x.public and x.event >= 0]
+    mechanisms = mechanism.without_origin, whole
+    joints: Any = tuple(x.constraint for x in added)
+    return Phases(mechanisms, (analysis, with_all), joints, tuple((x.event, x.name) for x in added), table)
+
+
+def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:
+    """Return the names of the constraints that an event removes; an added joint replaces another one of its name."""
+    addition = event.action.addition(mechanism, f"event {quote(event.name)}")
+    return event.action.removed | ({addition[0]} if addition else frozenset())
+
+
+def _switches(mechanism: Mechanism, events: Sequence[Event]) -> list[_Switch]:
+    """Return the switches: constraints of the scene, then added joints, then contacts. Raises `ValueError` for unknown names."""
+    additions = [(k, e.action.addition(mechanism, f"event {quote(e.name)}")) for k, e in enumerate(events)]
+    added = [(k, *found) for k, found in additions if found is not None]
+    known, released = [*mechanism.constraints, *(name for _, name, _ in added)], set()
     for event in events:
         for name in sorted(event.action.removed.difference(known)):
             raise ValueError(f"event {quote(event.name)}: no joint or driver named {quote(name)}{suggestion(name, known)}")
-    first: frozenset[str] = frozenset(mechanism.constraints)
-    active_sets, transitions = [first], []
-    for active in active_sets:  # the list grows in this loop
-        rows = [_next_phases(event, active, names, added_by, k) for k, event in enumerate(events)]
-        for target in (x for row in rows for x in row):
-            if target not in active_sets:
-                active_sets.append(target)
-        if len(active_sets) > MOST_PHASES:
-            raise ValueError(
-                f"events: more than {MOST_PHASES} combinations of constraints can follow one another; contacts with "
-                'at_rest="stop" instead of "hold" add none'
-            )
-        transitions.append(rows)
-    index_of = {active: k for k, active in enumerate(active_sets)}
-    after, resting, freed = (tuple(tuple(index_of[row[i]] for row in rows) for rows in transitions) for i in range(3))
-    contacts = {_contact(event): HeldContact.of(event, mechanism) for event in events if event.action.rest == "hold"}
-    extra = {**dict(zip(names, added, strict=True)), **contacts}
-    mechanisms = [_with(mechanism, active, extra) for active in active_sets]
-    analyses = [analysis]
-    for active, phase in zip(active_sets[1:], mechanisms[1:], strict=True):
-        base = _with(mechanism, active - extra.keys(), {})
-        analyses.append(_analysis(phase, lambda base=base: analysis if base is mechanism else analyse(base)))
-    held = tuple(
-        tuple(_row(a, _contact(e)) if _contact(e) in active else -1 for e in events)
-        for active, a in zip(active_sets, analyses, strict=True)
-    )
-    tables = Tables(after, resting, freed, held)
-    return Phases(tuple(m.without_origin for m in mechanisms), tuple(analyses), tuple(added), tuple(added_by), tables)
+        released |= event.action.removed
+    for k, name, _ in added:
+        if name in mechanism.constraints and name not in released:
+            cure = "attach the joint under another name, or release this one before"
+            raise ValueError(f"event {quote(events[k].name)}: {quote(name)} is in the scene already; {cure}")
+    found = [_Switch(name, name, x, -1) for name, x in mechanism.constraints.items() if name in released]
+    taken = set(mechanism.constraints)
+
+    def unique(name: str) -> str:
+        name = next(x for x in (name, *(f"{name} {k}" for k in range(2, len(events) + 3))) if x not in taken)
+        taken.add(name)
+        return name
+
+    found += [_Switch(unique(name), name, joint, k) for k, name, joint in added]
+    contacts = [(k, e) for k, e in enumerate(events) if e.action.rest == "hold"]
+    return found + [_Switch(unique(f"{e.name}.contact"), "", HeldContact.of(e, mechanism), k) for k, e in contacts]
 
 
-def _additions(mechanism: Mechanism, events: Sequence[Event]) -> tuple[list[Joint], list[tuple[int, str]]]:
-    joints, by = [], []
-    for k, event in enumerate(events):
-        addition = event.action.addition(mechanism, f"event {quote(event.name)}")
-        if addition is not None:
-            name, joint = addition
-            joints.append(joint)
-            by.append((k, name))
-    for k, name in by:
-        if [other for _, other in by].count(name) > 1:
-            raise ValueError(f"event {quote(events[k].name)}: two events add {quote(name)}; give one of them another name")
-    return joints, by
+def _analysis(whole: Mechanism, of_scene: Analysis) -> Analysis:
+    """Return the analysis of a mechanism with all switches on, whose independent rows are found in each phase as it begins."""
+    scales, own = of_scene.scales, scales_of(whole)
+    xp = jnp if is_traced((scales, own)) else np
+    scales = scales._replace(rows=own.rows, rank_tol=xp.minimum(scales.rank_tol, own.rank_tol))
+    row_names = tuple(scene_programs(whole).row_names)
+    return Analysis(jax.tree.map(number, scales), of_scene.coordinates, row_names, None)
 
 
-def _next_phases(
-    event: Event, active: frozenset[str], names: Sequence[str], by: Sequence[tuple[int, str]], k: int
-) -> tuple[frozenset[str], frozenset[str], frozenset[str]]:
-    """Return the active constraints after an event, after its contact has come to rest, and after the contact has opened."""
-    added = frozenset(name for i, name in by if i == k)
-    contact = frozenset([_contact(event)] if event.action.rest == "hold" else [])
-    return (active - event.action.removed) | added, active | contact, active - contact
-
-
-def _contact(event: Event) -> str:
-    return f"{event.name}.contact"
-
-
-def _analysis(phase: Mechanism, analyse_scene: Callable[[], Analysis]) -> Analysis:
-    """Return the analysis of a phase; constraints added with traced numbers are taken to be independent of the scene's."""
-    analysis = analyse(phase)
-    of_scene = analyse_scene() if analysis.redundant_rows is None else analysis
-    if of_scene.redundant_rows is None or analysis.redundant_rows is not None:
-        return analysis
-    rows = tuple(analysis.row_names.index(row) for row in of_scene.redundant)
-    return replace(analysis, redundant_rows=rows)
-
-
-def _row(analysis: Analysis, name: str) -> int:
-    return [n for n, _ in analysis.row_names].index(name)
-
-
-def _with(mechanism: Mechanism, active: frozenset[str], extra: dict[str, Joint]) -> Mechanism:
-    """Return the mechanism with only the active constraints, from its own and from `extra`."""
-    if active == frozenset(mechanism.constraints):
-        return mechanism
-    joints = {name: joint for name, joint in mechanism.joints.items() if name in active}
-    added = {name: joint for name, joint in extra.items() if name in active}
-    drivers = {name: driver for name, driver in mechanism.drivers.items() if name in active}
-    parts = (joints | added, drivers, mechanism.forces, mechanism.gravity, mechanism.name)
-    is_concrete = not any(isinstance(x, Tracer) for x in jax.tree.leaves(list(added.values())))
-    if mechanism.is_concrete and is_concrete:
-        with jax.ensure_compile_time_eval():  # numbers taken from the guess stay concrete even under tracing
-            return Mechanism(mechanism.bodies, *parts)
-    origin = None
-    if mechanism.origin is not None and is_concrete:
-        origin = Origin(_with(mechanism.origin.mechanism, active, extra))
-    return Mechanism(mechanism.bodies, *parts, origin)
+def _with(mechanism: Mechanism, switches: Sequence[_Switch]) -> Mechanism:
+    """Return the mechanism with all switches, switched on."""
+    of_scene: dict[str, Any] = {x.name: switched(x.constraint) for x in switches if x.event < 0}
+    others: dict[str, Any] = {x.name: x.constraint for x in switches if x.event >= 0}
+    is_concrete = mechanism.is_concrete and not is_traced(list(others.values()))
+    with jax.ensure_compile_time_eval() if is_concrete else nullcontext():  # numbers taken from the guess stay concrete
+        joints, drivers = (
+            {k: of_scene.get(k, x) for k, x in elements.items()} for elements in (mechanism.joints, mechanism.drivers)
+        )
+        forces = with_switched_friction(dict(mechanism.forces), list(of_scene))
+        whole = Mechanism(mechanism.bodies, joints | others, drivers, forces, mechanism.gravity, mechanism.name).without_origin
+        completed = [switched(whole.joints[name]) for name in others]
+        return eqx.tree_at(lambda m: [m._joints[m.joint_names.index(name)] for name in others], whole, completed)
 
 
 class HeldContact(Joint):
     """A contact at rest: its condition stays zero. 1 row, in the condition's unit."""
 
-    labels: tuple[str, ...] = eqx.field(static=True)  # the names of the bodies in the condition
+    labels: tuple[str, ...] = eqx.field(static=True)  # the names by which the condition knows the bodies
     condition: Callable[[Number, Frames], ArrayLike]
 
     @classmethod
     def of(cls, event: Event, mechanism: Mechanism) -> "HeldContact":
         """Return the contact of an event; its bodies are all, or those in the attribute `bodies` of the condition."""
-        bodies = getattr(event.condition, "bodies", mechanism.body_names)
-        return cls(bodies=bodies, labels=tuple(bodies), condition=event.condition)
+        condition, bodies = event.condition, getattr(event.condition, "bodies", mechanism.body_names)
+        if not isinstance(condition, BodyCondition):
+            return cls(bodies=bodies, labels=tuple(bodies), condition=condition)
+        # Contacts that differ in their bodies alone share their programs.
+        labels = tuple(str(k) for k in range(len(bodies)))
+        return cls(bodies=bodies, labels=labels, condition=condition.of_bodies(labels))
 
     def residual(self, t, *frames):
         return [self.condition(t, {GROUND: GROUND_FRAME_AT_REST, **dict(zip(self.labels, frames, strict=True))})]

@@ -18,9 +18,10 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.loads import mass_of
 from udkjax.integrate.events.crossings import NO_EVENT
 from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
-from udkjax.integrate.events.hybrid import Added, Hybrid
+from udkjax.integrate.events.hybrid import Hybrid
 from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.loop import run_loop
+from udkjax.integrate.events.phases import SCENE, Added
 from udkjax.integrate.events.runs import Change, EventRun, MemberIndices, MemberRuns, RunState, results, runs_before
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.outcome import failure
@@ -75,7 +76,7 @@ class PlainSystem:
         self.hybrid, self.plan = hybrid, hybrid.plan
         self.end, self.rate = hybrid.ts[-1:], hybrid.rate[None]
         self.coordinates = hybrid.scales.coordinates(len(hybrid.q))[None]
-        self.inverse_mass = 1 / mass_of(hybrid.phases.mechanisms[0], jnp)[None]
+        self.inverse_mass = 1 / mass_of(hybrid.phases.mechanisms[SCENE], jnp)[None]
 
     def contacts(self, members: MemberIndices) -> Contacts:
         """Return the contacts."""
@@ -90,13 +91,13 @@ class PlainSystem:
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
         """Return positions and velocities that the phase of a state allows."""
 
-        def of_phase(p: int, t: Array, q: Array, v: Array, added: Added) -> tuple[Array, Array]:
+        def of_mechanism(which: int, at: RunState) -> tuple[Array, Array]:
             # Velocities jump, so `equations.project`, whose derivatives hold for small corrections, cannot be used.
-            equations = self.hybrid.textbook(p, added)
-            return uk.project(equations.mechanism, t, q, v, equations.inverse, equations.weights)
+            equations = self.hybrid.textbook(which, at)
+            return uk.project(equations.mechanism, *at[:3], equations.inverse, equations.weights)
 
-        t, q, v, phase, added = without_member(at)
-        q, v = self.hybrid.in_phase(phase, of_phase, t, q, v, added, is_free=is_free)
+        state = without_member(at)
+        q, v = self.hybrid.in_phase(state.phase, of_mechanism, state, is_free=is_free)
         return q[None], v[None]
 
     def add_joints(self, members: MemberIndices, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:

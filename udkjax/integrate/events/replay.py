@@ -249,7 +249,7 @@ def _apply_at_fixed_time(
     k = jnp.where(index >= 2 * E, index - 2 * E, index)
     values, _ = condition_values(system, None, with_member(state))
     h, rate, a = values.h[0, k % E], values.rate[0, k % E], values.a[0]
-    if system.plan.held.any():
+    if system.plan.held_at_rest.any():
         force = lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v))[k % E]  # noqa: E731
         h, rate = (jnp.where(k >= E, *x) for x in zip(rate_along(force, *state[:3], a), (h, rate), strict=True))
     h = h - stop_gradients(h)

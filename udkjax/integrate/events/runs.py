@@ -26,8 +26,13 @@ class RunState(NamedTuple):
     t: Float[Any, "*m"]
     q: Float[Any, "*m n"]
     v: Float[Any, "*m n"]
-    phase: Int[Any, "*m"]
+    phase: Bool[Any, "*m C"]
     joints: Any  # joints, with JAX arrays of one member; or NumPy arrays of the numbers of all members, changed in place
+
+    def where(self, mask: Bool[np.ndarray, "m"]) -> "RunState":
+        """Return the masked states."""
+        t, q, v, phase, joints = self
+        return RunState(t[mask], q[mask], v[mask], phase[mask], joints)
 
 
 class EventRun(NamedTuple):
@@ -40,7 +45,7 @@ class EventRun(NamedTuple):
     event_q: Float[Any, "*m K 2 n"]  # before and after the event
     event_v: Float[Any, "*m K 2 n"]
     event_index: Int[Any, "*m K"]  # index of the event; plus E if a contact opens, plus 2 E if it comes to rest
-    event_phase: Int[Any, "*m K"]  # phase after the event
+    event_phase: Bool[Any, "*m K C"]  # phase after the event
     together: Bool[Any, "*m K"]  # whether it is simultaneous with the previous event, as one event
     closed: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
     sides: Float[Any, "*m K S"]  # the sides of comparisons after the event
@@ -64,10 +69,8 @@ RECORD = (
 
 def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
     """Return the shapes of the fields of a run of T output times and n coordinates, with room for `room` events."""
-    E, K = plan.count, room
-    return EventRun(
-        (T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K,), (K,), (K, E), (K, plan.side_count), (), (E,), (E,), (), (4,)
-    )
+    E, K, C, S = plan.count, room, len(plan.first), plan.side_count
+    return EventRun((T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K, C), (K,), (K, E), (K, S), (), (E,), (E,), (), (4,))
 
 
 class MemberRuns(NamedTuple):
@@ -76,7 +79,7 @@ class MemberRuns(NamedTuple):
     t: Float[Any, "B"]
     q: Float[Any, "B n"]
     v: Float[Any, "B n"]
-    phase: Int[Any, "B"]
+    phase: Bool[Any, "B C"]
     joints: Any
     event: Int[Any, "B"]  # index of the event at this time, plus E if a contact opens; or `NO_EVENT`, `BEGIN`, `AGAIN`
     sides: Int[Any, "B 2E"]  # the last side of zero of each condition and contact force: -1 or 1; 0 if unknown
@@ -130,7 +133,7 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
     shapes = shapes_of_run(plan, T, n, plan.room + 1)._asdict()
     values = dict.fromkeys(EVENT_STATES, np.inf) | {
         "event_index": -1,
-        "event_phase": -1,
+        "event_phase": False,
         "together": False,
         "closed": 0,
         "sides": 0.0,

@@ -24,7 +24,7 @@ from udkjax.integrate.events.event_plan import event_plan
 from udkjax.integrate.events.host_run import HostRun, concrete_plan, event_arrays
 from udkjax.integrate.events.hybrid import Hybrid
 from udkjax.integrate.events.kinks import FREE, MOST_KINKS, renewed_sides, with_held_forces
-from udkjax.integrate.events.phases import Phases, phases_of
+from udkjax.integrate.events.phases import SCENE, Phases, phases_of
 from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.events.runs import RECORD, EventRun
 from udkjax.integrate.prepare import Choices, prepare_run
@@ -91,7 +91,7 @@ def simulate_events(
     """
     listed, phases = _prepare(mechanism, events, analysis)
     has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax
-    conditions = watched_conditions(listed, phases.mechanisms[0]) if has_code else None
+    conditions = watched_conditions(listed, phases.mechanisms[SCENE]) if has_code else None
     if conditions is not None:
         listed = with_cached_functions(listed, conditions)
     ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
@@ -123,7 +123,7 @@ def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[st
     compiled = [compile_concrete(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     if not all(x.plan.is_native for x in compiled):
         return None
-    run = prepare_run(compiled[0], phases.analyses[0], given.ts, given.state, given.closure, choices, np)
+    run = prepare_run(compiled[0], phases.analyses[SCENE], given.ts, given.state, given.closure, choices, np)
     code = Result.successful if run.is_closed else Result.could_not_assemble
     code = Result.invalid_argument if not run.is_usable else Result.drift if run.has_missed_rows else code
     problems = [replace(run.problem, compiled=x) for x in compiled]
@@ -158,10 +158,10 @@ def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents] | None, anal
 
 
 def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
-    """Run; return the result, and for each phase why machine code cannot integrate it."""
+    """Run; return the result, and for each mechanism why machine code cannot integrate it."""
     phases, events, ts, state, closure, choices, max_events, conditions, moves = given
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
-    run = prepare_run(compiled[0], phases.analyses[0], ts, state, closure, choices)
+    run = prepare_run(compiled[0], phases.analyses[SCENE], ts, state, closure, choices)
     problem, stabilization, ts = run.problem, choices.stabilization, run.problem.ts
     if moves:
         fixed = replace(problem, ts=stop_gradients(ts))
@@ -209,7 +209,7 @@ def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
     """Return the sides of all comparisons at the start."""
     free = jnp.full(sum(held.smooth.count for held in phases.held), FREE)
     at = problem.ts[0], problem.q, problem.v, free
-    return stop_gradients(renewed_sides(phases.held, phases.mechanisms[0]._forces, *at))
+    return stop_gradients(renewed_sides(phases.held, phases.mechanisms[SCENE]._forces, *at))
 
 
 _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
