@@ -129,7 +129,7 @@ def test_members_of_a_batch_have_breakpoints_of_their_own(single):
     [
         {"solver": diffrax.Tsit5()},
         pytest.param({"solver": udk.Adams()}, marks=pytest.mark.slow),
-        pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow),
+        pytest.param({"solver": diffrax.Kvaerno4()}, marks=pytest.mark.slow),
     ],
 )
 def test_other_solvers(choices):

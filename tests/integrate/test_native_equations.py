@@ -154,7 +154,7 @@ def test_batches_and_derivatives():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [udk.Adams(), udk.BDF(), diffrax.Kvaerno5()])
+@pytest.mark.parametrize("solver", [udk.Adams(), udk.BDF()])
 def test_runs_of_other_solvers_take_the_steps_of_the_plain_form(solver):
     mechanism = udk.library.compound_pendulum()
     one, two = (udk.simulate(mechanism, TIMES, rtol=1e-6, atol=1e-6, solver=solver, engine=e) for e in ("auto", "jax"))

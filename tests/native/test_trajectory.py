@@ -261,6 +261,6 @@ def test_a_small_network_is_integrated_by_either_engine(served):
     agrees(mechanism, np.linspace(0.0, 0.5, 4))
 
 
-def test_implicit_solvers_are_not_served(served):
-    traced(udk.library.compound_pendulum(), solver=diffrax.Kvaerno3())
+def test_solvers_of_several_steps_are_not_served(served):
+    traced(udk.library.compound_pendulum(), solver=udk.BDF())
     assert not any(served)

@@ -45,6 +45,7 @@ class Unrolled:
         active: For each input of the prologue, whether derivatives with respect to it are needed.
         mode: Mode of differentiation: `FORWARD`, `TWICE`, or `REVERSE`, from cotangents of the results to those of q, v and the
             constants.
+        slopes: Whether to differentiate the accelerations by the state, for `slopes`.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class Unrolled:
         differentiated: Sequence[str] = (),
         active: Sequence[bool] = (),
         mode: str = FORWARD,
+        slopes: bool = False,
     ):
         graph = self.graph = Graph()
         n, count = programs.coordinate_count, programs.number_count
@@ -71,7 +73,10 @@ class Unrolled:
         active_nodes = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
         self.moving = [k for k, s in sorted(layout.items()) if s.index in active_nodes]
         """The constants that depend on active numbers; derivatives index only these."""
-        self._derivatives = {x: self._differentiate(programs.differentiable[x], n, mode) for x in differentiated}
+        self._derivatives = {x: self._differentiate(programs.differentiable[x], n, mode, self.moving) for x in differentiated}
+        if slopes:
+            accelerations = programs.for_derivatives.differentiable["accelerations"]
+            self._derivatives["slopes"] = self._differentiate(accelerations, n, FORWARD, ())
         outputs = [
             s
             for result in (*self._results.values(), *(x for d in self._derivatives.values() for x in d))
@@ -98,6 +103,11 @@ class Unrolled:
         stored_inputs = {s: ("stored", k) for k, s in enumerate(stored)}
         evaluation = self._program(results | {place: s for s, place in stored_inputs.items()}, {})
         return UnrolledDerivative(evaluation, self._program(outputs, stored_inputs | self._seeds))
+
+    @property
+    def slopes(self) -> UnrolledDerivative:
+        """The accelerations with their derivative by the state alone."""
+        return self.derivative("slopes")
 
     def evaluations(self, names: Sequence[str]) -> UnrolledProgram:
         """Return the program of the numbers that derivatives need at one state, in arrays "stored" plus the name of a program."""
@@ -149,12 +159,12 @@ class Unrolled:
         return {}
 
     def _differentiate(
-        self, differentiable: DifferentiableProgram, n: int, mode: str
+        self, differentiable: DifferentiableProgram, n: int, mode: str, moving: Sequence[int]
     ) -> tuple[dict[ArrayPlace, Scalar], dict[ArrayPlace, Scalar]]:
         """Return the results and their tangents, or the cotangents of the inputs."""
         arrays = self._unroll(differentiable.program)
         results = {x: range(n) for x in ("a", "q1", "v1") if x in arrays}
-        variables = {"constants": self.moving, "q": range(n), "v": range(n)}
+        variables = {"constants": moving, "q": range(n), "v": range(n)}
         prefixes, program = PREFIXES[mode], differentiable.in_mode(mode)
         group = "cotangent" if mode == REVERSE else "tangent"
         sources, targets = (results, variables) if mode == REVERSE else (variables, results)

@@ -19,7 +19,7 @@ from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.solvers import is_explicit, method_of
+from udkjax.integrate.solvers import has_method, method_of
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
@@ -133,8 +133,8 @@ def _reason_for_diffrax(
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
         return "a progress meter is diffrax's"
-    if not is_explicit(solver):
-        return f"{type(solver).__name__} is not an explicit Runge-Kutta method"
+    if not has_method(solver):
+        return f"{type(solver).__name__} is not a Runge-Kutta method with one tableau, explicit or singly diagonally implicit"
     return _reason_for_equations(equations)
 
 

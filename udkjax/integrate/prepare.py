@@ -17,7 +17,7 @@ from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.outcome import LEAST_ATOL, increases, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.solvers import is_explicit
+from udkjax.integrate.solvers import has_method
 from udkjax.native.base.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
@@ -63,7 +63,7 @@ class Choices(NamedTuple):
     @property
     def take_diffrax(self) -> bool:
         """True if diffrax integrates every mechanism with these choices."""
-        others = self.adjoint is not None or self.meter is not None or not is_explicit(self.solver)
+        others = self.adjoint is not None or self.meter is not None or not has_method(self.solver)
         return self.engine in ("diffrax", "jax") or others
 
     @property

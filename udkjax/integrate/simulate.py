@@ -98,11 +98,11 @@ def simulate(
         throw: whether a run that does not reach its end raises; a traced run never does.
         progress: True prints the progress of the run; a progress meter of diffrax is used as it is.
         analysis: the mechanism's `Analysis`; by default computed here.
-        engine: "native" is machine code generated from the scene's expressions, on the CPU: explicit Runge-Kutta methods with
-            elimination, under vmap in lanes that step independently. "diffrax" is `diffrax.diffeqsolve`: every solver,
-            adjoint, progress meter and method; machine code evaluates the equations where possible. "jax" is "diffrax" with
-            equations in plain JAX, on every device. "auto" uses machine code where possible; `Solution.settings` names the
-            engine and the reason.
+        engine: "native" is machine code generated from the scene's expressions, on the CPU: Runge-Kutta methods, explicit or
+            singly diagonally implicit, under vmap in lanes that step independently. "diffrax" is `diffrax.diffeqsolve`: every
+            solver, adjoint, progress meter and method; machine code evaluates the equations where possible. "jax" is
+            "diffrax" with equations in plain JAX, on every device. "auto" uses machine code where possible;
+            `Solution.settings` names the engine and the reason.
         events: actions where conditions cross zero: an `Event`, `JointLimit` or `Contact`, or a list of them, with the
             actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to machine precision,
             independently of `ts`, and the run restarts after each; contacts that act on one another are hit together. Both

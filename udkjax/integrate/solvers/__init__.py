@@ -1,4 +1,4 @@
-"""Solvers by name, from diffrax and from this package, and the tableaus of explicit solvers.
+"""Solvers by name, from diffrax and from this package, and the tableaus of Runge-Kutta methods.
 
 diffrax is imported on demand, since its import takes as long as that of JAX.
 """
@@ -42,10 +42,27 @@ def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
         return True
     import diffrax
 
-    return isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau)
+    # A wrapped solver counts as an instance of the class of the one within, but has no tableau.
+    return isinstance(solver, diffrax.AbstractERK) and isinstance(getattr(solver, "tableau", None), diffrax.ButcherTableau)
 
 
-def method_of(solver: "diffrax.AbstractERK | None") -> Method:
+def has_method(solver: "diffrax.AbstractSolver | None") -> bool:
+    """Return True if `method_of` has the tableau of a solver: it is explicit, or singly diagonally implicit.
+
+    An implicit tableau begins with an explicit stage and ends with the end of the step, like those of `diffrax.Kvaerno5`.
+    """
+    if is_explicit(solver):
+        return True
+    import diffrax
+
+    tableau: Any = getattr(solver, "tableau", None)
+    if not isinstance(solver, diffrax.AbstractESDIRK) or not isinstance(tableau, diffrax.ButcherTableau):
+        return False
+    last = np.append(tableau.a_lower[-1], tableau.a_diagonal[-1])
+    return bool(np.array_equal(last, tableau.b_sol)) and tableau.a_predictor is not None
+
+
+def method_of(solver: "diffrax.AbstractRungeKutta | None") -> Method:
     """Return the tableau of a solver; None is the default."""
     if solver is None:
         return DOPRI8
@@ -54,6 +71,8 @@ def method_of(solver: "diffrax.AbstractERK | None") -> Method:
     tableau: Any = solver.tableau
     order: Any = solver.error_order(diffrax.ODETerm(lambda t, y, args: y))
     c, stages, b, error = np.append(0.0, tableau.c), tableau.a_lower, np.asarray(tableau.b_sol), np.asarray(tableau.b_error)
+    if not is_explicit(solver):
+        return Method.of(c, stages, b, error, order, diagonal=tableau.a_diagonal[-1], predictor=tableau.a_predictor)
     ends = bool(tableau.fsal and error[-1] != 0)
     if tableau.fsal and not ends:  # the last stage is used for interpolation or by the next step
         c, stages, b, error = c[:-1], stages[:-1], b[:-1], error[:-1]

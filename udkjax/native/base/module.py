@@ -54,7 +54,7 @@ class Module(Running):
         self.measures_drift = plan.steps and m > 0 and not plan.projected
         self.pieces = code.piece_count if plan.breaks else 0
         self.programs = {name: getattr(code, name) for name in self.program_names()}
-        self.unrolled = Unrolled(code, list(self.programs), differentiated, active, self.mode) if plan.unrolled else None
+        self.unrolled = self._unroll(differentiated, active) if plan.unrolled else None
         self.constants = len(self.unrolled.constants if self.unrolled else code.constants)
         self.moving = range(self.constants if any(active) else 0) if self.unrolled is None else self.unrolled.moving
         """Indices, in the layout of the scene, of the constants that depend on active numbers."""
@@ -65,6 +65,9 @@ class Module(Running):
         self.loops = LoopWriter(plan.width, cold=plan.unrolled)
         self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
+
+    def _unroll(self, differentiated: Sequence[str], active: Sequence[bool]) -> Unrolled:
+        return Unrolled(self.code, list(self.programs), differentiated, active, self.mode, self.method.is_implicit)
 
     def _lay_out(self):
         """Reserve memory for all arrays; layout.py describes them."""
@@ -205,8 +208,9 @@ class Module(Running):
         pointers: Sequence[str],
         at: Mapping[str, PointerPlace],
         width: int | None = None,
+        tangent: Layout | None = None,
     ):
-        """Write an unrolled program."""
+        """Write an unrolled program; `tangent` is the layout at its pointer `tangent`, by default that of the module."""
 
         def find(places: Sequence[PointerPlace]) -> list[PointerPlace]:
             return [place(x, k) if x in at else (pointers[0], 0) for x, k in places]
@@ -217,7 +221,7 @@ class Module(Running):
             is_shared = is_shared and index != self.drop_tol_place  # a run changes this threshold
             return ("block_memory", k) if is_shared else (pointer, index)
 
-        lanes = {x: self.tangents.width for x in ("tangent", "out") if "tangent" in pointers} | {"block_memory": 1}
+        lanes = {x: (tangent or self.tangents).width for x in ("tangent", "out") if "tangent" in pointers} | {"block_memory": 1}
         inputs, outputs = find(program.inputs), find(program.outputs)
         self.functions.append(
             write(

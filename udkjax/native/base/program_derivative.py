@@ -8,17 +8,21 @@ close a mechanism ("_newton_q", "_newton_v") the functions are
     twice(work, stored, tangent, out)     the same along two directions and along both, in three consecutive tangents
     reverse(work, stored, bar)      `bar constants` and `bar state`, from the cotangents of the results
 
+The slopes of the accelerations ("_slopes") are their derivatives by the state alone, for implicit methods, in any module.
+
 All programs except the accelerations write tangents to `result` of a tangent, and read cotangents from `bar result`.
 """
 
 from collections.abc import Sequence
 
 from udkjax.equations.differentiable_programs import DifferentiableProgram
-from udkjax.expressions.loop_derivative import COTANGENT, PREFIXES, TWICE
+from udkjax.expressions.loop_derivative import COTANGENT, FORWARD, PREFIXES, TWICE
 from udkjax.expressions.loop_program import LoopProgram, Reset
+from udkjax.native.base.layout import Layout
 from udkjax.native.base.module import Module
 from udkjax.native.base.program import PointerPlace
 
+SLOPES = "slopes"  # suffix of the functions of the slopes of the accelerations
 WAYS = ("d", "e", "de")  # derivatives along two directions and along both, one in each of three tangents
 GIVEN = ("d", "e")  # directions of numbers and of initial states, whose second derivatives are zero
 
@@ -29,19 +33,22 @@ class ProgramDerivative:
     stored: int
     """The number of intermediate results that its derivatives need."""
 
-    def __init__(self, module: Module, name: str, evaluation: str = "evaluation"):
-        self._module, self._name = module, name
-        self._suffix = "" if name == "accelerations" else f"_{name}"
+    def __init__(self, module: Module, name: str, evaluation: str = "evaluation", slopes: Layout | None = None):
+        """`slopes`: the tangent of the slopes of the accelerations."""
+        self._module, self._name = module, name if slopes is None else SLOPES
+        self._suffix = "" if self._name == "accelerations" else f"_{self._name}"
         self._evaluation = evaluation + self._suffix
-        self._evaluated: DifferentiableProgram = module.code.differentiable[name]
-        self._fixed = [] if module.moving else ["constants"]
+        self._mode, self._tangent = (module.mode, None) if slopes is None else (FORWARD, slopes)
+        code = module.code if slopes is None else module.code.for_derivatives
+        self._evaluated: DifferentiableProgram = code.differentiable[name]
+        self._fixed = [] if module.moving and slopes is None else ["constants"]
         self._stored: dict[str, int] = {}  # offsets of the arrays of loops
         self.stored = 0
         if module.unrolled:
-            self._unrolled = module.unrolled.derivative(name)
+            self._unrolled = module.unrolled.derivative(name) if slopes is None else module.unrolled.slopes
             self.stored = sum(x == "stored" for x, _ in self._unrolled.evaluation.outputs)
             return
-        parts = self._evaluated.second_parts if module.mode == TWICE else self._evaluated.parts
+        parts = self._evaluated.second_parts if self._mode == TWICE else self._evaluated.parts
         used = self._evaluated.program.arrays | LoopProgram(parts).arrays
         for x, count in module.code.stored_sizes.items():
             if x in used:
@@ -79,14 +86,14 @@ class ProgramDerivative:
 
     def forward(self):
         """Write `forward`, or `twice`."""
-        module, w = self._module, self._module.tangents
+        w = self._tangent or self._module.tangents
         changes = {"constants": "constants", "q": "state q", "v": "state v", "q1": "result q", "v1": "result v"}
-        prefixes, program = PREFIXES[module.mode], self._evaluated.in_mode(module.mode, self._fixed)
+        prefixes, program = PREFIXES[self._mode], self._evaluated.in_mode(self._mode, self._fixed)
         at = self._at | self._along(prefixes)
         for k, prefix in enumerate(prefixes):
-            at |= {prefix + x: ("tangent", w[place] + k * w.size) for x, place in changes.items()}
+            at |= {prefix + x: ("tangent", w[place] + k * w.size) for x, place in changes.items() if place in w.places}
             at[f"{prefix}a"] = ("out", k * w.size)
-        self._write(program, f"{module.mode}{self._suffix}", ("work", "stored", "tangent", "out"), at)
+        self._write(program, f"{self._mode}{self._suffix}", ("work", "stored", "tangent", "out"), at)
 
     def reverse(self):
         module, p = self._module, self._module.places
@@ -104,6 +111,6 @@ class ProgramDerivative:
 
     def _write(self, program: LoopProgram, name: str, pointers: tuple[str, ...], at: dict[str, PointerPlace]):
         if self._module.unrolled:
-            self._module.write_scalars(self._unrolled.derivative, name, pointers, at)
+            self._module.write_scalars(self._unrolled.derivative, name, pointers, at, tangent=self._tangent)
         else:
             self._module.loops.write(program, name, pointers, at)

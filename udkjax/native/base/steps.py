@@ -53,6 +53,11 @@ AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
 HALVINGS = 40  # bisections that locate the end of a piece within a step
 TRIES = 8  # successive attempts to end a step at the end of a piece; for a state at rest there, rounding decides between pieces
 
+# Stages of implicit methods. A correction below STAGE_TOL of the tolerance of a step is the last. One that is DIVERGING times the
+# one before shows that the iteration diverges; so does one still too large after STAGE_ITERATIONS. The step is then repeated with
+# STAGE_SHRINK of its length.
+STAGE_TOL, STAGE_ITERATIONS, DIVERGING, STAGE_SHRINK = 1e-3, 8, 1.0, 0.4
+
 POINTS = 4  # states that the interpolating polynomial passes through; with three, velocities between steps are less accurate
 # Fraction of a step. If less than this would remain for the last step, the remaining time is halved instead. Outputs of the
 # first step are interpolated after the second, and interpolation through two close points amplifies rounding errors: to 1e-4 m/s

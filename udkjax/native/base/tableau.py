@@ -1,7 +1,7 @@
-"""Tableaus of explicit Runge-Kutta methods for q'' = a(t, q, v), including the default method."""
+"""Tableaus of Runge-Kutta methods for q'' = a(t, q, v), explicit or singly diagonally implicit, including the default method."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, ClassVar
 
@@ -10,7 +10,11 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A tableau for q'' = a, without stages that only serve interpolation; `of` returns the same object for equal numbers."""
+    """A tableau for q'' = a, without stages that only serve interpolation; `of` returns the same object for equal numbers.
+
+    A method is implicit if its `diagonal` is not zero: its first stage is that of an explicit method, each other one has the same
+    entry on the diagonal of A, and the last one is the end of the step.
+    """
 
     nodes: np.ndarray  # c, and in the last row 1, the end of the step
     v: np.ndarray  # A, and in the last row b
@@ -18,19 +22,37 @@ class Method:
     error_v: np.ndarray  # (stages,)
     error_q: np.ndarray
     order: float
-    ends: bool  # whether the last stage is the first of the next step
+    ends: bool  # whether the last stage of an explicit method is the first of the next step
+    diagonal: float = 0.0  # entry of A on the diagonal of all stages but the first
+    # Weights of the accelerations from which the iteration of each stage begins, for implicit methods.
+    predictor: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     _methods: ClassVar[dict[tuple[bytes, ...], "Method"]] = {}  # by their numbers, as operations compare methods by identity
 
     @classmethod
     def of(
-        cls, c: np.ndarray, stages: Sequence[Any], b: np.ndarray, error: np.ndarray, order: float, ends: bool = False
+        cls,
+        c: np.ndarray,
+        stages: Sequence[Any],
+        b: np.ndarray,
+        error: np.ndarray,
+        order: float,
+        ends: bool = False,
+        diagonal: float = 0.0,
+        predictor: Sequence[Any] = (),
     ) -> "Method":
-        """Return the method with nodes c, rows of A after the first, weights b, weights of the error estimate, and an order."""
-        A = np.zeros((len(c), len(c)))
-        for i, coefficients in enumerate(stages):
-            A[i + 1, : i + 1] = coefficients
-        numbers = np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A, float(order), ends
+        """Return the method with nodes c, rows of A after the first, weights b, weights of the error estimate, and an order.
+
+        The rows of A have no entries on the diagonal; those of an implicit method are all `diagonal`. `predictor` has as many
+        rows: the accelerations of each stage, extrapolated from those of the stages before.
+        """
+        A, P = np.zeros((len(c), len(c))), np.zeros((len(c) if diagonal else 0, len(c)))
+        for rows, given in ((A, stages), (P, predictor)):
+            for i, coefficients in enumerate(given):
+                rows[i + 1, : i + 1] = coefficients
+        A += np.diag(np.append(0.0, np.full(len(c) - 1, diagonal)))
+        numbers = np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A
+        numbers = *numbers, float(order), ends, float(diagonal), P
         return cls._methods.setdefault(tuple(np.asarray(x).tobytes() for x in numbers), cls(*numbers))
 
     @property
@@ -38,9 +60,14 @@ class Method:
         return len(self.error_v)
 
     @property
+    def is_implicit(self) -> bool:
+        """True if stages are the solutions of equations."""
+        return self.diagonal != 0
+
+    @property
     def clearings(self) -> tuple[float, float]:
         """Fractions of a step far from all nodes: the middles of the widest gap between nodes, and of the widest gap before."""
-        nodes = np.unique(self.nodes)
+        nodes = np.unique(self.nodes[self.nodes <= 1])
         middles, gaps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
         widest = np.argmax(gaps)
         return middles[np.argmax(gaps[: max(widest, 1)])], middles[widest]

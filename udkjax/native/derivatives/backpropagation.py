@@ -8,7 +8,9 @@ step before it, and through the sums
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
 of the stages of this step, the last first, to the previous point. The stages are evaluated again with the intermediate results
-that derivatives need; the transposed programs are those of expressions/differential.py.
+that derivatives need; the transposed programs are those of expressions/differential.py. Those of
+an implicit method are solved again (stage_equations.py), and cotangents of their accelerations are those of their equations by
+the transpose of D.
 
 Members in lanes are backpropagated together; the next ones are loaded when all are complete.
 """
@@ -58,6 +60,8 @@ class Reverse(Recorded):
         if self.count:
             write_prologue_derivative(self, self.active, REVERSE)
         write_differences_back(self)
+        if self.stages:
+            self.stages.write_stages("point2")
         self._write_step_back()
         self._write_leave_row()
         if self.plan.sampled:
@@ -96,7 +100,10 @@ class Reverse(Recorded):
         stages = range(1, last)
         steps = f.any_of(active & (s.begin < 0.5))  # the beginning of a run has no stages
         with f.if_(steps):
-            for i in stages:
+            if self.stages:
+                s.step, s.stepping = step, f.select(active, f.const(1.0, DOUBLE, f.width), 0.0)
+                f.call("take_stages_from_point2", f.given["work"])
+            for i in () if self.stages else stages:
                 stage_state(self, f, s, i, "point2", step)
                 self.evaluate_stage(f, i)
         setattr(s, "state t", s.point3_t)
@@ -104,20 +111,47 @@ class Reverse(Recorded):
             for x in "qv":
                 self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
         self._evaluate_end(f)
-        self._pull_accelerations(f, f"stage{last} linearization", "bar point3 a", active)
+        if self.stages:
+            self._pull_accelerations_at_beginning(f, s, active)
+        else:
+            self._pull_accelerations(f, f"stage{last} linearization", "bar point3 a", active)
         with f.each(self.rowcount) as r:
             for x in "qv":
                 self.put(f, f"bar result {x}", r, self.vector(f, f"bar point3 {x}", r) + self.vector(f, f"bar state {x}", r))
         self._pull_projection(f, active)
         self._accumulate_stage(f, h, last, range(last), active, first=True)
+        if self.stages:  # the accelerations at the end of a step are those of its last stage
+            with f.each(self.rowcount) as r:
+                old, bar = (self.vector(f, name, r) for name in (f"bar stage{last - 1} a", "bar point3 a"))
+                self.put(f, f"bar stage{last - 1} a", r, f.select(active & (s.begin < 0.5), old + bar, old))
         with f.if_(steps):
             for i in reversed(stages):
                 stage_state(self, f, s, i, "point2", step)
+                if self.stages:
+                    self._evaluate_solved(f, i)
+                    self._solve_transposed(f, f"bar stage{i} a")
                 self._pull_accelerations(f, f"stage{i} linearization", f"bar stage{i} a", active)
                 self._accumulate_stage(f, h, i, range(i), active)
         with f.each(self.rowcount) as r:
             old = self.vector(f, "bar point2 a", r)
             self.put(f, "bar point2 a", r, f.select(active, old + self.vector(f, "bar stage0 a", r), old))
+
+    def _pull_accelerations_at_beginning(self, f: Function, s: Lane, active: Value):
+        """Pull the cotangents of point 3's accelerations where a run begins; elsewhere they are those of a stage."""
+        with f.each(self.rowcount) as r:
+            bar = self.vector(f, "bar point3 a", r)
+            self.put(f, "residual a", r, f.select(active & (s.begin > 0.5), bar, 0.0))
+        self._pull_accelerations(f, f"stage{self.last} linearization", "residual a", active)
+
+    def _solve_transposed(self, f: Function, name: str):
+        """Replace cotangents w of the accelerations of a solved stage by D^(-T) w."""
+        assert self.stages is not None
+        d = self.stages.exact(f)
+        with f.each(self.rowcount) as r:
+            d.row("x")[r] = self.vector(f, name, r)
+        f.call("solve_exact_transposed", f.given["work"])
+        with f.each(self.rowcount) as r:
+            self.put(f, name, r, d.row("b")[r])
 
     def _accumulate_stage(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
         """Add `bar state` of stage i to the cotangents of the point before and of the earlier stages."""

@@ -31,6 +31,11 @@ class Differentiated(Trajectory):
         if self.dense or self.formulated:
             self.accelerate(f, f"stage{i} a")  # derivatives are the same for all methods; values depend on the method
 
+    def _evaluate_solved(self, f: Function, i: int):
+        """Evaluate what derivatives need at the state of a solved stage of an implicit method, and factorize its matrix there."""
+        f.call("evaluation", f.given["work"], self.address(f, "residual a"), self.address(f, f"stage{i} linearization"))
+        f.call("factor_exact", f.given["work"])
+
     def write_programs(self):
         super().write_programs()
         for derivative in self._linearizations:

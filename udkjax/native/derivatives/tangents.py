@@ -6,11 +6,14 @@ the tangents of the stages are the sums
     dq_i = dq + h c_i dv + h^2 sum_j (A A)_ij da_j,        dv_i = dv + h sum_j A_ij da_j,
 
 and the tangents of the accelerations, the end of a step and the projected outputs come from the programs of derivatives
-(expressions/differential.py), which need intermediate results of the evaluation. Interpolation is linear.
+(expressions/differential.py), which need intermediate results of the evaluation. Interpolation is linear. A stage of an implicit
+method is the solution of a_i = a(t_i, Q_i + h^2 g^2 a_i, V_i + h g a_i) (stage_equations.py), so that
+
+    D da_i = a_q dQ_i + a_v dV_i + a_p dp.
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from udkjax.expressions.loop_derivative import FORWARD, TWICE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
@@ -112,10 +115,68 @@ class Forward(Differentiated):
     def record_stage(self, f: Function, s: Lane, i: int):
         """Compute the tangents of the stage's accelerations."""
         h = self.broadcast(f, s.step)
+        if self.stages:
+            self._change_solved_stage(f, i, h)
+            return
         with self._each_tangent(f):
             self._change_stage(f, i, h, "point3")
         with self._each_group(f):
             self._call_derivative(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
+
+    def _change_solved_stage(self, f: Function, i: int, h: Value):
+        """Compute the tangents of the accelerations of a solved stage; second derivatives from those along each direction."""
+        name, stored = f"stage{i} a", f"stage{i} linearization"
+        self._evaluate_solved(f, i)
+        with self._each_tangent(f):
+            self._clear(f, name)
+            self._change_stage(f, i, h, "point3")
+        with self._each_group(f) as p:
+            self._call_derivative(f, self.mode, stored, self._tangent_address(f, name))
+            self._solve(f, p, name, [way for way in self.ways if way in GIVEN])
+        if len(self.ways) == 1:
+            return
+        with self._each_group(f) as p:
+            group = f.given["tangent"]
+            f.given["tangent"] = self._way(f, self.ways[-1])
+            self._clear(f, name)
+            f.given["tangent"] = group
+        with self._each_tangent(f):
+            self._change_stage(f, i, h, "point3")
+        with self._each_group(f) as p:
+            self._call_derivative(f, self.mode, stored, self._tangent_address(f, "difference0"))
+            group = f.given["tangent"]
+            f.given["tangent"] = self._way(f, self.ways[-1])
+            with f.each(self.registers("tangent")) as r:
+                self.put(f, name, r, self.vector(f, "difference0", r, "tangent"), "tangent")
+            f.given["tangent"] = group
+            self._solve(f, p, name, self.ways[-1:])
+
+    def _clear(self, f: Function, name: str):
+        with f.each(self.registers("tangent")) as r:
+            self.put(f, name, r, f.const(0.0, DOUBLE, self.plan.vector), "tangent")
+
+    def _solve(self, f: Function, p: Value, name: str, ways: Sequence[str]):
+        """Solve D x = b in some tangents of group p, in place of the array b."""
+        assert self.stages is not None
+        d, group = self.stages.exact(f), f.given["tangent"]
+        b, x = d.row("b"), d.row("x")
+        for way in ways:
+            f.given["tangent"] = group
+            f.given["tangent"] = self._way(f, way)
+            if self.group == 1:
+                with f.each(self.rowcount) as r:
+                    b[r] = self.vector(f, name, r, "tangent")
+                f.call("solve_exact", f.given["work"])
+                with f.each(self.rowcount) as r:
+                    self.put(f, name, r, x[r], "tangent")
+                continue
+            with self._each_direction(f, p, f.const(0, INT)) as (_, lane):  # all have the same matrix
+                with f.each(self.n) as i:
+                    b.put(i, self.lane_entry(f, name, lane, i, "tangent"))
+                f.call("solve_exact", f.given["work"])
+                with f.each(self.n) as i:
+                    self.put_lane_entry(f, name, lane, x.entry(i), i, "tangent")
+        f.given["tangent"] = group
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         with f.if_(f.any_of(accept)):
@@ -142,11 +203,14 @@ class Forward(Differentiated):
                     new = f.select(begin, self.vector(f, f"point2 {x}", r, "tangent"), self.vector(f, f"state {x}", r, "tangent"))
                     self.put(f, f"state {x}", r, new, "tangent")
         self._project_end(f, begin)
-        with self._each_group(f):
+        # The accelerations at the end of an implicit step are those of its last stage.
+        with f.if_(f.any_of(begin)) if self.stages else nullcontext(), self._each_group(f):
             self._call_derivative(f, self.mode, f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
                 old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
+                if self.stages and x == "a":
+                    new = f.select(begin, new, self.vector(f, f"stage{self.last - 1} a", r, "tangent"))
                 self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
 
     def _project_end(self, f: Function, begin: Value):

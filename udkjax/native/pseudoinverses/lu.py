@@ -80,6 +80,16 @@ class LUCode(DenseMethod):
         with reversed_each(d, d.m) as k:  # entries left of the diagonal multiply coordinates that are still zero
             x.put(k, (y.entry(k) - d.dot(d.row("upper", k), x)) * d.row("inverse").entry(k))
 
+    def solve_transposed(self, d: DenseMatrices):
+        b, x, y = d.row("b"), d.row("x"), d.row("y")
+        with d.f.each(d.m) as k:  # entries left of the diagonal change coordinates that have been used
+            entry = x.entry(k) * d.row("inverse").entry(k)
+            y.put(k, entry)
+            d.axpy(-entry, d.row("upper", k), x)
+        b.clear()
+        with reversed_each(d, d.m) as k:
+            b.put_at(d.whole(d.row("order").entry(k)), y.entry(k) - d.dot(d.row("lower", k), b))
+
     def sign(self, d: DenseMatrices) -> Value:
         """Return the sign of det D: the product of the signs of the pivots, and -1 for each inversion of rows."""
         f, order, sign = d.f, d.row("order"), d.f.variable(1.0)
@@ -89,3 +99,33 @@ class LUCode(DenseMethod):
             with f.each(k) as i:
                 sign.value = f.select(order.entry(i) > place, -sign.value, sign.value)
         return sign.value
+
+
+@dataclass(frozen=True)
+class OrderedLUCode(LUCode):
+    """LU whose solutions round equally in any number of lanes: without scalar products, whose terms lanes add in another order.
+
+    Row k of `columns` is column k of U.
+    """
+
+    def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
+        return super().matrices(m, n) | {"columns": (n, m)}
+
+    def factor(self, d: DenseMatrices):
+        super().factor(d)
+        with d.f.each(d.m) as k:
+            upper = d.row("upper", k)
+            with d.f.each(d.n, k) as j:
+                d.row("columns", j).put(k, upper.entry(j))
+
+    def solve(self, d: DenseMatrices):
+        f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
+        with f.each(d.m) as k:
+            entry = b.at(d.whole(d.row("order").entry(k)))
+            y.put(k, entry)
+            d.axpy(-entry, d.row("lower", k), b)
+        x.clear()
+        with reversed_each(d, d.m) as k:  # entries below the diagonal change numbers that have been used
+            entry = y.entry(k) * d.row("inverse").entry(k)
+            x.put(k, entry)
+            d.axpy(-entry, d.row("columns", k), y)

@@ -77,7 +77,8 @@ def write_decide(module: Module):
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)
-    cost = where(begin, f.const(1.0, DOUBLE, f.width), float(module.method.stages))
+    per_step = s.iterations + 1.0 if module.method.is_implicit else f.const(float(module.method.stages), DOUBLE, f.width)
+    cost = where(begin, f.const(1.0, DOUBLE, f.width), per_step)
     cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
     s.until = _due_until(module, f, s, accept, stepping & begin)
@@ -162,10 +163,13 @@ def _judge_drift(module: Module, f: Function, s: Lane, accept: Value) -> Value:
 
 def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value) -> Value:
     """Return the time up to which outputs are due."""
-    begin = s.begin > 0.5
-    ready = accept & ((s.accepted > 0.0) | (~begin & (s.last > 0.5)))
+    begin, implicit = s.begin > 0.5, module.method.is_implicit
+    # Outputs of the first step are interpolated after the second; by an implicit method each step serves its own.
+    ready = accept & (~begin if implicit else (s.accepted > 0.0) | (~begin & (s.last > 0.5)))
     # The last step may end slightly before a breakpoint at the end of the run, where outputs are also due.
     until = f.select(ready, f.select(s.last > 0.5, f.max(s.t1, s.end), s.t1), -np.inf)
+    if implicit:
+        return until + f.select(s.lands > 0.5, s.smallest * GAP, 0.0)
     if module.plan.breaks:
         enough = ~begun & ((s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
         until = f.select(enough, until + f.select(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)

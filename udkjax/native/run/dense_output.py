@@ -1,6 +1,6 @@
 """States between steps: Newton's divided differences of the last four states with their velocities and accelerations."""
 
-from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Layout
 from udkjax.native.base.module import Module
 from udkjax.native.base.steps import POINTS, STRETCH
@@ -38,7 +38,8 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
             d = times[j] - times[i]
             inverse[i, j] = module.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
     used: list[Value | None] = [None, None]
-    all_near: Value | None = None
+    # Accelerations from an implicit method carry errors of steps before, which a polynomial of high degree would multiply.
+    all_near = f.const(False, BOOL, f.width) if module.method.is_implicit else None
     for k in range(1, POINTS - 1):
         near = (times[k] - times[k + 1]) * STRETCH >= step
         all_near = near if all_near is None else all_near & near

@@ -1,11 +1,11 @@
-"""One step of an explicit Runge-Kutta method with error estimate."""
+"""One step of a Runge-Kutta method with error estimate."""
 
 import numpy as np
 
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
-from udkjax.native.base.steps import NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT
+from udkjax.native.base.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
 from udkjax.native.run.manifold import newton, with_threshold
 
 
@@ -22,6 +22,9 @@ def write_attempt(module: Module):
     begins = f.all_of((s.begin > 0.5) | (s.stepping < 0.5))
 
     def take_stages():
+        if method.is_implicit:
+            f.call("take_stages_from_point3", f.given["work"])
+            return
         for i in range(1, stages):
             stage_state(module, f, s, i)
             module.accelerate_stage(f, i)
@@ -65,7 +68,12 @@ def write_attempt(module: Module):
                 module.invoke(f, "finish_by_fallback")
                 module.accelerate_end(f)
                 s.where(by_fallback, ok=1.0)
+    if method.is_implicit:  # at the beginning of a run there are no stages
+        module.copy(f, f"stage{stages - 1} a", "result a", s.begin < 0.5)
     _measure_error(module, f, s)
+    if method.is_implicit:
+        repeated = (FACTORS.safety / STAGE_SHRINK) ** method.order
+        s.where((s.diverged > 0.5) & (s.begin < 0.5) & (s.stepping > 0.5), error=repeated)
 
 
 def _measure_error(module: Module, f: Function, s: Lane):

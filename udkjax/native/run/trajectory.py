@@ -1,9 +1,10 @@
-"""Trajectories as machine code: an explicit Runge-Kutta method for q'' = a(t, q, v) with step control and projection.
+"""Trajectories as machine code: a Runge-Kutta method for q'' = a(t, q, v) with step control and projection.
 
 A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages only need accelerations (Hairer, Norsett, Wanner, II.14):
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j,        a_i = a(t + c_i h, q_i, v_i).
 
+The stages of an implicit method are solved one after another (stage_equations.py).
 Each accepted step is projected onto the constraint manifold. Outputs lie on the polynomial of degree 11 through the positions,
 velocities and accelerations of four consecutive accepted states, which is as accurate as the states and costs no evaluation, and
 are projected as well. Where the motion is not smooth, a step ends and the run begins anew.
@@ -32,6 +33,7 @@ from udkjax.native.run.formulations import FORMULATE
 from udkjax.native.run.members import write_begin, write_finish
 from udkjax.native.run.pieces import write_leave
 from udkjax.native.run.runge_kutta import write_attempt
+from udkjax.native.run.stage_equations import StageEquations
 
 
 class Trajectory(Module):
@@ -41,6 +43,7 @@ class Trajectory(Module):
         super().__init__(plan, differentiated, active)
         self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
         self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
+        self.stages = StageEquations(self, bool(differentiated)) if plan.steps and plan.method.is_implicit else None
 
     def write_programs(self):
         super().write_programs()
@@ -76,6 +79,8 @@ class Trajectory(Module):
 
     def write_functions(self):
         self.write_programs()
+        if self.stages:
+            self.stages.write()
         write_attempt(self)
         if self.pieces:
             write_leave(self)

@@ -19,7 +19,7 @@ from udkjax.devices import default_devices
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
-from udkjax.integrate.solvers import is_explicit
+from udkjax.integrate.solvers import has_method
 from udkjax.pinv import Auto, Elimination
 from udkjax.positions.assembly import Closure, State, close
 from udkjax.scene.mechanism import Mechanism
@@ -104,7 +104,7 @@ class GroupRun:
         method, formulation = fixed.get("method"), fixed.get("formulation")
         is_straight = isinstance(method, STRAIGHT_METHODS) and formulation is None
         in_lanes = (
-            is_explicit(fixed.get("solver"))
+            has_method(fixed.get("solver"))
             and (is_straight or not reason_for_plain(method or Auto(), formulation))
             and self.redundant is not None
         )

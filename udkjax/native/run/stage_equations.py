@@ -1,0 +1,195 @@
+"""The stages of a singly diagonally implicit Runge-Kutta method for q'' = a(t, q, v), by a simplified Newton method.
+
+With g the diagonal of the tableau, the accelerations a_i of a stage are the solution of
+
+    a_i = a(t_i, q_i, v_i),        q_i = Q_i + h^2 g^2 a_i,        v_i = V_i + h g a_i,
+
+where Q_i and V_i follow from the stages before. A correction d of a_i solves D d = a(t_i, q_i, v_i) - a_i, with the matrix
+
+    D = I - h g a_v - h^2 g^2 a_q,
+
+whose slopes are those at the beginning of the step. Its columns are derivatives along n directions, as many at a time as there
+are lanes for them. The correction changes q_i and v_i as well: their rounding errors are thus those of the state, not those of
+the accelerations, which a stiff force multiplies. For the same reason the accelerations at the end of a step are those of its
+last stage, and not those of the projected state.
+
+The iteration ends when the next correction of the state, from the rate of convergence, is below `STAGE_TOL` of the tolerance. A
+lane whose iteration does not converge repeats its step with a shorter one.
+"""
+
+from udkjax.native.base.ir import DOUBLE, INT, Function, Operand, Value
+from udkjax.native.base.layout import Layout
+from udkjax.native.base.module import Module
+from udkjax.native.base.program_derivative import SLOPES, ProgramDerivative
+from udkjax.native.base.steps import DIVERGING, STAGE_ITERATIONS, STAGE_TOL
+from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
+from udkjax.native.pseudoinverses.lu import OrderedLUCode
+from udkjax.native.run.runge_kutta import check_pivots, stage_state
+
+
+class StageEquations:
+    """The functions of a module that solve stages.
+
+        take_stages_from_point3(work)    the accelerations of all stages of the step `step` from point 3
+        factor_stage(work)               the LU factors of D, from the slopes at the state
+        solve_stage(work)                `guess a` of a stage, and its state
+
+    `exact`: whether there is a second matrix, at the state of each solved stage, for derivatives: by the implicit function
+    theorem those of a_i follow from D at the solution and from the slopes of a, whatever the iteration was. Its functions are
+
+        factor_exact(work)               its LU factors
+        solve_exact(work)                the row `x` = D^(-1) b
+        solve_exact_transposed(work)     the row `b` = D^(-T) x
+    """
+
+    def __init__(self, module: Module, exact: bool = False):
+        self._in, plan, n = module, module.plan, module.n
+        lanes = plan.vector if plan.width == 1 and plan.unrolled else plan.width
+        self._group = lanes // plan.width  # directions of a tangent
+        self._tangent = w = Layout(lanes, plan.vector)
+        for name in ("state q", "state v", "slope a"):
+            w.add(name, n)
+        self._slopes = ProgramDerivative(module, "accelerations", slopes=w)
+        p = module.places
+        p.add("slopes linearization", self._slopes.stored)
+        p.add("slope tangent", w.size * self._group)
+        for name in ("residual a", "guess a", "weight q", "weight v"):
+            p.add(name, n)
+        self._lu = OrderedLUCode(relative=True)
+        shapes = self._lu.matrices(n, n)
+        self._layout = DenseLayout(module, shapes, (n, n), "stage")
+        self._exact = DenseLayout(module, shapes, (n, n), "exact") if exact else None
+
+    def write(self):
+        """Write all functions."""
+        self._slopes.evaluation()
+        self._slopes.forward()
+        self._write_factor("factor_stage", self._layout)
+        self._write_solve()
+        self.write_stages("point3")
+        if self._exact is None:
+            return
+        self._write_factor("factor_exact", self._exact)
+        for name, solve in (("solve_exact", self._lu.solve), ("solve_exact_transposed", self._lu.solve_transposed)):
+            f, _ = self._in.function(name)
+            solve(DenseMatrices(self._exact, f))
+
+    def exact(self, f: Function) -> DenseMatrices:
+        """Return the matrix at a solved stage, in a function."""
+        assert self._exact is not None
+        return DenseMatrices(self._exact, f)
+
+    def _write_factor(self, name: str, layout: DenseLayout):
+        """Write the computation of D, from the slopes at the state, and of its LU factors."""
+        module = self._in
+        f, s = module.function(name)
+        work, d, lanes = f.given["work"], DenseMatrices(layout, f), self._tangent.width
+        tangent = f.given["tangent"] = module.address(f, "slope tangent")
+        f.call(f"evaluation_{SLOPES}", work, module.address(f, "residual a"), module.address(f, "slopes linearization"))
+        hg = s.step * module.method.diagonal
+        of_v = hg if module.plan.width > 1 else f.repeat(hg, lanes) if lanes > 1 else hg
+        of_q = of_v * of_v
+        with f.each(-(-module.n // self._group)) as group:
+            first = group * self._group
+            with f.each(self._tangent.size) as k:
+                f.store(0.0, tangent, k * lanes, lanes)
+            self._seed(f, first, of_q, of_v)
+            f.call(f"forward_{SLOPES}", work, module.address(f, "slopes linearization"), tangent, self._slope_address(f))
+            self._enter_columns(f, d, first)
+        self._lu.factor(d)
+
+    def _place(self, name: str, i: Operand) -> Operand:
+        return i * self._tangent.width + self._tangent[name] * self._tangent.width
+
+    def _slope_address(self, f: Function) -> Value:
+        return f.at(f.given["tangent"], self._tangent["slope a"] * self._tangent.width)
+
+    def _seed(self, f: Function, first: Value, of_q: Value, of_v: Value):
+        """Set the changes of the state along directions from `first` on: those of unit accelerations of one coordinate each."""
+        tangent, lanes, count = f.given["tangent"], self._tangent.width, self._in.n
+        if self._group == 1:
+            for name, x in (("state q", of_q), ("state v", of_v)):
+                f.store(x, tangent, self._place(name, first), lanes)
+            return
+        with f.each(self._group) as j, f.if_(first + j < count):
+            for name, x in (("state q", of_q), ("state v", of_v)):
+                f.store(f.lane(x, j), tangent, self._place(name, first + j) + j)
+
+    def _enter_columns(self, f: Function, d: DenseMatrices, first: Value):
+        """Enter the columns of D along directions from `first` on; those beyond the last are zero."""
+        tangent, n, lanes = f.given["tangent"], self._in.n, self._tangent.width
+        with f.each(n) as i:
+            f.store(-f.load(tangent, self._place("slope a", i), lanes), d.row("D", i).address, first * f.width, lanes)
+        with f.each(self._group) as j, f.if_(first + j < n):
+            row = d.row("D", first + j)
+            row.put(first + j, row.entry(first + j) + 1.0)
+
+    def _write_solve(self):
+        """Write `solve_stage(work)`: correct `guess a` with the state until they agree, in lanes that are `stepping`."""
+        module = self._in
+        f, s = module.function("solve_stage")
+        diagonal, width = module.method.diagonal, f.width
+        yes, d = f.const(1.0, DOUBLE, width), DenseMatrices(self._layout, f)
+        s.iterating, s.size = s.stepping, f.const(1.0, DOUBLE, width)
+        k = f.variable(0, INT, 1)
+        with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < STAGE_ITERATIONS)):
+            module.accelerate(f, "residual a")
+            check_pivots(module, f, s, "residual a")
+            self._correct(f, d)
+            active, hg = s.iterating > 0.5, module.broadcast(f, s.step * diagonal)
+
+            def change(r: Value, active: Value = active, hg: Value = hg) -> list[Value]:
+                step = f.select(active, d.row("x")[r], 0.0)
+                module.put(f, "guess a", r, module.vector(f, "guess a", r) + step)
+                ratios = []
+                for x, size in (("v", hg * step), ("q", hg * (hg * step))):
+                    module.put(f, f"state {x}", r, module.vector(f, f"state {x}", r) + size)
+                    ratio = f.abs(size) * module.vector(f, f"weight {x}", r)
+                    ratios.append(f.select(ratio.is_(ratio), ratio, float("inf")))
+                return ratios
+
+            size = module.largest(f, change)
+            is_first = k.value.is_(0)
+            rate = f.select(is_first, s.contraction, f.max(s.contraction * 0.3, size / f.max(s.size, 1e-300)))
+            converged = size * f.min(rate, 1.0) <= STAGE_TOL
+            diverges = ~(size < float("inf")) | (~is_first & (size > s.size * DIVERGING))
+            s.where(active, contraction=f.min(rate, 1.0), size=size, iterations=s.iterations + 1.0)
+            s.where(active & diverges & ~converged, diverged=1.0)
+            s.iterating = f.select(active & ~converged & ~diverges, yes, 0.0)
+            k.value = k.value + 1
+        s.where(s.iterating > 0.5, diverged=1.0)
+
+    def _correct(self, f: Function, d: DenseMatrices):
+        """Compute the correction x of `guess a` from `residual a`, the accelerations at its state."""
+        module, b = self._in, d.row("b")
+
+        def residual(r: Operand):
+            b[r] = module.vector(f, "residual a", f.like(r, INT, 1)) - module.vector(f, "guess a", f.like(r, INT, 1))
+
+        d.over_registers(module.rowcount, residual)
+        self._lu.solve(d)
+
+    def write_stages(self, start: str):
+        """Write the accelerations of all stages after the first, of the step from a point."""
+        module, method = self._in, self._in.method
+        f, s = module.function(f"take_stages_from_{start}")
+        s.contraction, s.diverged, s.iterations = f.const(1.0, DOUBLE, f.width), *(f.const(0.0, DOUBLE, f.width),) * 2
+        setattr(s, "state t", getattr(s, f"{start}_t"))
+        rtol, names = module.broadcast(f, s.rtol), [f"{start} a", *module.stage_accelerations[1:]]
+        with f.each(module.rowcount) as r:
+            for x in "qv":
+                old = module.vector(f, f"{start} {x}", r)
+                module.put(f, f"state {x}", r, old)
+                module.put(f, f"weight {x}", r, 1.0 / f.fma(rtol, f.abs(old), module.vector(f, f"scale {x}", r)))
+        f.call("factor_stage", f.given["work"])
+        for i in range(1, method.stages):
+            with f.each(module.rowcount) as r:
+                guess = module.weighted_sum(f, method.predictor[i], r, names)
+                guess = f.const(0.0, DOUBLE, module.plan.vector) if guess is None else guess
+                module.put(f, f"stage{i} a", r, guess)
+                module.put(f, "guess a", r, guess)
+            stage_state(module, f, s, i, start)
+            f.call("solve_stage", f.given["work"])
+            module.copy(f, "guess a", f"stage{i} a")
+            if start == "point3":
+                module.record_stage(f, s, i)
