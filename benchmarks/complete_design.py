@@ -1,4 +1,4 @@
-"""All four-bars through nine places and five poses: `python -m benchmarks.complete_design [SETS]`.
+"""All four-bars through nine points or five poses: `python -m benchmarks.complete_design [SETS]`.
 
 The published problem is solved in its own process, without stored machine code and on one core: its times include importing and
 compiling. Then known four-bars are searched by nine of their own places, at random crank angles, and by five poses. Finally the
@@ -75,7 +75,7 @@ def main(sets: int = SETS) -> None:
         flush=True,
     )
     rng = np.random.default_rng(0)
-    for count, what in ((9, "nine places"), (5, "five poses")):
+    for count, what in ((9, "nine points"), (5, "five poses")):
         times, hits, whole, classes = [], 0, 0, []
         for _ in range(sets):
             joints, poses = known_four_bar(rng, count)

@@ -140,12 +140,12 @@ def check_place(mechanism: Mechanism, of: str, point: Numbers | None) -> None:
 
 
 class PathGoal(Goal):
-    """A point passes through places in order.
+    """A point of the mechanism passes through given positions in order.
 
     Args:
         point: the name of a pin, or of a body together with `at`.
-        targets: the places (J, 2) in m; on a closed curve the last may equal the first.
-        values: values of the driver at each place (rad, m); by default found by the search.
+        targets: the positions (J, 2) in m; on a closed curve the last may equal the first.
+        values: values of the driver at each position (rad, m); by default found by the search.
         start: "given": values count from zero; "free": from a value found by the search.
         line: two pins; values are measured from the direction from the first to the second pin.
         at: the point in the body's own frame (m).
@@ -173,15 +173,15 @@ class PathGoal(Goal):
 
 
 class PoseGoal(Goal):
-    """A link passes through poses: one of its points reaches places, and the link reaches angles.
+    """A link passes through poses: one of its points reaches positions, and the link reaches angles.
 
     Angles are measured from one that the search determines; their residual is 2 `arm` sin(difference / 2), in m.
 
     Args:
         body: the link.
         targets: x, y (m) and angle (rad) of each pose (J, 3).
-        arm: the length (m) that weights angles; by default the extent of the places.
-        pin: the pin of the link that passes through the places; by default the link's origin, its centre of mass.
+        arm: the length (m) that weights angles; by default the extent of the positions.
+        pin: the pin of the link that passes through the positions; by default the link's origin, its centre of mass.
         values: values of the driver, as in a `PathGoal`.
         start: as in a `PathGoal`.
         line: as in a `PathGoal`.
@@ -260,7 +260,7 @@ class FunctionGoal(Goal):
 
 
 def goal_scale(goal: Goal, mechanism: Mechanism) -> float:
-    """Return the scale of the residuals: the extent of the places (m); for a function one radian or metre."""
+    """Return the scale of the residuals: the extent of the targets (m); for a function one radian or metre."""
     if not goal.has_place:
         return 1.0
     extent = float(np.max(np.ptp(goal.targets[:, :2], axis=0)))

@@ -119,7 +119,7 @@ def test_circuits_are_those_that_motions_meet(published):
 
 
 def test_a_known_mechanism_is_among_those_found():
-    """Random four-bars, turned, moved and scaled. If the crank turns, the nine places are in order, without defects."""
+    """Random four-bars, turned, moved and scaled. If the crank turns, the nine points are in order, without defects."""
     rng = np.random.default_rng(3)
     angles = np.sort(rng.uniform(0, 2 * np.pi, 9))
     A, B, P, _ = places_of(4.0, 1.0, 3.5, 3.0, 2.0 + 1.5j, angles)
@@ -189,7 +189,7 @@ CIRCLE = np.stack([np.cos(np.arange(9) * 0.6), np.sin(np.arange(9) * 0.6)], 1)
 @pytest.mark.parametrize(
     ("targets", "says"),
     [
-        (np.array(DATA["points"])[:8], "nine places; there are 8: use `design`"),
+        (np.array(DATA["points"])[:8], "nine points; there are 8: use `design`"),
         (np.array([*DATA["points"], DATA["points"][0]]), "leave out the last one"),
         (np.array([*DATA["points"][:8], DATA["points"][2]]), "targets 2 and 8 are the same"),
         (np.stack([np.arange(9.0), 2 * np.arange(9.0)], 1), "9 of the targets are on one line"),

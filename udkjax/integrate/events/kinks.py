@@ -206,7 +206,7 @@ class KinkPlaces(NamedTuple):
 
 
 def places_of_kinks(events: Sequence[Event], held: Sequence[HeldElement]) -> KinkPlaces:
-    """Return where the numbers of kinks are among those of all events."""
+    """Return the positions of the numbers of kinks among the numbers of all events."""
     sizes = [sum(map(np.size, jax.tree.leaves(eqx.filter(e, eqx.is_inexact_array)))) for e in events]
     starts, first = np.cumsum([0, *sizes]), len(events) - sum(len(x.smooth.turns) for x in held)
     sides, elements = [], []

@@ -1,4 +1,4 @@
-"""All four-bars through nine places of a point, or five poses of a link, each proven and classified.
+"""All four-bars through nine points of a path, or five poses of a link, each proven and classified.
 
 `complete_design` has the public function, `complete_designs` its results. `nine_points` tracks solutions of the equations of
 `dyads` from stored ones; `five_poses` finds dyads as eigenvectors; `certificate` proves real ones, with `balls`. `four_bars`

@@ -1,4 +1,4 @@
-"""All four-bars that meet a goal exactly: nine places of a point, or five poses of a link."""
+"""All four-bars that meet a goal exactly: nine points of a path, or five poses of a link."""
 
 from collections.abc import Mapping
 from itertools import combinations
@@ -61,9 +61,9 @@ def design_all(
     transmission: float = 0.0,
     rotation: bool = False,
 ) -> CompleteDesigns:
-    """Find all four-bars whose coupler point passes through nine places, or whose coupler passes through five poses.
+    """Find all four-bars that move a pin of the coupler through nine points, or the coupler through five poses.
 
-    Nine places have 1,442 classes of complex solutions, all tracked by a homotopy; five poses have four dyads, computed as
+    Nine points have 1,442 classes of complex solutions, all tracked by a homotopy; five poses have four dyads, computed as
     eigenvectors of a matrix. Each real solution is proven: by Krawczyk's theorem, with all rounding errors bounded, exactly one
     four-bar that meets the goal exactly lies within `radius` of its pins. There is no proof that further solutions do not
     exist; `paths` counts the outcomes of all tracked solutions. Positions are then assigned to circuits and branches, and the
@@ -93,7 +93,7 @@ def design_all(
         raise ValueError("the goal has values of the driver: no four-bar meets them in all positions; leave them out")
     point = goal.point if isinstance(goal, PathGoal) else goal.pin
     if point is None:
-        raise ValueError("pin: name the pin of the coupler that passes through the places")
+        raise ValueError("pin: name the pin of the coupler that passes through the points")
     drawn = read_four_bar(mechanism, point, only_driver(mechanism) if driver is None else driver)
     if isinstance(goal, PoseGoal) and goal.body != drawn.coupler:
         raise SceneError([f"goal: the body is not the coupler, {drawn.coupler}"], mechanism.name)

@@ -89,12 +89,12 @@ def require_nine_points(points: np.ndarray) -> None:
     """Raise `ValueError` unless there are nine different points, with at most six on a line or circle."""
     if len(points) != 9:
         cure = "leave out the last one of a closed curve" if len(points) == 10 else "use `design` for fewer or more"
-        raise ValueError(f"goal: finitely many four-bars go through nine places; there are {len(points)}: {cure}")
+        raise ValueError(f"goal: finitely many four-bars go through nine points; there are {len(points)}: {cure}")
     extent = float(np.max(np.ptp(points, axis=0)))
     for i, j in combinations(range(9), 2):
         if np.max(np.abs(points[i] - points[j])) <= SAME * extent:
             raise ValueError(
-                f"goal: targets {i} and {j} are the same place: eight places leave infinitely many four-bars; move one"
+                f"goal: targets {i} and {j} are the same point: eight points leave infinitely many four-bars; move one"
             )
     z = (points - points.mean(axis=0)) / extent
     rows = np.column_stack([np.sum(z**2, axis=1), z, np.ones(9)])
