@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.integrate.own_systems import G, pendulum
 from udkjax.equations.general import prepare_general
 from udkjax.equations.traced_system import trace_system
 from udkjax.integrate.compiled_mechanism import compile_mechanism
@@ -172,5 +173,64 @@ def test_what_has_no_scalar_form_is_left_to_diffrax():
 
 def test_the_shape_of_what_functions_return():
     system = udk.ConstrainedSystem(lambda q: jnp.ones(3), lambda t, q, v: -q)
-    with pytest.raises(ArgumentError, match=r"mass must return \(3, 3\) for 3 coordinates, not an array of shape \(3,\)"):
+    with pytest.raises(
+        ArgumentError, match=r"mass must return the shape \(3, 3\) for 3 coordinates, not an array of shape \(3,\)"
+    ):
         udk.simulate(system, TS, udk.State(np.zeros(3), np.zeros(3)))
+
+
+def test_quantities_of_a_motion():
+    """Energy, violation, load and multipliers of the spatial pendulum, of which all are known; also with traced numbers."""
+    mass, length = 2.0, 1.0
+    system = pendulum(mass, length)
+    start = udk.State(np.array([0.6, 0.0, -0.8]), np.array([0.0, 1.5, 0.0]))
+    run = udk.simulate(system, TS, start, **TIGHT)
+    energy = udk.energy(system, run)
+    assert_allclose(energy.kinetic, mass * np.sum(np.square(run.v), 1) / 2, rtol=1e-14)
+    assert_allclose(energy.total, mass * (1.5**2 / 2 - 0.8 * G), rtol=1e-10)
+    assert_allclose(udk.violation(system, run), 0.0, atol=1e-15)
+    reaction = udk.reactions(system, run)["constraint"]
+    pull = mass * (np.sum(np.square(run.v), 1) - G * np.asarray(run.q)[:, 2])
+    assert_allclose(reaction["load"], -pull[:, None] * run.q, atol=1e-9)
+    assert_allclose(reaction["multipliers"][:, 0], pull / 2, atol=1e-9)
+    assert_allclose(udk.singular_values(system, 0.0, start.q), [2.0], rtol=1e-14)
+    slope = jax.grad(lambda m: udk.energy(pendulum(m, length), run).total[0])(mass)
+    assert_allclose(slope, energy.total[0] / mass, rtol=1e-12)
+
+
+def test_assembly():
+    """The nearest state on the sphere, with its derivative by the radius; a state that cannot be closed is refused."""
+    guess = udk.State(np.array([0.7, 0.1, -0.8]), np.array([0.0, 1.5, 0.0]))
+    unit = guess.q / np.linalg.norm(guess.q)
+    found = udk.assemble(pendulum(), 0.0, guess)
+    assert_allclose(found.q, unit, atol=1e-14)
+    assert_allclose(found.v, guess.v - unit * (unit @ guess.v), atol=1e-14)
+    assert_allclose(jax.jacrev(lambda length: udk.assemble(pendulum(2.0, length), 0.0, guess).q)(1.0), unit, atol=1e-12)
+    never = udk.ConstrainedSystem(lambda q: jnp.eye(3), constraint=lambda t, q: q @ q + 1.0)
+    with pytest.raises(udk.AssemblyError, match="Psi by 1"):
+        udk.assemble(never, 0.0, guess)
+    with pytest.raises(ValueError, match="no initial guess"):
+        udk.assemble(pendulum())
+
+
+@pytest.mark.slow
+def test_control_intervals():
+    """Four intervals are one run; a gradient through a loop of them, whose systems hold the inputs."""
+    start = udk.State(np.array([0.6, 0.0, -0.8]), np.array([0.0, 1.5, 0.0]))
+
+    def end(push):
+        def advance(state, k):
+            base = pendulum()
+            pushed = udk.ConstrainedSystem(
+                base.mass, lambda t, q, v: push * jnp.array([1.0, 0.0, 0.0]), base.constraint, potential=base.potential
+            )
+            return udk.step(pushed, state, None, 0.5, **TIGHT), None
+
+        return jax.lax.scan(advance, start, jnp.arange(4))[0].q
+
+    single = udk.simulate(pendulum(), np.array([0.0, 2.0]), start, **TIGHT)
+    assert_allclose(end(0.0), single.q[-1], atol=1e-8)
+    slope = jax.jit(jax.jacrev(end))(0.3)
+    assert_allclose(slope, (end(0.3 + 1e-4) - end(0.3 - 1e-4)) / 2e-4, atol=1e-6)
+    with pytest.raises(ValueError, match="inputs are for mechanisms"):
+        udk.step(pendulum(), start, {"mass": 1.0}, 0.5)

@@ -10,9 +10,13 @@ from inspect import signature
 from typing import ParamSpec, TypeVar
 
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.annotations import NumberLike
 from udkjax.equations import constraints, determinacy, loads
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.constraints import BodyArray
+from udkjax.equations.general import ConstrainedSystem, singular_values_of_rows
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
@@ -58,5 +62,33 @@ force = compiled(loads.force)
 mass = compiled(loads.mass)
 kinetic_energy = compiled(loads.kinetic_energy)
 potential_energy = compiled(loads.potential_energy)
-singular_values = compiled(determinacy.singular_values)
+_singular_values = compiled(determinacy.singular_values)
+
+
+@checked
+def singular_values(
+    mechanism: Mechanism | ConstrainedSystem,
+    t: NumberLike,
+    q: BodyArray,
+    analysis: Analysis | None = None,
+    v: Float[ArrayLike, "n"] | None = None,
+) -> Float[Array, "k"]:
+    """Return the singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
+
+    Args:
+        mechanism: The mechanism, or a `ConstrainedSystem`, whose J is (Psi_q; phi_v).
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        analysis: The mechanism's `Analysis`, for its scales; by default computed here.
+        v: Velocities (n,) of a `ConstrainedSystem`, on which phi_v may depend; by default zero.
+
+    Returns:
+        min(m, n) singular values, dimensionless.
+    """
+    if isinstance(mechanism, Mechanism):
+        return _singular_values(mechanism, t, q, analysis)
+    t, q = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q))
+    return singular_values_of_rows(mechanism.traced(q.size), t, q, jnp.zeros_like(q) if v is None else jnp.asarray(v, q.dtype))
+
+
 uniqueness = compiled(determinacy.uniqueness)

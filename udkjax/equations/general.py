@@ -17,11 +17,12 @@ from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.scales import Scales
 from udkjax.equations.system_programs import system_programs
-from udkjax.equations.traced_system import TracedSystem, trace_system
+from udkjax.equations.traced_system import TracedSystem, load, trace_system
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.printing import PrintsLine
+from udkjax.programs.deferred import deferred
 
 
 class ConstrainedSystem(PrintsLine):
@@ -34,21 +35,64 @@ class ConstrainedSystem(PrintsLine):
 
     Args:
         mass: q -> M (n, n).
-        force: (t, q, v) -> F (n,).
+        force: (t, q, v) -> F (n,), or None.
         constraint: (t, q) -> Psi (m,), or None.
         velocity_constraint: (t, q, v) -> phi (k,), or None.
         breakpoints: times (s) where force or constraints are not smooth.
+        potential: (t, q) -> V (); -V_q is added to F, and `energy` returns V.
     """
 
     mass: Callable[[Vector], Float[ArrayLike, "n n"]]
-    force: Callable[[Time, Vector, Vector], Float[ArrayLike, "n"]]
+    force: Callable[[Time, Vector, Vector], Float[ArrayLike, "n"]] | None = None
     constraint: Callable[[Time, Vector], Float[ArrayLike, "m"]] | None = None
     velocity_constraint: Callable[[Time, Vector, Vector], Float[ArrayLike, "k"]] | None = None
     breakpoints: Float[Array, "k"] | None = eqx.field(converter=number_called("breakpoints", optional=True), default=None)
 
-    def traced(self, n: int) -> TracedSystem:
-        """Return the system with its functions traced for n coordinates, as machine code needs it."""
-        return trace_system(self, n)
+    potential: Callable[[Time, Vector], Float[ArrayLike, ""]] | None = None
+
+    @classmethod
+    def of_energy(
+        cls,
+        kinetic: Callable[[Vector, Vector], Float[ArrayLike, ""]],
+        force: Callable[[Time, Vector, Vector], Float[ArrayLike, "n"]] | None = None,
+        **others: Any,
+    ) -> "ConstrainedSystem":
+        """Return the system of a kinetic energy T = v^T M(q) v / 2, by Lagrange's equations: M = T_vv, F = T_q - (T_v)_q v.
+
+        Args:
+            kinetic: (q, v) -> T (), quadratic in v, in jax.numpy.
+            force: (t, q, v) -> generalized forces (n,), or None.
+            others: The other functions of a `ConstrainedSystem`, such as `potential` and `constraint`.
+        """
+        return cls(MassOfEnergy(kinetic), ForceOfEnergy(kinetic, force), **others)
+
+    def traced(self, n: int) -> Any:
+        """Return the system with functions that are traced for n coordinates; unchanged without float64, for JAX alone.
+
+        All its numbers are leaves then, also those that functions hold in their closures.
+        """
+        return trace_system(self, n) if jax.config.jax_enable_x64 else self
+
+
+class MassOfEnergy(eqx.Module):
+    """The mass matrix of a kinetic energy, T_vv."""
+
+    kinetic: Callable[[Vector, Vector], Any]
+
+    def __call__(self, q: Vector) -> Float[Array, "n n"]:
+        return jax.hessian(self.kinetic, 1)(q, jnp.zeros_like(q))
+
+
+class ForceOfEnergy(eqx.Module):
+    """The forces of Lagrange's equations beside M a: T_q - (T_v)_q v, and those that are given."""
+
+    kinetic: Callable[[Vector, Vector], Any]
+    force: Callable[[Time, Vector, Vector], Any] | None
+
+    def __call__(self, t: Time, q: Vector, v: Vector) -> Vector:
+        slope, change = jax.grad(self.kinetic)(q, v), jax.jvp(lambda q: jax.grad(self.kinetic, 1)(q, v), (q,), (v,))[1]
+        total = slope - change
+        return total if self.force is None else total + jnp.asarray(self.force(t, q, v))
 
 
 class GeneralEquations(AbstractSystem):
@@ -98,23 +142,30 @@ class GeneralEquations(AbstractSystem):
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Take two Newton steps in position and two in velocity, because phi may be nonlinear."""
-        for _ in range(2 if self.system.constraint is not None else 0):
-            plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
-            q = q - weight(plus @ self._psi(t, q))
-        for _ in range(2 if self.constrained else 0):
-            plus, weight = self._plus(q, self._slopes(t, q, v))
-            v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
+        for _ in range(2):
+            q = self.correct_position(t, q)
+        for _ in range(2):
+            v = self.correct_velocity(t, q, v)
         return q, v
 
     def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Take a Newton step in position and one in velocity; on the manifold the result has the derivatives of a projection."""
-        if self.system.constraint is not None:
-            plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
-            q = q - weight(plus @ self._psi(t, q))
-        if self.constrained:
-            plus, weight = self._plus(q, self._slopes(t, q, v))
-            v = v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
-        return q, v
+        q = self.correct_position(t, q)
+        return q, self.correct_velocity(t, q, v)
+
+    def correct_position(self, t: Time, q: Vector) -> Vector:
+        """Take a Newton step to Psi = 0."""
+        if self.system.constraint is None:
+            return q
+        plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
+        return q - weight(plus @ self._psi(t, q))
+
+    def correct_velocity(self, t: Time, q: Vector, v: Vector) -> Vector:
+        """Take a Newton step to Psi_dot = 0 and phi = 0."""
+        if not self.constrained:
+            return v
+        plus, weight = self._plus(q, self._slopes(t, q, v))
+        return v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """Return (I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
@@ -128,6 +179,25 @@ class GeneralEquations(AbstractSystem):
             dv = dv - weight(plus @ (slopes @ dv))
         return TangentPart(dq, dv)
 
+    def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
+        """Return v^T M v / 2 and V, zero without a potential."""
+        potential = self.system.potential
+        kinetic = v @ jnp.asarray(self.system.mass(q)) @ v / 2
+        return kinetic, jnp.zeros_like(kinetic) if potential is None else jnp.asarray(potential(t, q))
+
+    def residuals(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
+        """Return Psi and phi."""
+        return jnp.concatenate([self._psi(t, q), self._phi(t, q, v)])
+
+    def jacobian(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m n"]:
+        """Return A = (Psi_q; phi_v)."""
+        return self._slopes(t, q, v)
+
+    def loads(self, t: Time, q: Vector, v: Vector) -> Float[Array, "2 n"]:
+        """Return the loads of the constraints, -Psi_q^T lambda and -phi_v^T lambda."""
+        rows, multipliers, m = self._slopes(t, q, v), self.multipliers(t, q, v), len(self._psi(t, q))
+        return -jnp.stack([rows[:m].T @ multipliers[:m], rows[m:].T @ multipliers[m:]])
+
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         return jnp.all(jnp.isfinite(self.accelerations(t, q, v)))
 
@@ -139,8 +209,7 @@ class GeneralEquations(AbstractSystem):
         return self.system.constraint is not None or self.system.velocity_constraint is not None
 
     def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
-        mass, force = (jnp.asarray(x) for x in (self.system.mass(q), self.system.force(t, q, v)))
-        return mass, force, *self._rows(t, q, v)
+        return jnp.asarray(self.system.mass(q)), load(self.system, t, q, v), *self._rows(t, q, v)
 
     def _rows(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"]]:
         """Return A and c of A a = c."""
@@ -173,7 +242,7 @@ class GeneralEquations(AbstractSystem):
 
     def _free(self, t: Time, q: Vector, v: Vector) -> Vector:
         factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.system.mass(q)), lower=True)
-        return jax.scipy.linalg.cho_solve(factor, jnp.asarray(self.system.force(t, q, v)))
+        return jax.scipy.linalg.cho_solve(factor, load(self.system, t, q, v))
 
     def _slopes(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m n"]:
         return jnp.concatenate([jax.jacfwd(self._psi, 1)(t, q), jax.jacfwd(self._phi, 2)(t, q, v)])
@@ -195,3 +264,19 @@ def prepare_general(system: Any, method: Pseudoinverse | None, baumgarte: Baumga
     method = Auto() if method is None else method
     tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol
     return GeneralEquations(system, eqx.tree_at(lambda m: m.rank_tol, method, tol, is_leaf=lambda x: x is None), baumgarte)
+
+
+@deferred
+def singular_values_of_rows(system: Any, t: Time, q: Vector, v: Vector) -> Float[Array, "k"]:
+    """Return the singular values of A = (Psi_q; phi_v).
+
+    Args:
+        system: The system; its numbers may be traced.
+        t: Time (s).
+        q: Coordinates (n,).
+        v: Velocities (n,).
+
+    Returns:
+        min(m, n) singular values, largest first.
+    """
+    return jnp.linalg.svd(prepare_general(system, None, None).jacobian(t, q, v), compute_uv=False)

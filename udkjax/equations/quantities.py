@@ -5,13 +5,14 @@ from typing import Literal, NamedTuple, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import NumberLike, Vector
 from udkjax.equations.abstract_system import AbstractSystem, HistoryLike, MechanismSystem
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
-from udkjax.equations.general import ConstrainedSystem, prepare_general
+from udkjax.equations.general import ConstrainedSystem, GeneralEquations, prepare_general
 from udkjax.equations.textbook import prepare
 from udkjax.equations.traced_system import TracedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -125,7 +126,8 @@ def accelerations(
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
-    return _accelerations(mechanism, analysis, t, q, v, method, stabilization, formulation, multipliers)
+    system = mechanism.traced(q.size) if isinstance(mechanism, ConstrainedSystem) else mechanism
+    return _accelerations(system, analysis, t, q, v, method, stabilization, formulation, multipliers)
 
 
 @checked
@@ -137,17 +139,18 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -
         solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
 
     Returns:
-        Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers.
+        Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers. For a `ConstrainedSystem` the
+        rows of Psi, then those of phi.
     """
-    return _evaluate_along(mechanism, solution, _psi)
+    return _evaluate_along(mechanism, solution, _psi if isinstance(mechanism, Mechanism) else _residuals)
 
 
 @checked
-def energy(mechanism: Mechanism, solution: HistoryLike) -> Energy:
+def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> Energy:
     """Return T = v^T M v / 2 and V at each time of a solution.
 
     Args:
-        mechanism: The scene.
+        mechanism: The mechanism, or a `ConstrainedSystem`, whose V is its potential, zero without one.
         solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
 
     Returns:
@@ -203,7 +206,11 @@ def _psi(equations: AbstractSystem, t: Array, q: Vector, v: Vector) -> Array:
     return equations.violation(t, q, v)[0]
 
 
-def _energy(equations: MechanismSystem, t: Array, q: Vector, v: Vector) -> Energy:
+def _residuals(equations: GeneralEquations, t: Array, q: Vector, v: Vector) -> Array:
+    return equations.residuals(t, q, v)
+
+
+def _energy(equations: MechanismSystem | GeneralEquations, t: Array, q: Vector, v: Vector) -> Energy:
     return Energy(*equations.energy(t, q, v))
 
 
@@ -211,6 +218,8 @@ def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: HistoryL
     analysis = None
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism), mechanism.without_origin
+    else:
+        mechanism = mechanism.traced(np.shape(solution.q)[-1])
     return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity)
 
 

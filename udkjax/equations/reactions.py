@@ -12,7 +12,7 @@ without compliance, loads that remain undetermined are those of least norm.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from udkjax.equations.abstract_system import HistoryLike
 from udkjax.equations.analysis import analyse
 from udkjax.equations.constraints import psi_q
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
+from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -47,7 +48,7 @@ COMPLIANCE_TOL = 1e-10
 
 @checked
 def reactions(
-    mechanism: Mechanism,
+    mechanism: Mechanism | ConstrainedSystem,
     solution: HistoryLike,
     method: Pseudoinverse | None = None,
     stabilization: Baumgarte | None = None,
@@ -58,7 +59,7 @@ def reactions(
     """Return the load -Psi_q^T lambda of each joint and driver on each of its bodies: `reactions(mech, sol)["A"]["link1"]`.
 
     Args:
-        mechanism: the mechanism.
+        mechanism: the mechanism, or a `ConstrainedSystem`.
         solution: anything with ts (T,), q and v (T, bodies, 3).
         method: the pseudoinverse; by default `SVD`.
         stabilization: the run's `Baumgarte`, to include its terms.
@@ -73,10 +74,17 @@ def reactions(
     Returns:
         The load (T, 3): force x, force y (N) and torque (N m), -Psi_q^T lambda of the constraint's rows. With redundant
         constraints only the components marked by `unique_reactions` are determined; the accelerations are always unique.
+        Of a `ConstrainedSystem`: for "constraint" and "velocity_constraint" the "load" -A^T lambda on its coordinates (T, n), and
+        the "multipliers" lambda (T, m) of its rows A.
 
     Raises:
         ValueError: a compliance is negative or belongs to an unknown joint, or a joint has the wrong number of compliances.
     """
+    if isinstance(mechanism, ConstrainedSystem):
+        if compliances is not None or (frame, about) != ("ground", "centre"):
+            raise ValueError("the coordinates of a ConstrainedSystem have no frame: leave out frame, about and compliances")
+        states = _states(solution)
+        return _of_system(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
     loads = _loads(mechanism.without_origin, analysis, *states, method, stabilization, soft, frame, about)
@@ -108,6 +116,17 @@ def unique_reactions(
     analysis, (ts, q, _) = analyse(mechanism), _states(solution)
     marks = _uniqueness_of_loads(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol), frame, about)
     return _name_by_body(mechanism, marks)
+
+
+@deferred
+def _of_system(system: Any, ts: Array, q: Array, v: Array, method: Pseudoinverse, baumgarte: Baumgarte | None) -> ByBody:
+    equations = prepare_general(system, method, baumgarte)
+    loads, multipliers = (jax.vmap(f)(ts, q, v) for f in (equations.loads, equations.multipliers))
+    m = 0 if system.constraint is None else int(np.prod(jax.eval_shape(system.constraint, ts[0], q[0]).shape))
+    named = {"constraint": (loads[:, 0], multipliers[:, :m]), "velocity_constraint": (loads[:, 1], multipliers[:, m:])}
+    return {
+        name: {"load": load, "multipliers": rows} for name, (load, rows) in named.items() if getattr(system, name) is not None
+    }
 
 
 def _name_by_body(mechanism: Mechanism, values: list[list[Array]]) -> ByBody:

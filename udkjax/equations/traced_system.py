@@ -29,8 +29,14 @@ from udkjax.expressions.differential import SparseRow
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError
 
-FUNCTIONS = {"mass": "q", "force": "tqv", "constraint": "tq", "velocity_constraint": "tqv"}  # and their arguments
+FUNCTIONS = {"mass": "q", "force": "tqv", "constraint": "tq", "velocity_constraint": "tqv", "potential": "tq"}  # and arguments
 MOST_NUMBERS = 20_000  # more, as of a table, would be copied to the memory of every lane
+
+
+def load(system: Any, t: Time, q: Vector, v: Vector) -> Vector:
+    """Return F: the force of a system, if it has one, minus the slope of its potential."""
+    total = jnp.zeros_like(q) if system.force is None else jnp.asarray(system.force(t, q, v))
+    return total if system.potential is None else total - jax.grad(system.potential, 1)(t, q)
 
 
 class SystemFunctions:
@@ -105,7 +111,7 @@ class SystemFunctions:
         one, dq = graph.constant(1.0), [graph.input(("dq", i), "direction") for i in range(n)]
         (mass,) = self._read(partial(self.call, "mass"), "q")
         self.mass = [{i: s for i, s in enumerate(row) if not s.is_zero} for row in mass]
-        (force,) = self._read(partial(self.call, "force"), "t", "q", "v")
+        (force,) = self._read(lambda numbers, *state: load(TracedSystem(numbers, self), *state), "t", "q", "v")
         self.force = list(force.flat)
         self.psi, self.psi_dot, self.gamma, self.phi, self.bend = [], [], [], [], []
         self.psi_q, self.phi_v = [], []
@@ -157,17 +163,24 @@ class TracedSystem(eqx.Module):
     def mass(self, q: Vector) -> Float[Array, "n n"]:
         return self.functions.call("mass", self.numbers, q)
 
-    def force(self, t: Time, q: Vector, v: Vector) -> Vector:
-        return self.functions.call("force", self.numbers, t, q, v)
+    @property
+    def force(self) -> Callable[[Time, Vector, Vector], Array] | None:
+        return self._function("force")
 
     @property
     def constraint(self) -> Callable[[Time, Vector], Array] | None:
-        return partial(self.functions.call, "constraint", self.numbers) if self.functions.has("constraint") else None
+        return self._function("constraint")
 
     @property
     def velocity_constraint(self) -> Callable[[Time, Vector, Vector], Array] | None:
-        has_function = self.functions.has("velocity_constraint")
-        return partial(self.functions.call, "velocity_constraint", self.numbers) if has_function else None
+        return self._function("velocity_constraint")
+
+    @property
+    def potential(self) -> Callable[[Time, Vector], Array] | None:
+        return self._function("potential")
+
+    def _function(self, name: str) -> Callable[..., Array] | None:
+        return partial(self.functions.call, name, self.numbers) if self.functions.has(name) else None
 
     @property
     def without_origin(self) -> "TracedSystem":
@@ -227,8 +240,8 @@ def _checked(name: str, value: Array, n: int) -> Array:
     """Return the value of a function in the shape that it must have."""
     if name in ("constraint", "velocity_constraint"):
         value = jnp.atleast_1d(value)
-    wanted = {"mass": (n, n), "force": (n,)}.get(name)
-    if (wanted is not None and value.shape != wanted) or value.ndim > 2 or (wanted is None and value.ndim > 1):
-        shape = "a vector" if wanted is None else str(wanted)
+    wanted = {"mass": (n, n), "force": (n,), "potential": ()}.get(name)
+    if (wanted is not None and value.shape != wanted) or (wanted is None and value.ndim > 1):
+        shape = "a vector" if wanted is None else f"the shape {wanted}" if wanted else "a number"
         raise ArgumentError(f"{name} must return {shape} for {n} coordinates, not an array of shape {value.shape}")
     return value

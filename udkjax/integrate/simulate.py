@@ -20,6 +20,7 @@ from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.causes.find import explained
+from udkjax.integrate.causes.system_causes import explained_system
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.native_engine import integrate_concrete
@@ -152,7 +153,7 @@ def simulate(
         engine=engine,
     )
     system = mechanism
-    if isinstance(mechanism, ConstrainedSystem) and jax.config.jax_enable_x64:
+    if isinstance(mechanism, ConstrainedSystem):
         assert isinstance(state, State)  # checked above
         system = mechanism.traced(np.size(state.q))
     is_concrete = not isinstance(system, ConstrainedSystem) and system.is_concrete
@@ -191,6 +192,8 @@ def simulate(
         located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
 
     solution, missed, end = _run(system, analysis, ts, state, closure, choices, all_concrete)
+    if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(solution):
+        return _required(explained_system(solution, system, end), throw)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution, throw)
     if missed:

@@ -15,6 +15,7 @@ from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, is_within_jit, make_module, number
 from udkjax.devices import on_host
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
@@ -33,7 +34,7 @@ MOST_STEPS_OF_INTERVAL = 1_000  # default
 
 @checked
 def step(
-    mechanism: Mechanism,
+    mechanism: Mechanism | ConstrainedSystem,
     state: State,
     inputs: Mapping[str, Numbers] | None,
     dt: NumberLike,
@@ -51,7 +52,7 @@ def step(
     with a state from `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster.
 
     Args:
-        mechanism: the mechanism.
+        mechanism: the mechanism, or a `ConstrainedSystem`, whose functions hold the inputs.
         state: the state at the beginning.
         inputs: values of parameters by name, as in `with_parameters`, such as {"force.motor.value": 1.5}; None: no inputs.
         dt: the length of the interval (s), greater than zero.
@@ -68,29 +69,34 @@ def step(
     Raises:
         SimulationError: all numbers are concrete, and the end was not reached.
         SceneError: a name in `inputs` is not a parameter, or a value has another shape.
+        ValueError: there are inputs for a `ConstrainedSystem`.
     """
+    if inputs and isinstance(mechanism, ConstrainedSystem):
+        raise ValueError("inputs are for mechanisms: make a ConstrainedSystem of functions that hold the inputs of the interval")
+    moved: Any = mechanism.traced(np.size(state.q)) if isinstance(mechanism, ConstrainedSystem) else mechanism
     values, has_concrete_times = dict(inputs or {}), not (isinstance(t, Tracer) or isinstance(dt, Tracer))
     numbers = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, state, values, numbers, analysis))):
-        analysis = analysis or analyse(mechanism)
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((moved, state, values, numbers, analysis))):
+        analysis = analysis or _analysis_of(moved)
         if is_within_jit():
-            return _advance(mechanism, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
+            return _advance(moved, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
         values, numbers = ({name: number(x) for name, x in given.items()} for given in (values, numbers))
-        return _advance_at_once(mechanism.without_origin, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
-    split = _parts(mechanism, analysis)
+        return _advance_at_once(moved.without_origin, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
+    split = _parts(moved, analysis)
     run = _program(split.form, max_steps, engine)
     q, v = run(split.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
     if not np.isfinite(np.asarray(q)).all():
         ts = np.asarray(t, float) + np.array([0.0, 1.0]) * np.asarray(dt, float)
         tolerances: Any = {"rtol": rtol, "atol": atol, "dt0": dt, "max_steps": max_steps}
-        run = simulate(mechanism.with_parameters(values), ts, state, **tolerances, engine=engine)  # raises, with the cause
+        given = moved.with_parameters(values) if values else mechanism
+        run = simulate(given, ts, state, **tolerances, engine=engine)  # raises, with the cause
         return State(run.q[-1], run.v[-1])
     return make_module(State, q=q, v=v)
 
 
 def _advance(
-    mechanism: Mechanism,
-    analysis: Analysis,
+    mechanism: Any,
+    analysis: Analysis | None,
     state: State,
     values: Mapping[str, Numbers],
     numbers: Mapping[str, NumberLike],
@@ -114,6 +120,11 @@ def _advance(
 _advance_at_once = deferred(_advance)
 
 
+def _analysis_of(mechanism: Any) -> Analysis | None:
+    """Return the analysis of a mechanism; a user-defined system has none."""
+    return analyse(mechanism) if isinstance(mechanism, Mechanism) else None
+
+
 class MechanismParts(NamedTuple):
     """A mechanism and its analysis, split into structure and numbers."""
 
@@ -122,9 +133,9 @@ class MechanismParts(NamedTuple):
 
 
 @cached_by_identity
-def _parts(mechanism: Mechanism, analysis: Analysis | None) -> MechanismParts:
+def _parts(mechanism: Any, analysis: Analysis | None) -> MechanismParts:
     """Return the parts of a mechanism, cached for all of its steps."""
-    leaves, form = jax.tree.flatten((mechanism.without_origin, analysis or analyse(mechanism)))
+    leaves, form = jax.tree.flatten((mechanism.without_origin, analysis or _analysis_of(mechanism)))
     return MechanismParts(form, leaves if is_traced(leaves) else [np.asarray(x) for x in leaves])
 
 

@@ -26,13 +26,15 @@ from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.element_programs import has_rheonomic_joints
-from udkjax.equations.position_closure import is_closed
+from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.position_closure import CLOSURE, is_closed
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.positions import native_closing
 from udkjax.positions.closure import close_by_jax, close_by_machine_code, from_moment
 from udkjax.positions.open_rows import explain_open
+from udkjax.positions.system_closure import close_system
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
@@ -92,7 +94,11 @@ class Closure(NamedTuple):
 
 @checked
 def assemble(
-    mechanism: Mechanism, t: NumberLike = 0.0, state: State | None = None, throw: bool = True, analysis: Analysis | None = None
+    mechanism: Mechanism | ConstrainedSystem,
+    t: NumberLike = 0.0,
+    state: State | None = None,
+    throw: bool = True,
+    analysis: Analysis | None = None,
 ) -> State:
     """Return a state with Psi(t, q) = 0 and Psi_dot(t, q, v) = 0, near a given one.
 
@@ -100,7 +106,7 @@ def assemble(
     respect to every number of the mechanism and of the guess, even with redundant constraints.
 
     Args:
-        mechanism: the mechanism.
+        mechanism: the mechanism, or a `ConstrainedSystem`; this has no guess of its own, and first derivatives only.
         t: time (s).
         state: the state to start from; by default the initial guess of the bodies.
         throw: whether a mechanism that cannot be closed raises; with False, or where numbers are traced, the best state found is
@@ -113,10 +119,27 @@ def assemble(
     Raises:
         AssemblyError: joints stay open; it names them and carries the best state found.
     """
+    if isinstance(mechanism, ConstrainedSystem):
+        return _assemble_system(mechanism, t, state, throw)
     closure = close(mechanism, t, state, analysis=analysis)
     if throw:
         require_closed(mechanism, closure, t, state)
     return closure.state
+
+
+def _assemble_system(system: ConstrainedSystem, t: NumberLike, state: State | None, throw: bool) -> State:
+    if state is None:
+        raise ValueError("a ConstrainedSystem has no initial guess: give a state near a closed one, State(q, v)")
+    closed = close_system(
+        system.traced(np.size(state.q)), *(jnp.asarray(x, jnp.result_type(float)) for x in (t, state.q, state.v))
+    )
+    found = State(closed.q, closed.v)
+    if throw and not is_traced(closed):
+        worst = max(float(closed.position), float(closed.velocity))
+        if not worst <= CLOSURE.tol * max(1.0, float(jnp.max(jnp.abs(closed.v), initial=0.0))):
+            message = f"the constraints stay violated, Psi by {float(closed.position):.3g} and velocities by"
+            raise AssemblyError(f"{message} {float(closed.velocity):.3g}: start nearer to a state that satisfies them", found)
+    return found
 
 
 def close(

@@ -39,6 +39,13 @@ class FoundCause:
         self._run, self._text = run, text
         self._key = None if run is None else (int(run.result), run.time)
 
+    @classmethod
+    def of(cls, solution: Solution, text: str) -> "FoundCause":
+        """Return a cause that is known already."""
+        cause = cls(None, text)
+        cause._key = int(solution.code), float(solution.time)
+        return cause
+
     def text(self, code: int, time: float) -> str | None:
         """Return the cause of a run that ended with this code at this time (s); None for another run."""
         if (code, time) != self._key:

@@ -1,0 +1,146 @@
+"""Systems of the user's own whose motion is known: exactly, by independent equations, or by what it conserves."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+
+import udkjax as udk
+from tests.integrate import own_systems
+from tests.integrate.own_systems import G
+
+TIGHT: Any = {"rtol": 1e-11, "atol": 1e-11}
+TS = np.linspace(0.0, 10.0, 41)
+
+
+def run(system, q, v, ts=TS, **choices):
+    solution = udk.simulate(system, ts, udk.State(np.array(q), np.array(v)), **(TIGHT | choices))
+    assert solution.settings["engine"] == "native"
+    return solution
+
+
+def by_scipy(slope, y0, ts=TS):
+    return solve_ivp(slope, (ts[0], ts[-1]), y0, "DOP853", ts, rtol=1e-12, atol=1e-12).y
+
+
+def test_a_conical_pendulum():
+    radius, depth = 0.8, 0.6
+    rate = np.sqrt(G / depth)
+    q = run(own_systems.pendulum(), [radius, 0.0, -depth], [0.0, radius * rate, 0.0]).q
+    circle = [radius * np.cos(rate * TS), radius * np.sin(rate * TS), 0 * TS - depth]
+    assert_allclose(q, np.stack(circle, 1), rtol=0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_bead_on_a_turning_hoop():
+    radius, rate, start = 0.5, 6.0, 2.5
+    angle, _ = by_scipy(lambda t, y: [y[1], np.sin(y[0]) * (rate**2 * np.cos(y[0]) - G / radius)], [start, 0.0])
+    out = radius * np.sin(start)
+    solution = run(own_systems.bead_on_hoop(rate, radius), [out, 0.0, -radius * np.cos(start)], [0.0, out * rate, 0.0])
+    out = radius * np.sin(angle)
+    expected = [out * np.cos(rate * TS), out * np.sin(rate * TS), -radius * np.cos(angle)]
+    assert_allclose(solution.q, np.stack(expected, 1), rtol=0, atol=1e-10)
+
+
+def test_a_disc_rolls_in_a_circle():
+    """Leaning at a constant angle, at the rate that balances the moments; its energy is that of its motion and its height."""
+    lean, turn = -0.3, 2.0
+    spin, system = own_systems.steady_spin(lean, turn), own_systems.disc()
+    solution = run(system, [0.0, 0.0, 0.0, lean, 0.0], [0.4 * spin, 0.0, turn, 0.0, spin - turn * np.sin(lean)])
+    radius = 0.4 * spin / turn
+    circle = [radius * np.sin(turn * TS), radius * (1 - np.cos(turn * TS)), turn * TS, 0 * TS + lean]
+    assert_allclose(solution.q[:, :4], np.stack(circle, 1), rtol=0, atol=1e-9)
+    assert_allclose(udk.violation(system, solution), 0.0, atol=1e-14)
+    total = udk.energy(system, solution).total
+    assert_allclose(total, total[0], rtol=1e-12)
+    assert total[0] > udk.energy(system, solution).potential[0] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("chain", "rows", "rank"),
+    [pytest.param(own_systems.bennett, 14, 11, id="Bennett"), pytest.param(own_systems.bricard, 24, 23, id="Bricard")],
+)
+@pytest.mark.slow
+def test_an_overconstrained_chain_in_space(chain, rows, rank):
+    """One freedom where counting finds none: rank n - 1 of more rows; closed and conservative for 100 s."""
+    system, start = chain()
+    values = udk.singular_values(system, 0.0, start.q)
+    assert int(np.sum(values > 1e-9 * values[0])) == rank == len(start.q) - 1
+    ts = np.linspace(0.0, 100.0, 401)
+    solution = run(system, start.q, start.v, ts)
+    violated = udk.violation(system, solution)
+    assert violated.shape == (401, rows)
+    assert np.abs(violated).max() < 1e-12
+    energy = udk.energy(system, solution)
+    assert np.ptp(energy.total) < 1e-9 * energy.kinetic.max()
+    moved = np.linalg.norm(np.diff(solution.q, axis=0), axis=1)
+    assert moved.max() > 0.3
+
+
+@pytest.mark.slow
+def test_the_angles_of_bricards_chain():
+    """Its threefold symmetry relates alternate angles: cos a + cos b + cos a cos b = 0."""
+    system, start = own_systems.bricard()
+    q = run(system, start.q, start.v).q
+    axes = np.asarray(q)[:, 12:].reshape(len(TS), 4, 3)
+    points = np.asarray(q)[:, :12].reshape(len(TS), 4, 3)
+    links = np.diff(points, axis=1)
+    cosines = np.sum(links[:, 1:] * links[:, :-1], 2)  # between links that meet in a joint, both normal to its axis
+    assert_allclose(np.linalg.norm(axes, axis=2), 1.0, atol=1e-12)
+    a, b = cosines.T
+    assert_allclose(a + b + a * b, 0.0, atol=1e-9)
+    assert np.ptp(a) > 0.5
+
+
+@pytest.mark.slow
+def test_satellites_keep_a_formation():
+    """The relative motion is prescribed; the other is that of both masses together. The multipliers are the thrust."""
+    distance, rate = 0.1, 3.0
+
+    def gap(t):
+        return distance * np.array([np.cos(rate * t), 0.8 * np.sin(rate * t), 0.6 * np.sin(rate * t)])
+
+    def pull(r):
+        return -r / np.linalg.norm(r) ** 3
+
+    def slope(t, y):
+        return [*y[3:], *((2 * pull(y[:3]) + pull(y[:3] + gap(t)) + rate**2 * gap(t)) / 3)]
+
+    expected = by_scipy(slope, [1.0, 0, 0, 0, 1.0, 0])
+    system = own_systems.satellites(distance, rate)
+    q, v = [1.0, 0, 0, 1.0 + distance, 0, 0], [0, 1.0, 0, 0, 1.0 + 0.8 * distance * rate, 0.6 * distance * rate]
+    solution = run(system, q, v)
+    assert_allclose(solution.q[:, :3], expected[:3].T, rtol=0, atol=1e-9)
+    assert_allclose(solution.q[:, 3:] - solution.q[:, :3], np.stack([gap(t) for t in TS]), rtol=0, atol=1e-13)
+    load = udk.reactions(system, solution)["constraint"]["load"]
+    assert_allclose(load[:, :3], -load[:, 3:], rtol=0, atol=1e-12)
+    first = slope(0.0, expected[:, 0])[3:]
+    assert_allclose(load[0, :3], 2 * (first - pull(expected[:3, 0])), rtol=0, atol=1e-10)
+
+
+def test_a_rigid_body_by_a_quaternion():
+    """Its angular velocity is that of Euler's equations, whatever inertia the norm of the quaternion has."""
+    J, start = np.array([1.0, 2.0, 3.5]), np.array([0.3, 2.0, 0.1])
+
+    def euler(t, w):
+        return [
+            (J[1] - J[2]) * w[1] * w[2] / J[0],
+            (J[2] - J[0]) * w[2] * w[0] / J[1],
+            (J[0] - J[1]) * w[0] * w[1] / J[2],
+        ]
+
+    bodies = (own_systems.quaternion_body(J, along) for along in (jnp.array(1.0), jnp.array(5.0)))
+    one, other = (run(body, [1.0, 0, 0, 0], [0.0, *start / 2]) for body in bodies)
+    omega = jax.vmap(lambda p, dp: own_systems.spinning(p, dp)[0])(one.q, one.v)
+    assert_allclose(omega, by_scipy(euler, start).T, rtol=0, atol=5e-9)
+    assert_allclose(one.q, other.q, rtol=0, atol=1e-10)
+
+
+def test_a_singular_mass_matrix_is_named():
+    system = own_systems.quaternion_body(np.array([1.0, 2.0, 3.5]), 0.0)
+    with pytest.raises(udk.SimulationError, match="mass matrix is not positive definite: its eigenvalues are 0 to 14"):
+        run(system, [1.0, 0, 0, 0], [0.0, 0.1, 0.2, 0.3])

@@ -1,0 +1,46 @@
+"""The causes of failed runs of user-defined systems: a singular mass matrix, or a function that is not finite."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.integrate.causes.find import FoundCause
+from udkjax.integrate.solution import Solution
+from udkjax.programs.deferred import deferred
+
+SINGULAR = 1e-12  # largest ratio of the smallest eigenvalue of M to its largest that counts as zero
+
+
+def explained_system(solution: Solution, system: Any, end: tuple[Any, Any]) -> Solution:
+    """Return a failed solution with its cause, from the last state of the integrator; unchanged if there is none to see."""
+    t, (q, v) = np.asarray(end[0]), np.split(np.asarray(end[1]), 2)
+    with jax.ensure_compile_time_eval():
+        text = _cause(_values(system, t, q, v))
+    return replace(solution, found_cause=FoundCause.of(solution, text)) if text else solution
+
+
+@deferred
+def _values(system: Any, t: Any, q: Any, v: Any) -> dict[str, Array]:
+    """Return the values of all functions of a system at a state."""
+    values = {"mass": system.mass(q)}
+    values |= {name: function(t, q) for name in ("constraint", "potential") if (function := getattr(system, name)) is not None}
+    names = "force", "velocity_constraint"
+    return values | {name: function(t, q, v) for name in names if (function := getattr(system, name)) is not None}
+
+
+def _cause(values: dict[str, Array]) -> str:
+    broken = [name for name, value in values.items() if not np.all(np.isfinite(np.asarray(value)))]
+    if broken:
+        return f"{' and '.join(broken)} of the system {'is' if len(broken) == 1 else 'are'} not finite"
+    M = np.asarray(values["mass"])
+    eigenvalues = np.linalg.eigvalsh((M + M.T) / 2)
+    if not eigenvalues[0] > SINGULAR * np.abs(eigenvalues).max():
+        return (
+            f"the mass matrix is not positive definite: its eigenvalues are {eigenvalues[0]:.3g} to {eigenvalues[-1]:.3g}. Add "
+            "mass in directions that the constraints fix, such as Psi_q^T Psi_q to M and Psi_q^T gamma to F: the motion stays "
+            "the same"
+        )
+    return ""
