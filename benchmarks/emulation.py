@@ -7,10 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from udkjax.native import primitive
+from udkjax.native import primitive, records
 from udkjax.native.base import machine
+from udkjax.native.base.layout import INPUTS
+from udkjax.native.derivatives.record import FIRST_POINTS, Recorded
 from udkjax.native.gpu.kernel import VECTOR, KernelCode, kernel_code
 from udkjax.native.operations import Operation
+from udkjax.native.primitive import BREAKS
 
 ALONE = "define i1 @meet(i1 %goes_on) { ret i1 %goes_on }\n"  # a block of one thread
 
@@ -34,35 +37,39 @@ def calls_of(function: Callable, *given: Any) -> list[Called]:
     calls, call_members = [], primitive.call_members
 
     def record(*inputs: Any, operation: Operation, times: int) -> list[np.ndarray]:
-        arrays = [np.ascontiguousarray(x, float) for x in inputs]
+        arrays = [np.array(x, float) for x in inputs]  # copies, as callers may change theirs
         code = primitive.machine_code(operation, 1, 1)  # dense methods round otherwise in lanes
         outputs = code(arrays, operation.shapes(arrays, times))
         calls.append(Called(operation, arrays, times, [np.array(x) for x in outputs]))
         return outputs
 
-    caches, lanes = (primitive.generate, primitive.machine_code), machine.lanes
+    caches, lanes, largest = (primitive.generate, primitive.machine_code), machine.lanes, records.LARGEST
     for cache in caches:
         cache.cache_clear()
     # Sums over vectors depend on the size of a register.
     primitive.call_members, machine.lanes = record, lambda: VECTOR
+    records.LARGEST = 0  # as for the large batches of kernels
     try:
         with jax.disable_jit():
             function(*given)
     finally:
-        primitive.call_members, machine.lanes = call_members, lanes
+        primitive.call_members, machine.lanes, records.LARGEST = call_members, lanes, largest
         for cache in caches:
             cache.cache_clear()
     return [call for call in calls if call.outputs[0].shape[0] > 1]
 
 
-def call_record(code: KernelCode, call: Called, addresses: Sequence[int]) -> np.ndarray:
-    """The call record of a kernel, from the addresses of its inputs and outputs."""
-    inputs, count = call.inputs, len(call.inputs)
-    words = [len(call.outputs[0]), call.times, inputs[6].shape[1], inputs[-1].shape[code.module.directions_in]]
-    words += addresses[:count]
+def call_record(code: KernelCode, call: Called, addresses: Sequence[int], buffer: Sequence[int] = ()) -> np.ndarray:
+    """The call record of a kernel, from the addresses of its inputs and outputs; `buffer` has the fields of a buffer."""
+    inputs, module = call.inputs, code.module
+    names, arrays = (*INPUTS, *module.inputs, *module.results, *module.outputs), (*inputs, *call.outputs)
+    words = [len(call.outputs[0]), call.times, inputs[BREAKS].shape[1], inputs[-1].shape[module.directions_in]]
+    words += addresses[: len(inputs)]
     words += [x.size // len(x) if len(x) > 1 else 0 for x in inputs]
-    words += [*addresses[count:], 0]
-    assert len(words) == len(code.module.call_fields)
+    words += addresses[len(inputs) :]
+    words += [arrays[names.index(name)].shape[1] for name in module.lengths]
+    words += [*buffer, 0]
+    assert len(words) == len(module.call_fields)
     return np.array(words, np.int64)
 
 
@@ -80,10 +87,27 @@ class Thread:
         self._run(record, -(-self._memory.ctypes.data // 64) * 64, member)
 
 
+class Arrays:
+    """The arrays of a call of a kernel: its outputs, its buffer of records, and its call record."""
+
+    def __init__(self, code: KernelCode, call: Called):
+        self.outputs, fields = [np.full(x.shape, np.nan) for x in call.outputs], []
+        if isinstance(code.module, Recorded):
+            steps = call.inputs[-records.GIVEN_STEPS]
+            points = int(steps.max(initial=0.0)) + FIRST_POINTS
+            self._buffer = np.full(len(self.outputs[0]) * points * code.module.row + 1, np.nan)
+            fields = [self._buffer.ctypes.data, points, 0]
+        self.record = call_record(code, call, [x.ctypes.data for x in (*call.inputs, *self.outputs)], fields)
+
+    @property
+    def address(self) -> int:
+        """The address of the call record."""
+        return self.record.ctypes.data
+
+
 def run_threads(code: KernelCode, call: Called) -> list[np.ndarray]:
     """Run the threads one after another; return the outputs."""
-    thread, outputs = Thread(code), [np.full(x.shape, np.nan) for x in call.outputs]
-    record = call_record(code, call, [x.ctypes.data for x in (*call.inputs, *outputs)])
-    for member in range(len(outputs[0]) + 3):  # a block has threads without a member
-        thread(record.ctypes.data, member)
-    return outputs
+    thread, arrays = Thread(code), Arrays(code, call)
+    for member in range(len(arrays.outputs[0]) + 3):  # a block has threads without a member
+        thread(arrays.address, member)
+    return arrays.outputs

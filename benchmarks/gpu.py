@@ -30,6 +30,7 @@ END, OUTPUTS = 20.0, 101  # s; output times of runs with dense output
 TOLERANCES = (1e-6, 1e-9)
 SIZES = (1, 64, 256, 1024, 4096, 16_384, 65_536, 262_144, 1_048_576)
 MANY, CHECKED = 262_144, 4096  # members of throughputs, and of comparisons
+GRADIENTS = (4096, 65_536, 262_144)  # members of batches in reverse mode
 SCENES = {"excavator": 20.0, "andrews_squeezer": 0.03, "n_four_bar": 20.0, "slider_crank": 20.0, "four_bar": 20.0}  # ends (s)
 SCRIPT_LANES = 4096
 LIMIT = 280.0  # s of all measurements together
@@ -171,21 +172,32 @@ def tangents(report: Report):
 
 
 def gradients(report: Report):
-    """A gradient in reverse mode, of one run and of a batch: computed by the host."""
-    mechanism, ts = udk.library.parallelogram(), np.linspace(0.0, 2.0, 11)
-    known = udk.analyse(mechanism)
+    """Gradients in reverse mode with respect to a mass: over 2 s with 11 outputs, and over 20 s of the end."""
+    mechanism = udk.library.parallelogram()
+    known, cpu = udk.analyse(mechanism), jax.devices("cpu")[0]
 
-    def loss(mass):
-        moved = mechanism.with_parameters({"body.coupler.mass": mass})
-        return jnp.sum(udk.simulate(moved, ts, rtol=1e-6, atol=1e-6, throw=False, analysis=known).q ** 2)
+    def gradient(ts: Array | np.ndarray) -> Callable[[Array], Array]:
+        def loss(mass: Array) -> Array:
+            moved = mechanism.with_parameters({"body.coupler.mass": mass})
+            return jnp.sum(udk.simulate(moved, ts, rtol=1e-6, atol=1e-6, throw=False, analysis=known).q ** 2)
 
-    gradient = jax.grad(loss)
-    for kind, run, given in (
-        ("one", jax.jit(gradient), jnp.asarray(2.0)),
-        ("batch", jax.jit(jax.vmap(gradient)), jnp.linspace(1.0, 3.0, CHECKED)),
-    ):
-        each = seconds(lambda run=run, given=given: run(given))
-        report.add("gradients", kind=kind, members=given.size, ms=each * 1e3)
+        return jax.grad(loss)
+
+    short, long = gradient(np.linspace(0.0, 2.0, 11)), gradient(np.linspace(0.0, END, 2))
+    each = seconds(lambda run=jax.jit(short): run(jnp.asarray(2.0)))
+    report.add("gradients", kind="one", members=1, ms=each * 1e3)
+    for kind, batch, sizes in (("batch", jax.vmap(short), GRADIENTS[:1]), ("end", jax.vmap(long), GRADIENTS)):
+        masses = np.linspace(1.0, 3.0, sizes[0])
+        with jax.default_device(cpu):
+            on_host = np.asarray(jax.jit(batch)(jax.device_put(masses, cpu)))
+        on_card = np.asarray(jax.jit(batch)(jax.device_put(masses)))
+        report.add("gradients", kind=kind, equal=np.mean(on_card == on_host), largest=np.abs(on_card / on_host - 1.0).max())
+        for members in sizes:
+            run, given = jax.jit(batch), jnp.linspace(1.0, 3.0, members)
+            start = time.perf_counter()
+            jax.block_until_ready(run(given))
+            first, each = time.perf_counter() - start, seconds(lambda run=run, given=given: run(given))
+            report.add("gradients", kind=kind, members=members, first=first, ms=each * 1e3, a_second=members / each)
 
 
 def scenes(report: Report, name: str):
@@ -293,8 +305,10 @@ def emulated(smoke: bool) -> list[dict[str, Any]]:
     figures, mechanism = [], udk.library.parallelogram()
     members, end = (3, 0.2) if smoke else (64, END)
     for outputs in (2, 11):
-        run, y = ours(mechanism, np.linspace(0.0, end, outputs)), states(angles(-45.0, members))
-        for call in calls_of(run, y, 1e-6):
+        ts = np.linspace(0.0, end, outputs)
+        run, y = ours(mechanism, ts), states(angles(-45.0, members))
+        gradients = jax.vmap(jax.grad(lambda y, run=run: jnp.sum(run(y[None], 1e-6))))
+        for call in [*calls_of(run, y, 1e-6), *calls_of(gradients, y)]:
             results = run_threads(call.kernel, call)
             same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(results, call.outputs, strict=True))
             figures.append({"name": "emulation", "operation": type(call.operation).__name__, "outputs": outputs, "equal": same})

@@ -55,6 +55,7 @@ def integrate(problem: Problem) -> IntegratorOutput:
 class RecordedRun(NamedTuple):
     """The record of a run, through which reverse mode goes back."""
 
+    steps: Array  # accepted steps (1,)
     record: Array
     states: tuple[Array, ...]  # q and v (T, n) if T > 2, else empty
     kept: Array  # `IntegratorOutput.kept`
@@ -63,10 +64,10 @@ class RecordedRun(NamedTuple):
 def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, RecordedRun]:
     """Integrate a problem, and return its output with the record that `vjp` needs; both run the same compiled code."""
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
-    empty = (np.zeros(shape) for shape in ((1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
+    empty = (np.zeros(shape) for shape in ((1, 0), (1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     results = native_p.bind(*run_inputs(problem, operation), *empty, operation=operation, times=times)
     raw = _output(results[: RunStates.results])
-    return raw, RecordedRun(results[-1][0], (raw.q, raw.v) if times > 2 else (), raw.kept)
+    return raw, RecordedRun(raw.accepted.astype(float)[None], results[-1][0], (raw.q, raw.v) if times > 2 else (), raw.kept)
 
 
 def serves_derivatives(active: Problem) -> bool:
@@ -122,7 +123,7 @@ def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) 
     """Return the cotangents of the `active` numbers, from cotangents of the output states (T, 2n) and of the end (2n,)."""
     operation, kept = _operation(problem, active, reverse=True), run.kept[:, None]
     states: Any = [jnp.where(kept, x, x[0]) for x in run.states] or [np.zeros((len(problem.ts), len(problem.q)))] * 2
-    inputs = [x[None] for x in (run.record, *states, jnp.where(kept, ys, 0.0), end)]
+    inputs = [x[None] for x in (run.steps, run.record, *states, jnp.where(kept, ys, 0.0), end)]
     results = native_p.bind(*run_inputs(problem, operation), *inputs, operation=operation, times=len(problem.ts))
     numbersbar, qbar, vbar = results[RunStates.results : RunStates.results + 3]
     no_cotangents = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)

@@ -40,7 +40,6 @@ class Operation(ABC):
     in_lanes: ClassVar[bool] = True  # whether members run in lanes
     results: ClassVar[int] = len(OUTPUTS)  # number of outputs without directions, which come first
     share: ClassVar[int] = SHARE  # minimum number of members of a thread
-    is_reverse: ClassVar[bool] = False  # whether two passes, integration and backpropagation, write a part of the outputs each
 
     @property
     def all_settings(self) -> tuple[str, ...]:

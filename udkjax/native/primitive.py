@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scales import scales_p
+from udkjax.native import records
 from udkjax.native.base import host_program, machine
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
@@ -27,10 +28,10 @@ from udkjax.native.base.memory import Memory
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.steps import Status
 from udkjax.native.base.text import text_of_module
-from udkjax.native.derivatives import record
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
+from udkjax.native.runs import RunCotangents, goes_back
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
 from udkjax.threads import cores, thread_count
@@ -39,9 +40,6 @@ QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled co
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
 TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
-# Smallest batch whose records are not copied to a graphics card and back: members are integrated again, which takes as long.
-RECORDS = 64
-GIVEN_RECORD = 5  # place of the record among the inputs of reverse mode, from the last
 FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
 
@@ -80,7 +78,7 @@ class LoadedCode:
     """
 
     def __init__(self, operation: Operation, width: int, tangent_lanes: int):
-        self._module, self._in_passes = generate(operation, width, tangent_lanes), operation.is_reverse
+        self._operation, self._module = operation, generate(operation, width, tangent_lanes)
         self._field_count, self._share = len(self._module.call_fields), operation.share
         settings = operation.all_settings
         self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
@@ -109,11 +107,20 @@ class LoadedCode:
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
-        if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and not self._quick.library.is_optimized:
+        if (
+            self._seconds > 0.0
+            and shapes[0][0] <= QUICK_MEMBERS
+            and not self._quick.library.is_optimized
+            and self._is_quick(inputs)
+        ):
             outputs = self._call_quickly(inputs, shapes)
             if outputs is not None:
                 return outputs
         return self.prepare(inputs, shapes)()
+
+    def _is_quick(self, inputs: Sequence[np.ndarray]) -> bool:
+        """Return whether a limit of steps can be set and met: not if reverse mode integrates again, which has no such result."""
+        return not isinstance(self._operation, RunCotangents) or not goes_back(inputs) or records.are_given(inputs)
 
     def _call_quickly(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray] | None:
         """Return the outputs; None if there are too many steps."""
@@ -126,11 +133,11 @@ class LoadedCode:
         start = time.perf_counter()
         outputs = self.prepare(inputs, shapes, self._quick)()
         self._seconds -= time.perf_counter() - start
-        if column is not None and np.any(
-            is_limited & (outputs[OUTPUTS.index("info")][:, INFO.index("code")] == Status.STEP_LIMIT)
-        ):
-            self._seconds = 0.0
-            return None
+        if column is not None:
+            info = outputs[OUTPUTS.index("info")]
+            if info.size and np.any(is_limited & (info[:, INFO.index("code")] == Status.STEP_LIMIT)):
+                self._seconds = 0.0
+                return None
         return outputs
 
     def prepare(
@@ -138,8 +145,7 @@ class LoadedCode:
     ) -> "PreparedCall":
         """Return a call that can be repeated with other numbers in `inputs`, which are the given arrays if these are float64."""
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
-        # Each pass of reverse mode writes only a part of the outputs. The rest is zero, as jax.debug_nans would report NaN.
-        outputs = [np.full(shape, 0.0 if self._in_passes else np.nan) for shape in shapes]
+        outputs = [np.full(shape, np.nan) for shape in shapes]
         members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
         arrays, following = (*inputs, *outputs), (ctypes.c_int64 * 2)()
         record = (  # the fields in the order of `Memory.call_fields`
@@ -222,16 +228,18 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
 
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     """Lower for an NVIDIA graphics card: large batches run as a kernel; the host computes everything else."""
-    name = kernel_target(operation, inputs) or _select_code(inputs, operation).name_on_card
-    if not operation.is_reverse or max(x.shape[0] for x in inputs) < RECORDS:
-        return _call_target(name, inputs, operation, times)
-    # The record is copied without its points, so that members are integrated again.
-    if inputs[-1].shape[0]:
-        given = [x[:, : record.TITLE] if k == len(inputs) - GIVEN_RECORD else x for k, x in enumerate(inputs)]
-        return _call_target(name, given, operation, times)
-    *outputs, title = _call_target(name, inputs, operation, times, record.TITLE)
-    length = operation.shapes(inputs, times)[-1][1]
-    return [*outputs, jnp.pad(title, ((0, 0), (0, length - record.TITLE)))]
+
+    def call(inputs: Sequence[Any], operation: Operation) -> Sequence[Array]:
+        kernel = kernel_target(operation, inputs)
+        if kernel is None:
+            return _call_target(_select_code(inputs, operation).name_on_card, inputs, operation, times)
+        return _call_target(kernel, records.with_longest(inputs, operation), operation, times)
+
+    members = operation.shapes(inputs, times)[0][0]
+    if records.are_stored(inputs, operation, members, on_card=True):
+        return call(inputs, operation)
+    *outputs, last = call(*records.without_records(inputs, operation))
+    return [*outputs, last if goes_back(inputs) else records.absent_records(operation, members)]
 
 
 def _lower_for_others(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
@@ -245,21 +253,9 @@ def _result_shapes(inputs: Sequence[Any], operation: Operation, times: int) -> l
     return [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in operation.shapes(inputs, times)]
 
 
-def _call_target(
-    name: str, inputs: Sequence[Any], operation: Operation, times: int, last_length: int | None = None
-) -> Sequence[Array]:
-    """Call a target of XLA; the last output may have another length than usual."""
-    shapes = _result_shapes(inputs, operation, times)
-    if last_length is not None:
-        shapes[-1] = jax.ShapeDtypeStruct((shapes[-1].shape[0], last_length), jnp.float64)
-    outputs = jax.ffi.ffi_call(name, shapes)(*inputs)
-    if not operation.is_reverse:
-        return outputs
-    # The outputs that a pass does not write (`LoadedCode`) are uninitialized memory.
-    results, (*bars, last) = outputs[: len(OUTPUTS)], outputs[len(OUTPUTS) :]
-    if inputs[-1].shape[0]:
-        return [*map(jnp.zeros_like, results), *bars, last]
-    return [*results, *map(jnp.zeros_like, bars), jnp.where(jnp.isfinite(last), last, 0.0)]
+def _call_target(name: str, inputs: Sequence[Any], operation: Operation, times: int) -> Sequence[Array]:
+    """Call a target of XLA."""
+    return jax.ffi.ffi_call(name, _result_shapes(inputs, operation, times))(*inputs)
 
 
 def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:
@@ -286,6 +282,12 @@ def _batch(
         changes = [x.reshape(x.shape[0], size, x.shape[1] // size, *x.shape[2:]) for x in outputs[results:]]
         return [*outputs[:results], *changes], [*[None] * results, *[1] * len(changes)]
     members = max(x.shape[0 if axis is None else 1] for x, axis in zip(first, axes, strict=True))
+    if not records.are_stored(first, operation, size * members):
+        inputs, without = records.without_records(first, operation)
+        outputs, batched = _batch(inputs, [None if axis is None else 0 for axis in axes], without, times)
+        if not goes_back(inputs):
+            outputs[-1], batched[-1] = records.absent_records(operation, members), None
+        return outputs, batched
 
     def as_members(x: Any, axis: int | None) -> Any:
         if axis is None and x.shape[0] <= 1:

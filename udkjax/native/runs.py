@@ -139,19 +139,36 @@ class RunSecondTangents(RunTangents):
 
 @dataclass(frozen=True)
 class RunCotangents(RunStates):
-    """Integrate and return a record; or, with cotangents of the states and of the end, backpropagate to all numbers."""
+    """Integrate and return a record; or, with cotangents of the states and of the end, backpropagate to all numbers.
+
+    The outputs of the other pass are empty.
+    """
 
     active: tuple[bool, ...] = ()
-    points: int = record.STORED  # capacity of the record of a run
-    is_reverse: ClassVar[bool] = True
+    points: int = record.STORED  # capacity of the record of a run; without capacity, runs are integrated again
+
+    @property
+    def record_length(self) -> int:
+        """The length of a record that is stored."""
+        return self.points and record.record_length(self.code.coordinate_count, self.points)
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return Reverse(self.plan(width, vector), self.active)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
-        n, is_first = self.code.coordinate_count, not inputs[-1].shape[0]  # without cotangents
+        n, results = self.code.coordinate_count, super().outputs(inputs, times)
         bars: list[tuple[int, ...]] = [(self.code.number_count,), (n,), (n,)]
         if self.sampled:
-            bars.append((0 if is_first else inputs[INPUTS.index("breaks")].shape[1] + 1, len(self.sampled)))
-        stored = (record.record_length(n, self.points) if is_first else 0,)
-        return [*super().outputs(inputs, times), *bars, stored]
+            bars.append((inputs[INPUTS.index("breaks")].shape[1] + 1, len(self.sampled)))
+        if goes_back(inputs):
+            return [*map(_empty, results), *bars, (0,)]
+        return [*results, *map(_empty, bars), (self.record_length,)]
+
+
+def goes_back(inputs: Sequence[Any]) -> bool:
+    """Return whether the inputs of reverse mode are those of its second pass, with cotangents."""
+    return inputs[-1].shape[-2] > 0
+
+
+def _empty(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (0, *shape[1:])

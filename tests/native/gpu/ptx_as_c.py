@@ -135,6 +135,9 @@ def instruction(text: str) -> str:
         return f"{to} = (u)(((unsigned __int128){x[0]} * {x[1]}) >> 64);"
     if parts[0] == "shr" and parts[-1][0] == "s":
         return f"{to} = (u)((s){x[0]} >> {x[1]});"
+    if parts[0] in ("max", "min"):
+        sign, cast = "><"[parts[0] == "min"], "(s)" if parts[-1][0] == "s" else ""
+        return f"{to} = {cast}{x[0]} {sign} {cast}{x[1]} ? {x[0]} : {x[1]};"
     return f"{to} = {OF_WHOLE[parts[0]].format(*x)};"
 
 

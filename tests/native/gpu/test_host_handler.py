@@ -11,6 +11,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from jax.interpreters import mlir
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from udkjax.native import primitive
+from udkjax.native import primitive, records
 from udkjax.native.base import ffi, host_function, host_program
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.driver import CudaError
@@ -81,12 +82,8 @@ class Card:
         return ctypes.cast(self._functions[name], ctypes.c_void_p).value
 
     def within_cpu(self, library, name="copy_and_call"):
-        """A handler of the CPU that calls the handler of a library in a frame whose API has the stream of a card."""
+        """A handler of the CPU that calls the handler of a library in a frame with functions of a card (`functions_of_xla`)."""
         handle = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(library[name])
-
-        @ctypes.CFUNCTYPE(ctypes.c_void_p, ADDRESS)
-        def stream(struct):
-            self.write(struct + 24, STREAM)
 
         @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
         def trampoline(frame):
@@ -94,15 +91,24 @@ class Card:
                 return handle(frame)
             api = ADDRESS.from_address(frame + ffi.API).value
             copied = ctypes.create_string_buffer(ctypes.string_at(api, ADDRESS.from_address(api).value))
-            self.write(ctypes.addressof(copied) + ffi.STREAM, ctypes.cast(stream, ctypes.c_void_p).value)
+            replaced = {
+                offset: ctypes.CFUNCTYPE(ctypes.c_void_p, ADDRESS)(partial(function, api))
+                for offset, function in self.functions_of_xla().items()
+            }
+            for offset, function in replaced.items():
+                self.write(ctypes.addressof(copied) + offset, ctypes.cast(function, ctypes.c_void_p).value)
             self.write(frame + ffi.API, ctypes.addressof(copied))
             try:
                 return handle(frame)
             finally:
                 self.write(frame + ffi.API, api)
 
-        self._functions[next(self._frames)] = stream, trampoline, library
+        self._functions[next(self._frames)] = trampoline, library
         return {name: ctypes.cast(trampoline, ctypes.c_void_p).value}
+
+    def functions_of_xla(self):
+        """The functions of XLA that differ on a card, by their offsets: of the API's address and that of their arguments."""
+        return {ffi.STREAM: lambda api, struct: self.write(struct + 24, STREAM)}
 
 
 @pytest.fixture
@@ -153,7 +159,7 @@ def test_runs_and_their_derivatives_are_those_of_the_cpu(request):
 
 
 def test_batches_do_not_copy_their_records(request):
-    inertias = jnp.linspace(0.3, 0.5, primitive.RECORDS)
+    inertias = jnp.linspace(0.3, 0.5, records.LARGEST_ON_CARD)
     slope = jax.vmap(jax.grad(lambda x: angles(x)[-1]))
     expected = np.asarray(jax.jit(slope)(inertias))
     card = request.getfixturevalue("card")

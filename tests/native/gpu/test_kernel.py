@@ -1,5 +1,6 @@
 """Kernels without a graphics card: their threads run one after another, bitwise equal to the engine, also in JAX programs."""
 
+import ctypes
 import itertools
 import platform
 import shutil
@@ -16,12 +17,12 @@ from numpy.testing import assert_array_equal
 import udkjax as udk
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
-from udkjax.native import primitive
-from udkjax.native.base import machine
-from udkjax.native.base.program import UnsupportedError
-from udkjax.native.gpu import launch, target
+from udkjax.native import primitive, records
+from udkjax.native.base import ffi, machine
+from udkjax.native.gpu import launch, launch_handler, target
 from udkjax.native.gpu.driver import CudaError
-from udkjax.native.gpu.kernel import VECTOR, kernel_code
+from udkjax.native.gpu.kernel import VECTOR
+from udkjax.native.runs import RunCotangents
 
 emulation = pytest.importorskip("benchmarks.emulation", reason="not in a source tree")
 gpu = pytest.importorskip("benchmarks.gpu")
@@ -47,6 +48,10 @@ def with_tangent(f):
     return lambda x: jax.jvp(f, (x,), (1.0,))
 
 
+def with_gradient(f):
+    return jax.grad(lambda x: jnp.sum(jnp.sin(f(x))))
+
+
 def with_second(f):
     return lambda x: jax.jvp(jax.jacfwd(f), (x,), (1.0,))
 
@@ -63,25 +68,24 @@ RUNS = {
     "SVD": last(LINKAGE, "body.coupler.mass", method=udk.SVD()),
     "tangent": with_tangent(last(PENDULUM, "body.rod.mass", 4)),
     "two tangents": jax.jacfwd(lambda x: last(FOUR_BAR, "pin.B", 3)(jnp.stack([x, 1.0]))),
+    "gradient": with_gradient(last(PENDULUM, "body.rod.mass", 4)),
+    "gradient of a closed one": with_gradient(last(FOUR_BAR, "pin.B[0]", 3)),
+    "gradient by Baumgarte": with_gradient(last(LINKAGE, "body.coupler.mass", stabilization=udk.Baumgarte())),
     "second tangent": with_second(last(PENDULUM, "body.rod.mass", 3)),
 }
 
 
-FAST = ("redundant", "closed", "elementary functions", "tangent", "SVD")
+FAST = ("redundant", "gradient", "closed", "elementary functions", "tangent", "SVD")
 
 
 @pytest.mark.parametrize("name", [x if x in FAST else pytest.param(x, marks=pytest.mark.slow) for x in RUNS])
 def test_threads_compute_what_the_engine_computes(name):
     calls = emulation.calls_of(jax.vmap(RUNS[name]), MASSES)
-    served = 0
+    assert calls
     for call in calls:
-        if call.operation.is_reverse:
-            continue
         results = emulation.run_threads(call.kernel, call)
         for found, known in zip(results, call.outputs, strict=True):
             assert_array_equal(found, known)
-        served += 1
-    assert served
 
 
 def test_constants_that_all_members_share_are_in_the_memory_of_the_block(tmp_path):
@@ -91,9 +95,9 @@ def test_constants_that_all_members_share_are_in_the_memory_of_the_block(tmp_pat
     assert call.kernel.constants > 0 and "@block_memory" in call.kernel.text
     found = [emulation.run_threads(call.kernel, call)]
     if shutil.which("cc") and platform.machine() == "x86_64":
-        found.append([np.full(x.shape, np.nan) for x in call.outputs])
-        record = emulation.call_record(call.kernel, call, [x.ctypes.data for x in (*call.inputs, *found[1])])
-        ptx_as_c.compiled(target.ptx(call.kernel.text), tmp_path)(record.ctypes.data, 5)
+        arrays = emulation.Arrays(call.kernel, call)
+        ptx_as_c.compiled(target.ptx(call.kernel.text), tmp_path)(arrays.address, 5)
+        found.append(arrays.outputs)
     for outputs in found:
         for x, known in zip(outputs, call.outputs, strict=True):
             assert_array_equal(x, known)
@@ -112,27 +116,22 @@ def test_threads_run_every_mechanism_of_the_library(name):
         moved = mechanism.with_parameters({"gravity": gravity * x})
         return udk.simulate(moved, np.linspace(0.0, end, 4), rtol=1e-7, atol=1e-7, throw=False, analysis=known).q
 
-    for f in (run, with_tangent(run)):
-        calls = [x for x in emulation.calls_of(jax.vmap(f), np.array([0.8, 1.0, 1.1])) if not x.operation.is_reverse]
+    for f in (run, with_tangent(run), with_gradient(run)):
+        calls = emulation.calls_of(jax.vmap(f), np.array([0.8, 1.0, 1.1]))
         assert any("Run" in type(x.operation).__name__ for x in calls)
         for call in calls:
             for found, known_output in zip(emulation.run_threads(call.kernel, call), call.outputs, strict=True):
                 assert_array_equal(found, known_output)
 
 
-def test_operations_without_a_kernel_are_refused():
-    calls = emulation.calls_of(jax.vmap(jax.grad(lambda x: RUNS["tangent"](x)[0].sum())), MASSES)
-    (name, *_) = (type(x.operation).__name__ for x in calls if x.operation.is_reverse)
-    with pytest.raises(UnsupportedError, match=f"{name} on a GPU"):
-        kernel_code(next(x.operation for x in calls if x.operation.is_reverse))
-
-
 class Launching(Card):
-    """A card that runs the threads of a kernel one after another."""
+    """A card that runs the threads of a kernel one after another, and lends at most `most` bytes."""
+
+    most = 2**40
 
     def __init__(self):
         super().__init__()
-        self.threads, self.grids = [], []
+        self.threads, self.grids, self.lent = [], [], []
         self.add("cuLaunchKernel", 11, self._launch)
 
     def _launch(self, kernel, *given):
@@ -140,13 +139,33 @@ class Launching(Card):
         stream, parameters, extra = given[7:]
         assert (y, z, *others, shared, stream, extra) == (1, 1, 1, 1, 0, STREAM, 0)
         self.grids.append((x, threads))
-        for member in range(x * threads):
-            self.threads[kernel - 1](ADDRESS.from_address(parameters).value, member)
+        for thread in range(x * threads):
+            self.threads[kernel - 1](ADDRESS.from_address(parameters).value, thread)
 
     def load_kernel(self, of, code):
         assert of is self
         self.threads.append(emulation.Thread(code))
         return len(self.threads)
+
+    def functions_of_xla(self):
+        return super().functions_of_xla() | {ffi.ALLOCATE: self._lend, ffi.FREE: self._take_back}
+
+    def _lend(self, api, struct):
+        size, alignment = (ADDRESS.from_address(struct + offset).value for offset in (24, 32))
+        assert alignment <= 16  # as XLA demands
+        if size > self.most:
+            create = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(ADDRESS.from_address(api + ffi.CREATE_ERROR).value)
+            words = ctypes.c_char_p(b"the card is full")
+            given = (ctypes.c_uint64 * 4)(32, 0, ctypes.cast(words, ctypes.c_void_p).value, ffi.RESOURCE_EXHAUSTED)
+            return create(ctypes.addressof(given))
+        self.lent.append(np.full(size // 8 + alignment // 8, np.nan))
+        self.write(struct + 40, -(-self.lent[-1].ctypes.data // alignment) * alignment)
+        return None
+
+    def _take_back(self, api, struct):
+        size, place = (ADDRESS.from_address(struct + offset).value for offset in (24, 32))
+        assert size == self.lent[-1].nbytes - 16 and 0 <= place - self.lent[-1].ctypes.data < 16
+        self.lent[-1] = size
 
 
 @pytest.fixture
@@ -158,27 +177,20 @@ def card(monkeypatch):
         "TARGET": f"udkjax_test_{next(NUMBERS)}_",
         "MEMBERS_OF_CORE": 1,
         "thread_count": lambda: 2,
-        "BLOCK": 4,
         "driver": lambda: card,
         "load_kernel": card.load_kernel,
         "load_handler": lambda *given: card.within_cpu(load(*given), "launch"),
         "_has_memory": lambda of, kernel: True,
     }.items():
         monkeypatch.setattr(launch, name, value)
+    monkeypatch.setattr(launch_handler, "BLOCK", 4)
     monkeypatch.setattr(machine, "lanes", lambda: VECTOR)
-    mlir.register_lowering(primitive.native_p, mlir.lower_fun(as_for_a_card), platform="cpu")
+    monkeypatch.setattr(primitive.LoadedCode, "name_on_card", primitive.LoadedCode.name)
+    mlir.register_lowering(primitive.native_p, mlir.lower_fun(primitive._lower_for_card), platform="cpu")
     _forget()
     yield card
     mlir.register_lowering(primitive.native_p, mlir.lower_fun(primitive._lower), platform="cpu")
     _forget()
-
-
-def as_for_a_card(*inputs, operation, times):
-    """A kernel if the batch would have one on a card, or else the CPU's code."""
-    name = launch.kernel_target(operation, inputs)
-    if name is None:
-        return primitive._lower(*inputs, operation=operation, times=times)
-    return primitive._call_target(name, inputs, operation, times)
 
 
 def _forget():
@@ -213,6 +225,7 @@ def test_programs_launch_batches(request, name):
 
 
 def test_scans_and_gradients_launch_batches(request):
+    """Batches this small store the records of their steps on the card."""
     run = jax.vmap(lambda x: RUNS["tangent"](x)[0].sum())
 
     def scanned(xs):
@@ -224,6 +237,58 @@ def test_scans_and_gradients_launch_batches(request):
     known, found, card = both(request, lambda xs: (scanned(xs), slopes(MASSES * xs[0])), np.array([1.0, 1.1]))
     jax.tree.map(assert_array_equal, found, known)
     assert len(card.grids) >= 2
+
+
+def gradients(masses):
+    return jax.vmap(RUNS["gradient"])(masses)
+
+
+ELEVEN = np.linspace(1.0, 2.0, 11)
+
+
+@pytest.fixture
+def without_records(monkeypatch):
+    """Reverse mode without records between its passes, as of large batches."""
+    monkeypatch.setattr(records, "LARGEST_ON_CARD", 1)
+
+
+RECORD = 8 * (3 + 3 * PENDULUM.q0.size) * 8  # bytes: eight points
+
+
+@pytest.mark.usefixtures("without_records")
+@pytest.mark.parametrize(
+    ("limit", "members", "chunks"),
+    [("none", 11, 1), ("buffer", 4, 3), ("card", 2, 6), ("steps", 11, 1)],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_reverse_mode_runs_in_chunks_for_which_there_is_memory(request, monkeypatch, limit, members, chunks):
+    """With memory for all members, for some, on a card that refuses more, and for more steps than the first pass made."""
+    if limit == "buffer":
+        monkeypatch.setattr(launch_handler, "MOST_RECORDS", 5 * RECORD)
+    if limit == "steps":
+        longest, at = records.with_longest, -records.GIVEN_STEPS
+
+        def third(inputs, operation):
+            found = longest(inputs, operation)
+            return [*found[:at], found[at] / 3.0, *found[at + 1 :]] if isinstance(operation, RunCotangents) else found
+
+        monkeypatch.setattr(records, "with_longest", third)
+    if limit == "card":
+        monkeypatch.setattr(Launching, "most", 3 * RECORD)
+    known, found, card = both(request, gradients, ELEVEN)
+    assert_array_equal(found, known)
+    assert card.lent[-1] == members * RECORD + launch_handler.SHARED
+    whole, blocks = (3, 4), (-(-members // 4), 4)
+    assert len(card.lent) == 1 + (limit == "steps")
+    assert card.grids == [*[whole] * 3, *[blocks] * chunks * len(card.lent), whole]
+
+
+@pytest.mark.usefixtures("without_records")
+def test_a_card_without_memory_for_a_single_record_is_an_error(card):
+    card.most = RECORD // 2
+    with pytest.raises(Exception, match="RESOURCE_EXHAUSTED: the card is full"):
+        jax.block_until_ready(jax.jit(gradients)(ELEVEN))
+    assert card.names[-1] == "cuCtxPopCurrent_v2"
 
 
 def test_an_error_of_the_launch_is_that_of_the_program(card):
@@ -250,31 +315,38 @@ def test_small_batches_stay_with_the_host(monkeypatch):
         target_of(7)
 
 
-@pytest.mark.parametrize("name", ["redundant", "tangent"])
+@pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "tangent", "gradient"])
 def test_kernels_are_assembled(name):
     assembler = target.ptxas()
     if assembler is None:
         pytest.skip("no ptxas")
-    for call in emulation.calls_of(jax.vmap(RUNS[name]), MASSES):
-        if not call.operation.is_reverse:
-            text = target.ptx(call.kernel.text)
-            assert "ld.local" in text or type(call.operation).__name__ == "FindScales"
-            assert target.assemble(text, target.NEWEST, assembler)[:4] == b"\x7fELF"
+    texts = {call.kernel.text: call for call in emulation.calls_of(jax.vmap(RUNS[name]), MASSES)}
+    for kernel, call in texts.items():
+        if isinstance(call.operation, RunCotangents) and name != "gradient":
+            continue  # the first pass of another test
+        text = target.ptx(kernel)
+        assert "ld.local" in text or type(call.operation).__name__ == "FindScales"
+        assert target.assemble(text, target.NEWEST, assembler)[:4] == b"\x7fELF"
 
 
 @pytest.mark.skipif(shutil.which("cc") is None or platform.machine() != "x86_64", reason="no C compiler for this processor")
-@pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "elementary functions", "tangent"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("redundant", marks=pytest.mark.slow), "elementary functions", "tangent", "gradient"]
+)
 def test_ptx_computes_what_the_engine_computes(name, tmp_path):
     """LLVM's PTX, transliterated to C, is bitwise right, and so are the address spaces of its pointers."""
-    for k, call in enumerate(emulation.calls_of(jax.vmap(RUNS[name]), MASSES)):
-        if call.operation.is_reverse:
-            continue
-        folder, code = tmp_path / str(k), call.kernel
-        folder.mkdir()
-        outputs = [np.full(x.shape, np.nan) for x in call.outputs]
-        record = emulation.call_record(code, call, [x.ctypes.data for x in (*call.inputs, *outputs)])
-        ptx_as_c.compiled(target.ptx(code.text), folder)(record.ctypes.data, len(outputs[0]))
-        for found, known in zip(outputs, call.outputs, strict=True):
+    programs = {}
+    for call in emulation.calls_of(jax.vmap(RUNS[name]), MASSES):
+        code = call.kernel
+        if isinstance(call.operation, RunCotangents) and name != "gradient":
+            continue  # the first pass of another test
+        if code.text not in programs:
+            folder = tmp_path / str(len(programs))
+            folder.mkdir()
+            programs[code.text] = ptx_as_c.compiled(target.ptx(code.text), folder)
+        arrays = emulation.Arrays(code, call)
+        programs[code.text](arrays.address, len(arrays.outputs[0]))
+        for found, known in zip(arrays.outputs, call.outputs, strict=True):
             assert_array_equal(found, known)
 
 
@@ -309,7 +381,7 @@ class Loading:
     ],
 )
 def test_kernels_are_loaded_or_left_to_the_host(driver, images, handle):
-    call = next(x for x in emulation.calls_of(jax.vmap(RUNS["elementary functions"]), MASSES) if not x.operation.is_reverse)
+    call = next(x for x in emulation.calls_of(jax.vmap(RUNS["elementary functions"]), MASSES))
     if target.ptxas() is None:
         images = min(images, 1)
     assert launch.load_kernel(driver, call.kernel) == handle

@@ -21,7 +21,7 @@ from udkjax.threads import thread_limit
 # size, extensions, count, types, buffers.
 EXTENSIONS, API, CONTEXT, ARGUMENTS, RESULTS, COUNT, BUFFERS = 8, 16, 24, 40, 80, 16, 32
 # Functions of XLA_FFI_Api. The only argument of each is the address of a struct: size, extensions, then the actual arguments.
-CREATE_ERROR, DESTROY_ERROR, STREAM, SCHEDULE, THREAD_COUNT = 48, 64, 80, 136, 144
+CREATE_ERROR, DESTROY_ERROR, STREAM, ALLOCATE, FREE, SCHEDULE, THREAD_COUNT = 48, 64, 80, 120, 128, 136, 144
 # XLA_FFI_Buffer: size, extensions, dtype, data, rank, dims.
 DATA, RANK, DIMS = 24, 32, 40
 # Offset of the address of the metadata in an extension that requests metadata; offsets of the interface version in the metadata.

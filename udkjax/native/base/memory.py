@@ -1,7 +1,7 @@
 """Access of a run's code to its memory, inputs and outputs."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from udkjax.native.base.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout, P
 class ThreadCode(NamedTuple):
     """The functions of a thread of a GPU, which runs one member."""
 
-    functions: list[Function]  # `run_member(call, work, member)` and what it calls
+    functions: list[Function]  # `run_member` and what it calls
     shared: list[Function]  # further functions, whose arguments point to any memory
     globals: list[str]
     size: int  # numbers in the memory of a thread
@@ -184,12 +184,17 @@ class Memory:
         """Return the address of row `number` of an output with rows of `length` numbers."""
         return f.at(self.field(f, name, POINTER), number * length)
 
+    def writing_results(self, f: Function) -> AbstractContextManager[None]:
+        """Return a context that writes a block only for calls with the outputs `results`; by default all calls have them."""
+        return nullcontext()
+
     def write_state(self, f: Function, s: Lane, k: Value, number: Value, q: str, v: str):
         """Write the state of lane k as state `number` of the outputs."""
         row, violated = self.to_int(f, f.lane(s.member, k)) * self.field(f, "times") + number, f.lane(s.violated, k)
-        for name, x in (("qs", q), ("vs", v)):
-            self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, k)
-        f.store(violated, self.field(f, "violation", POINTER), row)
+        with self.writing_results(f):
+            for name, x in (("qs", q), ("vs", v)):
+                self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, k)
+            f.store(violated, self.field(f, "violation", POINTER), row)
         with f.if_(~(violated <= f.lane(s.drift_tol, k))):
             first = f.min(f.lane(s.lost, k), f.op(f"sitofp i64 {number.name} to double", DOUBLE))
             self.put_lane_entry(f, "lost", k, first)

@@ -9,6 +9,8 @@ from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.text import ALLOCATION, text_of_module
 
+Repeat = Callable[[Callable[[], Value], Callable[[], None]], None]  # repeats a step while a condition holds: (goes_on, step)
+
 
 class Running(Memory):
     """A module that runs members in lanes.
@@ -48,6 +50,14 @@ class Running(Memory):
     @abstractmethod
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Take one step in all lanes, and finish completed members."""
+
+    def member_of(self, f: Function, thread: Value) -> Value:
+        """Return the index of the member of a thread of a GPU."""
+        return thread
+
+    def write_member(self, f: Function, s: Lane, repeat: Repeat):
+        """Take the member of a thread of a GPU through all its steps."""
+        repeat(lambda: self.goes_on(f, s), lambda: self.step_all(f, s, lambda: None))
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Fill the lanes of completed members with the next members."""
@@ -102,23 +112,24 @@ class Running(Memory):
             f.line(f"call void @free(ptr {block.name})")
 
     def _write_run_member(self):
-        """Write `run_member(call, work, member)`: run one member in the memory at `work`.
+        """Write `run_member(call, work, thread)`: run the member of a thread in the memory at `work`.
 
         A thread of a GPU calls it, together with the other threads of its block: `meet(goes_on)` waits for them before each
         step, and returns whether one of them goes on, so that all run the same instructions at the same time.
         """
-        f = Function("run_member", [(POINTER, "call"), (POINTER, "work"), (INT, "member")], self.plan.width)
+        f = Function("run_member", [(POINTER, "call"), (POINTER, "work"), (INT, "thread")], self.plan.width)
         self.functions.append(f)
-        call, work, member, s = f.given["call"], f.given["work"], f.given["member"], Lane(f, self.places)
+        call, work, s = f.given["call"], f.given["work"], Lane(f, self.places)
+        member = self.member_of(f, f.given["thread"])
         self._clear_memory(f)
         with f.if_(member < self.field(f, "members")):
             f.call("begin", work, call, f.const(0, INT), member)
 
-        def any_goes_on() -> Value:
-            return f.op(f"call i1 @meet(i1 {self.goes_on(f, s).name})", BOOL)
+        def together(goes_on: Callable[[], Value], step: Callable[[], None]):
+            with f.while_(lambda: f.op(f"call i1 @meet(i1 {goes_on().name})", BOOL)), f.if_(goes_on()):
+                step()
 
-        with f.while_(any_goes_on), f.if_(self.goes_on(f, s)):
-            self.step_all(f, s, lambda: None)
+        self.write_member(f, s, together)
 
     # --- memory of directions
 

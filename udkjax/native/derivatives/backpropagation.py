@@ -21,6 +21,7 @@ from udkjax.expressions.loop_derivative import REVERSE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.base.running import Repeat
 from udkjax.native.base.samples import ARGUMENTS, count_breakpoints, numbers_of_row
 from udkjax.native.base.steps import POINTS, Status
 from udkjax.native.derivatives.record import Recorded
@@ -31,7 +32,7 @@ from udkjax.native.run.runge_kutta import stage_state
 class Reverse(Recorded):
     """A trajectory with backpropagation from cotangents of its outputs and its end; without cotangents it only integrates."""
 
-    inputs = ("given record", "given qs", "given vs", "ysbar", "endbar")
+    inputs = ("given steps", "given record", "given qs", "given vs", "ysbar", "endbar")
     outputs = ("numbersbar", "qbar", "vbar", "record")
     mode = REVERSE
 
@@ -66,7 +67,7 @@ class Reverse(Recorded):
         self._write_leave_row()
         if self.plan.sampled:
             self._write_find_rows()
-        self._write_backpropagate()
+        self._write_walk()
 
     # --- backpropagation
 
@@ -171,34 +172,45 @@ class Reverse(Recorded):
                 if first or a2 or a:
                     self.put(f, f"bar stage{j} a", r, total)
 
-    def _write_backpropagate(self):
-        """Write the backpropagation of all members that are `ready` to the cotangents of their initial states and numbers."""
-        f, s = self.function("walk", [(POINTER, "work"), (POINTER, "call")])
-        call, yes = f.given["call"], f.const(1.0, DOUBLE, f.width)
+    def walk(self, f: Function, s: Lane, repeat: Repeat):
+        arguments = f.given["work"], f.given["call"]
+        f.call("begin_walk", *arguments)
+        repeat(lambda: f.any_of(s.at > 0.5), lambda: f.call("walk", *arguments))
+        f.call("end_walk", *arguments)
+
+    def _write_walk(self):
+        """Write the backpropagation of members that are `ready`: its beginning, its steps while there are points, and its end.
+
+        The last cotangent is that of the given initial state, which is also the first output.
+        """
+        f, s = self.function("begin_walk", ARGUMENTS[:2])
         self._begin_backpropagation(f, s)
+
+        f, s = self.function("walk", ARGUMENTS[:2])
+        yes = f.const(1.0, DOUBLE, f.width)
 
         def due() -> Value:
             s.due = f.select((s.at > 0.5) & (s.written > s.before), yes, 0.0)
             return f.any_of(s.due > 0.5)
 
-        with f.while_(lambda: f.any_of(s.at > 0.5)):
-            if self.plan.sampled:
-                f.call("find_rows", f.given["work"], call)
-            s.any = f.const(0.0, DOUBLE, f.width)
-            with f.while_(due):
-                s.any = yes
-                self._pull_output(f, s)
-            with f.if_(f.any_of(s.any > 0.5)):
-                f.call("differences_back", f.given["work"])
-            f.call("step_back", f.given["work"])
-            self._move_back(f, s)
-        # The remaining cotangent is that of the given initial state, which is also the first output.
+        if self.plan.sampled:
+            f.call("find_rows", f.given["work"], f.given["call"])
+        s.any = f.const(0.0, DOUBLE, f.width)
+        with f.while_(due):
+            s.any = yes
+            self._pull_output(f, s)
+        with f.if_(f.any_of(s.any > 0.5)):
+            f.call("differences_back", f.given["work"])
+        f.call("step_back", f.given["work"])
+        self._move_back(f, s)
+
+        f, s = self.function("end_walk", ARGUMENTS[:2])
         with self.each_lane(f, s.ready > 0.5) as k:
             self._add_output(f, k, f.const(0, INT), "bar point3")
             for x in "qv":
                 self.copy_lane(f, self._result(f, f"{x}bar", k, self.n), 0, f"bar point3 {x}", k)
             if self.count:
-                f.call("leave_row", f.given["work"], call, k)
+                f.call("leave_row", f.given["work"], f.given["call"], k)
             self.free_record(f, k)
         s.ready = f.const(0.0, DOUBLE, f.width)
 

@@ -1,37 +1,55 @@
 """The record of a trajectory for reverse mode: its accepted states and the steps between them.
 
-A first call of the code integrates, and returns the record of each member among its outputs. A second call reads the record and
-the cotangents, and backpropagates; a member whose record was too long for the output is integrated again.
+A first call of the code integrates, and writes the record of each member into an output. A second call reads the record and the
+cotangents, and backpropagates. Members without a record, because it was too long for the output or because there is no output for
+records of many members, are integrated again by the second call: their records take memory only while they run.
 """
 
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 
-from udkjax.native.base.ir import POINTER, Function, Value
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.base.running import Repeat
 from udkjax.native.derivatives.differentiated import Differentiated
 
-FIRST = 32  # initial capacity of a record, in points, while a member runs
 STORED = 200  # capacity in points of the record passed to the second call: as much memory as 300 outputs
 PER_BREAKPOINT = 3  # additional capacity for each breakpoint: the beginning of a new run, and two steps
+FIRST_POINTS = 2  # points before the first step: the state as given, and projected
 TITLE = 3  # numbers of a record before its points: the number of points, how the run ended, the number of outputs written
 HEAD = 3  # numbers of a point before its state: its time, the number of outputs before its step, whether a run begins
+# For threads of a GPU, whose records are in one buffer: its address, the capacity of each record, and the first of its members.
+BUFFER = ("records", "capacity", "first")
 
 
 def record_length(n: int, points: int) -> int:
     """Return the length of a record of `points` points with n coordinates."""
-    return TITLE + points * (HEAD + 3 * n)
+    return TITLE + points * row_length(n)
+
+
+def row_length(n: int) -> int:
+    """Return the length of a point with n coordinates."""
+    return HEAD + 3 * n
 
 
 class Recorded(Differentiated):
-    """A trajectory that returns a record, or backpropagates along a given record."""
+    """A trajectory that returns a record, or backpropagates along a record."""
 
     lengths = ("given record", "record")
+    has_buffer = False  # whether records are in a buffer (`BUFFER`), not in memory that members allocate
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan, active)
         for name in ("record", "capacity", "points", "at", "ready", "given"):
             self.places.add(name)
-        self.row = HEAD + 3 * self.n
+        self.row = row_length(self.n)
+
+    @property
+    def call_fields(self) -> tuple[str, ...]:
+        *fields, following = super().call_fields
+        return (*fields, *(BUFFER if self.has_buffer else ()), following)
 
     def backpropagates(self, f: Function) -> Value:
         """Return whether there are cotangents."""
@@ -39,6 +57,11 @@ class Recorded(Differentiated):
 
     def _returns_record(self, f: Function) -> Value:
         return self.field(f, "record length") > 0
+
+    @contextmanager
+    def writing_results(self, f: Function) -> Iterator[None]:
+        with f.if_(~self.backpropagates(f)):
+            yield
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         self.put_lane_entry(f, "given", lane, 0.0)
@@ -51,7 +74,14 @@ class Recorded(Differentiated):
                 for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
                     self.put_lane_entry(f, name, lane, x)
         with f.if_((self.lane_entry(f, "given", lane) < 0.5) & (self.backpropagates(f) | self._returns_record(f))):
-            self._new_record(f, lane)
+            self.put_lane_entry(f, "points", lane, 0.0)
+            f.choose(
+                self.backpropagates(f),
+                lambda: self._allocate_record(f, lane, member),
+                lambda: self._place_in_output(f, lane, member),
+            )
+            with f.if_(self.lane_entry(f, "active", lane) > 0.5):
+                self._store_point(f, Lane(f, self.places), lane)
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         with f.if_(self.backpropagates(f) | self._returns_record(f)), self.each_lane(f, accept) as k:
@@ -61,23 +91,67 @@ class Recorded(Differentiated):
         with f.if_(self.backpropagates(f)):
             s.where(s.due > 0.5, ready=1.0)
         with f.if_(self._returns_record(f)), self.each_lane(f, s.due) as k:
-            self._return_record(f, k)
+            self._end_output(f, k)
 
-    def _return_record(self, f: Function, k: Value):
-        """Write the record of lane k to the output; without points if it is too long."""
+    # --- memory
+
+    def _place_in_output(self, f: Function, k: Value, member: Value):
+        length = self.field(f, "record length")
+        self.put_lane_entry(f, "record", k, f.at(self.result_address(f, "record", member, length), TITLE), base=POINTER)
+        self.put_lane_entry(f, "capacity", k, f.like(f.arithmetic("div", length - TITLE, self.row), DOUBLE, 1))
+
+    def _end_output(self, f: Function, k: Value):
+        """Write the title of lane k's record, without points if they did not fit, and zeros after its points."""
+        fits = self.lane_entry(f, "capacity", k) > 0.0
+        self.put_lane_entry(f, "points", k, f.select(fits, self.lane_entry(f, "points", k), 0.0))
         length = self.field(f, "record length")
         to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
-        points, record = self.lane_entry(f, "points", k), self._record(f, k)
-        count = self.to_int(f, points) * self.row
-        fits = count + TITLE <= length
-        for j, x in enumerate((f.select(fits, points, 0.0), self.lane_entry(f, "code", k), self.lane_entry(f, "written", k))):
-            f.store(x, to, j)
-        with f.if_(fits), f.each(count) as i:
-            f.store(f.load(record, i), to, i + TITLE)
-        f.line(f"call void @free(ptr {record.name})")
+        for j, name in enumerate(("points", "code", "written")):
+            f.store(self.lane_entry(f, name, k), to, j)
+        with f.each(length, self.to_int(f, self.lane_entry(f, "points", k)) * self.row + TITLE) as i:
+            f.store(0.0, to, i)
+
+    def _allocate_record(self, f: Function, k: Value, member: Value):
+        """Allocate the record of lane k, for the steps of the first call; without memory the lane stays empty."""
+        if self.has_buffer:
+            capacity = self.field(f, "capacity")
+            number = (member - self.field(f, "first")) * (capacity * self.row)
+            self.put_lane_entry(f, "record", k, f.at(self.field(f, "records", POINTER), number), base=POINTER)
+            self.put_lane_entry(f, "capacity", k, f.like(capacity, DOUBLE, 1))
+            return
+        points = self.input_number(f, "given steps", member, f.const(0, INT)) + float(FIRST_POINTS)
+        record = f.op(f"call ptr @malloc(i64 {(self.to_int(f, points) * (self.row * 8)).name})", POINTER)
+        self.put_lane_entry(f, "record", k, record, base=POINTER)
+        self.put_lane_entry(f, "capacity", k, points)
+        with f.if_(f.is_null(record)):
+            self.report_no_memory(f)
+            self.put_lane_entry(f, "active", k, 0.0)
+
+    def _extend_record(self, f: Function, k: Value):
+        """Make room for more points of lane k than the first call had, which may have rounded otherwise.
+
+        Without memory the run ends at its next step.
+        """
+        capacity = self.lane_entry(f, "capacity", k)
+        if self.has_buffer:
+            self.report_no_memory(f)
+            self.put_lane_entry(f, "max_steps", k, 0.0)
+            return
+        size = self.to_int(f, capacity * 2.0) * (self.row * 8)
+        new = f.op(f"call ptr @realloc(ptr {self._record(f, k).name}, i64 {size.name})", POINTER)
+        f.declared.add("declare ptr @realloc(ptr, i64)")
+        missing = f.is_null(new)
+        with f.if_(missing):  # the old record stays
+            self.report_no_memory(f)
+            self.put_lane_entry(f, "max_steps", k, 0.0)
+        with f.if_(~missing):
+            self.put_lane_entry(f, "record", k, new, base=POINTER)
+            self.put_lane_entry(f, "capacity", k, capacity * 2.0)
 
     def free_record(self, f: Function, k: Value):
         """Free the memory of lane k's record."""
+        if self.has_buffer:
+            return
         with f.if_(self.lane_entry(f, "given", k) < 0.5):
             f.line(f"call void @free(ptr {self._record(f, k).name})")
 
@@ -95,44 +169,37 @@ class Recorded(Differentiated):
         with f.if_(f.any_of(s.active > 0.5)):
             super().step_all(f, s, fill)
         with f.if_(self.backpropagates(f) & ~f.any_of(s.active > 0.5)):
-            f.call("walk", f.given["work"], f.given["call"])
+            self.walk(f, s, partial(_repeat, f))
             fill()
 
-    # --- points
+    def member_of(self, f: Function, thread: Value) -> Value:
+        return thread + self.field(f, "first") if self.has_buffer else thread
 
-    def _new_record(self, f: Function, lane: Value):
-        """Begin the record of a lane; without memory the lane stays empty."""
-        s = Lane(f, self.places)
-        record = f.op(f"call ptr @malloc(i64 {FIRST * self.row * 8})", POINTER)
-        missing = f.is_null(record)
-        with f.if_(missing):
-            self.report_no_memory(f)
-            self.put_lane_entry(f, "active", lane, 0.0)
-        with f.if_(~missing):
-            self.put_lane_entry(f, "record", lane, record, base=POINTER)
-            self.put_lane_entry(f, "capacity", lane, float(FIRST))
-            self.put_lane_entry(f, "points", lane, 0.0)
-            self._store_point(f, s, lane)
+    def write_member(self, f: Function, s: Lane, repeat: Repeat):
+        """Integrate all members of a block of threads, then backpropagate all of them."""
+        repeat(lambda: f.any_of(s.active > 0.5), lambda: super(Recorded, self).step_all(f, s, lambda: None))
+        with f.if_(self.backpropagates(f)):
+            self.walk(f, s, repeat)
+
+    @abstractmethod
+    def walk(self, f: Function, s: Lane, repeat: Repeat):
+        """Backpropagate the members of lanes that are `ready`, by repeated steps back."""
+
+    # --- points
 
     def _record(self, f: Function, k: Value) -> Value:
         """Return the address of the record of lane k."""
         return self.lane_entry(f, "record", k, base=POINTER)
 
     def _store_point(self, f: Function, s: Lane, k: Value):
-        """Append point 3 to the record of lane k; without memory the run ends at its next step."""
-        points, capacity = self.lane_entry(f, "points", k), self.lane_entry(f, "capacity", k)
-        with f.if_(points >= capacity):
-            size = self.to_int(f, capacity * 2.0) * (self.row * 8)
-            old = self._record(f, k)
-            new = f.op(f"call ptr @realloc(ptr {old.name}, i64 {size.name})", POINTER)
-            f.declared.add("declare ptr @realloc(ptr, i64)")
-            missing = f.is_null(new)
-            with f.if_(missing):  # the old record stays
-                self.report_no_memory(f)
-                self.put_lane_entry(f, "max_steps", k, 0.0)
-            with f.if_(~missing):
-                self.put_lane_entry(f, "record", k, new, base=POINTER)
-                self.put_lane_entry(f, "capacity", k, capacity * 2.0)
+        """Append point 3 to the record of lane k."""
+        points = self.lane_entry(f, "points", k)
+        with f.if_(points >= self.lane_entry(f, "capacity", k)):
+            f.choose(
+                self.backpropagates(f),
+                lambda: self._extend_record(f, k),
+                lambda: self.put_lane_entry(f, "capacity", k, 0.0),
+            )
         with f.if_(points < self.lane_entry(f, "capacity", k)):
             row = f.at(self._record(f, k), self.to_int(f, points) * self.row)
             for j, name in enumerate(("point3_t", "written", "begin")):
@@ -154,3 +221,8 @@ class Recorded(Differentiated):
         row = f.at(self._record(f, k), self.to_int(f, self.lane_entry(f, "at", k)) * self.row)
         self.put_lane_entry(f, "before", k, f.load(row, 1))
         self.put_lane_entry(f, "begin", k, f.load(row, 2))
+
+
+def _repeat(f: Function, goes_on: Callable[[], Value], step: Callable[[], None]):
+    with f.while_(goes_on):
+        step()

@@ -9,6 +9,7 @@ from udkjax.native.gpu.driver import CudaDriver
 
 PLATFORM = "CUDA"  # XLA's name of the platform
 CONTEXT_OF_STREAM, PUSH, POP = "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"
+TO_HOST, TO_DEVICE, WAIT = "cuMemcpyDtoHAsync_v2", "cuMemcpyHtoDAsync_v2", "cuStreamSynchronize"
 DESCRIBE = "cuGetErrorString"
 GIVEN = 24  # offset in bytes of the first number in a struct of arguments of XLA's functions, after the context
 UNKNOWN = b"the driver does not say why"

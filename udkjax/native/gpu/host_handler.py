@@ -35,10 +35,20 @@ from udkjax.native.base.ffi import (
 from udkjax.native.base.ir import BOOL, INT, POINTER, Function, Value, Variable
 from udkjax.native.base.text import ALLOCATION, text_of_module
 from udkjax.native.gpu.driver import CudaDriver, driver
-from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, GIVEN, PLATFORM, POP, PUSH, Words, stream_of
+from udkjax.native.gpu.driver_calls import (
+    CONTEXT_OF_STREAM,
+    GIVEN,
+    PLATFORM,
+    POP,
+    PUSH,
+    TO_DEVICE,
+    TO_HOST,
+    WAIT,
+    Words,
+    stream_of,
+)
 from udkjax.threads import cores
 
-TO_HOST, TO_DEVICE, WAIT = "cuMemcpyDtoHAsync_v2", "cuMemcpyHtoDAsync_v2", "cuStreamSynchronize"
 # The handler of the operation, the number of threads, and the address and the number of bytes of the pinned memory.
 HANDLER, THREADS, PINNED, PINNED_SIZE = "handler", "threads", "pinned", "pinned size"
 WORDS = Words((TO_HOST, TO_DEVICE, WAIT), (HANDLER, THREADS, PINNED, PINNED_SIZE))

@@ -14,6 +14,7 @@ from udkjax.native.base.memory import Memory, ThreadCode
 from udkjax.native.base.module import Module
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.text import external_functions, text_of_module, with_evaluated
+from udkjax.native.derivatives.record import Recorded
 from udkjax.native.operations import Operation
 
 NAME = "run_members"  # of the kernel
@@ -21,7 +22,7 @@ NAME = "run_members"  # of the kernel
 # or 6.
 VECTOR = 2
 # The arguments of functions that point to the memory of a thread, or into it.
-LOCAL = ("work", "out", "tangent", "stored", "accelerations", "projection")
+LOCAL = ("work", "out", "tangent", "bar", "stored", "accelerations", "projection")
 # A barrier that also asks whether the condition holds in any thread of the block.
 ANY_OF_BLOCK = "{ .reg .pred p, q; setp.ne.u32 p, $1, 0; barrier.cta.red.or.pred q, 0, p; selp.u32 $0, 1, 0, q; }"
 KERNEL = f"""
@@ -42,9 +43,9 @@ define ptx_kernel void @{NAME}(ptr byval([FIELDS x i64]) align 8 %call) {{
   %threads = call i32 @llvm.nvvm.read.ptx.sreg.ntid.x()
   %before = mul i32 %block, %threads
   %index = add i32 %before, %thread
-  %member = zext i32 %index to i64
+  %number = zext i32 %index to i64
   %work = alloca [SIZE x double], align 64
-  call void @run_member(ptr %call, ptr %work, i64 %member)
+  call void @run_member(ptr %call, ptr %work, i64 %number)
   ret void
 }}
 """
@@ -80,10 +81,10 @@ def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool 
         shares_numbers: Whether all members have the same numbers. Their constants are then in the shared memory of a block,
             which leaves room for other numbers in the caches.
     """
-    if operation.is_reverse:
-        raise UnsupportedError(f"{type(operation).__name__} on a GPU")
     module = operation.module(1, 1, VECTOR)
     constants = 0
+    if isinstance(module, Recorded):
+        module.has_buffer = True
     if isinstance(module, Module):
         if module.ways:
             module.tangents_begin = module.places.add("all tangents", directions * len(module.ways) * module.tangents.size)

@@ -1,7 +1,7 @@
-"""Batches as kernels in programs of a graphics card: a handler writes the call record, and launches the kernel on XLA's stream.
+"""Batches as kernels in programs of a graphics card: kernels are compiled, loaded and registered with XLA.
 
 The card's driver keeps a kernel for all cards of the machine (a library of cuLibraryLoadData), and loads it on a card when it is
-first launched there. The call record is a parameter of the kernel, so that nothing is allocated in a call.
+first launched there.
 """
 
 import ctypes
@@ -14,26 +14,21 @@ from typing import Any
 import jax
 
 from udkjax.native.base import machine
-from udkjax.native.base.ffi import answer_metadata, call_record
-from udkjax.native.base.ir import INT, POINTER, Function, Value
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.text import text_of_module
 from udkjax.native.gpu import target
 from udkjax.native.gpu.driver import CudaDriver, driver
-from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, PLATFORM, POP, PUSH, Words, stream_of
+from udkjax.native.gpu.driver_calls import PLATFORM
 from udkjax.native.gpu.kernel import NAME, KernelCode, kernel_code
+from udkjax.native.gpu.launch_handler import WORDS, launch_handler
 from udkjax.native.operations import Operation
 from udkjax.threads import thread_count
 
 # A kernel takes about as long, however small the batch, as a core of the host for this number of members; measured on an H100.
 # Batches of fewer members for each core run on the host, unless `UDKJAX_KERNEL_MEMBERS` sets the smallest batch.
 MEMBERS_OF_CORE = 128
-BLOCK = 128  # threads of a block; of 64, 128 and 256 the fastest for the paper's linkage on an H100
 MOST_MEMORY = 2**16  # bytes of a thread; the driver reserves them for each of the 270,000 threads that an H100 can hold
-LAUNCH, KERNEL = "cuLaunchKernel", "kernel"
 TARGET = "udkjax_kernel_"  # prefix of the names of FFI targets
-WORDS = Words((LAUNCH,), (KERNEL,))
-FAILED = b"launching a kernel for a batch failed: "
 # Attributes of a function and of a device (CUfunction_attribute, CUdevice_attribute).
 LOCAL_BYTES, MAJOR, MINOR, MULTIPROCESSORS, THREADS_EACH = 3, 75, 76, 16, 39
 
@@ -130,33 +125,7 @@ def _has_memory(of: CudaDriver, kernel: int) -> bool:
 
 def load_handler(of: CudaDriver, code: KernelCode, kernel: int) -> machine.Library:
     """Load the handler `launch(frame)` of a kernel."""
-    f = _launch(code)
-    text = text_of_module([f], [WORDS.text])
+    text = text_of_module([launch_handler(code)], [WORDS.text])
     library = machine.library(text, ("launch", "words"))
     WORDS.fill(library, of, kernel)
     return library
-
-
-def _launch(code: KernelCode) -> Function:
-    """Write the handler."""
-    f, module = Function("launch", [(POINTER, "frame")], returns="ptr", cold=True), code.module
-    frame = f.given["frame"]
-    answer_metadata(f, frame)
-    call, members = call_record(f, frame, module)
-    f.store(0, call, module.call_fields.index("next"), base=INT)
-    stream, place = stream_of(f, frame), Value(f, f.reserve(POINTER), POINTER)
-    parameters = Value(f, f.reserve(POINTER), POINTER)
-    f.store(call, parameters, base=POINTER)
-    blocks = f.arithmetic("div", members + (BLOCK - 1), BLOCK)
-    grid = f.op(f"trunc i64 {blocks.name} to i32", "i32")
-    answer = f.variable(WORDS.drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
-    with f.if_(answer.value.is_(0) & (members > 0)):
-        answer.value = WORDS.drive(f, PUSH, f.load(place, base=POINTER))
-        with f.if_(answer.value.is_(0)):
-            sizes = f"i32 {grid.name}", "i32 1", "i32 1", f"i32 {BLOCK}", "i32 1", "i32 1", "i32 0"
-            answer.value = WORDS.drive(f, LAUNCH, WORDS.load(f, KERNEL), *sizes, stream, parameters, "ptr null")
-            WORDS.drive(f, POP, place)
-    with f.if_(answer.value.is_not(0)):
-        f.leave(f"ptr {WORDS.error(f, frame, FAILED, answer.value).name}")
-    f.line("ret ptr null")
-    return f

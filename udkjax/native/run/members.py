@@ -104,14 +104,19 @@ def write_finish(module: Module):
     s.violated = largest_violation(module, f)
     with module.each_lane(f, s.due) as k:
         module.write_state(f, s, k, f.const(0, INT), "state q", "result v")
-        info = module.result_address(f, "info", module.to_int(f, f.lane(s.member, k)), len(INFO) + 2 * module.n)
-        ends = {"t": s.point3_t, "accepted": f.max(s.accepted, 0.0)}  # -1 if the initial state was not accepted
-        for j, name in enumerate(INFO):
-            f.store(f.lane(ends[name] if name in ends else getattr(s, name), k), info, j)
-        module.copy_lane(f, info, len(INFO), "point3 q", k)
-        module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
-        _clear_outputs(module, f, s, k)
+        with module.writing_results(f):
+            _write_info(module, f, s, k)
+            _clear_outputs(module, f, s, k)
     module.end_members(f, s)
+
+
+def _write_info(module: Module, f: Function, s: Lane, k: Value):
+    info = module.result_address(f, "info", module.to_int(f, f.lane(s.member, k)), len(INFO) + 2 * module.n)
+    ends = {"t": s.point3_t, "accepted": f.max(s.accepted, 0.0)}  # -1 if the initial state was not accepted
+    for j, name in enumerate(INFO):
+        f.store(f.lane(ends[name] if name in ends else getattr(s, name), k), info, j)
+    module.copy_lane(f, info, len(INFO), "point3 q", k)
+    module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
 
 
 def _find_cause(module: Module, f: Function, s: Lane):

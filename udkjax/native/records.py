@@ -1,0 +1,58 @@
+"""Records between the two passes of reverse mode: whether a batch stores them, or integrates again in the second pass.
+
+The shape of a record is that of the longest that is stored, so that records of a large batch would take far more memory than
+their steps. The second pass then makes the record of a member anew, in memory of the thread that runs it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from udkjax.native.operations import Operation
+from udkjax.native.runs import RunCotangents, goes_back
+
+# The largest records of a batch (bytes). To write and read more memory takes longer than to integrate again: for 1,000 runs of
+# the paper's linkage 2.7 times as long over 1 s, and equally long over 20 s; for 64 over 20 s it takes 0.85 times as long.
+LARGEST = 2**25
+LARGEST_ON_CARD = 64  # members: the same for records that are copied to a graphics card and back
+GIVEN_RECORD, GIVEN_STEPS = 5, 6  # places of the record and of the number of steps among the inputs, from the last
+
+
+def are_stored(inputs: Sequence[Any], operation: Operation, members: int, on_card: bool = False) -> bool:
+    """Return whether a pass of reverse mode with so many members stores or reads records; True for other operations."""
+    if not isinstance(operation, RunCotangents):
+        return True
+    if goes_back(inputs) and math.prod(inputs[-GIVEN_RECORD].shape[:-1]) == 1:  # all members share it
+        return True
+    if on_card:
+        return members < LARGEST_ON_CARD
+    return 8 * members * operation.record_length <= LARGEST
+
+
+def without_records(inputs: Sequence[Any], operation: Any) -> tuple[list[Any], Any]:
+    """Return the inputs and the operation of a pass that neither stores nor reads records; its last output is empty."""
+    if goes_back(inputs):
+        inputs = [x[..., :0] if k == len(inputs) - GIVEN_RECORD else x for k, x in enumerate(inputs)]
+    return list(inputs), replace(operation, points=0)
+
+
+def absent_records(operation: Any, members: int) -> Array:
+    """Return records without points."""
+    return jnp.zeros((members, operation.record_length))
+
+
+def with_longest(inputs: Sequence[Any], operation: Operation) -> list[Any]:
+    """Return the inputs of a kernel; in the second pass with the steps of the longest run instead of those of each."""
+    if not isinstance(operation, RunCotangents) or not goes_back(inputs):
+        return list(inputs)
+    return [jnp.max(x, axis=0, keepdims=True) if k == len(inputs) - GIVEN_STEPS else x for k, x in enumerate(inputs)]
+
+
+def are_given(inputs: Sequence[Any]) -> bool:
+    """Return whether all members have records in the inputs of the second pass."""
+    given = inputs[-GIVEN_RECORD]
+    return given.shape[1] > 0 and bool((given[:, 0] > 0.0).all())
