@@ -30,8 +30,8 @@ class ConstrainedSystem(PrintsLine):
 
     `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,),
     or is None; `velocity_constraint(t, q, v)` returns phi (k,), nonholonomic or not, or is None. All of them are differentiated:
-    write them in jax.numpy. To trace or differentiate numbers, keep them in an equinox module with these functions as methods.
-    Simulate it from a `State` with q and v (n,).
+    write them in jax.numpy. Numbers that they close over, or that are fields of the equinox module whose methods they are, may be
+    traced and differentiated. Simulate it from a `State` with q and v (n,); these and the rows should be of order one.
 
     Args:
         mass: q -> M (n, n).
