@@ -7,8 +7,10 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from udkjax import devices
+import udkjax as udk
+from udkjax import arrays, devices
 
 
 def test_the_default_devices_are_those_of_the_choice():
@@ -29,6 +31,34 @@ def test_without_a_cpu_device_nothing_changes(monkeypatch):
     monkeypatch.setattr(jax, "local_devices", no_cpu)
     assert devices.host_device() is None
     assert devices.on_host(jnp.sin)(0.0) == 0.0
+
+
+def test_results_are_put_on_a_graphics_card_in_one_copy(monkeypatch):
+    """They are put there often enough for a program to be worth compiling; all bits stay."""
+    given = {"q": np.array([[0.1, np.nan], [-0.0, np.inf]]), "steps": np.int64(-7), "code": np.int64(0), "none": np.zeros((0, 3))}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(arrays, "_WORTH_A_PROGRAM", 0)
+    copied, unpacked = [], arrays._unpacked
+    monkeypatch.setattr(arrays, "_unpacked", lambda *packed: copied.append(packed) or unpacked(*packed))
+    found = arrays.put_arrays(given)
+    assert len(copied) == 1 and all(isinstance(x, jax.Array) for x in found.values())
+    for name, x in given.items():
+        assert (found[name].shape, found[name].dtype) == (x.shape, x.dtype)
+        assert np.asarray(found[name]).tobytes() == x.tobytes()
+
+
+def test_a_run_reads_nothing_back_from_a_graphics_card(monkeypatch):
+    put = []
+
+    class OnCard:
+        """An array that cannot be read."""
+
+        def __init__(self, x):
+            put.append(x)
+
+    monkeypatch.setattr(sys.modules[udk.simulate.__module__], "put_arrays", lambda tree: jax.tree.map(OnCard, tree))
+    udk.simulate(udk.library.compound_pendulum(), [0.0, 0.1])
+    assert put
 
 
 BESIDE = """

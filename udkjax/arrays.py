@@ -1,7 +1,9 @@
 """Arrays of NumPy or JAX: the choice of the library, tests for traced numbers, and conversions that compile no program."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -70,7 +72,20 @@ def put_arrays(arrays: Any) -> Any:
     _calls[shapes := tuple(map(np.shape, leaves))] += 1
     if _calls[shapes] <= _WORTH_A_PROGRAM:
         return jax.device_put(arrays)
-    return jax.tree.unflatten(tree, _put_together(*leaves))
+    leaves = [np.asarray(x) for x in leaves]
+    has_words = jax.config.jax_enable_x64 and all(x.dtype in (np.float64, np.int64) for x in leaves)
+    if jax.default_backend() == "cpu" or not has_words:
+        return jax.tree.unflatten(tree, _put_together(*leaves))
+    words = np.concatenate([x.ravel().view(np.float64) for x in leaves])
+    return jax.tree.unflatten(tree, _unpacked(words, tuple((x.shape, x.dtype.name) for x in leaves)))
+
+
+@partial(jax.jit, static_argnums=1)
+def _unpacked(words: Float[Array, "N"], kinds: Sequence[tuple[tuple[int, ...], str]]) -> list[Array]:
+    """Return arrays of 64-bit numbers from one vector, since each copy to a graphics card takes some 10 us."""
+    ends = np.cumsum([math.prod(shape) for shape, _ in kinds])[:-1]
+    parts = zip(jnp.split(words, ends), kinds, strict=True)
+    return [jax.lax.bitcast_convert_type(part, kind).reshape(shape) for part, (shape, kind) in parts]
 
 
 def make_module(cls: type[Module], **fields: Any) -> Module:

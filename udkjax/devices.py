@@ -9,6 +9,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from udkjax.arrays import is_within_jit
+
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
@@ -49,7 +51,7 @@ def on_host(program: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 
     @wraps(program)
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        if host_device() is None or isinstance(jax.device_put(0.0), Tracer):
+        if host_device() is None or is_within_jit():
             return program(*args, **kwargs)
         with computing_on_host():
             results = program(*args, **kwargs)

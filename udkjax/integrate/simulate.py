@@ -185,21 +185,21 @@ def simulate(
 
         assert analysis is not None  # a mechanism has one
         solution = simulate_events(mechanism, events, analysis, ts, state, closure, choices, max_events)
-        if not _has_failed(solution) or not is_concrete or int(solution.stats.get("events", 0)):
+        if not _has_failed(solution.code) or not is_concrete or int(solution.stats.get("events", 0)):
             return _required(solution, throw)  # events may have changed what moved
         if events is not None:
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
         located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
 
-    solution, missed, end = _run(system, analysis, ts, state, closure, choices, all_concrete)
-    if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(solution):
+    solution, missed, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
+    if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(code):
         return _required(explained_system(solution, system, end), throw)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution, throw)
     if missed:
         analysis = analyse(mechanism)  # with the numbers of the given analysis more rows were redundant
-        solution, _, end = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
-    if _has_failed(solution):
+        solution, _, end, code = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
+    if _has_failed(code):
         found = solution if located is None else located
         return _required(explained(found, mechanism, analysis, choices.drift_tol, solver, end), throw)
     if located is not None:
@@ -212,14 +212,14 @@ def _may_have_kinks(mechanism: Mechanism) -> bool:
     return any(force.may_have_kinks for force in mechanism.forces.values())
 
 
-def _has_failed(solution: Solution) -> bool:
-    """Return True if a single run with concrete numbers has not reached its end."""
-    return not isinstance(solution.code, Tracer) and int(solution.code) not in SUCCESSES
+def _has_failed(code: Any) -> bool:
+    """Return True if `code` is that of a single run with concrete numbers that has not reached its end."""
+    return not isinstance(code, Tracer) and int(code) not in SUCCESSES
 
 
 def _required(solution: Solution, throw: bool) -> Solution:
     """Return a solution, or raise the error of a failed run."""
-    if throw and _has_failed(solution):
+    if throw and _has_failed(solution.code):
         raise SimulationError(solution.cause, solution)
     return solution
 
@@ -232,9 +232,10 @@ def _run(
     closure: Closure | None,
     choices: Choices,
     all_concrete: bool,
-) -> tuple[Solution, Any, Any]:
-    """Return the solution, whether rows left out as redundant are independent, and the last state (t, (q, v)) of the integrator.
+) -> tuple[Solution, Any, Any, Any]:
+    """Return the solution, whether rows left out as redundant are independent, the last state (t, (q, v)), and the `Result`.
 
+    The result is a NumPy number if machine code is called by NumPy: reading that of the solution from a graphics card takes long.
     With concrete numbers NumPy calls machine code directly; everything else is traced.
     """
     body_names = getattr(system, "body_names", ())
@@ -261,7 +262,7 @@ def _simulate(
     closure: Closure | None,
     choices: Choices,
     has_concrete_times: bool,
-) -> tuple[Solution, Any, Any]:
+) -> tuple[Solution, Any, Any, Any]:
     compiled = compile_mechanism(system, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, closure, choices)
     if choices.adjoint is not None or choices.meter is not None:
@@ -276,7 +277,7 @@ _compiled, _deferred = on_host(eqx.filter_jit(_simulate)), deferred(_simulate)
 
 def _finish(
     run: PreparedRun, raw: IntegratorOutput, bodies: tuple[str, ...], choices: Choices, xp: ModuleType = jnp
-) -> tuple[Solution, Any, Any]:
+) -> tuple[Solution, Any, Any, Any]:
     """Return the results of `_run`, from the output of the integrator."""
     problem, ts = run.problem, run.ts
     ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows)
@@ -284,6 +285,7 @@ def _finish(
     q, v = (y.reshape(-1, *run.state_shape) for y in (raw.q, raw.v))
     stats = counts(raw, problem.compiled.plan.projected, len(ts), xp)
     rtol, atol = xp.asarray(choices.rtol, float), xp.asarray(choices.atol, float)
+    code_found = code
     if xp is np:
         ts, q, v, code, time, stats, rtol, atol = put_arrays((ts, q, v, code, time, stats, rtol, atol))
     names = choices.settings(problem.compiled.plan.why_not_native)
@@ -302,7 +304,7 @@ def _finish(
         events=None,
         found_cause=None,
     )
-    return solution, run.has_missed_rows, (raw.t, raw.y)
+    return solution, run.has_missed_rows, (raw.t, raw.y), code_found
 
 
 def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
