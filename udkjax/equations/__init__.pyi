@@ -9,6 +9,7 @@ from udkjax.equations.abstract_system import MechanismSystem as MechanismSystem
 from udkjax.equations.abstract_system import TangentPart as TangentPart
 from udkjax.equations.analysis import Analysis as Analysis
 from udkjax.equations.analysis import analyse as analyse
+from udkjax.equations.analysis import hold_pins as hold_pins
 from udkjax.equations.dense_rows import DenseRows as DenseRows
 from udkjax.equations.dense_rows import DenseTerms as DenseTerms
 from udkjax.equations.dense_rows import KinematicRows as KinematicRows
@@ -62,7 +63,6 @@ from udkjax.equations.redundancy import kinematic_rows as kinematic_rows
 from udkjax.equations.run_programs import RunPrograms as RunPrograms
 from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales
-from udkjax.equations.scales import scales_of as scales_of
 from udkjax.equations.scales import scales_p as scales_p
 from udkjax.equations.scene_programs import scene_programs as scene_programs
 from udkjax.equations.sparse_rows import SparseRows as SparseRows

@@ -12,20 +12,23 @@ one radian.
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from contextlib import nullcontext
 from dataclasses import replace
 from threading import Lock
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.arrays import is_traced
-from udkjax.equations.redundancy import redundant_rows
+from udkjax.arrays import is_traced, number
+from udkjax.equations.redundancy import FoundRows, examine_rows
 from udkjax.equations.scales import Scales, concrete_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.stationary_rows import HeldPin, with_held_pins
 from udkjax.equations.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
 from udkjax.programs.identity_cache import cached_by_identity
@@ -103,6 +106,16 @@ class Analysis(PrintsTable):
         """The characteristic mass (kg), the mass of the heaviest body."""
         return self.scales.mass
 
+    def with_rows_of(self, mechanism: Mechanism) -> "Analysis":
+        """Return the analysis of the mechanism with more constraints, of which rows are redundant is not known.
+
+        Its lengths, times and masses stay those of the original mechanism.
+        """
+        own = (concrete_scales if mechanism.is_concrete else traced_scales)(mechanism)
+        xp = jnp if is_traced((self.scales, own)) else np
+        scales = self.scales._replace(rows=own.rows, rank_tol=xp.minimum(self.scales.rank_tol, own.rank_tol))
+        return Analysis(jax.tree.map(number, scales), self.coordinates, _row_names(mechanism), None)
+
 
 @checked
 def analyse(mechanism: Mechanism) -> Analysis:
@@ -159,15 +172,42 @@ class _Cache(Generic[Stored]):
 
 
 _analyses: _Cache[Analysis] = _Cache()
-_redundant: _Cache[tuple[int, ...] | None] = _Cache()
+_found_rows: _Cache[FoundRows] = _Cache()
 
 
 def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
     with jax.ensure_compile_time_eval():  # also during a trace
         scales = concrete_scales(mechanism)
-        # Redundancy does not depend on masses and loads: mechanisms that differ only in these share the result.
-        rows = _redundant.get((kind, _bytes_of(_geometry(mechanism))), lambda: redundant_rows(mechanism))
+        rows = _rows_of(mechanism, kind).redundant
         return Analysis(scales, 3 * len(mechanism.body_names), _row_names(mechanism), rows)
+
+
+def _rows_of(mechanism: Mechanism, kind: Hashable) -> FoundRows:
+    # Redundancy does not depend on masses and loads: mechanisms that differ only in these share the result.
+    return _found_rows.get((kind, _bytes_of(_geometry(mechanism))), lambda: examine_rows(mechanism))
+
+
+class Holding(NamedTuple):
+    """A mechanism whose pins that do not turn are held by angles, and these pins."""
+
+    mechanism: Mechanism
+    pins: tuple[HeldPin, ...]
+
+
+@cached_by_identity
+def hold_pins(mechanism: Mechanism) -> Holding:
+    """Hold the pins that constraints hold to second order only (stationary_rows.py), as far as concrete numbers tell."""
+    source = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
+    pins = () if source is None else _held_pins(source)
+    with jax.ensure_compile_time_eval() if mechanism.is_concrete else nullcontext():
+        return Holding(with_held_pins(mechanism, pins) if pins else mechanism, pins)
+
+
+@cached_by_identity
+def _held_pins(mechanism: Mechanism) -> tuple[HeldPin, ...]:
+    with jax.ensure_compile_time_eval():
+        mechanism = mechanism.without_origin
+        return _rows_of(mechanism, structure(mechanism)).held
 
 
 def _rows_of_concrete_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:

@@ -1,22 +1,39 @@
 """Redundant rows of Psi, which `analyse` finds once for all runs, and generic positions (position_rows.py)."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_rows import NEGLIGIBLE_SHARE, PositionRows
 from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.stationary_rows import HeldPin, held_pins
 from udkjax.scene.mechanism import Mechanism
 
 
+class FoundRows(NamedTuple):
+    """The dependent rows of Psi."""
+
+    redundant: tuple[int, ...] | None  # the rows to leave out; None if the guess cannot be closed or moved
+    held: tuple[HeldPin, ...]  # the pins that rows hold to second order only
+
+
 @np.errstate(all="ignore")  # non-finite coordinates are not closed
-def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
-    """Return the rows of Psi to leave out; None if the guess cannot be closed or moved. All numbers are concrete."""
+def examine_rows(mechanism: Mechanism) -> FoundRows:
+    """Find redundant rows, and pins held to second order. All numbers are concrete."""
     rows = kinematic_rows(mechanism)
     if not rows.count:
-        return ()
-    positions = rows.sample(np.asarray(mechanism.q0, float).ravel())
-    return rows.redundant(positions) if positions else None
+        return FoundRows((), ())
+    q = np.asarray(mechanism.q0, float).ravel()
+    positions = rows.sample(q)
+    redundant = rows.redundant(positions) if positions else None
+    return FoundRows(redundant, held_pins(mechanism, rows, q, len(redundant or ())) if isinstance(rows, KinematicRows) else ())
+
+
+def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
+    """Return the rows of Psi to leave out; None if the guess cannot be closed or moved. All numbers are concrete."""
+    return examine_rows(mechanism).redundant
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:

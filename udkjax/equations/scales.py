@@ -71,11 +71,6 @@ class Scales(NamedTuple):
         return xp.max(xp.abs(psi) / self.rows, initial=0.0)
 
 
-def scales_of(mechanism: Mechanism) -> Scales:
-    """Return the scales of a mechanism, without derivatives."""
-    return (concrete_scales if mechanism.is_concrete else traced_scales)(mechanism)
-
-
 def concrete_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism with concrete numbers, by NumPy."""
     numbers = np.asarray(numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS]))

@@ -53,6 +53,7 @@ class Choices(NamedTuple):
     meter: "diffrax.AbstractProgressMeter | None" = None
     max_steps: int = 100_000
     engine: str = "auto"
+    held: str = ""  # pins whose angles are held, as the constraints hold them to second order only
     kinks: str = ""  # whether kinks of forces are located, and which are not; empty without any
 
     @property
@@ -86,6 +87,7 @@ class Choices(NamedTuple):
             ("max_steps", str(self.max_steps)),
             ("first_step", "chosen" if self.dt0 is None else "given"),
             ("engine", f"{self.integrator}: {why_not_native}" if why_not_native else "native"),
+            *([("held pins", self.held)] if self.held else []),
             *([("kinks", self.kinks)] if self.kinks else []),
         )
 

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays
 from udkjax.devices import on_host
-from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.analysis import Analysis, analyse, hold_pins
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -25,7 +25,16 @@ from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechan
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.native_engine import integrate_concrete
 from udkjax.integrate.outcome import LEAST_ATOL, FinishedRun, counts, outcome
-from udkjax.integrate.prepare import AUTO, DRIFT_FREE, DRIFT_PROJECTED, Choices, PreparedRun, begin, begin_concrete, prepare_run
+from udkjax.integrate.prepare import (
+    AUTO,
+    DRIFT_FREE,
+    DRIFT_PROJECTED,
+    Choices,
+    PreparedRun,
+    begin,
+    begin_concrete,
+    prepare_run,
+)
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
@@ -152,6 +161,11 @@ def simulate(
         max_steps=max_steps,
         engine=engine,
     )
+    if isinstance(mechanism, Mechanism) and not _releases(events):
+        holding = hold_pins(mechanism)
+        if holding.pins:
+            names = ", ".join(pin.name for pin in holding.pins)
+            mechanism, analysis, choices = holding.mechanism, None, choices._replace(held=names)
     system = mechanism
     if isinstance(mechanism, ConstrainedSystem):
         assert isinstance(state, State)  # checked above
@@ -205,6 +219,12 @@ def simulate(
     if located is not None:
         return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
     return solution
+
+
+def _releases(events: Any) -> bool:
+    """Return whether an event removes a constraint."""
+    listed = () if events is None else events if isinstance(events, Sequence) else (events,)
+    return any(getattr(getattr(event, "action", None), "removed", None) for event in listed)
 
 
 @cached_by_identity

@@ -20,8 +20,6 @@ from jaxtyping import Array, ArrayLike, Bool
 from udkjax.annotations import Number
 from udkjax.arrays import is_traced, number
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.scales import scales_of
-from udkjax.equations.scene_programs import scene_programs
 from udkjax.integrate.events.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import HeldElement
@@ -119,7 +117,7 @@ def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis)
         none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E)
         return Phases((mechanism.without_origin,), (analysis,), (), (), none)
     whole = _with(mechanism, switches)
-    with_all = _analysis(whole, analysis)
+    with_all = analysis.with_rows_of(whole)
     row_names, names = [name for name, _ in with_all.row_names], [x.name for x in switches]
     contacts = {x.event: k for k, x in enumerate(switches) if not x.public}
     table = Switches(
@@ -168,15 +166,6 @@ def _switches(mechanism: Mechanism, events: Sequence[Event]) -> list[_Switch]:
     found += [_Switch(unique(name), name, joint, k) for k, name, joint in added]
     contacts = [(k, e) for k, e in enumerate(events) if e.action.rest == "hold"]
     return found + [_Switch(unique(f"{e.name}.contact"), "", HeldContact.of(e, mechanism), k) for k, e in contacts]
-
-
-def _analysis(whole: Mechanism, of_scene: Analysis) -> Analysis:
-    """Return the analysis of a mechanism with all switches on, whose independent rows are found in each phase as it begins."""
-    scales, own = of_scene.scales, scales_of(whole)
-    xp = jnp if is_traced((scales, own)) else np
-    scales = scales._replace(rows=own.rows, rank_tol=xp.minimum(scales.rank_tol, own.rank_tol))
-    row_names = tuple(scene_programs(whole).row_names)
-    return Analysis(jax.tree.map(number, scales), of_scene.coordinates, row_names, None)
 
 
 def _with(mechanism: Mechanism, switches: Sequence[_Switch]) -> Mechanism:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from udkjax.equations import determinacy
+from udkjax.equations.analysis import hold_pins
 from udkjax.equations.position_rows import PositionRows
 from udkjax.positions.assembly import State, close, require_closed
 from udkjax.positions.channels import StateHistory
@@ -13,7 +14,7 @@ from udkjax.study.diagnosis.clearance import clearance
 from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions
 from udkjax.study.diagnosis.dependence import Dependency, dependencies
 from udkjax.study.diagnosis.diagnosis import Diagnosis
-from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fixes_of
+from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fix_of_held_pin, fixes_of
 from udkjax.study.diagnosis.second_order import branches
 from udkjax.study.diagnosis.timeline import timeline
 
@@ -62,15 +63,23 @@ def diagnose(
     q = np.asarray(closure.state.q, float)
     positions = RankedPositions(mechanism, rank_tol)
     rows = positions.rows
-    current = positions.at(float(t), q.ravel())
+    current, (held_mechanism, held) = positions.at(float(t), q.ravel()), hold_pins(mechanism)
     neighbours = positions.around(current)
+    if held:  # only with their angles held do positions lie on the motion
+        holding = RankedPositions(held_mechanism, rank_tol)
+        neighbours = [positions.at(c.t, c.q) for c in holding.around(holding.at(current.t, current.q))]
     generic_rank = max([current.rank, *(c.rank for c in neighbours)])
     generic = [c for c in [current, *neighbours] if c.rank == generic_rank]
     owners = [name for name, _ in rows.names]
     permanent, momentary = _dependencies(mechanism, current, generic, owners)
     if not neighbours and current.freedom:  # moves to first order only: rows are dependent here
         permanent, momentary = [], [*permanent, *momentary]
-    redundancies = _with_fixes(mechanism, positions, generic if fixes else [], permanent)
+    redundancies = _with_fixes(mechanism, positions, generic if fixes and not held else [], permanent)
+    for k, r in enumerate(redundancies if held else []):
+        pins = [pin for pin in held if pin.name in r.constraints]
+        joints = [(pin.name, pin.prismatic(mechanism, current.q)) for pin in pins if fixes]
+        changes = [fix_of_held_pin(mechanism, positions, current, *x) for x in joints]
+        redundancies[k] = r._replace(fixes=tuple(x for x in changes if x), held=tuple(pin.name for pin in pins))
     redundancies += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
     of_joints = [k for k, name in enumerate(owners) if name in mechanism.joints]
     return Diagnosis(
@@ -91,6 +100,7 @@ def diagnose(
         singular_values=current.sigma,
         clearance=clearance(positions, current, generic_rank, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
+        held=tuple(pin.name for pin in held),
     )
 
 

@@ -51,6 +51,7 @@ class Diagnosis(NamedTuple):
     singular_values: np.ndarray  # singular values of the scaled Jacobian
     clearance: Clearance
     timeline: Timeline | None
+    held: tuple[str, ...] = ()  # pins that constraints hold to second order only, along the whole motion
 
     @property
     def gruebler(self) -> int:
@@ -62,7 +63,7 @@ class Diagnosis(NamedTuple):
         """Number of degrees of freedom with locked drivers, on the branch with the most."""
         if self.is_singular or not self.can_move:
             return max((branch.degrees_of_freedom for branch in self.branches if branch.followed), default=0)
-        return self.coordinates - self.ordinary_rank
+        return self.coordinates - self.ordinary_rank - len(self.held)
 
     @property
     def mobility(self) -> int:
@@ -130,7 +131,7 @@ def _sections(result: Diagnosis) -> list[tuple[str, list[str]]]:
     """Return the title and the lines of each section that is not empty."""
     parts = [
         ("mobility", _mobility(result)),
-        ("redundancy", [line for r in result.redundancies for line in _redundancy(r)]),
+        ("redundancy", [line for r in result.redundancies for line in _redundancy(r, bool(result.cure))]),
         ("cure", _cure(result)),
         ("singular", _singular(result)),
         ("branches", _branches(result)),
@@ -149,7 +150,7 @@ def _mobility(result: Diagnosis) -> list[str]:
         f"by the rank: {result.coordinates} coordinates - rank {result.ordinary_rank} = {actual}"
         + (f" ({free})" if result.degrees_of_freedom == actual else f"; it moves with {free}"),
     ]
-    if result.gruebler != actual:
+    if result.gruebler != actual and not result.held:
         extra = plural(result.rows - result.ordinary_rank, "row")
         lines.append(f"Gruebler's count treats every row as independent, but {extra} can be left out without any effect")
     if result.rows > result.joint_rows:
@@ -158,8 +159,8 @@ def _mobility(result: Diagnosis) -> list[str]:
     return lines
 
 
-def _redundancy(r: Redundancy) -> list[str]:
-    when = "in every position" if r.permanent else "in this configuration only"
+def _redundancy(r: Redundancy, has_cure: bool) -> list[str]:
+    when = "along the whole motion" if r.held else "in every position" if r.permanent else "in this configuration only"
     lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant constraint')} {when}"]
     if r.fixes:
         lines[0] += "; any one of these changes removes it:" if r.count == 1 else "; any one of these changes helps:"
@@ -167,7 +168,11 @@ def _redundancy(r: Redundancy) -> list[str]:
         more = f", removes {fix.removes} redundant constraints" if fix.removes > 1 and fix.removes > r.count else ""
         lines.append(f"  {fix.constraint}: {fix.change} (condition number {1 / fix.conditioning:.3g}{more})")
     lines += [f"  ... {len(r.fixes) - MOST_FIXES_SHOWN} more"] if len(r.fixes) > MOST_FIXES_SHOWN else []
-    if r.permanent and not r.fixes:
+    if r.held:
+        lines.insert(
+            1, f"  their gradients depend on each other wherever it can go, and hold {', '.join(r.held)} to second order only"
+        )
+    if r.permanent and not r.fixes and not r.held and not has_cure:
         lines.append("  no single change of a joint was found that removes redundancy and keeps the mobility")
     return lines
 

@@ -66,6 +66,7 @@ class Redundancy(NamedTuple):
     count: int  # number of their redundant rows
     permanent: bool  # True if dependent in every position, False if in this configuration only
     fixes: tuple[Fix, ...]  # verified changes; empty if not permanent
+    held: tuple[str, ...] = ()  # pins among them that they hold to second order only
 
 
 class _ChangesOfConstraint(NamedTuple):
@@ -125,6 +126,20 @@ def _verify(
         if changed is not None and _removes_redundancy(changed, removes, at, positions.rank_tol):
             return Fix(candidates.constraint, change.text, removes, conditioning, changed)
     return None
+
+
+def fix_of_held_pin(
+    mechanism: Mechanism, positions: RankedPositions, at: Configuration, name: str, joint: Prismatic
+) -> Fix | None:
+    """Return the change of a pin that does not turn to a prismatic joint; None if it does not help."""
+    axis = _half_turn(float(joint.axis))
+    text = f'make it a prismatic joint along {np.rad2deg(axis):.4g} degrees of the frame of "{joint.bodies[0]}": it does not turn'
+    changed = apply_change(mechanism, name, JointChange(text, Prismatic(joint.bodies, joint.points, axis, joint.angle)))
+    if changed is None:
+        return None
+    after = RankedPositions(changed, positions.rank_tol).at(at.t, at.q)
+    removes = at.redundancy - after.redundancy
+    return Fix(name, text, removes, after.smallest, changed) if removes > 0 and after.rank > at.rank else None
 
 
 def apply_change(mechanism: Mechanism, name: str, change: JointChange) -> Mechanism | None:

@@ -22,7 +22,6 @@ from udkjax.annotations import Numbers
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_rows import PositionRows
 from udkjax.equations.redundancy import kinematic_rows
-from udkjax.equations.scales import scales_of
 from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT, connected_columns, echelon, null_space, row_space
 from udkjax.positions.assembly import close, require_closed
 from udkjax.programs.deferred import deferred
@@ -116,7 +115,7 @@ def require_consistent_loops(mechanism: Mechanism, unknowns: Unknowns) -> None:
 
 
 def _length(mechanism: Mechanism) -> float:
-    return float(scales_of(mechanism).length)
+    return float(analyse(mechanism).length)
 
 
 def _constraint_bytes(mechanism: Mechanism) -> list[bytes]:

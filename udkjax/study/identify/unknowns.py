@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import qr
 from scipy.special import expit, logit
 
+from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.scales import scales_of
 from udkjax.positions.assembly import State, assemble
 from udkjax.positions.channels import RATES, UNITS
 from udkjax.scene.bodies import COORDINATES
@@ -253,7 +253,7 @@ def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Es
         position = rows.close(t0, q)
         assert position is not None, "an assembled state is closed"
         free = rows.metric[:, None] * position.vt[position.rank :].T
-    chosen, scales = _independent_rows(free), scales_of(mech)
+    chosen, scales = _independent_rows(free), analyse(mech).scales
     size = np.where(np.array(chosen) % 3 == 2, 1.0, float(scales.length))  # angles in rad
     rate = float(scales.rate) or 1.0  # 1/s for a scene without motion and loads
     basis = free @ np.linalg.inv(free[chosen]) * size
