@@ -130,6 +130,7 @@ class SceneLayout:
             for group in (*self.constraints, *self.forces)
             if "piece" in group.programs.outputs
         ]
+        self.has_piecewise_loads = any(isinstance(group, ForceGroup) for group, _ in self.pieces)
         self.body_table = np.array([[3 * b, 2 * b, self.of_body(b)] for b in range(self.body_count)]).reshape(-1, 3)
 
     def _kinds(self, labels: Sequence[Hashable] | None = None) -> list[ElementKind]:

@@ -51,7 +51,7 @@ class ScenePrograms(RunPrograms):
         layout = self._layout = SceneLayout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row)
         self._terms = SceneTerms(layout, self._kernels)
         self._solver = SceneSolver(self._terms, policy)
-        self.scratch, self.row_names = layout.sizes, layout.row_names
+        self.scratch, self.row_names, self.has_piecewise_loads = layout.sizes, layout.row_names, layout.has_piecewise_loads
         self.coordinate_count, self.row_count = layout.coordinate_count, layout.row_count
         self.constants = range(layout.constant_count)
         starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])

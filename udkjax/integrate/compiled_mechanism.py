@@ -44,11 +44,18 @@ class RunPlan:
     evaluation: Accelerate | None  # the machine code that evaluates its equations for diffrax; None: `TextbookEquations` in JAX
     why_not_native: str  # the reason why machine code does not integrate; empty if it does
     independent_rows: int = 0  # the number of rows that the method uses
+    orders_by_diffrax: float = np.inf  # the highest order of derivatives that diffrax, which does not locate pieces, has right
 
     @cached_property
     def is_native(self) -> bool:
         """True if machine code integrates."""
         return not self.why_not_native
+
+    @cached_property
+    def has_timed_pieces(self) -> bool:
+        """True if the smooth piece of an element depends on time, so that the rate of the state alone does not lead across."""
+        code = self.operation.code if self.operation else None
+        return code is not None and code.piece_count > 0 and "t" in code.pieces.arrays
 
     @cached_property
     def marks_rows(self) -> bool:
@@ -111,8 +118,25 @@ def compile_mechanism(
         evaluation = evaluation_of(equations)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" uses diffrax instead')
-    plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows)
+    orders = _orders_by_diffrax(system, projected)
+    plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows, orders)
     return CompiledMechanism(equations, breakpoints, plan)
+
+
+def _orders_by_diffrax(system: Any, projected: bool) -> float:
+    """Return the highest order of derivatives that diffrax, which steps across the ends of pieces, computes right.
+
+    There derivatives of the second order jump. Projection makes a jump right that follows from the constraints alone.
+    """
+    if not _is_piecewise(system):
+        return np.inf
+    return 2 if projected and not any(map(has_pieces, system.forces.values())) else 1
+
+
+def _is_piecewise(system: Any) -> bool:
+    """Return whether constraints or loads of a mechanism are only piecewise smooth in the state."""
+    elements = (*system.constraints.values(), *system.forces.values()) if isinstance(system, Mechanism) else ()
+    return any(map(has_pieces, elements))
 
 
 @cached_by_identity
@@ -183,12 +207,11 @@ def eliminates(method: Pseudoinverse) -> bool:
 def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None) -> RunStates:
     textbook = textbook_of(equations)
     mechanism = textbook.mechanism
-    elements = (*mechanism.constraints.values(), *mechanism.forces.values()) if isinstance(mechanism, Mechanism) else ()
     return RunStates(
         code=textbook.programs,
         method=method_of(solver),
         projected=projected,
-        breaks=breakpoints is not None or any(map(has_pieces, elements)),
+        breaks=breakpoints is not None or _is_piecewise(mechanism),
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
         **_method_code(equations)._asdict(),
     )

@@ -139,11 +139,22 @@ class DifferentiableRun(DifferentiableFunction):
         moves_samples = any(x is True for x in jax.tree.leaves(mask.textbook.mechanism.samples))
         if moves_samples or not self._is_native(inputs, either):  # splines are not linear in their knots
             return super().twice(inputs, active, tangents, others, other_tangents)
+        self._require(not self.problem.rest.compiled.plan.has_timed_pieces, 2, "of pieces that depend on time")
         changes = (
             (self.problem.marks(mask), self.problem.changes(mask, dxs))
             for mask, dxs in ((active, tangents), (others, other_tangents))
         )
         return list(native_engine.second_derivative(problem, mask, *changes))
+
+    def require_order(self, order: int) -> None:
+        self._require(order <= self.problem.rest.compiled.plan.orders_by_diffrax, order, "by diffrax")
+
+    def _require(self, is_right: bool, order: int, how: str) -> None:
+        if not is_right:
+            raise NotImplementedError(
+                f"derivatives of order {order} {how} lack the jumps where a smooth piece of a constraint or a force ends, "
+                "such as the knots of a cam: take differences of derivatives of the first order"
+            )
 
     def run_and_jvp(self, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[IntegratorOutput, list[Array]]:
         """Return the run and the change of its states along tangents of the active inputs, by machine code if possible."""

@@ -13,7 +13,7 @@ How the code of a run is made, and where to look:
    `breakpoints` and `pieces` (where the motion is not smooth), `dense_output` (states between steps), `members` (loading lanes).
    `dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination; `formulations` has
    alternatives to the Udwadia-Kalaba equation; `state_functions` evaluates single states, and `row_marks` finds independent rows.
-4. derivatives/ adds `tangents` (forward mode, to second order) and `backpropagation` (reverse mode) along a `record`.
+4. derivatives/ adds `tangents` and `second_tangents` (forward mode), and `backpropagation` (reverse mode) along a `record`.
 5. watching/ ends runs at zero crossings of conditions, the events of `udkjax.integrate`.
 6. closing/ computes positions: `closing` assembles a mechanism, with derivatives, `marching` follows its positions, and
    `positions` computes batches of positions from the programs of equations/position_programs.py.

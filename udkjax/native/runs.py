@@ -9,7 +9,8 @@ from udkjax.native.base.module import Module
 from udkjax.native.base.tableau import Method
 from udkjax.native.derivatives import record
 from udkjax.native.derivatives.backpropagation import Reverse
-from udkjax.native.derivatives.tangents import Forward, ForwardTwice
+from udkjax.native.derivatives.second_tangents import ForwardTwice
+from udkjax.native.derivatives.tangents import Forward
 from udkjax.native.operations import Accelerate, Operation
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode

@@ -59,7 +59,8 @@ class ForceElement(PrintsLine):
     def piece(self, t: Number, *frames: Frame) -> Number | None:
         """Return the index of the current smooth piece of the loads, or None if they are smooth everywhere (the default).
 
-        Loads are continuous where pieces meet. No interpolation crosses from one piece to another.
+        Loads are continuous where pieces meet. No interpolation crosses from one piece to another. If the index depends on t,
+        runs have no second derivatives.
         """
         return None
 

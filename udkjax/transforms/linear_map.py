@@ -70,7 +70,11 @@ class DifferentiableFunction(eqx.Module):
         self, inputs: list[Array], active: Mask, tangents: list[Array], others: Mask, other_tangents: list[Array]
     ) -> list[Array]:
         """Return D^2 f [v, u], with v along the `active` inputs and u along the `others`."""
+        self.require_order(2)
         return change_along(lambda inputs: change_along(self, inputs, active, tangents)[1], inputs, others, other_tangents)[1]
+
+    def require_order(self, order: int) -> None:
+        """Raise an error if derivatives of this order by JAX, through a call, would be wrong; by default they are right."""
 
 
 class TangentMap(DifferentiableFunction):
@@ -111,6 +115,9 @@ class TangentMap(DifferentiableFunction):
         """Return a mask of x from a mask of the active entries of x."""
         marks = iter(which)
         return tuple(m and next(marks) for m in self.active)
+
+    def require_order(self, order: int) -> None:
+        self.of.require_order(order + 1)
 
     def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
         return self.of.shapes(self.parts(inputs)[0])

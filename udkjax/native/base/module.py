@@ -14,6 +14,8 @@ from udkjax.native.base.steps import POINTS
 # Rarely called functions: once per run, near singular configurations, or where a piece may end.
 COLD = (
     "leave",
+    "along_motion",
+    "jump",
     "finish_members",
     "begin",
     "rows_and_loads",

@@ -15,10 +15,10 @@ method is the solution of a_i = a(t_i, Q_i + h^2 g^2 a_i, V_i + h g a_i) (stage_
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
-from udkjax.expressions.loop_derivative import FORWARD, TWICE
+from udkjax.expressions.loop_derivative import FORWARD
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Layout, Plan
-from udkjax.native.base.program_derivative import GIVEN, WAYS
+from udkjax.native.base.program_derivative import GIVEN
 from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.base.samples import row_address
 from udkjax.native.base.steps import POINTS
@@ -204,8 +204,10 @@ class Forward(Differentiated):
                     self.put(f, f"state {x}", r, new, "tangent")
         self._project_end(f, begin)
         # The accelerations at the end of an implicit step are those of its last stage.
-        with f.if_(f.any_of(begin)) if self.stages else nullcontext(), self._each_group(f):
+        is_new = begin | (s.crosses > 0.5) if self.pieces else begin
+        with f.if_(f.any_of(is_new)) if self.stages else nullcontext(), self._each_group(f):
             self._call_derivative(f, self.mode, f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
+        self._finish_change(f, s, accept)
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
                 old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
@@ -221,6 +223,9 @@ class Forward(Differentiated):
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for x in "qv":
                 self.put(f, f"state {x}", r, self.vector(f, f"result {x}", r, "tangent"), "tangent")
+
+    def _finish_change(self, f: Function, s: Lane, accept: Value):
+        """Hook: change the tangents of the end of a step, `result q` and `result v`."""
 
     def _change_stage(self, f: Function, i: int, h: Value, start: str):
         """Compute the state of stage i in a tangent, for the step from a point."""
@@ -321,21 +326,3 @@ class Forward(Differentiated):
                 self.copy_lane(f, to, self.n, "point3 v", lane, "tangent")
             self._write_change(f, s, k, p, f.const(0, INT), "state q", "state v")
             self._write_change(f, s, k, p, times - 1, "point3 q", "point3 v")
-
-
-class ForwardTwice(Forward):
-    """A trajectory with its second derivatives along pairs of directions.
-
-    Second derivatives are the same sums over stages, ends of steps and outputs; the programs of accelerations and projections
-    compute them together with the tangents along either direction.
-    """
-
-    mode = TWICE
-    ways = WAYS
-
-    def _project_end(self, f: Function, begin: Value):
-        # From a state off the manifold, one Newton step is exact to first order, two steps to second order. Only the initial
-        # state may be off the manifold.
-        super()._project_end(f, begin)
-        with f.if_(f.any_of(begin)):
-            super()._project_end(f, begin)

@@ -7,13 +7,16 @@ import numpy as np
 from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value
 from udkjax.native.base.module import Module
 from udkjax.native.base.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, HALVINGS, NEAR_END, TRIES
+from udkjax.native.run.runge_kutta import stage_state
 
 
 def write_leave(module: Module):
     """Write `leave`: decide in lanes of `again` whether a step that ends in another piece is accepted or repeated.
 
     Such a step is repeated to end just before the end of the piece. A tiny step then crosses the end, and the run begins anew:
-    the accelerations of all points of an interpolation must belong to one piece.
+    the accelerations of all points of an interpolation must belong to one piece. So must those of all stages of a step, since
+    their derivatives jump: a step that ends in its piece, but has a stage near its end in another, is repeated to end earlier.
+    Only a jump that follows from constraints may remain if states are projected, which makes their derivatives right.
     """
     f, s = module.function("leave")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
@@ -37,9 +40,16 @@ def write_leave(module: Module):
     find_pieces(s.point3_t, lambda r: (module.vector(f, "point3 q", r), module.vector(f, "point3 v", r)))
     with f.each(module.pieces) as k:
         module.put_entry(f, "pieces before", k, module.entry(f, "pieces", k))
+    strays = f.const(False, BOOL, f.width)
+    if not module.plan.projected or module.code.has_piecewise_loads:
+        for i in np.flatnonzero(module.method.nodes[: module.method.stages] > 1 - NEAR_END).tolist():
+            stage_state(module, f, s, i)
+            module.invoke(f, "pieces")
+            strays = strays | moved()
     find_pieces(s.t1, lambda r: (module.vector(f, "corrected q", r), module.vector(f, "result v", r)))
     stepping, step = s.again > 0.5, s.t1 - s.point3_t
-    leaves = stepping & (s.begin < 0.5) & moved() & f.is_finite(s.error)
+    can_leave = stepping & (s.begin < 0.5) & f.is_finite(s.error)
+    leaves = can_leave & moved()
     s.share, s.low = yes, f.const(0.0, DOUBLE, f.width)
     with f.if_(f.any_of(leaves)), f.each(HALVINGS):
         middle = (s.low + s.share) * 0.5
@@ -53,17 +63,22 @@ def write_leave(module: Module):
         module.put(f, "state q", r, module.vector(f, "corrected q", r))
         module.put(f, "state v", r, module.vector(f, "result v", r))
     share, aim, is_accurate = s.share, s.aim, s.error < 1.0
-    repeats = leaves & aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
+    again = aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
+    repeats, shortens = leaves & again, can_leave & strays & ~leaves & again
     is_near_end = f.min(share, yes - share) <= NEAR_END
     s.where(leaves & ~repeats, lands=1.0)
+    s.where(stepping, crosses=where(leaves & aim.is_(float(AIM_ACROSS)), yes, 0.0))
     short = (s.t1 < s.crossing - s.smallest) & (s.lands < 0.5)
-    reached = stepping & is_accurate & ~leaves & ~short & aim.is_(float(AIM_BEFORE))
+    reached = stepping & is_accurate & ~leaves & ~shortens & ~short & aim.is_(float(AIM_BEFORE))
     across = reached | (repeats & (share <= EDGE))
     before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
     aim = where(repeats, where(is_near_end, before, beyond), where(short, aim, beyond))
     expected = f.fma(where(is_near_end, share - EDGE / 2, share + NEAR_END / 2), step, s.point3_t)
     crossing = where(repeats, expected, where(short, s.crossing, inf))
     crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.point3_t)), crossing)
+    aim = where(shortens, beyond, aim)
+    crossing = where(shortens, f.fma(step, 1 - NEAR_END, s.point3_t), crossing)
+    repeats = repeats | shortens
     tries = where(repeats, s.tries + 1.0, where(is_accurate, 0.0, s.tries))
     s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
     s.again = where(repeats, yes, 0.0)

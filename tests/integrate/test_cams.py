@@ -1,0 +1,106 @@
+"""Derivatives of runs across the knots of a cam, where the derivatives of the accelerations jump."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+ANGLES, RADII = 2 * np.pi * np.arange(6) / 6, 1 + 0.2 * np.array([0.0, 1.0, -1.0, 0.5, 0.0, -0.5])
+CHANGE, START, FIXED = np.array([0.1, -0.05, 0.03, 0.12, 0.06, -0.15]), 0.2, np.zeros((2, 2))
+
+
+class TimedCam(udk.Cam):
+    """A cam whose profile turns."""
+
+    def residual(self, t, *frames):
+        d = self._arm(*frames)
+        return [d.norm() - self.profile(jnp.arctan2(d.y, d.x) - 0.1 * t)]
+
+    def piece(self, t, *frames):
+        d = self._arm(*frames)
+        return self.profile.piece(jnp.arctan2(d.y, d.x) - 0.1 * t)
+
+
+def at_end(x, kind=udk.Cam, tol=1e-10, **choices):
+    """A sum of states of a bead that slides along a fixed cam, by its first speed, a change of the profile, and gravity."""
+    speed, change, gravity = x
+    profile = udk.Profile(ANGLES, RADII + change * CHANGE)
+    scene = udk.Mechanism(
+        {"bead": udk.Body(1.0, 0.1)}, {"contact": kind(["ground", "bead"], FIXED, profile)}, gravity=[0.0, -gravity]
+    )
+    radius, slope = jax.jvp(profile, (START,), (1.0,))
+    along, across = jnp.array([np.cos(START), np.sin(START)]), jnp.array([-np.sin(START), np.cos(START)])
+    v = speed / radius * (slope * along + radius * across)
+    state = udk.State(jnp.append(radius * along, 0.0)[None], jnp.append(v, 0.0)[None])
+    run = udk.simulate(scene, [0.0, 0.25, 0.5], state, rtol=tol, atol=tol, throw=False, method=udk.Elimination(), **choices)
+    return run.q[1:].sum() + 0.3 * run.v[1:].sum()
+
+
+X = np.array([-6.0, 0.1, 3.0])
+
+
+def differences(function, xs, h):
+    return np.stack([(np.asarray(function(xs + h * e)) - np.asarray(function(xs - h * e))) / (2 * h) for e in np.eye(3)], 1)
+
+
+def along(function, direction=(1.0, 1.0, 1.0)):
+    """The derivative of a function along a direction."""
+    return lambda x: jax.jvp(function, (x,), (jnp.asarray(direction),))[1]
+
+
+@pytest.fixture(scope="module")
+def run():
+    """Values and gradients without projection, of many x, by a tolerance."""
+    by_tol = jax.value_and_grad(lambda x, tol: at_end(x, tol=tol, stabilization=None))
+    return jax.jit(jax.vmap(by_tol, (0, None)))
+
+
+def test_gradients_of_runs_without_projection(run):
+    """A stage of a step that ends at a knot is not beyond it, where derivatives are others: gradients were off by 0.2."""
+    rng = np.random.default_rng(0)
+    xs = X + rng.uniform(-1, 1, (64, 3)) * [1.0, 0.1, 1.0]
+    assert_allclose(run(xs, 1e-8)[1], differences(lambda x: run(x, 1e-12)[0], xs, 1e-5), rtol=0, atol=1e-6)
+
+
+def test_second_derivatives_without_projection(run):
+    """Without the jumps at the knots they are off by 1.3."""
+    found = jax.jit(along(along(lambda x: at_end(x, stabilization=None))))(X)
+    expected = differences(lambda x: run(x, 1e-10)[1], X[None], 3e-4)
+    assert_allclose(found, expected.sum(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_second_derivatives_with_baumgarte():
+    function = lambda x: at_end(x, stabilization=udk.Baumgarte(5.0, 5.0))  # noqa: E731
+    found, gradient = jax.hessian(function)(jnp.asarray(X)), jax.jit(jax.vmap(jax.grad(function)))
+    assert_allclose(found, differences(gradient, X[None], 3e-4)[0], rtol=0, atol=2e-6)
+    assert_allclose(found, found.T, rtol=0, atol=2e-7)
+
+
+@pytest.mark.slow
+def test_all_orders_of_modes_have_the_same_second_derivatives():
+    x = jnp.asarray(X)
+    function = lambda x: at_end(x, stabilization=None)  # noqa: E731
+    expected = jax.hessian(function)(x)
+    for outer, inner in ((jax.jacfwd, jax.jacfwd), (jax.jacrev, jax.jacfwd), (jax.jacrev, jax.jacrev)):
+        assert_allclose(outer(inner(function))(x), expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_derivatives_that_would_lack_jumps_are_refused():
+    def by_diffrax(x):
+        return at_end(x, engine="diffrax", max_steps=100, stabilization=None)
+
+    def timed(x):
+        return at_end(x, TimedCam)
+
+    for function, reason in (
+        (along(along(by_diffrax)), r"order 2 by diffrax lack the jumps .* take differences"),
+        (along(along(along(at_end))), "order 3 by diffrax"),
+        (along(along(timed)), "pieces that depend on time"),
+    ):
+        with pytest.raises(NotImplementedError, match=reason):
+            jax.jit(function).lower(X)

@@ -1,0 +1,43 @@
+"""Second derivatives of a trajectory in forward mode, along pairs of directions, computed with each step."""
+
+from udkjax.expressions.loop_derivative import TWICE
+from udkjax.native.base.ir import Function, Value
+from udkjax.native.base.layout import Lane, Plan
+from udkjax.native.base.program_derivative import WAYS
+from udkjax.native.derivatives.saltation import add_memory, write_saltation
+from udkjax.native.derivatives.tangents import Forward
+
+
+class ForwardTwice(Forward):
+    """A trajectory with its second derivatives along pairs of directions.
+
+    Second derivatives are the same sums over stages, ends of steps and outputs; the programs of accelerations and projections
+    compute them together with the tangents along either direction.
+    """
+
+    mode = TWICE
+    ways = WAYS
+
+    def __init__(self, plan: Plan, active: tuple[bool, ...], lanes: int):
+        super().__init__(plan, active, lanes)
+        if self.pieces:
+            add_memory(self)
+
+    def write_derivatives(self):
+        super().write_derivatives()
+        if self.pieces:
+            write_saltation(self)
+
+    def _finish_change(self, f: Function, s: Lane, accept: Value):
+        if self.pieces:
+            with f.if_(f.any_of(accept & (s.crosses > 0.5))):
+                f.call("along_motion", f.given["work"])
+                with self._each_group(f):
+                    f.call("jump", f.given["work"], f.given["tangent"])
+
+    def _project_end(self, f: Function, begin: Value):
+        # From a state off the manifold, one Newton step is exact to first order, two steps to second order. Only the initial
+        # state may be off the manifold.
+        super()._project_end(f, begin)
+        with f.if_(f.any_of(begin)):
+            super()._project_end(f, begin)
