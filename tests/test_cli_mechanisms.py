@@ -57,7 +57,7 @@ def test_velocities_are_those_of_the_motor_s_own_speed(tmp_path, capsys):
     slow = np.array(results(capsys, "kinematics", scene, "--count", 1, "--rate", 1.0)["v"])[0, :, 2]
     np.testing.assert_allclose(slow, v / 25.0, rtol=1e-12)
     assert udkjax("kinematics", scene, "--out", tmp_path / "k.csv") == 0
-    assert "velocities at 25 rad/s of motor1" in " ".join(capsys.readouterr().out.split())
+    assert "velocities at 25 rad/s (238.732 rpm) of motor1" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(
@@ -215,8 +215,19 @@ mass = 1
     scene.write_text(hoeken)
     assert udkjax("kinematics", scene) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "crank turns all the way round" in said and "from 3.14159 rad (180 deg)" in said and "angle at A" not in said
-    assert "angle at B 23.07 to 73.74 deg" in said  # 2 asin(50 / 250), 2 asin(150 / 250)
+    assert "values count the angle of O-A from the x axis" in said and "travel unlimited" in said and "angle at A" not in said
+    assert "361 values from 180 deg to 540 deg" in said and "velocities at 6.28319 rad/s (60 rpm) of motor1" in said
+    assert "transmission angle at B 23.0739 to 73.7398 deg" in said  # 2 asin(50 / 250), 2 asin(150 / 250)
+    assert "crank-rocker (O-A-B-C: shortest + longest < sum of the others)" in said and "mobility 1, by Gruebler" in said
+    few = results(capsys, "kinematics", scene, "--count", 3)["characteristics"]["transmission_angles"]["B"]
+    np.testing.assert_allclose(few, 2 * np.arcsin([0.2, 0.6]), rtol=1e-12)  # however few values are asked for
+    assert udkjax("kinematics", scene, "--at", "180 deg", "--rate", "10 rad/s") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "at 180 deg, the angle of O-A from the x axis; at 10 rad/s (95.493 rpm)" in said and "A -50 0 500 -90 5000 0" in said
+    assert "links x (mm) y (mm) ground and crank 0 0" in said
+    for wrong in (["--at", "5 mm"], ["--from", "x"], ["--at", "1 rad", "--count", "3"], ["--rate", "3 m"]):
+        assert udkjax("kinematics", scene, *wrong) == 2
+        assert wrong[0] in capsys.readouterr().err
     loose = hoeken.replace('name = "rocker"\npins = ["C", "B"]', 'name = "wheel"\npins = ["B"]\nwidth = 9')
     scene.write_text(loose.replace('ground = ["O", "C"]', 'ground = ["O"]').replace(", C = [100, 0]", ""))
     assert udkjax("kinematics", scene) == 2

@@ -59,6 +59,8 @@ def objects() -> dict[str, object]:
         *(run, run.events, udk.assemble(free), udk.check(free), udk.analyse(free), udk.energy(free, run)),
         *(motion, udk.travel(linkage, "joint.C.angle"), rest, udk.modes(free, rest.state), driven, udk.power_balance(free, run)),
         udk.motion_ranges(free, motion),
+        udk.motion_at(free, 0.3, coordinate),
+        udk.characteristics(free, coordinate),
         *(udk.diagnose(free), udk.explain(free), udk.Workspace(jnp.ones((2, 2, 2)), jnp.ones((2, 2), bool))),
         *(udk.Baumgarte(), udk.Projection(), udk.Coordinate(("ground", "a")), udk.Event(anything, udk.Stop())),
         *(udk.JointLimit("a", 0.1), udk.Contact("a"), udk.Impact(0.5), udk.Release("a"), udk.Lock("a")),

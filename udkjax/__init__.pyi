@@ -50,6 +50,9 @@ from udkjax.positions.assembly import State as State
 from udkjax.positions.assembly import assemble as assemble
 from udkjax.positions.assembly import check as check
 from udkjax.positions.branches import branches as branches
+from udkjax.positions.characteristics import Characteristics as Characteristics
+from udkjax.positions.characteristics import characteristics as characteristics
+from udkjax.positions.characteristics import instant_centres as instant_centres
 from udkjax.positions.continuation import Reached as Reached
 from udkjax.positions.coordinates import Coordinate as Coordinate
 from udkjax.positions.kinematics import Kinematics as Kinematics
@@ -58,6 +61,9 @@ from udkjax.positions.kinematics import kinematics as kinematics
 from udkjax.positions.kinematics import travel as travel
 from udkjax.positions.motion_ranges import MotionRanges as MotionRanges
 from udkjax.positions.motion_ranges import motion_ranges as motion_ranges
+from udkjax.positions.pin_motion import PinMotion as PinMotion
+from udkjax.positions.pin_motion import motion_at as motion_at
+from udkjax.positions.pin_motion import pin_motion as pin_motion
 from udkjax.positions.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.position_batch import PositionBatch as PositionBatch
 from udkjax.positions.transmission import Workspace as Workspace
@@ -80,6 +86,7 @@ from udkjax.scene import Friction as Friction
 from udkjax.scene import Gear as Gear
 from udkjax.scene import Held as Held
 from udkjax.scene import Joint as Joint
+from udkjax.scene import LiftProfile as LiftProfile
 from udkjax.scene import Link as Link
 from udkjax.scene import Mechanism as Mechanism
 from udkjax.scene import Motion as Motion
@@ -97,11 +104,15 @@ from udkjax.scene import Spring as Spring
 from udkjax.scene import Torque as Torque
 from udkjax.scene import TorsionSpring as TorsionSpring
 from udkjax.scene import Weld as Weld
+from udkjax.scene import circles as circles
 from udkjax.scene import dumps as dumps
 from udkjax.scene import library as library
 from udkjax.scene import load as load
 from udkjax.scene import loads as loads
 from udkjax.scene import mjcf_text as mjcf_text
+from udkjax.scene import on_line as on_line
+from udkjax.scene import on_rail as on_rail
+from udkjax.scene import polar as polar
 from udkjax.scene import read_mjcf as read_mjcf
 from udkjax.scene import save as save
 from udkjax.scene import with_angle as with_angle

@@ -6,6 +6,7 @@ import {test} from "node:test";
 const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
+const forms = await page("pin_forms");
 const {applyFix} = await page("fixes"), {shapeProblem} = await page("checks");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("page_engine"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
@@ -31,6 +32,63 @@ test("links share pins, and are written in the file's unit", () => {
   assert.deepEqual(found.ground, ["A", "D"]);
   assert.deepEqual(found.motor, [{pin: "A", speed: "60 rpm"}]);
   assert.deepEqual(d.members(found, "A"), ["ground", "link1"]);
+});
+
+/** The same four-bar by lengths and angles, with a coupler point. */
+function byLengths() {
+  const found = fourBar(), pins = {C: {from: ["B", "D"], length: [120, 80], side: "left"}, P: {from: "B", length: "5 cm", angle: 30, line: ["B", "C"]}, A: [0, 0],
+    B: {from: "A", length: 40, angle: 60}, D: {from: "A", along: [3, 0], length: 100}, M: {from: "B", to: "C", share: 0.5, off: 10}};
+  return freeze({...found, pins, link: found.link.map((link, k) => (k === 1 ? {...link, pins: ["B", "C", "P", "M"]} : link))});
+}
+const near = (a, b) => a.forEach((x, k) => assert.ok(Math.abs(x - b[k]) < 1e-9, `${a} is not ${b}`));
+
+test("pins by lengths and angles have places", () => {
+  const found = byLengths(), place = name => d.placeOf(found, name).map(x => 1000 * x), apart = (a, b) => Math.hypot(place(a)[0] - place(b)[0], place(a)[1] - place(b)[1]);
+  near(place("B"), [20, 20 * Math.sqrt(3)]);
+  near(place("D"), [100, 0]);
+  near([apart("B", "C"), apart("C", "D"), apart("B", "P")], [120, 80, 50]);
+  const [b, c] = [place("B"), place("C")], axis = [(c[0] - b[0]) / 120, (c[1] - b[1]) / 120];
+  near(place("M"), [(b[0] + c[0]) / 2 - 10 * axis[1], (b[1] + c[1]) / 2 + 10 * axis[0]]);
+});
+
+test("moving a pin changes the numbers of its form", () => {
+  const found = byLengths(), at = name => d.placeOf(found, name);
+  const moved = d.movePin(found, "B", [0.03, 0.04]);
+  near([moved.pins.B.length, moved.pins.B.angle], [50, Math.atan2(4, 3) * 180 / Math.PI]);
+  assert.equal(moved.pins.C, found.pins.C);  // the coupler and the rocker keep their lengths
+  const across = d.movePin(found, "C", [0.06, -0.05]).pins.C;
+  assert.equal(across.side, "right");
+  near(across.length, [Math.hypot(40, 50 + 20 * Math.sqrt(3)), Math.hypot(40, 50)]);
+  assert.equal(d.movePin(found, "P", at("P")).pins.P.length, "5 cm");
+  assert.deepEqual(d.movePin(found, "M", at("M")).pins.M, found.pins.M);
+  assert.deepEqual(d.movePin(found, "D", [0.09, 0.02]).pins.D, {from: "A", along: [3, 0], length: 90});
+  assert.equal(d.movePin(found, "B", [-0.3, 0]), found);  // the circles would not meet
+  const all = d.shiftPins(found, ["M", "C", "B", "A", "D", "P"], 0.01, 0.02);
+  assert.deepEqual(all.pins, {...found.pins, A: [10, 20]});
+});
+
+test("a pin on a rail stays on it", () => {
+  const found = freeze({...d.EMPTY, pins: {O: [0, 0], A: {from: "O", length: 50, angle: 60}, P: {from: "A", length: 200, on: "O", along: [2, 0]}}});
+  near(d.placeOf(found, "P"), [0.025 + Math.sqrt(0.04 - 0.001875), 0]);
+  const moved = d.movePin(found, "P", [0.1, 0.05]);
+  near(d.placeOf(moved, "P"), [0.1, 0]);
+  near(d.placeOf(d.movePin(found, "P", [-0.1, 0.05]), "P"), [-0.1, 0]);
+  assert.equal(d.movePin(found, "A", [0, 0.3]), found);  // the rod does not reach the rail
+  assert.equal(d.renamePin(found, "O", "X").pins.P.on, "X");
+});
+
+test("pins keep their places when those that they refer to go", () => {
+  const found = byLengths();
+  assert.deepEqual(d.renamePin(found, "B", "X").pins.P, {...found.pins.P, from: "X", line: ["X", "C"]});
+  const gone = d.removeElements(found, [{kind: "pin", name: "A"}]);
+  near(d.placeOf(gone, "B"), d.placeOf(found, "B"));
+  assert.ok(Array.isArray(gone.pins.B) && !Array.isArray(gone.pins.C));
+  const merged = d.mergePins(found, "M", "C");
+  assert.deepEqual([merged.pins.C, Object.keys(merged.pins)], [found.pins.C, ["C", "P", "A", "B", "D"]]);
+  for (const [words, value] of forms.formsOf(found, "C", ["B", "D", "P"])) {
+    near(d.placeOf({...found, pins: {...found.pins, C: value}}, "C"), d.placeOf(found, "C"));
+    assert.ok(!words.includes("P"));  // P follows from C
+  }
 });
 
 test("a senseless action is a problem in words", () => {

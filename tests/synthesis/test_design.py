@@ -258,6 +258,45 @@ def test_areas_bounds_and_lengths_hold():
             udk.DesignSearch(FOUR_BAR, udk.PathGoal("P", [[0, 0], [1, 1]]), areas=bad)
 
 
+BY_LENGTHS = udk.Drawing(
+    pins={"O": (0, 0), "A": udk.polar("O", 5, 60), "C": (10, 0)}
+    | {"B": udk.circles(("A", "C"), (11, 9), "left"), "P": udk.polar("A", 6, 40, line=("A", "B"))},
+    links={"crank": {"pins": ["O", "A"], "mass": 1.0}, "coupler": {"pins": ["A", "B", "P"], "mass": 1.0}}
+    | {"rocker": {"pins": ["C", "B"], "mass": 1.0}},
+    ground=["O", "C"],
+    motors={"motor": {"pin": "O", "speed": "1 rad/s"}},
+    units={"angle": "deg"},
+)
+
+
+def test_limits_of_pins_by_lengths_have_exact_derivatives():
+    goal, lengths = udk.PathGoal("P", [[6, 12], [4, 10], [2, 8]]), {("B", "P"): (1.0, 2.0), ("O", "A"): (1.0, np.inf)}
+    areas = {"P": (0, 0, 1), "B": [[10, 0], [14, 1], [12, 5]]}
+    problem = udk.DesignSearch(BY_LENGTHS, goal, lengths=lengths, areas=areas).problem
+    assert problem.free.names == ("pin.O", "pin.A.length", "pin.A.angle", "pin.C", "pin.B.length", "pin.P.length", "pin.P.angle")
+    assert np.all(problem.low[[2, 6, 7, 8]] >= 0.0) and problem.low[3] == -np.inf  # lengths are positive
+    x = problem.free.vector[None] * [[1.0], [1.01]]
+    values, slopes = problem.lengths(x)
+    steps = 1e-6 * np.eye(x.shape[1])
+    ends = [problem.lengths((x[:, None] + sign * steps).reshape(-1, x.shape[1]))[0] for sign in (1, -1)]
+    differences = ((ends[0] - ends[1]) / 2e-6).reshape(2, x.shape[1], -1).swapaxes(1, 2)
+    np.testing.assert_allclose(slopes, differences, atol=1e-7)
+    pins = BY_LENGTHS.pins
+    np.testing.assert_allclose(values[0, :2], [1.0 - (d := np.hypot(*(pins["B"] - pins["P"]))), d - 2.0])
+
+
+@pytest.mark.slow  # the test above covers the lengths
+def test_a_design_over_lengths_finds_the_lengths():
+    wanted = {"pin.B.length": (10.0, 10.0), "pin.A.length": 4.0, "pin.P.length": 7.0}
+    truth = BY_LENGTHS.mechanism().with_parameters(wanted)
+    turn = udk.kinematics(truth, "motor", np.linspace(1.0, 1.0 + 2 * np.pi, 12, endpoint=False))
+    goal = udk.PathGoal("P", np.asarray(udk.path(truth, turn, "P")))
+    found = udk.design(BY_LENGTHS, goal, list(wanted), lengths={("A", "B"): (9.5, 30.0)}, starts=20, results=1)[0]
+    assert found.loss < 1e-20
+    for name, value in wanted.items():
+        np.testing.assert_allclose(found.mechanism.parameters()[name], value, rtol=1e-9)
+
+
 def test_places_that_are_one_do_not_shrink_the_mechanism_to_a_point():
     found = udk.design(FOUR_BAR, udk.PathGoal("P", [[1, 1], [1, 1]]), starts=20, results=1)
     assert found[0].loss < 1e-20

@@ -11,7 +11,9 @@ from udkjax.extras import OptionalImport
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from udkjax.positions.kinematics import Travel
+    from udkjax import Mechanism
+    from udkjax.positions.counting import Count
+    from udkjax.positions.kinematics import Kinematics, Travel
 
 with OptionalImport():
     import tyro
@@ -21,73 +23,92 @@ def kinematics(
     scene: Scene,
     /,
     driver: str | None = None,
-    first: Annotated[float | None, tyro.conf.arg(name="from")] = None,
-    last: Annotated[float | None, tyro.conf.arg(name="to")] = None,
-    count: int = 361,
-    rate: float | None = None,
+    at: str | None = None,
+    first: Annotated[str | None, tyro.conf.arg(name="from")] = None,
+    last: Annotated[str | None, tyro.conf.arg(name="to")] = None,
+    count: int | None = None,
+    rate: str | None = None,
     branches: bool = False,
     channels: tuple[str, ...] = (),
     out: Path | None = None,
     plot: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Drive a scene through a range of positions: limits of travel, positions, velocities and accelerations.
+    """Answer what a course asks of a mechanism: positions, velocities, accelerations, dead points, strokes, type, transmission.
 
-    The limits of travel are toggle positions (dead points), where the driver can move no further. The exit code is 1 if a value
-    cannot be reached.
+    With --at, tables of all pins and links in one position, with its instant centres; with --count, tables by the driver's value.
+    Values may have units, "60 deg" or "2 turns"; plain numbers are in the unit of the drawing, or in SI units without one. They
+    count as in the drawing: the angle of a crank is that of its direction from its pin on the ground, from the x axis. The exit
+    code is 1 if a value cannot be reached.
 
     Args:
         scene: the mechanism.
         driver: a driver of the scene, by default its only one; or a coordinate: body.crank.angle, joint.B.angle, pin.C.x.
-        first: first value (rad, m); by default the lower limit of travel, or the initial value if there is no limit.
+        at: value of the driver for which all pins and links are shown.
+        first: first value; by default the lower limit of travel, or the initial value if there is no limit.
         last: last value; by default the upper limit of travel, or one turn after the first value.
-        count: number of values.
-        rate: rate of the driver (rad/s, m/s), for velocities and accelerations; by default that of a motor at constant speed,
-            or 1.
+        count: number of values, with tables of the pins and links at each; by default 361 without tables.
+        rate: rate of the driver, such as "60 rpm", for velocities and accelerations; by default that of a motor at constant
+            speed, or 1 rad/s or m/s.
         branches: also find all assembly modes (branches) at the first value.
         channels: further channels to write, such as pin.C.x, pin.C.vy or body.coupler(0.1, 0).ay.
         out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
         plot: picture to write (.png, .svg, .pdf or .jpg): poses and angles, or the channels.
     """
-    if count < 1:
+    if count is not None and count < 1:
         refuse(f"--count {count}: must be positive")
+    if at is not None and (first, last, count) != (None, None, None):
+        refuse("--at is one value: leave out --from, --to and --count")
     mech, text = load_to_write(scene, out, plot)
     driver, measured = choose_driver(mech, driver), channels_of(mech, channels)
     import numpy as np
 
     import udkjax as udk
     from udkjax.positions.coordinates import value_of
-    from udkjax.positions.drive import constant_speed
-    from udkjax.positions.motion_ranges import range_lines
-    from udkjax.printing import format_number
+    from udkjax.positions.counting import count_of, nearest_turn, read_number
+    from udkjax.positions.pin_motion import of_kinematics, rate_text, usual_rate
+    from udkjax.printing import text_table
     from udkjax.show.summary import table
 
-    travel = udk.travel(mech, driver)
-    rate = (constant_speed(mech, driver) or 1.0) if rate is None else rate
-    first = _default(first, float(travel.lower), float(value_of(mech, driver)(udk.assemble(mech).q)))
-    last = _default(last, float(travel.upper), first + (2 * math.pi if travel.unit == "rad" else float(udk.analyse(mech).length)))
-    motion = udk.kinematics(mech, driver, np.linspace(first, last, count), rate=rate)
-    assembly_modes = udk.branches(mech, driver, first) if branches else None
+    counted, travel = count_of(mech, driver), udk.travel(mech, driver)
+    speed = usual_rate(mech, driver) if rate is None else read_number(rate, counted.rate_unit, "--rate", counted.units)
+    drawn = float(value_of(mech, driver)(udk.assemble(mech).q))
+    if at is not None:
+        value = counted.read(at, "--at")
+        values = np.array([nearest_turn(value, drawn) if counted.is_angle else value])
+    else:
+        start = _default(None if first is None else counted.read(first, "--from"), float(travel.lower), drawn)
+        turn = start + (2 * math.pi if counted.is_angle else float(udk.analyse(mech).length))
+        end = _default(None if last is None else counted.read(last, "--to"), float(travel.upper), turn)
+        values = np.linspace(start, end, count or 361)
+    motion = udk.kinematics(mech, driver, values, rate=speed)
+    found = udk.characteristics(mech, driver)
+    assembly_modes = udk.branches(mech, driver, values[0]) if branches else None
     names = [udk.Reached(int(code)).name for code in np.asarray(motion.status)]
-    reached = int(np.sum(np.asarray(motion.reached)))
+    reached, number = int(np.sum(np.asarray(motion.reached))), len(values)
     free = (
         math.isinf(float(travel.lower)) and math.isinf(float(travel.upper)) and udk.Reached.lost not in np.asarray(travel.status)
     )
     lines = {
-        "travel": "unlimited" if free else f"{_end(travel, 0)} to {_end(travel, 1)}",
-        "reached": f"{reached} of {count} values from {_value(first, travel.unit)} to {_value(last, travel.unit)}",
+        "values count": counted.words,
+        "travel": "unlimited" if free else f"{_end(travel, 0, counted)} to {_end(travel, 1, counted)}",
+        "reached": f"{reached} of {number} values from {counted.text(values[0])} to {counted.text(values[-1])}",
+        "velocities": f"{rate_text(speed, counted)} of {driver}",
     }
-    if out is not None or plot is not None:
-        lines["velocities"] = f"at {format_number(rate)} {travel.unit}/s of {driver}"
     if math.isfinite(float(motion.limit)):
-        lines["toggle at"] = f"{float(motion.limit):.15g} {travel.unit}"
+        lines["toggle at"] = counted.text(float(motion.limit))
     for name, words in (("singular", "singular at"), ("not_determined", "rates undetermined at")):
         if name in names:
-            lines[words] = ", ".join(f"{float(s):g}" for s, n in zip(np.asarray(motion.values), names, strict=True) if n == name)
+            lines[words] = ", ".join(counted.text(s) for s, n in zip(values, names, strict=True) if n == name)
     if assembly_modes is not None:
-        lines["branches"] = f"{len(assembly_modes)} at {first:g}"
-    ranges = udk.motion_ranges(mech, motion, driver)
-    lines |= range_lines(ranges)
+        lines["branches"] = f"{len(assembly_modes)} at {counted.text(values[0])}"
+    lines |= {title: words for title, words in found.lines().items() if title != "driver"}
+    said = table(f"{mech.name or 'mechanism'}, driven by {driver}", lines)
+    if at is not None or count is not None:
+        tables = of_kinematics(mech, motion, counted).tables()
+        said = "\n\n".join([said, *(text_table(one, 10**9) for one in tables)])
+    if at is not None and reached:
+        said += "\n\n" + _centres(mech, motion, counted)
     columns = measure_channels(mech, motion, measured)
     results: dict[str, object] = {
         "driver": driver,
@@ -95,7 +116,13 @@ def kinematics(
         "values": motion.values,
         "status": names,
         "limit": motion.limit,
-        "ranges": {name: getattr(ranges, name) for name in ("swings", "strokes", "transmission_angles")},
+        "characteristics": {
+            "mobility": found.mobility._asdict(),
+            "four_bars": [bar._asdict() for bar in found.four_bars],
+            "outputs": {name: output._asdict() for name, output in found.outputs.items()},
+            "transmission_angles": found.transmission_angles,
+            "ratios": found.ratios,
+        },
         "bodies": list(motion.bodies),
         **{name: getattr(motion, name) for name in ("q", "v", "a")},
         "channels": {name: values for name, (values, _) in columns.items()},
@@ -117,13 +144,15 @@ def kinematics(
         label = f"{driver} ({motion.unit})"
         picture = channels_figure(motion.values, columns, label, mech.name) if columns else driven_figure(mech, motion, driver)
         picture.savefig(plot, dpi=150)
-    write(out, text, variables, coordinates, {"driver": driver, "rate": rate})
-    show(results, table(f"{mech.name or 'mechanism'}, driven by {driver}", lines), json)
-    if reached < count:
-        fail(f"{count - reached} values cannot be reached: {names[int(np.argmin(np.asarray(motion.reached)))].replace('_', ' ')}")
+    write(out, text, variables, coordinates, {"driver": driver, "rate": speed})
+    show(results, said, json)
+    if reached < number:
+        fail(
+            f"{number - reached} values cannot be reached: {names[int(np.argmin(np.asarray(motion.reached)))].replace('_', ' ')}"
+        )
 
 
-def _end(travel: "Travel", side: int) -> str:
+def _end(travel: "Travel", side: int, counted: "Count") -> str:
     """Return an end of travel as text: its value, or that it has no limit, or that the limit was not found."""
     import numpy as np
 
@@ -131,15 +160,24 @@ def _end(travel: "Travel", side: int) -> str:
 
     lost = np.asarray(travel.status)[side] == udk.Reached.lost
     value = float((travel.lower, travel.upper)[side])
-    return "unknown (lost on the way)" if lost else "no limit" if math.isinf(value) else _value(value, travel.unit)
+    return "unknown (lost on the way)" if lost else "no limit" if math.isinf(value) else counted.text(value)
 
 
-def _value(x: float, unit: str) -> str:
-    """Format a value with its unit; an angle in degrees, too."""
-    from udkjax.printing import format_number
+def _centres(mech: "Mechanism", motion: "Kinematics", counted: "Count") -> str:
+    """Return the table of the instant centres of all pairs of links in the first position."""
+    import numpy as np
 
-    degrees = f" ({format_number(math.degrees(x), scale=360.0)} deg)" if unit == "rad" else ""
-    return f"{format_number(x, scale=1.0)} {unit}{degrees}"
+    import udkjax as udk
+    from udkjax.positions.counting import direction_text
+    from udkjax.printing import PrintedTable, format_number, text_table
+
+    rows, unit, size = [], counted.units.shown("m"), counted.units.size("m")
+    centres = udk.instant_centres(mech, motion.q[0], motion.v[0])
+    largest = max((float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity), default=0.0)
+    for pair, (place, at_infinity) in centres.items():
+        x, y = (format_number(z / size, scale=largest / size) for z in place)
+        rows.append([" and ".join(pair), *((x, y) if not at_infinity else ("at infinity", direction_text(place)))])
+    return text_table(PrintedTable("instant centres", rows, ("links", f"x ({unit})", f"y ({unit})")), 10**9)
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:

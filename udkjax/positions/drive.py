@@ -121,6 +121,15 @@ def constant_speed(mechanism: Mechanism, driver: str) -> float:
     return float(np.asarray(motion.coefficients)[1]) if isinstance(motion, Polynomial) and len(motion.coefficients) == 2 else 0.0
 
 
+def only_driver(mechanism: Mechanism) -> str:
+    """Return the name of the only driver; raise `SceneError` unless there is exactly one."""
+    names = mechanism.driver_names
+    if len(names) != 1:
+        choices = f"there are {', '.join(names)}" if names else "there is none in the scene"
+        raise SceneError([f"driver: name the driver or a coordinate, such as body.crank.angle: {choices}"], mechanism.name)
+    return names[0]
+
+
 def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
     """Return the mechanism without its drivers, with these forces instead of its own if any are given."""
     with jax.ensure_compile_time_eval():

@@ -20,6 +20,10 @@ from udkjax.scene.description import format_pose as format_pose
 from udkjax.scene.description import size_of as size_of
 from udkjax.scene.drawing import Drawing as Drawing
 from udkjax.scene.drawing import Link as Link
+from udkjax.scene.drawing import circles as circles
+from udkjax.scene.drawing import on_line as on_line
+from udkjax.scene.drawing import on_rail as on_rail
+from udkjax.scene.drawing import polar as polar
 from udkjax.scene.drawing.drawing_tables import LISTS as LISTS
 from udkjax.scene.drawing.drawn_forces import shift_motion as shift_motion
 from udkjax.scene.drawing.drawn_quantities import Units as Units
@@ -31,7 +35,6 @@ from udkjax.scene.drivers import Spline as Spline
 from udkjax.scene.element_setup import attached_bodies as attached_bodies
 from udkjax.scene.fields import CALLED as CALLED
 from udkjax.scene.fields import NOT_NEGATIVE as NOT_NEGATIVE
-from udkjax.scene.fields import POSITIVE as POSITIVE
 from udkjax.scene.fields import given_number as given_number
 from udkjax.scene.fields import names as names
 from udkjax.scene.files import dumps as dumps
@@ -69,15 +72,15 @@ from udkjax.scene.mjcf import MjcfWarning as MjcfWarning
 from udkjax.scene.mjcf import mjcf_text as mjcf_text
 from udkjax.scene.mjcf import read_mjcf as read_mjcf
 from udkjax.scene.named_arguments import require_history as require_history
-from udkjax.scene.number_fields import owner_of as owner_of
+from udkjax.scene.number_fields import must_be_positive as must_be_positive
 from udkjax.scene.number_fields import parameters_of as parameters_of
 from udkjax.scene.number_fields import split_index as split_index
 from udkjax.scene.origin import Origin as Origin
+from udkjax.scene.profiles import LiftProfile as LiftProfile
 from udkjax.scene.profiles import Profile as Profile
 from udkjax.scene.reshaping import length_of as length_of
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length
-from udkjax.scene.schema import keys as keys
 from udkjax.scene.sources import AbstractDrawing as AbstractDrawing
 from udkjax.scene.suspicions import body_sizes as body_sizes
 from udkjax.scene.suspicions import suspicions as suspicions

@@ -19,6 +19,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import FieldMetadata, StaticValue
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
+from udkjax.scene.profiles import AbstractProfile, profile_class
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
@@ -169,9 +170,12 @@ def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetad
     elif annotation in (str, bool):
         if not isinstance(value, annotation):
             yield f"{path}: must be {'a string' if annotation is str else 'true or false'}, not {abbreviate(value)}"
-    elif get_origin(annotation) is tuple and get_args(annotation)[0] is str:
+    elif get_origin(annotation) is tuple and (get_args(annotation)[0] is str or get_origin(get_args(annotation)[0]) is Literal):
         if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
             yield f"{path}: must be a list of names, not {abbreviate(value)}"
+        elif choices := get_args(get_args(annotation)[0]):
+            for k, item in enumerate(value):
+                yield from _check_value(f"{path}[{k}]", Literal[choices], item, {}, sizes)  # pyright: ignore
     elif isinstance(annotation, type) and issubclass(annotation, eqx.Module):
         yield from _check_nested(path, annotation, value)
 
@@ -184,6 +188,8 @@ def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
         yield from check_table(path, type(value), table_of(value), {})
     elif not isinstance(value, dict):
         yield f"{path}: must be a table, not {abbreviate(value)}"
+    elif annotation is AbstractProfile:
+        yield from check_table(path, profile_class(value), value, {})
     elif annotation in CLASSES_WITHOUT_TYPE.values():
         yield from check_table(path, annotation, value, {})
     else:

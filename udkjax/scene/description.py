@@ -18,13 +18,15 @@ LEFT_OUT = ("velocity", "angular_velocity")  # fields omitted if zero
 def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str]]) -> PrintedTable:
     """Return the table of a mechanism; `frame_names` maps an element to its bodies."""
     groups = mechanism.groups
+    drawing = None if mechanism.departs_from_drawing else mechanism.drawing
+    lengths = {} if drawing is None else drawing.length_texts()
     rows = [
         (
             section,
             name,
             type(element).__name__,
             "" if section == "body" else ", ".join(frame_names(element)),
-            _format_element(element),
+            _with_length(lengths.get(name, "") if section == "body" else "", _format_element(element)),
         )
         for section, elements in groups.items()
         for name, element in elements.items()
@@ -33,14 +35,25 @@ def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str
     return PrintedTable(title, rows, ("section", "name", "type", "bodies", "numbers"))
 
 
-def drawing_table(name: str, groups: Mapping[str, Mapping[str, eqx.Module]], ground: Sequence[str]) -> PrintedTable:
-    """Return the table of a drawing, from its elements by section and name and its pins on the ground."""
+def drawing_table(
+    name: str, groups: Mapping[str, Mapping[str, eqx.Module]], ground: Sequence[str], lengths: Mapping[str, str]
+) -> PrintedTable:
+    """Return the table of a drawing, from its elements by section and name, its pins on the ground and the lengths of links."""
     rows = [
-        (section, key, "ground" if section == "pin" and key in ground else _names_in(element), _format_element(element))
+        (
+            section,
+            key,
+            "ground" if section == "pin" and key in ground else _names_in(element),
+            _with_length(lengths.get(key, "") if section == "link" else "", _format_element(element)),
+        )
         for section, elements in groups.items()
         for key, element in elements.items()
     ]
     return PrintedTable(f"{name or 'drawing'} ({_counts(groups)})", rows, ("section", "name", "between", "numbers"))
+
+
+def _with_length(length: str, numbers: str) -> str:
+    return ", ".join(text for text in (f"length {length}" if length else "", numbers) if text)
 
 
 def _counts(groups: Mapping[str, Mapping[str, object]]) -> str:

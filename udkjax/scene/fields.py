@@ -129,15 +129,26 @@ class FieldMetadata(TypedDict, total=False):
     names: Literal["body", "revolute", "pin", "link", "slide"]  # kind of the names that the field holds
 
 
+CLOSES = 1e-9  # relative to the sum of the sizes: numbers of a file have more digits
+
 _POSITIVE = Requirement("must be > 0", lambda v: v > 0)
 _NOT_NEGATIVE = Requirement("must be >= 0", lambda v: v >= 0, strict=False)
 _INCREASING = Requirement("must be greater than the entry before", lambda v: array_namespace(v).diff(v, prepend=-np.inf) > 0)
 _ONE_TURN = Requirement("must be less than a turn after the first (the profile closes by itself)", lambda v: v - v[0] < 2 * np.pi)
+_WHOLE_TURN = Requirement(
+    "the angles must add up to a whole turn",
+    lambda v: abs(v.sum() - 2 * np.pi) * array_namespace(v).ones_like(v) <= CLOSES * 2 * np.pi,
+)
+_RETURNS = Requirement(
+    "the lifts must add up to zero", lambda v: abs(v.sum()) * array_namespace(v).ones_like(v) <= CLOSES * abs(v).sum()
+)
 
 POSITIVE: FieldMetadata = {"require": (_POSITIVE,)}
 NOT_NEGATIVE: FieldMetadata = {"require": (_NOT_NEGATIVE,)}
 KNOTS: FieldMetadata = {"require": (_INCREASING,), "at_least": 2}
 PROFILE_ANGLES: FieldMetadata = {"require": (_INCREASING, _ONE_TURN), "at_least": 3}
+LAW_ANGLES: FieldMetadata = {"require": (_POSITIVE, _WHOLE_TURN), "at_least": 1}
+LIFTS: FieldMetadata = {"require": (_RETURNS,), "at_least": 1}
 PROFILE_RADII: FieldMetadata = {"require": (_POSITIVE,), "at_least": 3}
 CALLED: FieldMetadata = {"called": True}
 NOT_EMPTY: FieldMetadata = {"at_least": 1}

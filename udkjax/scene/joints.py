@@ -20,7 +20,7 @@ from udkjax.arrays import ROUNDING, array_namespace, number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import BODY, POSITIVE, given_direction, given_names, given_number, given_or_guess
-from udkjax.scene.profiles import Profile, as_profile
+from udkjax.scene.profiles import AbstractProfile, as_profile
 
 
 class Constraint(PrintsLine):
@@ -278,27 +278,37 @@ class Rack(Joint):
 
 
 class Cam(Joint):
-    """A point of a follower, body 2, stays on the closed `profile` of a cam, body 1.
+    """A point of a follower, body 2, stays on the closed `profile` of a cam, body 1; or a flat face of the follower touches it.
 
     1 row (m): |d| - radius(phi), positive outside the profile, with d the vector from point 1 to point 2 in body 1's frame, and
-    phi its polar angle. The constraint acts in both directions: the follower cannot lift off.
+    phi its polar angle. With a `face`, n . d - radius(phi) with phi the angle of its outward normal n in body 1's frame: radius
+    is then the distance of the tangent across n. The constraint acts in both directions: the follower cannot lift off.
 
     Args:
         bodies: the names of the cam and of the follower.
         points: the centre of the profile on body 1, and the point of body 2 that stays on it, each in the frame of its body (m).
-        profile: a `Profile`, or a table of its angles and radii.
+        profile: a `Profile` or a `LiftProfile`, or the table of one.
+        face: the direction of the normal of a flat face, away from the cam, in body 2's frame, as an angle (rad) or a vector.
     """
 
     points: Float[Array, "2 2"] = eqx.field(converter=given_number)
-    profile: Profile = eqx.field(converter=as_profile)
+    profile: AbstractProfile = eqx.field(converter=as_profile)
+    face: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)
 
     def residual(self, t, *frames):
-        d = self._arm(*frames)
-        return [d.norm() - self.profile(jnp.arctan2(d.y, d.x))]
+        d, angle = self._arm(*frames), self._angle(*frames)
+        out = d.norm() if self.face is None else d.x * jnp.cos(angle) + d.y * jnp.sin(angle)
+        return [out - self.profile(angle)]
 
     def piece(self, t, *frames):
-        d = self._arm(*frames)
-        return self.profile.piece(jnp.arctan2(d.y, d.x))
+        return self.profile.piece(self._angle(*frames))
+
+    def _angle(self, frame1: Frame, frame2: Frame) -> Number:
+        """Return the polar angle of the point, or the angle of the normal of the face, in body 1's frame (rad)."""
+        if self.face is not None:
+            return self.face + frame2.angle - frame1.angle
+        d = self._arm(frame1, frame2)
+        return jnp.arctan2(d.y, d.x)
 
     def _arm(self, frame1: Frame, frame2: Frame) -> Point:
         """Return the vector from point 1 to point 2 in body 1's frame."""

@@ -168,6 +168,12 @@ def _require_point(name: str, value: Any, given: GivenArguments) -> None:
     require_finite(name, value)
 
 
+def _require_rate(name: str, value: Any, given: GivenArguments) -> None:
+    """Require finite numbers; where a course asks `at` a value, a text with a unit is read there."""
+    if not (isinstance(value, str) and "at" in given):
+        require_finite(name, value)
+
+
 def _require_drivers(name: str, value: Any, given: GivenArguments) -> None:
     """Check a mapping of drivers to values, or a list of names of drivers where they have no values."""
     if isinstance(value, Mapping):
@@ -224,8 +230,8 @@ CHECKS: dict[str, ArgumentCheck] = {
     "values": require_finite,
     "axes": _require_mapping,
     "units": _require_units,
-    "rate": require_finite,
-    "acceleration": require_finite,
+    "rate": _require_rate,
+    "acceleration": _require_rate,
     "value": require_number,
     "length": partial(require_number, sign="positive"),
     "angle": require_number,

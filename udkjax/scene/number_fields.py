@@ -10,8 +10,9 @@ from jaxtyping import Array
 from udkjax.annotations import Numbers
 from udkjax.arrays import number
 from udkjax.scene.checks import SceneError
+from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.held import Held, given_sampled
-from udkjax.scene.schema import numbers_in
+from udkjax.scene.schema import keys, numbers_in
 from udkjax.wording import abbreviate, quote, suggestion
 
 SECTIONS = {"body": "bodies", "joint": "joints", "driver": "drivers", "force": "forces"}
@@ -23,6 +24,7 @@ class ElementsOfDrawing(Protocol):
 
     @property
     def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]: ...
+    def length_texts(self) -> Mapping[str, str]: ...
 
 
 class Sections(Protocol):
@@ -36,6 +38,8 @@ class Sections(Protocol):
     def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]: ...
     @property
     def drawing(self) -> ElementsOfDrawing | None: ...
+    @property
+    def departs_from_drawing(self) -> bool: ...
 
 
 class NumberField(NamedTuple):
@@ -71,6 +75,17 @@ def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
     drawing = None if parameter.section in SECTIONS else mechanism.drawing
     elements = (mechanism if drawing is None else drawing).groups[parameter.section]
     return _at(elements[parameter.owner], parameter.path[:-1])
+
+
+def must_be_positive(mechanism: Sections, name: str) -> bool:
+    """Return True if a number, or the number that an entry belongs to, must not be negative."""
+    known = parameters_of(mechanism)
+    field = known[split_index(name, known)[0]]
+    if not field.path:
+        return False
+    metadata = keys(type(owner_of(mechanism, field)))[field.path[-1]].metadata
+    bounds = (*POSITIVE.get("require", ()), *NOT_NEGATIVE.get("require", ()))
+    return any(rule in metadata.get("require", ()) for rule in bounds)
 
 
 def require_values(values: object, name: str) -> None:

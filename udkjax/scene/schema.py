@@ -17,7 +17,7 @@ from udkjax.scene import drivers, forces, joints
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import FieldMetadata
 from udkjax.scene.held import Held
-from udkjax.scene.profiles import Profile
+from udkjax.scene.profiles import AbstractProfile, LiftProfile, Profile, profile_class
 
 SECTIONS = ("body", "joint", "driver", "force")
 
@@ -43,7 +43,13 @@ CLASSES_BY_TYPE: dict[str, dict[str, type]] = {
     "motion": _by_type(drivers, drivers.Motion),
 }
 # Classes whose tables have no `type`.
-CLASSES_WITHOUT_TYPE: dict[str, type] = {"body": Body, "driver": drivers.Driver, "profile": Profile, "held": Held}
+CLASSES_WITHOUT_TYPE: dict[str, type] = {
+    "body": Body,
+    "driver": drivers.Driver,
+    "profile": Profile,
+    "lift_profile": LiftProfile,
+    "held": Held,
+}
 
 
 def is_in_format(cls: type) -> bool:
@@ -54,6 +60,7 @@ def is_in_format(cls: type) -> bool:
 class Key(NamedTuple):
     """One key of an element: a field of its class."""
 
+    field: str  # the name of the key, followed by an underscore if it is a keyword of Python
     annotation: Any  # a type or a union of types, without None
     required: bool
     metadata: FieldMetadata
@@ -69,14 +76,15 @@ def keys(cls: type) -> dict[str, Key]:
                 kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
                 annotation = kinds[0] if len(kinds) == 1 else annotation
             default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-            keys_by_name[field.name] = Key(annotation, not default, cast(FieldMetadata, field.metadata))
+            key = field.name.removesuffix("_")
+            keys_by_name[key] = Key(field.name, annotation, not default, cast(FieldMetadata, field.metadata))
     return keys_by_name
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:
     """Return an element as a table without absent values (None where it is the default); nested modules stay modules."""
-    table = {name: getattr(element, name) for name in keys(type(element))}
-    defaults = {f.name: f.default for f in dataclasses.fields(element)}
+    table = {name: getattr(element, key.field) for name, key in keys(type(element)).items()}
+    defaults = {f.name.removesuffix("_"): f.default for f in dataclasses.fields(element)}
     may_be_absent = [name for name in table if defaults[name] is None or defaults[name] is dataclasses.MISSING]
     return {name: value for name, value in table.items() if value is not None or name not in may_be_absent}
 
@@ -87,9 +95,10 @@ def build(annotation: Any, value: object) -> Any:
         return value
     if get_origin(annotation) is types.UnionType:  # a number, or samples of it
         annotation = get_args(annotation)[1]
+    annotation = profile_class(value) if annotation is AbstractProfile else annotation
     cls = CLASSES_BY_TYPE["motion"][value["type"]] if "type" in value else annotation
     expected = keys(cls)
-    return cls(**{name: build(expected[name].annotation, item) for name, item in value.items() if name != "type"})
+    return cls(**{expected[name].field: build(expected[name].annotation, item) for name, item in value.items() if name != "type"})
 
 
 def numbers_in(element: eqx.Module) -> Iterator[tuple[tuple[str, ...], jax.Array | None, tuple[int, ...] | None]]:
@@ -98,7 +107,7 @@ def numbers_in(element: eqx.Module) -> Iterator[tuple[tuple[str, ...], jax.Array
     The value of an absent number is None, and its shape is the annotation's, or None if the annotation does not determine it.
     """
     for name, key in keys(type(element)).items():
-        value = getattr(element, name)
+        value = getattr(element, key.field)
         if isinstance(value, eqx.Module):
             yield from (((name, *path), leaf, shape) for path, leaf, shape in numbers_in(value))
         elif eqx.is_array(value):

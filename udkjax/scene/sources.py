@@ -91,6 +91,11 @@ class AbstractDrawing(PrintsTable):
 
     @property
     @abstractmethod
+    def pins(self) -> Mapping[str, Any]:
+        """The world coordinates of the pins by name (m)."""
+
+    @property
+    @abstractmethod
     def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
         """The elements that hold the drawing's numbers, by section and name."""
 
@@ -109,6 +114,10 @@ class AbstractDrawing(PrintsTable):
     @abstractmethod
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
         """Return a body (or the ground) at a pin and the pin's position in the body's frame (m); None for an unknown pin."""
+
+    @abstractmethod
+    def length_texts(self) -> Mapping[str, str]:
+        """Return the lengths of each body and of the ground as text; empty if numbers are traced."""
 
     @abstractmethod
     def shapes(self) -> dict[str, Array]:
@@ -212,6 +221,13 @@ jax.tree_util.register_pytree_node(Follows, _refuse, lambda text, _: Follows(tex
 MOST_STRUCTURES = 256
 _derivations: "OrderedDict[TreeDef, Derivation]" = OrderedDict()  # of the structures met so far
 _NUMBERS = (jax.Array, np.ndarray, np.generic, float)
+
+
+def is_number(leaf: object) -> bool:
+    """Return True if a leaf is a number, and not what a function on trees has put in its place."""
+    return isinstance(leaf, _NUMBERS)
+
+
 _derived = deferred_if_traced(lambda source: source.derived())
 
 
@@ -223,7 +239,7 @@ def elements_of(source: Any) -> Elements:
     all other numbers are stand-ins that refuse to be used.
     """
     leaves, tree = jax.tree.flatten(source)
-    if not all(isinstance(x, (*_NUMBERS, jax.ShapeDtypeStruct)) for x in leaves):
+    if not all(isinstance(x, jax.ShapeDtypeStruct) or is_number(x) for x in leaves):
         return _with_stand_ins(source, leaves, tree)
     axes = _batch_axes(source, leaves)
     if len({id(x) for x in leaves}) < len(leaves):  # one array is several leaves: `Derivation` needs to tell them apart

@@ -38,6 +38,7 @@ _FIELDS = {
     "length": "m",
     "radius": "m",
     "radii": "m",
+    "off": "m",
     "constant": "m",
     "vector": "N",
     "value": "N m",
@@ -61,6 +62,11 @@ _OF_TYPE = {
     ("TorsionSpring", "damping"): "N m s/rad",
     ("Friction", "velocity"): "rad/s",
     ("Profile", "angle"): "rad",
+    ("LiftProfile", "base"): "m",
+    ("LiftProfile", "lift"): "m",
+    ("LiftProfile", "start"): "rad",
+    ("Cam", "face"): "rad",
+    ("CamPair", "face"): "rad",
     ("SlideMotor", "speed"): "m/s",
 }
 FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the coordinate that it drives
@@ -131,6 +137,7 @@ _SPELLINGS = {
 _WORDS = {
     **dict.fromkeys(("degree", "degrees"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("turn", "turns"), "rev"),
     **dict.fromkeys(("second", "seconds", "sec"), "s"),
     **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
 }

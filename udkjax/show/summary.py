@@ -21,6 +21,8 @@ def check_summary(mech: Mechanism, check: Check) -> str:
     lines = check_lines(check)
     lines["constraint equations"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
     lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in check.redundant) or "none"
+    lengths = {} if mech.drawing is None or mech.departs_from_drawing else mech.drawing.length_texts()
+    lines |= {f"length of {name}": text for name, text in lengths.items()}
     return table(mech.name or "mechanism", lines)
 
 

@@ -8,6 +8,7 @@ from udkjax.annotations import JsonObject
 from udkjax.integrate import SimulationError
 from udkjax.positions.assembly import AssemblyError
 from udkjax.positions.continuation import Reached
+from udkjax.positions.counting import count_of
 from udkjax.positions.kinematics import travel
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
@@ -120,7 +121,7 @@ def rest(mechanism: Mechanism) -> JsonObject:
 
 
 def motor_travel(mechanism: Mechanism) -> JsonObject:
-    """Return the travel of each motor from the drawn position, with the others held, and the pins in line at its limits."""
+    """Return the travel of each motor, with the others held, as values count (`words`), and the pins in line at its limits."""
     travels = []
     for name, driver in mechanism.drivers.items():
         if driver.coordinate == "y":
@@ -129,15 +130,14 @@ def motor_travel(mechanism: Mechanism) -> JsonObject:
             range_of_motor = travel(mechanism, name)
         except SceneError:
             continue  # this motor does not determine the positions
-        drawn_value = float(np.asarray(driver.motion(0.0)))
-        ends = []
+        counted, ends = count_of(mechanism, name), []
         for limit, q in ((range_of_motor.lower, range_of_motor.lower_q), (range_of_motor.upper, range_of_motor.upper_q)):
             if np.isfinite(float(limit)):
-                ends.append({"value": float(limit) - drawn_value, "in_line": pins_in_line(mechanism, np.asarray(q))})
+                ends.append({"value": float(limit) + counted.offset, "in_line": pins_in_line(mechanism, np.asarray(q))})
         lost = [
             side for side, code in zip(("lower", "upper"), np.asarray(range_of_motor.status), strict=True) if code == Reached.lost
         ]
-        travels.append({"motor": name, "unit": range_of_motor.unit, "ends": ends, "lost": lost})
+        travels.append({"motor": name, "unit": range_of_motor.unit, "words": counted.words, "ends": ends, "lost": lost})
     return {"travel": travels}
 
 

@@ -103,13 +103,20 @@ def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
     pins = list(document.get("pins", {}))
     names = [f"pin.{pin}" for pin in pins]
     try:
-        engine = portable_engine(mechanism, names, pull=False).data
+        engine = portable_engine(_by_coordinates(mechanism), names, pull=False).data
         hand = None
         if mechanism.drivers:
-            hand = portable_engine(loads(merge_document("", _undriven(document))), names, pull=False, runs=False).data
+            undriven = _by_coordinates(loads(merge_document("", _undriven(document))))
+            hand = portable_engine(undriven, names, pull=False, runs=False).data
     except (UnsupportedError, SceneError) as error:
         return {"why": str(error)}
     return {"engine": engine, "hand": hand, "pins": pins, "why": engine["why"]}
+
+
+def _by_coordinates(mechanism: Mechanism) -> Mechanism:
+    """Return the mechanism of the drawing with its pins by coordinates, which the page sends for pins of any form."""
+    assert isinstance(mechanism.drawing, Drawing)
+    return mechanism.drawing.by_coordinates().mechanism()
 
 
 def _undriven(document: JsonObject) -> JsonObject:

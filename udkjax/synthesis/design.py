@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.positions.drive import Drive
+from udkjax.positions.drive import Drive, only_driver
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.requirements import require_count, require_number
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import parameters_of
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import Designs
 from udkjax.synthesis.goals import Goal
@@ -139,7 +140,8 @@ def design(
             only define which links they join.
         goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`; or a list of one of these and motion goals: `TorqueGoal`, `LoadGoal`,
             `EnergyGoal`, `FrequencyGoal`, `ToleranceGoal` and `MotionGoal`.
-        free: names of the free numbers, such as `pin.A` or `pin.C[0]`; by default all pins.
+        free: names of the free numbers, such as `pin.A` or `pin.C[0]`; by default all pins, with their
+            lengths and angles.
         bounds: (low, high) by the names of free numbers; low and high are numbers, or arrays of the free number's shape (m).
         lengths: (least, most) distances (m) by pairs of pins.
         areas: the area of a pin by its name: a circle (x, y, radius) or the corners (k, 2) of a convex polygon (m).
@@ -175,22 +177,14 @@ def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[Motion
 def _all_pins(mechanism: Mechanism) -> list[str]:
     if mechanism.drawing is None:
         raise SceneError(["free: name the free numbers; only a drawing has a default, all pins"], mechanism.name)
-    return [f"pin.{name}" for name in mechanism.drawing.groups["pin"]]
-
-
-def only_driver(mechanism: Mechanism) -> str:
-    """Return the name of the only driver; raise `SceneError` unless there is exactly one."""
-    names = mechanism.driver_names
-    if len(names) != 1:
-        choices = f"there are {', '.join(names)}" if names else "there is none in the scene"
-        raise SceneError([f"driver: name the driver or a coordinate, such as body.crank.angle: {choices}"], mechanism.name)
-    return names[0]
+    numbers = {name: x for name, x in parameters_of(mechanism).items() if x.section == "pin" and x.value is not None}
+    return [name for name, x in numbers.items() if x.path[-1] not in ("velocity", "along")]
 
 
 def _places(mechanism: Mechanism, goal: Goal) -> np.ndarray:
     """Return the places that determine the location and size of the search."""
     if goal.has_place:
-        fixed = [] if mechanism.drawing is None else [np.asarray(p.position) for p in mechanism.drawing.groups["pin"].values()]  # pyright: ignore
+        fixed = [] if mechanism.drawing is None else [np.asarray(p) for p in mechanism.drawing.pins.values()]
         size = np.ptp(goal.targets[:, :2], axis=0).max()
         return goal.targets[:, :2] if size > 0 or not fixed else np.vstack([goal.targets[:, :2], *fixed])
     return np.asarray(mechanism.q0)[:, :2]

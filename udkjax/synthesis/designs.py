@@ -56,8 +56,7 @@ class FoundDesign(PrintsTable):
     @property
     def pins(self) -> dict[str, Float[Array, "2"]]:
         """The places of the drawing's pins by name (m); empty without a drawing."""
-        drawn = {} if self.mechanism.drawing is None else self.mechanism.drawing.groups["pin"]
-        return {name: getattr(pin, "position") for name, pin in drawn.items()}  # noqa: B009  # of a drawing, whose class is above
+        return {} if self.mechanism.drawing is None else dict(self.mechanism.drawing.pins)
 
     @property
     def drawing(self) -> AbstractDrawing | None:
@@ -69,6 +68,8 @@ class FoundDesign(PrintsTable):
         rows += [("measures", ", ".join(f"{np.min(m):.4g} to {np.max(m):.4g}" for m in self.measures))] if self.measures else []
         rows += [("transmission", f"{self.transmission:.3g}"), ("turns", "yes" if self.turns else "no")]
         rows += [(f"pin.{name}", format_numbers(place, "m")) for name, place in self.pins.items()]
+        lengths = {} if self.drawing is None else self.drawing.length_texts()
+        rows += [(f"length of {name}", text) for name, text in lengths.items()]
         return PrintedTable(f"design {self.mechanism.name}".strip(), rows)
 
 

@@ -1,6 +1,6 @@
 """Limits of a design: bounds of free numbers, lengths between pins, areas of pins, and the least transmission."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Array
 from scipy.spatial import ConvexHull, QhullError
 
+from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import must_be_positive, parameters_of, split_index
 from udkjax.wording import quote, suggestion
 
 Range = tuple[float, float]
@@ -46,16 +48,22 @@ def read_bounds(
     """
     low, high = np.full(free.count, -np.inf), np.full(free.count, np.inf)
     centre, extent = 0.5 * (places.min(0) + places.max(0)), max(float(np.max(np.ptp(places, axis=0))), 1e-12)
+    known = parameters_of(free.mechanism)
     problems = [f"bounds: {quote(key)} is not free{suggestion(key, free.names)}" for key in given if key not in free.names]
     first, last = np.empty(free.count), np.empty(free.count)
     for key, value, a, b in zip(free.names, free.values, free.starts, free.starts[1:], strict=False):
         shape = np.shape(value)
-        if key.startswith("pin.") and shape in ((2,), ()):
-            middle = centre if shape else centre[int(key[-2])] if key.endswith(("[0]", "[1]")) else 0.0
+        field = known[split_index(key, known)[0]]
+        if field.section == "pin" and field.path == ("position",):
+            middle = centre if shape else centre[int(key[-2])]
             first[a:b], last[a:b] = middle - reach * extent, middle + reach * extent
+        elif field.section == "pin" and field.path == ("angle",):
+            first[a:b], last[a:b] = value - np.pi, value + np.pi
         else:
             ends = np.stack([np.ravel(value) / DEFAULT_FACTOR, np.ravel(value) * DEFAULT_FACTOR])
             first[a:b], last[a:b] = ends.min(0), ends.max(0)
+        if must_be_positive(free.mechanism, key):
+            low[a:b] = np.finfo(float).tiny
         if key in given:
             try:
                 lower, upper = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in given[key])  # pyright: ignore
@@ -107,30 +115,50 @@ class LengthLimits:
         self.names = [*ends, *(f"the area of {pin}" for pin, *_ in sides)]
         self._way, self._end = np.array([sign for _, sign, _ in rows]), np.array([end for *_, end in rows])
 
-        def between(x: Array) -> Array:  # affine: pins are free numbers or constant
-            pins = free.moved(x).drawing.pins  # pyright: ignore
-            directions = [pins[b] if a is None else pins[b] - pins[a] for (a, b), *_ in rows]
-            return jnp.stack([*directions, *(pins[pin] for pin, *_ in sides)])
-
-        x = jnp.asarray(free.vector)
-        slopes = np.asarray(jax.jacobian(between)(x)) if self.count else np.zeros((0, 2, free.count))
-        offset = np.asarray(between(x)) - slopes @ free.vector if self.count else np.zeros((0, 2))
-        offset[len(rows) - len(centres) : len(rows)] -= centres
-        self._slopes, self._offset, ends = slopes[: len(rows)], offset[: len(rows)], slice(len(rows), None)
-        normals, distances = np.array([n for _, n, _ in sides]).reshape(-1, 2), np.array([d for *_, d in sides])
-        self._linear = np.einsum("kc,kcp->kp", normals, slopes[ends])
-        self._level = np.einsum("kc,kc->k", normals, offset[ends]) - distances
+        self._centres = np.zeros((len(rows), 2))
+        self._centres[len(rows) - len(centres) :] = centres
+        self._normals, self._distances = np.array([n for _, n, _ in sides]).reshape(-1, 2), np.array([d for *_, d in sides])
+        if self.count:
+            self._between = _with_slopes(free, [(start, end) for (start, end), *_ in rows] + [(None, pin) for pin, *_ in sides])
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return c (M, K) and dc/dx (M, K, P) for vectors (M, P) that begin with the free numbers."""
-        between = np.tensordot(x[:, : self._free], self._slopes, (1, 2)) + self._offset  # (M, K, 2)
-        length = np.sqrt(np.sum(between**2, axis=2))
-        slopes, first = np.zeros((len(x), self.count, x.shape[1])), length.shape[1]
-        unit = self._way[:, None] * between / np.maximum(length, np.finfo(float).tiny)[..., None]
-        slopes[:, :first, : self._free] = np.sum(unit[..., None] * self._slopes, axis=2)
-        slopes[:, first:, : self._free] = self._linear
-        sides = x[:, : self._free] @ self._linear.T + self._level
+        slopes, first = np.zeros((len(x), self.count, x.shape[1])), len(self._way)
+        if not self.count:
+            return np.zeros((len(x), 0)), slopes
+        between, moves = self._between(x[:, : self._free])  # (M, K, 2), (M, K, 2, F)
+        arms = between[:, :first] - self._centres
+        length = np.sqrt(np.sum(arms**2, axis=2))
+        unit = self._way[:, None] * arms / np.maximum(length, np.finfo(float).tiny)[..., None]
+        slopes[:, :first, : self._free] = np.sum(unit[..., None] * moves[:, :first], axis=2)
+        slopes[:, first:, : self._free] = np.einsum("kc,mkcp->mkp", self._normals, moves[:, first:])
+        sides = np.einsum("kc,mkc->mk", self._normals, between[:, first:]) - self._distances
         return np.concatenate([self._way * (length - self._end), sides], 1), slopes
+
+
+def _with_slopes(
+    free: FreeNumbers, pairs: Sequence[tuple[str | None, str]]
+) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Return the vectors (M, K, 2) between pairs of pins (from the origin: None), and their derivatives by the free numbers."""
+
+    def between(x: Array) -> Array:
+        pins = free.moved(x).drawing.pins  # pyright: ignore[reportOptionalMemberAccess]
+        return jnp.stack([jnp.asarray(pins[b] if a is None else pins[b] - pins[a]) for a, b in pairs])
+
+    def both(x: Array) -> Array:
+        return jnp.concatenate([jnp.ravel(between(x)), jnp.ravel(jax.jacfwd(between)(x))])
+
+    graph = Graph()
+    inputs = [graph.input(("x", k), "x") for k in range(free.count)]
+    program = ScalarProgram(graph, inputs, list(trace(both, jnp.asarray(free.vector))(graph, np.array(inputs, object))[0].flat))
+    count = 2 * len(pairs)
+
+    def values(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        with np.errstate(all="ignore"):  # where circles do not meet, limits are NaN
+            found = np.stack([np.broadcast_to(y, len(x)) for y in program.by_numpy(list(x.T))], 1)
+        return found[:, :count].reshape(-1, len(pairs), 2), found[:, count:].reshape(-1, len(pairs), 2, free.count)
+
+    return values
 
 
 def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str]) -> np.ndarray:

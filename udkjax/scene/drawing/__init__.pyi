@@ -10,3 +10,12 @@ from udkjax.scene.drawing.drawn_joints import GearPair as GearPair
 from udkjax.scene.drawing.drawn_joints import PinInSlot as PinInSlot
 from udkjax.scene.drawing.drawn_joints import Slide as Slide
 from udkjax.scene.drawing.link import Link as Link
+from udkjax.scene.drawing.pin_forms import CirclesPin as CirclesPin
+from udkjax.scene.drawing.pin_forms import LinePin as LinePin
+from udkjax.scene.drawing.pin_forms import Pin as Pin
+from udkjax.scene.drawing.pin_forms import PolarPin as PolarPin
+from udkjax.scene.drawing.pin_forms import RailPin as RailPin
+from udkjax.scene.drawing.pin_tables import circles as circles
+from udkjax.scene.drawing.pin_tables import on_line as on_line
+from udkjax.scene.drawing.pin_tables import on_rail as on_rail
+from udkjax.scene.drawing.pin_tables import polar as polar

@@ -4,12 +4,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers, TomlTable
 from udkjax.arrays import by_numpy, make_module, number
-from udkjax.printing import PrintedTable
-from udkjax.scene.bodies import Body
+from udkjax.printing import PrintedTable, has_numbers
+from udkjax.scene.bodies import GROUND, Body
 from udkjax.scene.checks import SceneEntry, SceneError
 from udkjax.scene.description import drawing_table
 from udkjax.scene.drawing.drawing_reader import (
@@ -23,8 +25,9 @@ from udkjax.scene.drawing.drawing_reader import (
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units
-from udkjax.scene.drawing.link import Link, Pin
+from udkjax.scene.drawing.link import Link, around
 from udkjax.scene.drawing.mistakes import joint_names, where
+from udkjax.scene.drawing.pin_forms import AbstractPin, Pin, norm, pin_entries, places_of
 from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import name_elements
 from udkjax.scene.forces import ForceElement
@@ -32,7 +35,7 @@ from udkjax.scene.joints import Joint, Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import ElementGroups
 from udkjax.scene.schema import table_of
-from udkjax.scene.sources import AbstractDrawing, Drawn
+from udkjax.scene.sources import AbstractDrawing, Drawn, Follows, is_number
 from udkjax.wording import abbreviate, quote, suggestion
 
 
@@ -44,7 +47,8 @@ class Drawing(AbstractDrawing):
     first pin towards the second. As in a mechanism, all numbers are leaves, and have names, such as `pin.A`.
 
     Args:
-        pins: World coordinates of each pin (m).
+        pins: World coordinates of each pin (m); or a pin by lengths and angles: `udk.polar`, `udk.circles`, `udk.on_line`, or a
+            table with the keys of a file.
         links: The links: `Link`s, or tables of their keys.
         ground: The pins that are fixed.
         slides: Links that slide along a line without turning on it. Like all elements below, a mapping from names, or a list;
@@ -79,7 +83,7 @@ class Drawing(AbstractDrawing):
 
     def __init__(
         self,
-        pins: Mapping[str, Pin | Numbers],
+        pins: Mapping[str, AbstractPin | TomlTable | Numbers],
         links: Mapping[str, Link | TomlTable],
         ground: Sequence[str] = (),
         slides: "Mapping[str, Slide | TomlTable] | Sequence[Slide | TomlTable] | None" = None,
@@ -99,13 +103,16 @@ class Drawing(AbstractDrawing):
         name: str = "",
         units: Mapping[str, str] | None = None,
     ):
-        given = {"pin": _pins(pins, velocities or {}), "link": links, "slide": slides, "slot": slots, "gear": gears, "cam": cams}
+        given = {"link": links, "slide": slides, "slot": slots, "gear": gears, "cam": cams}
         given |= {"motor": motors, "spring": springs, "damper": dampers, "load": loads}
         given |= {"body": bodies, "joint": joints, "driver": drivers, "force": forces}
         unknown = [
             f"velocities.{pin}: no pin named {quote(pin)}{suggestion(pin, pins)}" for pin in velocities or {} if pin not in pins
         ]
-        entries = [entry for section, group in given.items() for entry in _entries(section, group)]
+        entries = [
+            *pin_entries(pins, velocities or {}),
+            *(e for section, group in given.items() for e in _entries(section, group)),
+        ]
         checked = read_drawing(entries, ground, gravity, Units(units))
         if unknown or checked.problems:
             raise SceneError([*unknown, *checked.problems], name)
@@ -129,19 +136,52 @@ class Drawing(AbstractDrawing):
     @property
     def pins(self) -> dict[str, Float[Array, "2"]]:
         """The world coordinates of the pins by name (m)."""
-        return {name: pin.position for name, pin in self.groups["pin"].items()}
+        pins = self.groups["pin"]
+        computed = [name for name, pin in pins.items() if not isinstance(pin, Pin)]
+        if not computed:
+            places: Mapping[str, Any] = {}
+        elif all(map(is_number, jax.tree.leaves(pins))):
+            places = places_of(pins)
+        else:  # as in `eqx.tree_at`
+            text = "the place of pin {} is no leaf of the drawing: it follows from lengths and angles"
+            places = {name: Follows(text.format(quote(name))) for name in computed}
+        return {name: _stored(places[name]) if name in computed else pin.position for name, pin in pins.items()}
+
+    def by_coordinates(self) -> "Drawing":
+        """Return the same drawing with its pins given by coordinates; itself if they are."""
+        places, pins = self.pins, self.groups["pin"]
+        if all(isinstance(pin, Pin) for pin in pins.values()):
+            return self
+        drawn = self.groups | {"pin": {name: Pin(places[name], pin.velocity) for name, pin in pins.items()}}
+        return make_module(Drawing, **vars(self) | {"_elements": _in_order(drawn)[1]})
 
     @property
     def links(self) -> dict[str, Link]:
         """The links by name."""
         return self.groups["link"]
 
+    def lengths(self) -> dict[str, dict[tuple[str, str], Float[Array, ""]]]:
+        """Return the lengths (m) of each link and of the ground, by name and by the two pins between which they are measured."""
+        places = places_of(self.groups["pin"])
+        sides = {name: link.sides for name, link in self.links.items()} | {GROUND: around(self.ground, closed=True)}
+        return {n: {(a, b): number(norm(places[b] - places[a])) for a, b in pairs} for n, pairs in sides.items() if pairs}
+
+    def length_texts(self) -> dict[str, str]:
+        """Return the lengths of each link and of the ground as text, in the unit of the drawing; empty if traced or batched."""
+        if not has_numbers(self) or np.ndim(self.gravity) > 1:  # a batch has no single text
+            return {}
+        units = Units(dict(self.units))
+        return {
+            name: ", ".join(f"{a}-{b} {units.text(float(x), 'm')}" for (a, b), x in lengths.items())
+            for name, lengths in self.lengths().items()
+        }
+
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
         """Return the last link at a pin, or the ground, and the pin's position in its frame (m); None for an unknown pin."""
         placement = placement_of(self.groups, self.ground)
         if name not in placement.places:
             return None
-        body = placement.members(name)[-1]
+        body = (GROUND, *placement.members(name))[-1]  # a pin that only others refer to is a point of the ground
         return body, number(placement.local(body, placement.places[name]))
 
     @property
@@ -167,7 +207,7 @@ class Drawing(AbstractDrawing):
         return free
 
     def _table(self) -> PrintedTable:
-        return drawing_table(self.name, self.groups, self.ground)
+        return drawing_table(self.name, self.groups, self.ground, self.length_texts())
 
     _shapes = _table  # the table marks traced numbers
 
@@ -200,8 +240,8 @@ class Drawing(AbstractDrawing):
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
-        entries = [entry for section, group in groups.items() for entry in _entries(section, group)]
-        checked = read_drawing(entries, self.ground, gravity, Units())
+        drawn = [entry for section, group in groups.items() if section != "pin" for entry in _entries(section, group)]
+        checked = read_drawing([*pin_entries(groups["pin"], {}), *drawn], self.ground, gravity, Units(), Units(dict(self.units)))
         if checked.problems:
             raise SceneError(checked.problems, self.name)
         return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(checked.groups)[1]})
@@ -213,11 +253,8 @@ def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str,
     return tuple(map(tuple, sections)), tuple(tuple(group.values()) or None for group in sections)
 
 
-def _pins(pins: Mapping[str, Any], velocities: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: pin if isinstance(pin, Pin) else {"position": pin, **({"velocity": velocities[name]} if name in velocities else {})}
-        for name, pin in pins.items()
-    }
+def _stored(x: Any) -> Any:
+    return number(x) if isinstance(x, np.ndarray) else x
 
 
 def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> list[SceneEntry]:

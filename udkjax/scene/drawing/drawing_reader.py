@@ -12,8 +12,9 @@ from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes, name_
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
-from udkjax.scene.drawing.link import Link, Pin, with_concrete_numbers
-from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, shape_mistakes, where
+from udkjax.scene.drawing.link import Link, with_concrete_numbers
+from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, pin_mistakes, shape_mistakes, where
+from udkjax.scene.drawing.pin_forms import AbstractPin, places_of
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import as_leaves
@@ -32,7 +33,7 @@ SECTIONS: Mapping[str, type[DrawnElement]] = {
     "damper": PinDamper,
     "load": Load,
 }
-DRAWN = {"pin": Pin, "link": Link, **SECTIONS}
+DRAWN = {"pin": AbstractPin, "link": Link, **SECTIONS}
 BY_HAND = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}  # as in a mechanism
 
 
@@ -44,8 +45,13 @@ class DrawingElements(NamedTuple):
     problems: list[str]
 
 
-def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, units: Units) -> DrawingElements:
-    """Read the elements of a drawing and find all mistakes: in units, keys, shapes, names, connections and geometry."""
+def read_drawing(
+    entries: Sequence[SceneEntry], ground: object, gravity: Any, units: Units, shown: Units | None = None
+) -> DrawingElements:
+    """Read the elements of a drawing and find all mistakes: in units, keys, shapes, names, connections and geometry.
+
+    Plain numbers are in `units`; messages have numbers in the units `shown`, by default the same.
+    """
     problems = list(units.problems)
     if gravity is None:
         gravity = (0.0, -9.81)
@@ -76,12 +82,14 @@ def read_drawing(entries: Sequence[SceneEntry], ground: object, gravity: Any, un
                 _read_element(entry, known, units, groups[section], problems)
     if any(len(groups[s]) < len(named[s]) for s in ("pin", "link")) or any(pin not in named["pin"] for pin in fixed_pins):
         return DrawingElements(groups, gravity, problems)
+    if misplaced := list(pin_mistakes(groups["pin"], shown or units)):
+        return DrawingElements(groups, gravity, [*problems, *misplaced])
     layout = PinLayout(groups["link"], fixed_pins, groups["slide"])
     all_read = all(len(groups[section]) == len(named[section]) for section in groups)
     problems += layout_mistakes(layout, groups, fixed_pins, all_read)
     if not is_traced((groups["pin"], groups["link"])):
         drawn = concrete_elements(groups)
-        problems += shape_mistakes({name: pin.position for name, pin in drawn["pin"].items()}, drawn["link"])
+        problems += shape_mistakes(places_of(drawn["pin"]), drawn["link"])
         if not problems:
             problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
     return DrawingElements(groups, gravity, problems)
@@ -123,7 +131,7 @@ def units_of_element(cls: type, table: TomlTable) -> tuple[str, str]:
 def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str]) -> Placement:
     """Return the placement of the elements of a drawing, with NumPy or traced numbers."""
     links = groups["link"]
-    places = {name: by_numpy(pin.position) for name, pin in groups["pin"].items()}
+    places = places_of(groups["pin"])
     speeds = {name: np.zeros(2) if pin.velocity is None else by_numpy(pin.velocity) for name, pin in groups["pin"].items()}
     drawn = {name: link.body(places, speeds) for name, link in links.items()}
     frames = {name: Frame.at(by_numpy(body.position), by_numpy(body.angle)) for name, body in groups["body"].items()}

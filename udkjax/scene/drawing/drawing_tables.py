@@ -9,7 +9,7 @@ from udkjax.scene.checks import SceneEntry, SceneError
 from udkjax.scene.drawing.drawing import Drawing
 from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, read_drawing, units_of_element
 from udkjax.scene.drawing.drawn_quantities import Units
-from udkjax.scene.drawing.link import Pin
+from udkjax.scene.drawing.pin_forms import pin_entries
 from udkjax.scene.mechanism_tables import check_classes, check_known, head_mistakes, key_lines, read_section, type_key
 from udkjax.scene.schema import table_of
 from udkjax.wording import abbreviate, suggestion
@@ -41,9 +41,7 @@ def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneE
             return
     pins, velocities = tables.values()
     problems += [f"velocities.{name}: no pin of this name{suggestion(name, pins)}" for name in velocities if name not in pins]
-    for k, (name, position) in enumerate(pins.items()):
-        speed = {"velocity": velocities[name]} if name in velocities else {}
-        yield SceneEntry("pin", k, name, Pin, {"position": position, **speed})
+    yield from pin_entries(pins, velocities)
 
 
 def drawing_text(drawing: Drawing) -> str:
@@ -70,14 +68,19 @@ def drawing_text(drawing: Drawing) -> str:
         head["units"] = dict(drawing.units)
     head["gravity"] = [units.write(x, "m/s2") for x in np.asarray(drawing.gravity).tolist()]
     lines = key_lines(head | ({"ground": list(drawing.ground)} if drawing.ground else {}))
-    tables = {name: units.write_table(pin) for name, pin in groups["pin"].items()}
-    for title, key in (("pins", "position"), ("velocities", "velocity")):
-        written = {name: table[key] for name, table in tables.items() if key in table}
+    tables = {name: _without_empty(units.write_table(pin)) for name, pin in groups["pin"].items()}
+    velocities = {name: table.pop("velocity") for name, table in tables.items() if "velocity" in table}
+    pins = {name: table.get("position", table) for name, table in tables.items()}
+    for title, written in (("pins", pins), ("velocities", velocities)):
         lines += ["", f"[{title}]", *key_lines(written)] if written else []
     for section in (*LISTS, *BY_HAND):
         for name, element in groups[section].items():
             table = units.write_table(element, *units_of_element(type(element), table_of(element)))
             kind = type_key(type(element)) if section in BY_HAND else {}
-            table = {key: value for key, value in table.items() if value not in ((), "") and value is not False}
-            lines += ["", f"[[{section}]]", *key_lines({"name": name, **kind, **table})]
+            lines += ["", f"[[{section}]]", *key_lines({"name": name, **kind, **_without_empty(table)})]
     return "\n".join(lines) + "\n"
+
+
+def _without_empty(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table without names that are not given, and choices that are not made."""
+    return {key: value for key, value in table.items() if value not in ((), "") and value is not False}

@@ -1,5 +1,7 @@
 """Joints of a drawing other than pins: slides, slots, gears, cams."""
 
+from dataclasses import replace
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
@@ -9,7 +11,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, line_mistakes
 from udkjax.scene.fields import LINK, PIN, POSITIVE, given_direction, given_names, given_or_none
 from udkjax.scene.joints import Cam, Gear, Prismatic, Slot
-from udkjax.scene.profiles import Profile, as_profile
+from udkjax.scene.profiles import AbstractProfile, LiftProfile, as_profile
 from udkjax.wording import quote
 
 
@@ -116,24 +118,36 @@ class CamPair(DrawnElement):
     """A follower, the second pin, stays on the `profile` of a cam around the first pin.
 
     The polar angle of the profile is measured from the cam's x axis: from its first pin towards its second, or the world's x axis
-    for a cam with one pin.
+    for a cam with one pin. A `LiftProfile` begins at the follower as drawn. `face` is the direction of the normal of a flat face,
+    away from the cam.
     """
 
     pins: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=PIN)
-    profile: Profile = eqx.field(converter=as_profile)
+    profile: AbstractProfile = eqx.field(converter=as_profile)
+    face: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)  # rad or a vector
     links: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=LINK)  # cam and follower
 
     def mistakes(self, layout):
         if len(self.pins) != 2:
             yield "pins: must name two pins, the centre of the cam and the follower"
             return
+        counts = {len(self.profile.law), *self.profile.angle.shape} if isinstance(self.profile, LiftProfile) else {0}
+        if len(counts) > 1:
+            yield "profile.law: must have as many entries as angle and lift"
         pair = self._pair(layout)
         if len(pair) != 2 or any(p not in layout.members(pin) for p, pin in zip(pair, self.pins, strict=False)):
             yield "links: name two, the cam with the first pin and the follower with the second"
 
     def parts(self, placement):
-        pair = self._pair(placement)
-        return Parts(joint=Cam(pair, placement.points(pair, [placement.places[pin] for pin in self.pins]), self.profile))
+        pair, places = self._pair(placement), [placement.places[pin] for pin in self.pins]
+        face = None if self.face is None else by_numpy(self.face)
+        profile = self.profile
+        if isinstance(profile, LiftProfile) and profile.start is None:
+            d = places[1] - places[0]
+            at = array_namespace(d).arctan2(d[1], d[0]) if face is None else face
+            profile = replace(profile, start=at - placement.angle(pair[0]))
+        face = None if face is None else face - placement.angle(pair[1])
+        return Parts(joint=Cam(pair, placement.points(pair, places), profile, face))
 
     def _pair(self, layout: PinLayout) -> tuple[str, ...]:
         """Return the links, by default the only moving link of each pin."""

@@ -10,8 +10,9 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.annotations import TomlTable
+from udkjax.printing import format_number
 from udkjax.scene.fields import vector_as_angle
-from udkjax.scene.profiles import Profile
+from udkjax.scene.profiles import AbstractProfile, profile_class
 from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity, unit_sizes
 from udkjax.wording import abbreviate, quote, suggestion
@@ -35,7 +36,7 @@ QUANTITY_KINDS = {
     "torsional_damping": "N m s/rad",
 }
 _KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
-VECTORS = ("axis", "direction")  # angles that may also be vectors
+VECTORS = ("axis", "direction", "face")  # angles that may also be vectors
 
 
 class Units:
@@ -116,6 +117,14 @@ class Units:
         of_parts = {"m/s": f"{self.chosen.get('length', 'm')}/s", "rad/s": "rpm" if self.chosen.get("angle") == "deg" else unit}
         return self.chosen.get(_KIND_OF.get(unit, ""), of_parts.get(unit, unit))
 
+    def size(self, unit: str) -> float:
+        """Return the size, in an SI unit, of the unit in which numbers with this SI unit are shown."""
+        return conversion_factor(self.shown(unit), unit)
+
+    def text(self, value: float, unit: str) -> str:
+        """Return a number in SI units as text, in the unit in which it is shown."""
+        return format_number(value / self.size(unit), self.shown(unit))
+
     def write(self, value: float, unit: str) -> float | str:
         """Return a number in SI units as written to the file; reading it back gives bitwise the same number."""
         factor = self._factor(unit) if unit else 1.0
@@ -133,8 +142,9 @@ class Units:
         cls, table = type(element), {}
         for name, value in table_of(element).items():
             if isinstance(value, eqx.Module):
-                kind = {} if isinstance(value, Profile) else {"type": type_name(type(value))}
-                table[name] = {**kind, **self.write_table(value, law=law)}
+                kind = {} if isinstance(value, AbstractProfile) else {"type": type_name(type(value))}
+                nested = self.write_table(value, law=law)
+                table[name] = {**kind, **{key: x for key, x in nested.items() if x is not False}}
             elif not eqx.is_array(value):
                 table[name] = value
             elif name == "coefficients":
@@ -176,7 +186,7 @@ class Units:
         """Convert the table of a motion law or of a profile to SI units; return anything else unchanged."""
         if not isinstance(value, Mapping) or not (isinstance(annotation, type) and issubclass(annotation, eqx.Module)):
             return value
-        cls = Profile if annotation is Profile else CLASSES_BY_TYPE["motion"].get(str(value.get("type")))
+        cls = profile_class(value) if annotation is AbstractProfile else CLASSES_BY_TYPE["motion"].get(str(value.get("type")))
         return value if cls is None else self.convert_table(path, cls, value, problems, law=law)
 
 

@@ -1,6 +1,7 @@
 """A link: a rigid body that is drawn through its pins."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,9 +14,8 @@ from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Body, Frame
-from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, given_names, given_number, given_or_none
-
-PointArray = Float[Array, "n 2"] | np.ndarray
+from udkjax.scene.drawing.pin_forms import Places, PointArray
+from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, given_names, given_or_none
 
 
 class Shape(NamedTuple):
@@ -76,16 +76,6 @@ def _next_and_cross(points: PointArray) -> tuple[PointArray, PointArray]:
     return following, points[:, 0] * following[:, 1] - following[:, 0] * points[:, 1]
 
 
-Places = Mapping[str, PointArray]  # world coordinates of pins (m)
-
-
-class Pin(PrintsLine):
-    """A point where links meet, in world coordinates, and its initial velocity."""
-
-    position: Float[Array, "2"] = eqx.field(converter=given_number)  # m
-    velocity: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m/s; None: at rest
-
-
 class Link(PrintsLine):
     """A rigid body through pins: a disc about one pin, a bar along two, a plate of three or more, or any `outline`.
 
@@ -122,6 +112,12 @@ class Link(PrintsLine):
         if len(self.pins) == 1:
             return "disc"
         return "bar" if len(self.pins) == 2 or self.width is not None else "plate"
+
+    @property
+    def sides(self) -> list[tuple[str, str]]:
+        """The pairs of pins whose distances are the link's lengths: the ends of a bar, and pins that follow each other."""
+        ends = [(self.pins[0], self.pins[-1])] if self.kind == "bar" else []
+        return list(dict.fromkeys([*ends, *around(self.pins, closed=self.kind != "bar")]))
 
     def shape(self, places: Places) -> Shape:
         """Return the link's shape, given the positions of the pins. A disc needs a width; a bar without one is a thin rod."""
@@ -160,6 +156,11 @@ class Link(PrintsLine):
             [first_velocity[0] - rate * arm[1], first_velocity[1] + rate * arm[0]]
         )
         return DrawnBody(Frame.at((centre[0], centre[1]), angle), Body(mass, inertia, position, angle, velocity, rate))
+
+
+def around(pins: Sequence[str], closed: bool) -> list[tuple[str, str]]:
+    """Return the pairs of pins that follow each other; if `closed`, the last and the first of three or more, too."""
+    return [*pairwise(pins), *([(pins[-1], pins[0])] if closed and len(pins) > 2 else [])]
 
 
 class DrawnBody(NamedTuple):

@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.drawn_joints import GearPair, PinInSlot
-from udkjax.scene.drawing.link import Link, PointArray, twice_area
+from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.scene.drawing.link import Link, twice_area, with_concrete_numbers
+from udkjax.scene.drawing.pin_forms import AbstractPin, PointArray, in_order, reference_mistakes
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.wording import quote
 
@@ -50,8 +53,9 @@ def layout_mistakes(layout: PinLayout, groups: DrawnGroups, ground: Sequence[str
     for k, pin in enumerate(ground):
         if pin not in used | anchors:
             yield f"ground[{k}]: no link reaches pin {quote(pin)}"
+    referred = {other for pin in groups["pin"].values() for other in pin.references}
     for pin in groups["pin"]:
-        if pin not in used and pin not in ground:
+        if pin not in used and pin not in ground and pin not in referred:
             yield f"pins.{pin}: no link uses it"
     attached = _attached(layout, groups)
     for k, (name, link) in enumerate(layout.links.items()):
@@ -117,6 +121,26 @@ def _link_mistakes(link: Link) -> Iterator[str]:
         yield f".width: a link of one pin is a disc: give its diameter, the width, {cure}"
     elif link.kind == "bar" and link.width is None and link.density is not None:
         yield ".width: missing; the mass of a bar by density needs it"
+
+
+def pin_mistakes(pins: Mapping[str, AbstractPin], units: Units) -> Iterator[str]:
+    """Iterate over the mistakes in the forms of pins, and in their references and lengths; distances are shown in `units`."""
+    wrong_forms = [f"{where('pin', 0, name)}{problem}" for name, pin in pins.items() for problem in pin.mistakes()]
+    yield from wrong_forms or reference_mistakes(pins)
+    if wrong_forms or len(order := in_order(pins)) < len(pins) or is_traced(pins):
+        return
+    places: dict[str, PointArray] = {}
+    for name in order:
+        pin = with_concrete_numbers(pins[name])
+        if reason := pin.misplacement(places, lambda x: units.text(x, "m")):
+            yield f"{where('pin', 0, name)}: {reason}"
+            return  # pins that refer to this one have no place
+        with np.errstate(all="ignore"):
+            places[name] = pin.place(places)
+        if not np.all(np.isfinite(places[name])):
+            pair = next(pair for pair in combinations(pin.references, 2) if np.array_equal(*(places[p] for p in pair)))
+            yield f"{where('pin', 0, name)}: {quote(pair[0])} and {quote(pair[1])} are at the same place: they have no direction"
+            return
 
 
 def shape_mistakes(places: Mapping[str, PointArray], links: Mapping[str, Link]) -> Iterator[str]:

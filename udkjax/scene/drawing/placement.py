@@ -10,7 +10,8 @@ from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
-from udkjax.scene.drawing.link import DrawnBody, Link, PointArray
+from udkjax.scene.drawing.link import DrawnBody, Link
+from udkjax.scene.drawing.pin_forms import PointArray, norm
 from udkjax.scene.drivers import Driver
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Joint
@@ -83,8 +84,7 @@ class Placement(PinLayout):
 
     def distance(self, pin1: str, pin2: str) -> Number:
         """Return the distance between two pins (m)."""
-        difference = self.places[pin2] - self.places[pin1]
-        return array_namespace(difference).sqrt(difference @ difference)
+        return norm(self.places[pin2] - self.places[pin1])
 
     def direction(self, on: str, along: Sequence[str], direction: Number | None) -> Number:
         """Return the direction of a line in the frame of a body (rad), given by two pins or by its angle in world coordinates."""

@@ -12,6 +12,7 @@ from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import parameters_of
 from udkjax.scene.units import conversion_factor, units_of
 
 # Names of parameters or of their entries, alone or with the ranges of their sliders; True: all parameters.
@@ -90,9 +91,18 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
 
 
 def pins_in_line(mechanism: Mechanism) -> set[str]:
-    """Return the parameters of pins of bars with more than two pins: moving a single pin would take it out of line."""
-    links = mechanism.drawing.links.values() if isinstance(mechanism.drawing, Drawing) else []
-    return {f"pin.{pin}" for link in links if link.kind == "bar" and len(link.pins) > 2 for pin in link.pins}
+    """Return the parameters of pins of bars with more than two pins: moving a single pin would take it out of line.
+
+    Inner pins that are given on the line of others of the bar stay on it, whatever moves.
+    """
+    if not isinstance(mechanism.drawing, Drawing):
+        return set()
+    pins, bound = mechanism.drawing.groups["pin"], set()
+    for link in mechanism.drawing.links.values():
+        on_line = all(hasattr(pins[p], "to") and {*pins[p].references} <= {*link.pins} for p in link.pins[1:-1])
+        if link.kind == "bar" and len(link.pins) > 2 and not on_line:
+            bound |= {*link.pins}
+    return {name for name, x in parameters_of(mechanism).items() if x.section == "pin" and x.owner in bound}
 
 
 def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
@@ -128,7 +138,7 @@ def label_of(name: str) -> str:
     text = " ".join(words).replace("_", " ")
     if parts[-1] in ("points", "radii", "times", "values") and indices:
         text = f"{text.removesuffix('s') if parts[-1] == 'points' else text} {indices.pop(0) + 1}"
-    in_plane = parts[-1] in PLACES or parts[0] == "pin"
+    in_plane = parts[-1] in PLACES or (parts[0] == "pin" and parts[2:] != ["length"])
     text += "".join(f" {'xy'[k]}" if in_plane and k < 2 else f" {k + 1}" for k in indices)
     text_words = text.split(" ")
     return " ".join(word for k, word in enumerate(text_words) if k == 0 or word != text_words[k - 1])  # not "motor motor speed"

@@ -158,8 +158,13 @@ class _Drawing:
                 self._rack(joint)
             case Cam():
                 angle = np.linspace(0.0, 2 * np.pi, PROFILE_POINTS, endpoint=False)
-                radius = np.asarray(jax.vmap(joint.profile)(jax.numpy.asarray(angle)))
-                rim = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+                radius, slope = (
+                    np.asarray(x)[:, None] for x in jax.vmap(jax.value_and_grad(joint.profile))(jax.numpy.asarray(angle))
+                )
+                along = np.column_stack([np.cos(angle), np.sin(angle)])
+                rim = radius * along
+                if joint.face is not None:  # the envelope of the positions of the face
+                    rim = rim + slope * np.column_stack([-np.sin(angle), np.cos(angle)])
                 place = self._at(joint.bodies[0], joint.points[0])
                 self.wheels.append({"kind": MarkKind.OUTLINE, **place, "points": rim.tolist()})
                 self.elements.append({"kind": MarkKind.ROLLER, **self._at(joint.bodies[1], joint.points[1])})

@@ -1,7 +1,8 @@
 // Drawings as plain data (the tables of their file), and the editor's changes to them. A document is immutable: each function
 // returns a new one that shares the unchanged parts.
 
-import {length, point, written} from "./units.js";
+import {inOrder, loosened, pinAt, placesOf, referencesOf, withNames} from "./pin_forms.js";
+import {length, written} from "./units.js";
 
 export const LISTS = ["link", "slide", "slot", "gear", "cam", "motor", "spring", "damper", "load", "body", "joint", "driver", "force"];
 // Keys of tables that name pins and links.
@@ -15,7 +16,7 @@ export const EMPTY = {format: 2, units: {length: "mm", angle: "deg"}, ground: []
 export const list = (document, section) => (Array.isArray(document[section]) ? document[section] : []);
 export const pinsOf = document => document.pins ?? {};
 export const groundOf = document => document.ground ?? [];
-export const placeOf = (document, pin) => point(pinsOf(document)[pin], document);
+export const placeOf = (document, pin) => placesOf(document)[pin] ?? null;
 
 /** The name of an element: its own, or the section's with its number. */
 export const nameOf = (document, section, index) => list(document, section)[index]?.name ?? `${section}${index + 1}`;
@@ -70,20 +71,25 @@ export function addPin(document, place) {
   return [movePin(document, name, place), name];
 }
 
-/** The document with a pin at another place (m). */
-export function movePin(document, name, place) {
-  const old = pinsOf(document)[name], value = place.map((x, k) => written(x, document, old?.[k]));
-  return {...document, pins: {...pinsOf(document), [name]: value}};
+const withPin = (document, name, place) => ({...document, pins: {...pinsOf(document), [name]: pinAt(document, name, place)}});
+
+/** A changed document, or the one before if a pin would lose its place: circles no longer meet. */
+function withPlaces(found, before) {
+  const at = placesOf(found);
+  return Object.keys(placesOf(before)).every(name => at[name] || !Object.hasOwn(pinsOf(found), name)) ? found : before;
 }
+
+/** The document with a pin at another place (m), by the numbers of its form; unchanged if another pin would lose its place. */
+export const movePin = (document, name, place) => withPlaces(withPin(document, name, place), document);
 
 /** The document with some pins moved by (dx, dy) metres. */
 export function shiftPins(document, names, dx, dy) {
   let found = document;
-  for (const name of names) {
+  for (const name of inOrder(document, names)) {
     const place = placeOf(document, name);
-    if (place) found = movePin(found, name, [place[0] + dx, place[1] + dy]);
+    if (place) found = withPin(found, name, [place[0] + dx, place[1] + dy]);
   }
-  return found;
+  return withPlaces(found, document);
 }
 
 /** The document with pins moved onto their lines: inner pins of bars, and pins in slots along two pins. */
@@ -142,7 +148,7 @@ function renameKeys(document, keys, names) {
 /** The document with a pin renamed; a taken or empty name changes nothing. */
 export function renamePin(document, old, name) {
   if (!name || name === old || Object.hasOwn(pinsOf(document), name)) return document;
-  const swap = key => (key === old ? name : key), again = table => Object.fromEntries(Object.entries(table).map(([k, v]) => [swap(k), v]));
+  const swap = key => (key === old ? name : key), again = table => Object.fromEntries(Object.entries(table).map(([k, v]) => [swap(k), withNames(v, swap)]));
   const found = {...document, pins: again(pinsOf(document)), ground: groundOf(document).map(swap)};
   if (document.velocities) found.velocities = again(document.velocities);
   return renameKeys(found, PIN_KEYS, new Map([[old, name]]));
@@ -161,7 +167,8 @@ export function renameElement(document, section, index, name) {
 export function mergePins(document, from, into) {
   if (from === into) return document;
   const {[from]: _, ...pins} = pinsOf(document);
-  const found = {...document, pins, ground: [...new Set(groundOf(document).map(pin => (pin === from ? into : pin)))]};
+  const swap = pin => (pin === from ? into : pin), swapped = Object.fromEntries(Object.entries(pins).map(([k, v]) => [k, withNames(v, swap)]));
+  const found = loosened({...document, pins: swapped, ground: [...new Set(groundOf(document).map(swap))]}, document);
   if (document.velocities) found.velocities = Object.fromEntries(Object.entries(document.velocities).filter(([pin]) => pin !== from));
   const merged = renameKeys(found, PIN_KEYS, new Map([[from, into]]));
   const gone = list(merged, "link").flatMap((link, k) => (link.pins.length < list(document, "link")[k].pins.length && link.pins.length < 2 ? [k] : []));
@@ -199,8 +206,13 @@ export function removeElements(document, items) {
     if (gone[section].size) found = withSection(found, section, list(found, section).filter((_, k) => !gone[section].has(k)));
   }
   found = dropUnsupported(document, found);
-  const before = usedPins(document), after = usedPins(found);
-  return dropPins(found, pin => names.has(pin) || (before.has(pin) && !after.has(pin)));
+  found = loosened(dropPins(found, pin => names.has(pin)), document);
+  const before = usedPins(document);
+  for (;;) {  // a pin that goes may have been the last to refer to another one
+    const after = usedPins(found), lost = new Set(Object.keys(pinsOf(found)).filter(pin => before.has(pin) && !after.has(pin)));
+    if (!lost.size) return found;
+    found = dropPins(found, pin => lost.has(pin));
+  }
 }
 
 /** The document without motors, springs, dampers and loads at pins that have lost the members they acted on. */
@@ -214,8 +226,9 @@ function dropUnsupported(before, document) {
   return found;
 }
 
-/** The names of pins that tables refer to. */
-const usedPins = document => new Set(LISTS.flatMap(s => list(document, s).flatMap(entry => PIN_KEYS.flatMap(key => [entry[key]].flat()))));
+/** The names of pins that tables and other pins refer to. */
+const usedPins = document => new Set([...Object.values(pinsOf(document)).flatMap(referencesOf),
+  ...LISTS.flatMap(s => list(document, s).flatMap(entry => PIN_KEYS.flatMap(key => [entry[key]].flat())))]);
 
 function dropPins(document, isDropped) {
   const keep = pin => !isDropped(pin), only = table => Object.fromEntries(Object.entries(table ?? {}).filter(([pin]) => keep(pin)));

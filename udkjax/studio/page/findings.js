@@ -126,12 +126,12 @@ function changeWords({change, drawn}) {
   return drawn?.kind === "slot" ? `let the pin on ${of(drawn.link)} slide in a slot of ${of(drawn.on)}` : change;
 }
 
-function travelWords({motor, unit, ends, lost}) {
+function travelWords({motor, unit, words, ends, lost}) {
   const value = x => (unit === "rad" ? `${(x * 180 / Math.PI).toFixed(1)}°` : `${+(1e3 * x).toPrecision(4)} mm`).replace("-", "−");
   const unknown = lost.length ? ` Its ${lost.join(" and ")} limit${lost.length > 1 ? "s" : ""} could not be found.` : "";
   if (!ends.length) return unknown ? `${motor}:${unknown.toLowerCase()}` : `${motor} ${unit === "rad" ? "turns all the way round" : "has no limits"}.`;
   const line = triples => (triples.length ? ` (${triples.map(names => names.join(", ")).join("; ")} in line)` : "");
-  return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(" and at ")}, measured from the drawn position.${unknown}`;
+  return `${motor} stops at ${ends.map(end => value(end.value) + line(end.in_line)).join(" and at ")}: ${words}.${unknown}`;
 }
 
 /** The pin or element of a constraint, by its name; undefined if there is none. */

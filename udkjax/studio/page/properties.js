@@ -1,11 +1,12 @@
 // The fields of the selected element: each value with its unit, as written in the file.
 
-import {groundOf, list, nameOf, pinsOf, renameElement, renamePin, toggleGround, withKey} from "./document.js";
+import {groundOf, list, nameOf, pinsOf, placeOf, renameElement, renamePin, toggleGround, withKey} from "./document.js";
 import {readValue, valueText} from "./values.js";
 import {shapeProblem} from "./checks.js";
 import {copy, remove} from "./keys.js";
 import {swapPair} from "./actions.js";
-import {length} from "./units.js";
+import {formsOf} from "./pin_forms.js";
+import {angle, length, lengthName, lengthUnit} from "./units.js";
 import {make} from "./player/elements.js";
 
 // The editable keys of each kind of element, and the kind of quantity of each.
@@ -29,6 +30,19 @@ function unitOf(document, quantity) {
   const chosen = document.units?.[{speed: "angular_velocity"}[quantity] ?? quantity];
   if (quantity === "speed" && !chosen && (document.units?.angle ?? "rad") !== "rad") return "";  // the reader refuses a number without a unit here, as ambiguous
   return chosen ?? SI[quantity] ?? "";
+}
+
+/** The distances of the pins of a link that follow each other: those of a plate all around. */
+function lengthsText(document, {pins = [], width, outline}) {
+  const isBar = pins.length === 2 || (width !== undefined && !outline), closed = isBar ? pins : [...pins, ...pins.slice(0, 1)];
+  const pairs = closed.slice(1).map((pin, k) => [closed[k], pin]);
+  if (isBar && pins.length > 2) pairs.unshift([pins[0], pins.at(-1)]);
+  const text = ([a, b]) => {
+    const [p, q] = [placeOf(document, a), placeOf(document, b)];
+    return p && q ? `${a}–${b} ${+(Math.hypot(q[0] - p[0], q[1] - p[1]) / lengthUnit(document)).toPrecision(6)}` : "";
+  };
+  const found = pins.length > 1 ? pairs.map(text).filter(Boolean) : [];
+  return found.length ? `length ${found.join(", ")} ${lengthName(document)}` : "";
 }
 
 export class PropertiesPanel {
@@ -94,14 +108,40 @@ export class PropertiesPanel {
     ];
   }
 
-  pin(name) {
-    const {studio} = this, {document} = studio, place = pinsOf(document)[name] ?? ["", ""], unit = unitOf(document, "length");
-    const to = k => text => {
-      const value = readValue(text), next = [...place];
-      if (!Number.isFinite(length(value, document))) return this.refuse(`"${text}" is not a length: write 12 or 12 mm, for example`);
-      next[k] = value;
-      return this.set({...document, pins: {...pinsOf(document), [name]: next}});
+  /** The fields of a pin: its coordinates, or the numbers of its form. */
+  place(name) {
+    const {document} = this.studio, value = pinsOf(document)[name] ?? ["", ""];
+    const put = next => this.set({...document, pins: {...pinsOf(document), [name]: next}});
+    const take = (quantity, change) => text => {
+      const next = readValue(text), read = {length, angle}[quantity] ?? (x => (typeof x === "number" ? x : NaN));
+      if (!Number.isFinite(read(next, document))) return this.refuse(`"${text}" is not ${{length: "a length: write 12 or 12 mm", angle: "an angle: write 30 or 30 deg"}[quantity] ?? "a number: write 0.5"}, for example`);
+      return put(change(next));
     };
+    const numbers = (key, quantity, values, names) => values.map((x, k) => this.field(names?.[k] ?? key, valueText(x), unitOf(document, quantity),
+      take(quantity, next => (key === "" ? value.with(k, next) : {...value, [key]: Array.isArray(value[key]) ? value[key].with(k, next) : next}))));
+    if (Array.isArray(value)) return numbers("", "length", value, ["x", "y"]);
+    const from = [value.from].flat(), line = value.line ? ` from ${value.line.join("-")}` : "";
+    return Object.entries(value).flatMap(([key, x]) => {
+      if (key === "length") return numbers(key, "length", [x].flat(), from.map(other => `from ${other}`));
+      if (key === "angle") return numbers(key, "angle", [x], [`angle${line}`]);
+      if (key === "off") return numbers(key, "length", [x], ["off the line"]);
+      if (key === "share") return numbers(key, "", [x], [`share of ${value.from}-${value.to}`]);
+      const isNames = key !== "along";
+      return [this.field(key, valueText(x), "", text => put({...value, [key]: readValue(text, isNames)}))];
+    });
+  }
+
+  /** A choice of the form of a pin; choosing one keeps its place. */
+  form(name) {
+    const {document} = this.studio, links = list(document, "link").filter(link => link.pins?.includes(name));
+    const forms = formsOf(document, name, links.flatMap(link => link.pins).filter(other => other !== name));
+    const select = make("select", {"aria-label": "given by"}, make("option", {value: ""}, "given by …"), ...forms.map(([words], k) => make("option", {value: `${k}`}, words)));
+    select.addEventListener("change", () => select.value && this.set({...document, pins: {...pinsOf(document), [name]: forms[+select.value][1]}}));
+    return make("label", {class: "field"}, make("span", {}, "form"), select, make("span", {class: "unit"}));
+  }
+
+  pin(name) {
+    const {studio} = this, {document} = studio;
     const rename = to => {
       const found = renamePin(document, name, to);
       if (found === document && to !== name) return this.refuse(to ? `another pin is called ${to}` : "a pin needs a name");
@@ -112,7 +152,7 @@ export class PropertiesPanel {
     fixed.addEventListener("change", () => this.set(toggleGround(document, name)));
     return [make("h3", {}, `pin ${name}`),
       this.field("name", name, "", rename),
-      this.field("x", valueText(place[0]), unit, to(0)), this.field("y", valueText(place[1]), unit, to(1)),
+      ...this.place(name), this.form(name),
       make("label", {class: "field check"}, make("span", {}, "fixed"), fixed, make("span", {class: "unit"}))];
   }
 
@@ -133,7 +173,8 @@ export class PropertiesPanel {
       if (found === document && to !== title) return this.refuse(to ? `another ${kind} is called ${to}` : `a ${kind} needs a name`);
       return this.set(found);
     };
-    const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", rename, title), ...fields,
+    const lengths = kind === "link" ? [make("p", {}, lengthsText(document, entry))] : [];
+    const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", rename, title), ...lengths, ...fields,
       ...extra.map(key => this.field(key, valueText(entry[key]), "", text => this.set(withKey(document, kind, index, key, readValue(text)))))];
     if (Array.isArray(entry.of) && entry.of.length === 2) parts.push(make("button", {type: "button", onclick: () => this.set(swapPair(document, kind, index))}, "Swap the two links"));
     return parts;

@@ -45,6 +45,12 @@ export function written(metres, document, old) {
   return unit ? `${tidy(metres / unit)} ${found[2]}` : tidy(metres / lengthUnit(document));
 }
 
+/** Radians as a number in the file's unit, or, if the old value was a text with a unit, as a text in that unit. */
+export function angleWritten(radians, document, old) {
+  const found = typeof old === "string" ? TEXT.exec(old) : null, unit = found?.[2] && ANGLES[found[2]];
+  return unit ? `${tidy(radians / unit)} ${found[2]}` : tidy(radians / angleUnit(document));
+}
+
 /** A number and its unit, to be shown. */
 export function shown(value, unit) {
   if (!Number.isFinite(value)) return "–";

@@ -9,11 +9,9 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from udkjax.scene.checks import SceneError
-from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import owner_of, parameters_of, split_index
+from udkjax.scene.number_fields import must_be_positive, parameters_of, split_index
 from udkjax.scene.reshaping import length_of
-from udkjax.scene.schema import keys
 from udkjax.scene.units import units_of
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
@@ -169,17 +167,7 @@ def _is_positive(mechanism: Mechanism, target: Target, guess: float) -> bool:
     """Return True if a value must stay positive."""
     if target.function is not None:
         return isinstance(target.function, Length)
-    return guess > 0 and (target.scaled or all(_must_be_positive(mechanism, name) for name in target.names))
-
-
-def _must_be_positive(mechanism: Mechanism, name: str) -> bool:
-    numbers = parameters_of(mechanism)
-    entry = numbers[split_index(name, numbers)[0]]
-    if not entry.path:
-        return False
-    metadata = keys(type(owner_of(mechanism, entry)))[entry.path[-1]].metadata
-    bounds = (*POSITIVE.get("require", ()), *NOT_NEGATIVE.get("require", ()))
-    return any(rule in metadata.get("require", ()) for rule in bounds)
+    return guess > 0 and (target.scaled or all(must_be_positive(mechanism, name) for name in target.names))
 
 
 # --- numbers that a parameter refers to

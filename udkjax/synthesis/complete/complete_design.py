@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from udkjax.positions.drive import Drive
+from udkjax.positions.drive import Drive, only_driver
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.requirements import require_number
 from udkjax.scene.arguments import checked
@@ -29,7 +29,6 @@ from udkjax.synthesis.complete.four_bars import (
 )
 from udkjax.synthesis.complete.motion_check import check_motions
 from udkjax.synthesis.complete.nine_points import find_real_classes
-from udkjax.synthesis.design import only_driver
 from udkjax.synthesis.goals import PathGoal, PoseGoal
 from udkjax.synthesis.limits import LengthLimits, Range, read_bounds
 
@@ -88,7 +87,11 @@ def design_all(
         SceneError: the drawing is not a four-bar, the driver does not turn a crank, or a limit is invalid.
         ValueError: the goal has the wrong number of positions, or its solutions are not isolated.
     """
-    mechanism = drawing.mechanism() if isinstance(drawing, Drawing) else drawing
+    drawn = drawing if isinstance(drawing, Drawing) else drawing.drawing
+    if isinstance(drawn, Drawing) and (drawn.by_coordinates() is not drawn or drawing is drawn):
+        mechanism = drawn.by_coordinates().mechanism()  # the pins found are places
+    else:
+        mechanism = drawing
     if goal.values is not None:
         raise ValueError("the goal has values of the driver: no four-bar meets them in all positions; leave them out")
     point = goal.point if isinstance(goal, PathGoal) else goal.pin

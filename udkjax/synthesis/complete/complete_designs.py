@@ -68,8 +68,7 @@ class CompleteDesign(PrintsTable):
     @property
     def pins(self) -> dict[str, Float[Array, "2"]]:
         """The places of the pins by name (m), in the first position."""
-        drawn = {} if self.mechanism.drawing is None else self.mechanism.drawing.groups["pin"]
-        return {name: getattr(pin, "position") for name, pin in drawn.items()}  # noqa: B009  # of a drawing, whose class is above
+        return {} if self.mechanism.drawing is None else dict(self.mechanism.drawing.pins)
 
     @property
     def drawing(self) -> AbstractDrawing | None:

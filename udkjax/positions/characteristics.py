@@ -1,0 +1,236 @@
+"""Characteristics of a mechanism as a course asks for them: type, mobility, strokes, dead points, transmission, ratios."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.arrays import ROUNDING
+from udkjax.positions.coordinates import Coordinate, element_of
+from udkjax.positions.counting import Count, count_of
+from udkjax.positions.drive import Drive, only_driver
+from udkjax.positions.linkage_type import FourBarType, Mobility, Pins, four_bars, mobility, pins_with_bodies
+from udkjax.positions.turning_points import Cycle, TurningPoint, Weights
+from udkjax.printing import PrintedTable, PrintsTable, format_number
+from udkjax.scene.arguments import checked
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.joints import Gear, Prismatic, Revolute, Slot
+from udkjax.scene.mechanism import Mechanism
+
+
+class Output(NamedTuple):
+    """The motion of a link on the ground over the whole range of the driver.
+
+    Attributes:
+        kind: swings, slides or turns.
+        extent: its swing angle (rad) or its stroke (m); for a link that turns all the way round, a whole turn.
+        dead_points: the values of the driver (rad, m) at which it turns back.
+        time_ratio: of a link that turns back twice a turn: the driver's longer way between them over the shorter one, else None.
+    """
+
+    kind: str
+    extent: float
+    dead_points: tuple[float, ...]
+    time_ratio: float | None
+
+
+class Characteristics(PrintsTable):
+    """Characteristics of a mechanism over the whole range of its driver. Angles in rad, lengths in m.
+
+    Attributes:
+        mobility: degrees of freedom, counted by Gruebler and true; a motor is no constraint.
+        four_bars: Grashof's type of each four-bar loop on the ground.
+        turns: whether the driver makes whole turns.
+        limits: the toggle positions of the driver; empty if it has none.
+        outputs: the motions of the links on the ground, by name.
+        transmission_angles: by pin, the least and the largest acute angle between coupler and output (rad).
+        ratios: by link, its angular velocity for one of the driver, in a gear train.
+        count: the zero and the units in which values of the driver are shown.
+    """
+
+    mobility: Mobility
+    four_bars: list[FourBarType]
+    turns: bool
+    limits: tuple[float, ...]
+    outputs: dict[str, Output]
+    transmission_angles: dict[str, tuple[float, float]]
+    ratios: dict[str, float]
+    count: Count = eqx.field(static=True)
+
+    def lines(self) -> dict[str, str]:
+        """Return the characteristics as texts by title, in the units of the drawing, counted as in the drawing."""
+        count = self.count
+        lines = {"mobility": self.mobility.words}
+        lines |= {_numbered("type", k, len(self.four_bars)): bar.words for k, bar in enumerate(self.four_bars)}
+        ends = " and ".join(count.text(value) for value in self.limits)
+        lines["driver"] = (
+            f"{count.words}: {'turns all the way round' if self.turns else f'toggles at {ends}' if ends else 'no limit'}"
+        )
+        for name, output in self.outputs.items():
+            extent = count.units.text(output.extent, "m") if output.kind == "slides" else f"{np.degrees(output.extent):.6g} deg"
+            lines[name] = "turns all the way round" if output.kind == "turns" else f"{output.kind} by {extent}"
+            if output.dead_points:
+                lines[f"dead points of {name}"] = "driver at " + ", ".join(
+                    map(count.within_turn if self.turns else count.text, output.dead_points)
+                )
+            if output.time_ratio is not None:
+                lines[f"time ratio of {name}"] = f"{output.time_ratio:.6g}"
+        for pin, angles in self.transmission_angles.items():
+            least, most = (format_number(np.degrees(x), scale=90.0) for x in angles)
+            lines[f"transmission angle at {pin}"] = f"{least} to {most} deg"
+        lines |= {f"ratio of {name}": f"{ratio:.9g}" for name, ratio in self.ratios.items()}
+        return lines
+
+    def _table(self) -> PrintedTable:
+        return PrintedTable("characteristics", list(self.lines().items()))
+
+
+def _numbered(title: str, k: int, count: int) -> str:
+    return title if count == 1 else f"{title} {k + 1}"
+
+
+@checked
+def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristics:
+    """Return the characteristics that a course asks for: type, mobility, strokes, dead points, transmission, ratios.
+
+    Extremes over the driver's range are located to rounding, from exact derivatives of the positions. The transmission angle is
+    that between two links, folded to at most 90 degrees.
+
+    Args:
+        mechanism: a mechanism of one degree of freedom once its drivers hold; its numbers are not traced.
+        driver: a driver or coordinate, as for `kinematics`; by default the only driver.
+
+    Returns:
+        `Characteristics`, which print as a table.
+
+    Raises:
+        SceneError: there is no such driver, or positions do not follow from it.
+    """
+    driver = only_driver(mechanism) if driver is None else driver
+    element, cycle = element_of(mechanism, driver), Cycle(mechanism, driver)
+    limits = tuple(value for value, _ in cycle.ends)
+    measured = _outputs(mechanism, element) if cycle.is_known else {}
+    turning = dict(zip(measured, cycle.turning_points([weights for _, weights in measured.values()]), strict=True))
+    outputs = {name: _output(cycle, kind, weights, turning[name]) for name, (kind, weights) in measured.items()}
+    angles = _transmission_angles(mechanism, element, cycle, pins_with_bodies(mechanism)) if cycle.is_known else {}
+    has_gears = any(isinstance(joint, Gear) for joint in mechanism.joints.values())
+    ratios = _ratios(mechanism, cycle, element) if has_gears and cycle.is_known else {}
+    bars = four_bars(mechanism, element)
+    return Characteristics(mobility(mechanism), bars, cycle.turns, limits, outputs, angles, ratios, count_of(mechanism, driver))
+
+
+def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, Weights]]:
+    """Return the angle or the displacement of each link that a joint connects to the ground, apart from the driven one."""
+    found = {}
+    for name, joint in mechanism.joints.items():
+        moving = [body for body in getattr(joint, "bodies", ()) if body != GROUND]
+        if len(moving) != 1 or not isinstance(joint, Revolute | Prismatic | Slot):
+            continue
+        body, weights = moving[0], np.zeros((len(mechanism.bodies), 3))
+        k = mechanism.body_names.index(body)
+        if isinstance(joint, Revolute):
+            weights[k, 2] = 1.0
+            if not (driven.coordinate == "angle" and {*driven.bodies} == {GROUND, body}):
+                found[body] = ("swings", Weights(weights))
+        elif isinstance(joint, Prismatic):
+            axis = float(np.asarray(joint.axis)) if joint.bodies[0] == GROUND else None
+            if axis is not None and driven.bodies != joint.bodies:
+                weights[k, :2] = np.cos(axis), np.sin(axis)
+                found[body] = ("slides", Weights(weights))
+        elif joint.bodies[0] == GROUND and not np.any(np.asarray(joint.points)[1]):
+            axis = float(np.asarray(joint.axis))
+            weights[k, :2] = np.cos(axis), np.sin(axis)
+            found.setdefault(name, ("slides", Weights(weights)))
+    return found
+
+
+def _output(cycle: Cycle, kind: str, weights: Weights, turning: list[TurningPoint]) -> Output:
+    heights = cycle.heights(weights, turning)
+    extent = float(np.ptp(heights))
+    if kind == "swings" and extent >= 2 * np.pi * (1 - 1e-9) and not turning:
+        return Output("turns", 2 * np.pi, (), None)
+    values, ratio = tuple(point.value for point in turning if not point.dwells), None
+    if cycle.turns and len(values) == len(turning) == 2:
+        way = (values[1] - values[0]) % (2 * np.pi)
+        ratio = max(way, 2 * np.pi - way) / min(way, 2 * np.pi - way)
+    return Output(kind, extent, values, ratio)
+
+
+def _transmission_angles(mechanism: Mechanism, driven: Coordinate, cycle: Cycle, pins: Pins) -> dict[str, tuple[float, float]]:
+    """Return the limits of the acute angle between two moving links of two pins each, at pins off the driven links."""
+    found = {}
+    of_body = {body: [pin for pin, at in pins.items() if body in at] for body in mechanism.body_names}
+    for pin, at in pins.items():
+        pair = list(at)
+        if len(pair) != 2 or GROUND in pair or {*pair} & {*driven.bodies} or any(len(of_body[body]) != 2 for body in pair):
+            continue
+        weights, directions = np.zeros((len(mechanism.bodies), 3)), []
+        for sign, body in zip((-1.0, 1.0), pair, strict=True):
+            weights[mechanism.body_names.index(body), 2] = sign
+            other = next(p for p in of_body[body] if p != pin)
+            arm = pins[other][body] - at[body]
+            directions.append(np.arctan2(arm[1], arm[0]))
+        between = Weights(weights)
+        heights = cycle.heights(between, cycle.turning_points([between])[0]) + directions[1] - directions[0]
+        found[pin] = acute_range(float(np.min(heights)), float(np.max(heights)))
+    return found
+
+
+def acute_range(low: float, high: float) -> tuple[float, float]:
+    """Return the least and the largest acute angle (rad) of two lines whose angle runs from `low` to `high`."""
+    quarters = np.arange(np.ceil(low / (np.pi / 2)), np.floor(high / (np.pi / 2)) + 1)  # lines along or across each other
+    angles = np.array([low, high, *(quarters * np.pi / 2)])
+    acute = np.abs(angles - np.pi * np.round(angles / np.pi))
+    return float(acute.min()), float(acute.max())
+
+
+def _ratios(mechanism: Mechanism, cycle: Cycle, driven: Coordinate) -> dict[str, float]:
+    """Return the constant angular velocities of links for one of the driver; links whose ratio varies have none."""
+    if driven.coordinate != "angle":
+        return {}
+    rates = cycle.dq[:, :, 2]
+    varies = np.ptp(rates, axis=0) > ROUNDING * 1e3 * np.max(np.abs(rates), initial=1.0)
+    names = zip(mechanism.body_names, rates[0], varies, strict=True)
+    return {name: float(rate) for name, rate, various in names if not various and name not in driven.bodies}
+
+
+class InstantCentre(NamedTuple):
+    """The point (m) at which two links move alike; at infinity it is a direction, a unit vector."""
+
+    place: Float[np.ndarray, "2"]
+    at_infinity: bool
+
+
+@checked
+def instant_centres(
+    mechanism: Mechanism, q: Float[np.ndarray, "bodies 3"], v: Float[np.ndarray, "bodies 3"]
+) -> Mapping[tuple[str, str], InstantCentre]:
+    """Return the instant centres of all pairs of links in a position, by the names of the links; "ground" is one of them.
+
+    With u the velocity that a link has at the origin, (u_1 - u_2) + (omega_1 - omega_2) x p = 0. Links of the same angular
+    velocity have their centre at infinity, across their relative velocity; links that move as one have none.
+
+    Args:
+        mechanism: the mechanism.
+        q: coordinates of its bodies (m, m, rad), (bodies, 3).
+        v: their rates (m/s, m/s, rad/s).
+
+    Returns:
+        The centres by pairs of names.
+    """
+    q, v = np.asarray(q), np.asarray(v)
+    at_origin = np.stack([v[:, 0] + v[:, 2] * q[:, 1], v[:, 1] - v[:, 2] * q[:, 0], v[:, 2]], 1)
+    motions = {GROUND: np.zeros(3)} | dict(zip(mechanism.body_names, at_origin, strict=True))
+    names, found = list(motions), {}
+    fastest = np.max(np.abs(v[:, 2]), initial=0.0)
+    speed = np.max(np.hypot(at_origin[:, 0], at_origin[:, 1]), initial=0.0)
+    for k, one in enumerate(names):
+        for other in names[k + 1 :]:
+            ux, uy, omega = motions[one] - motions[other]
+            if abs(omega) > ROUNDING * fastest:
+                found[one, other] = InstantCentre(np.array([-uy, ux]) / omega, False)
+            elif np.hypot(ux, uy) > ROUNDING * speed:
+                found[one, other] = InstantCentre(np.array([-uy, ux]) / np.hypot(ux, uy), True)
+    return found
