@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 from udkjax.arrays import ROUNDING
 from udkjax.positions.coordinates import Coordinate, element_of
@@ -205,7 +205,7 @@ class InstantCentre(NamedTuple):
 
 @checked
 def instant_centres(
-    mechanism: Mechanism, q: Float[np.ndarray, "bodies 3"], v: Float[np.ndarray, "bodies 3"]
+    mechanism: Mechanism, q: Float[ArrayLike, "bodies 3"], v: Float[ArrayLike, "bodies 3"]
 ) -> Mapping[tuple[str, str], InstantCentre]:
     """Return the instant centres of all pairs of links in a position, by the names of the links; "ground" is one of them.
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.arrays import ROUNDING
-from udkjax.positions.coordinates import element_of
-from udkjax.positions.drive import Drive
+from udkjax.positions.coordinates import Coordinate, element_of
 from udkjax.printing import format_number
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
@@ -93,7 +92,7 @@ def units_of_drawing(mechanism: Mechanism) -> Units:
     return Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
 
 
-def count_of(mechanism: Mechanism, driver: Drive) -> Count:
+def count_of(mechanism: Mechanism, driver: str | Coordinate) -> Count:
     """Return the count of the values of a driver or coordinate; numbers of the mechanism are concrete.
 
     The angle of a drawn link on the ground is that of the direction from its pin on the ground to its first other pin; other

@@ -20,6 +20,8 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
+Rows = Sequence[Sequence[float]] | np.ndarray  # of a table, (T, columns)
+
 
 class PinMotion(PrintsTable):
     """Motion of the pins and links of a mechanism over values of its driver; NaN at values that are not reached.
@@ -64,9 +66,10 @@ class PinMotion(PrintsTable):
         motions = {name: np.asarray(motion) / count.units.size("m") for name, motion in self.pins.items()}
         least = [PRINTED_AS_ZERO * max([0.0, *(float(np.nanmax(np.abs(x[:, k]))) for x in motions.values())]) for k in range(3)]
         pin_rows = {name: [_pin_row(x, least) for x in motion] for name, motion in motions.items()}
-        link_rows = {name: np.asarray(motion) * scale for name, motion in self.links.items()}
+        link_rows: dict[str, np.ndarray] = {name: np.asarray(motion) * scale for name, motion in self.links.items()}
         if len(self.values) == 1:  # over several values, angles are continuous
-            link_rows = {name: [[180.0 - (180.0 - angle) % 360.0, *rates]] for name, [[angle, *rates]] in link_rows.items()}
+            for rows in link_rows.values():
+                rows[:, 0] = 180.0 - (180.0 - rows[:, 0]) % 360.0
         if count.is_angle:  # torque out for one of the driver: power in is power out
             ratios = {name: _ratio(np.asarray(self.rate), np.asarray(motion)[:, 1]) for name, motion in self.links.items()}
             link_rows = {name: np.column_stack([rows, ratios[name]]) for name, rows in link_rows.items()}
@@ -80,7 +83,7 @@ class PinMotion(PrintsTable):
         at = f"at {ends[0]}" if len(self.values) == 1 else f"from {ends[0]} to {ends[1]}"
         return f"{at}, {count.words}; {rate_text(float(self.rate[0]), count)}"
 
-    def _rows(self, count: Count, title: str, heads: list[str], rows: Mapping[str, Sequence[Sequence[float]]]) -> PrintedTable:
+    def _rows(self, count: Count, title: str, heads: list[str], rows: Mapping[str, Rows]) -> PrintedTable:
         """Return a table with a row for each name and value; the driver's values are a column if there are several."""
         many = len(self.values) > 1
         sizes = np.abs(np.array([row for motion in rows.values() for row in motion]).reshape(-1, len(heads) - 1))

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.positions.continuation import Reached
-from udkjax.positions.coordinates import value_of
-from udkjax.positions.drive import Drive
+from udkjax.positions.coordinates import Coordinate, value_of
 from udkjax.positions.kinematics import FULL_TURN, Kinematics, kinematics, travel
 from udkjax.scene.mechanism import Mechanism
 
@@ -54,7 +53,7 @@ class Cycle:
         ends: values of the driver, and coordinates, at its toggles.
     """
 
-    def __init__(self, mechanism: Mechanism, driver: Drive):
+    def __init__(self, mechanism: Mechanism, driver: str | Coordinate):
         self._given = mechanism, driver
         limits = travel(mechanism, driver)
         lower, upper = float(limits.lower), float(limits.upper)

@@ -65,6 +65,7 @@ _OF_TYPE = {
     ("LiftProfile", "base"): "m",
     ("LiftProfile", "lift"): "m",
     ("LiftProfile", "start"): "rad",
+    ("GearPair", "pitch"): "m",
     ("Cam", "face"): "rad",
     ("CamPair", "face"): "rad",
     ("SlideMotor", "speed"): "m/s",

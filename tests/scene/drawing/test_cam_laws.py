@@ -75,7 +75,7 @@ def test_a_file_keeps_the_laws():
         ({"lift": [20, 0, -10, 0]}, "profile.lift.*must add up to zero"),
         (
             {"law": ["cycloid", "dwell", "3-4-5", "dwell"]},
-            'profile.law.0.: must be one of .*is "cycloid"; did you mean "cycloidal"',
+            'profile.law.0.: must be one of .*not "cycloid"; did you mean "cycloidal"',
         ),
         ({"law": ["cycloidal", "dwell", "3-4-5"]}, "profile.law: must have as many entries as angle and lift"),
         ({"base": -1}, "profile.base: must be > 0"),

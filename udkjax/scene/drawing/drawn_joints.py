@@ -1,8 +1,10 @@
 """Joints of a drawing other than pins: slides, slots, gears, cams."""
 
 from dataclasses import replace
+from typing import Literal
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
@@ -72,15 +74,27 @@ class PinInSlot(DrawnElement):
 
 
 class GearPair(DrawnElement):
-    """Two wheels mesh. Their centres are the pins about which they turn on the `carrier`; `teeth` or `radii` give the ratio."""
+    """Two wheels mesh, or a `belt` joins them. Their centres are the pins about which they turn on the `carrier`.
+
+    `teeth` or `radii` give the ratio. An open belt turns both wheels in the same direction, a crossed one in opposite directions;
+    neither slips. A belt needs radii; a chain has teeth and a `pitch`, the length of a link.
+    """
 
     links: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=LINK)
     teeth: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)
     radii: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m
     internal: bool = eqx.field(static=True, default=False)
     carrier: str = eqx.field(static=True, default=GROUND, metadata=LINK)
+    belt: Literal["open", "crossed"] | None = eqx.field(static=True, default=None)
+    pitch: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m, of a chain
 
     def mistakes(self, layout):
+        if self.belt is None and self.pitch is not None:
+            yield 'pitch: is that of a chain: add belt = "open", or leave it out'
+        elif self.belt is not None and (self.teeth is None) != (self.pitch is None):
+            yield "belt: give radii, or for a chain teeth and a pitch"
+        elif self.belt is not None and self.internal:
+            yield "internal: a belt is open or crossed: leave this out"
         if len(self.links) != 2 or self.links[0] == self.links[1]:
             yield "links: must name two links"
             return
@@ -95,6 +109,10 @@ class GearPair(DrawnElement):
 
     def parts(self, placement):
         radii = self.radii
+        if self.belt is not None:
+            if radii is None:  # the chain advances by its pitch for each tooth
+                radii = by_numpy(self.teeth) * by_numpy(self.pitch) / (2 * np.pi)
+            return Parts(joint=Gear(self.links, radii, self.belt == "open", self.carrier))
         if radii is None:  # chosen so that the wheels touch
             assert self.teeth is not None
             centre1, centre2 = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
@@ -103,8 +121,8 @@ class GearPair(DrawnElement):
         return Parts(joint=Gear(self.links, radii, self.internal, self.carrier))
 
     def misfit(self, placement: Placement) -> tuple[float, float] | None:
-        """Return the distance between the centres, and the distance required by the radii (m); None without radii."""
-        if self.radii is None:
+        """Return the distance between the centres, and the distance required by the radii (m); None if any distance fits."""
+        if self.radii is None or self.belt is not None:
             return None
         centre1, centre2 = (placement.centre(wheel, self.carrier) or "" for wheel in self.links)
         return float(placement.distance(centre1, centre2)), float(self._apart(self.radii))

@@ -138,7 +138,7 @@ def pin_mistakes(pins: Mapping[str, AbstractPin], units: Units) -> Iterator[str]
         with np.errstate(all="ignore"):
             places[name] = pin.place(places)
         if not np.all(np.isfinite(places[name])):
-            pair = next(pair for pair in combinations(pin.references, 2) if np.array_equal(*(places[p] for p in pair)))
+            pair = next(pair for pair in combinations(pin.references, 2) if np.array_equal(places[pair[0]], places[pair[1]]))
             yield f"{where('pin', 0, name)}: {quote(pair[0])} and {quote(pair[1])} are at the same place: they have no direction"
             return
 

@@ -82,7 +82,8 @@ class PolarPin(AbstractPin):
         if along is not None:
             unit = along / norm(along)
         else:
-            xp, angle = array_namespace(self.angle), by_numpy(self.angle)
+            angle = by_numpy(self.angle)
+            xp = array_namespace(angle)
             unit = xp.stack([xp.cos(angle), xp.sin(angle)])
         if self.line:
             axis = places[self.line[1]] - places[self.line[0]]

@@ -36,6 +36,7 @@ BodyPoints = Mapping[str, ArrayLike]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # number of points of a cam's outline
 SAME_PLACE = 1e-9  # attachments closer than this, relative to the largest coordinate, are one point
+TOUCHING = 0.02  # relative to their distance: wheels with a larger gap are joined by a belt
 ROD = 0.01  # relative difference from the inertia of a uniform rod up to which a body is drawn as a rod
 MARGIN = 0.08  # length of a rail beyond the used range, relative to the mechanism's length
 
@@ -231,13 +232,33 @@ class _Drawing:
         self.rails.append({"kind": MarkKind.FLOOR, **self._at(on, gap.through), "axis": axis, "span": span})
 
     def _gear(self, joint: Gear) -> None:
-        largest = int(np.argmax(np.asarray(joint.radii)))
-        for k, (body, radius) in enumerate(zip(joint.bodies, np.asarray(joint.radii, float).tolist(), strict=True)):
+        largest, radii = int(np.argmax(np.asarray(joint.radii))), np.asarray(joint.radii, float)
+        strands = self._belt(joint)
+        self.elements.extend({"kind": MarkKind.ROD, "a": a, "b": b} for a, b in strands)
+        for k, (body, radius) in enumerate(zip(joint.bodies, radii.tolist(), strict=True)):
             place = self._held_by(body, joint.carrier)
-            wheel = {"kind": MarkKind.WHEEL, **place, "radius": radius, "internal": joint.internal and k == largest}
+            is_ring = joint.internal and k == largest and not strands
+            wheel = {"kind": MarkKind.WHEEL, **place, "radius": radius, "internal": is_ring}
             if wheel not in self.wheels:
                 self.wheels.append(wheel)
             self.shaped.add(body)
+
+    def _belt(self, joint: Gear) -> list[tuple[list[float], ...]]:
+        """Return the two strands of the belt between wheels that do not touch, on their carrier; an open one is internal."""
+        radii, carrier = np.asarray(joint.radii, float), self._frames(joint.carrier)[0]
+        axles = [self._path(body, self._held_by(body, joint.carrier)["at"])[0] for body in joint.bodies]
+        centres = [_local(carrier, axle) for axle in axles]
+        arm = centres[1] - centres[0]
+        distance, reach = float(np.hypot(*arm)), radii[0] - radii[1] if joint.internal else radii[0] + radii[1]
+        if abs(distance - abs(reach)) <= TOUCHING * distance or distance <= abs(reach):
+            return []
+        strands, along = [], np.arctan2(arm[1], arm[0])
+        for side in (1.0, -1.0):  # the normal of a strand has the angle acos(reach / distance) to the line of centres
+            angle = along + side * np.arccos(reach / distance)
+            normal = np.array([np.cos(angle), np.sin(angle)])
+            ends = centres[0] + radii[0] * normal, centres[1] + (radii[1] if joint.internal else -radii[1]) * normal
+            strands.append(tuple([self.number[joint.carrier], *end.tolist()] for end in ends))
+        return strands
 
     def _rack(self, joint: Rack) -> None:
         first, second = joint.bodies

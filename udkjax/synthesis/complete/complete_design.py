@@ -87,11 +87,10 @@ def design_all(
         SceneError: the drawing is not a four-bar, the driver does not turn a crank, or a limit is invalid.
         ValueError: the goal has the wrong number of positions, or its solutions are not isolated.
     """
-    drawn = drawing if isinstance(drawing, Drawing) else drawing.drawing
-    if isinstance(drawn, Drawing) and (drawn.by_coordinates() is not drawn or drawing is drawn):
-        mechanism = drawn.by_coordinates().mechanism()  # the pins found are places
-    else:
-        mechanism = drawing
+    mechanism = drawing.mechanism() if isinstance(drawing, Drawing) else drawing
+    given = mechanism.drawing
+    if isinstance(given, Drawing) and given.by_coordinates() is not given:
+        mechanism = given.by_coordinates().mechanism()  # the pins found are places
     if goal.values is not None:
         raise ValueError("the goal has values of the driver: no four-bar meets them in all positions; leave them out")
     point = goal.point if isinstance(goal, PathGoal) else goal.pin
