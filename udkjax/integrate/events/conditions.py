@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, Self
 
 import equinox as eqx
@@ -29,6 +30,13 @@ def frames_of(names: Sequence[str], q: Array | np.ndarray, v: Array | np.ndarray
     for name, x, dx in zip(names, q, rates, strict=True):
         frames[name] = Frame(x[0], x[1], x[2], xp.cos(x[2]), xp.sin(x[2]), *dx)
     return frames
+
+
+@cache
+def probe_frames(names: tuple[str, ...], moving: bool = True) -> dict[str, Frame]:
+    """Return frames at an arbitrary concrete state, with or without velocities, to try conditions."""
+    probe = np.linspace(0.1, 0.9, 3 * len(names))
+    return frames_of(names, probe, probe if moving else None)
 
 
 class JointCoordinate(eqx.Module):
@@ -107,7 +115,7 @@ def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoord
 def sees_velocity(condition: Callable[[Number, Frames], Any], mechanism: Mechanism) -> bool:
     """Return whether a condition depends on velocities: it then fails with frames without velocities."""
     try:
-        return condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel())) is None
+        return condition(0.0, probe_frames(mechanism.body_names, moving=False)) is None
     except (TypeError, AttributeError, ValueError):  # errors of arithmetic with None, in Python, JAX or NumPy
         return True
 

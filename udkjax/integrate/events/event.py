@@ -10,6 +10,7 @@ is the condition, like the ready-made ones: numbers that a plain function closes
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import reduce
 from typing import Literal, Protocol
 
@@ -30,7 +31,15 @@ from udkjax.integrate.events.checks import (
     require_normal,
     require_vector,
 )
-from udkjax.integrate.events.conditions import Frames, Gap, WithinLimit, frames_of, joint_coordinate, require_name, sees_velocity
+from udkjax.integrate.events.conditions import (
+    Frames,
+    Gap,
+    WithinLimit,
+    joint_coordinate,
+    probe_frames,
+    require_name,
+    sees_velocity,
+)
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
 from udkjax.requirements import describe
 from udkjax.scene.bodies import GROUND
@@ -262,20 +271,18 @@ def _check(event: Event, mechanism: Mechanism) -> None:
         raise ValueError(f"{where}: the direction must be -1, 0 or 1, {describe(event.direction)}")
     if not callable(event.condition):
         raise ValueError(f"{where}: the condition must be a function (t, frames), not a {type(event.condition).__name__}")
+    frames, has_traced = probe_frames(mechanism.body_names), is_traced(event)
     try:
-        value = jnp.asarray(event.condition(0.0, frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())))
+        with nullcontext() if has_traced else jax.ensure_compile_time_eval():
+            value = event.condition(0.0, frames)
     except KeyError as error:
         name = error.args[0]
         raise ValueError(f"{where}: no body named {quote(str(name))}{suggestion(name, mechanism.body_names)}") from error
-    if not is_traced(event):
-        probe = np.linspace(0.1, 0.9, mechanism.q0.size)
-        with jax.ensure_compile_time_eval():
-            result = event.condition(0.0, frames_of(mechanism.body_names, probe, probe))
-        if isinstance(result, Tracer):  # derivatives with respect to the traced numbers would be lost
-            cure = "make it an equinox module that holds them and has a `__call__`"
-            raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
-    if value.shape:
-        raise ValueError(f"{where}: the condition must return one number, not an array of shape {value.shape}")
+    if not has_traced and isinstance(value, Tracer):  # derivatives with respect to the traced numbers would be lost
+        cure = "make it an equinox module that holds them and has a `__call__`"
+        raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
+    if shape := np.shape(value):
+        raise ValueError(f"{where}: the condition must return one number, not an array of shape {shape}")
     if action.is_impact:
         if event.direction == 1:
             cure = "turn the condition's sign, and leave the direction out"
