@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -234,3 +235,38 @@ def test_control_intervals():
     assert_allclose(slope, (end(0.3 + 1e-4) - end(0.3 - 1e-4)) / 2e-4, atol=1e-6)
     with pytest.raises(ValueError, match="inputs are for mechanisms"):
         udk.step(pendulum(), start, {"mass": 1.0}, 0.5)
+
+
+class Pushed(eqx.Module):
+    """A pendulum that a force pushes until a breakpoint."""
+
+    push: jax.Array
+
+    def force(self, t, q, v):
+        return jnp.where(t < 0.5, self.push, 0.0) * jnp.array([1.0, 0.0, 0.0])
+
+    def system(self):
+        base = pendulum()
+        return udk.ConstrainedSystem(base.mass, self.force, base.constraint, breakpoints=[0.5], potential=base.potential)
+
+
+@pytest.mark.slow
+def test_methods_of_a_module_with_a_breakpoint():
+    """The system itself is an argument of a compiled function; its leaf has a derivative on both sides of the jump."""
+    start = udk.State(np.array([0.6, 0.0, -0.8]), np.array([0.0, 1.5, 0.0]))
+    end = eqx.filter_jit(lambda system: udk.simulate(system, TS, start, **TIGHT).q[-1])
+    slope = jax.jacrev(lambda push: end(Pushed(push).system()))(jnp.array(1.0))
+    assert_allclose(slope, (end(Pushed(1.0 + 1e-4).system()) - end(Pushed(1.0 - 1e-4).system())) / 2e-4, atol=1e-6)
+    halves = udk.simulate(Pushed(jnp.array(1.0)).system(), np.array([0.0, 0.5]), start, **TIGHT)
+    rest = udk.simulate(pendulum(), np.array([0.5, 2.0]), udk.State(halves.q[-1], halves.v[-1]), **TIGHT)
+    assert_allclose(end(Pushed(jnp.array(1.0)).system()), rest.q[-1], atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("choice", [{"solver": diffrax.Kvaerno5()}, {"solver": udk.BDF()}, {"formulation": udk.Augmented()}])
+def test_other_solvers_and_formulations(choice):
+    """An implicit Runge-Kutta method by machine code; others by diffrax, whose steps machine code evaluates where it can."""
+    start = udk.State(np.array([0.6, 0.0, -0.8]), np.array([0.0, 1.5, 0.0]))
+    one, other = (udk.simulate(pendulum(), TS, start, rtol=1e-9, atol=1e-9, **x) for x in (choice, {}))
+    assert (one.settings["engine"] == "native") == isinstance(choice.get("solver"), diffrax.Kvaerno5)
+    assert_allclose(one.q, other.q, atol=1e-7)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -65,6 +65,11 @@ class ConstrainedSystem(PrintsLine):
             others: The other functions of a `ConstrainedSystem`, such as `potential` and `constraint`.
         """
         return cls(MassOfEnergy(kinetic), ForceOfEnergy(kinetic, force), **others)
+
+    cure: ClassVar[str] = (
+        ", which has no bodies and joints: map simulate over its numbers by jax.vmap, fit them by an optimizer, and find its "
+        "rank by singular_values"
+    )
 
     def traced(self, n: int) -> Any:
         """Return the system with functions that are traced for n coordinates; unchanged without float64, for JAX alone.

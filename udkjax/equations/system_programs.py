@@ -18,7 +18,7 @@ from udkjax.expressions.loop_program import KernelLoop, KernelWriter, LoopProgra
 from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.rank_policy import RankPolicy
 
-MOST_OPERATIONS = 40_000  # of the accelerations: more take minutes to compile
+MOST_OPERATIONS = 8_000  # of the accelerations: compiling takes 10 s for as many, and longer than in proportion for more
 
 
 class SystemPrograms(SystemTerms):

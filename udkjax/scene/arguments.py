@@ -144,7 +144,8 @@ def _instance(classes: tuple[type, ...]) -> ArgumentCheck:
 
     def check(name: str, value: Any, given: GivenArguments):
         if not isinstance(value, accepted):
-            raise ArgumentTypeError(f"{name} must be {expected}, {describe(value)}{_remedy(name, value, classes)}")
+            cure = getattr(value, "cure", "")
+            raise ArgumentTypeError(f"{name} must be {expected}, {describe(value)}{_remedy(name, value, classes)}{cure}")
 
     return check
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from udkjax.annotations import JsonObject
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
@@ -17,6 +18,7 @@ from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.named_arguments import require_history
 from udkjax.show.player import pictures
+from udkjax.show.player.drawn_systems import Drawing, drawn_system
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
 from udkjax.show.player.marks import BodyPoints
@@ -136,9 +138,10 @@ class Animation:
 
 
 def animate(
-    mechanism: Mechanism | Mapping[str, Mechanism],
+    mechanism: Mechanism | ConstrainedSystem | Mapping[str, Mechanism],
     solution: ShownMotion | Mapping[str, ShownMotion] | None = None,
     *,
+    drawing: Drawing | None = None,
     measures: Measures = ("violation", "energy", "rank"),
     reactions: bool = False,
     traces: Traces | None = None,
@@ -150,9 +153,12 @@ def animate(
     """Show the motion of a mechanism, or several motions side by side and synchronized.
 
     Args:
-        mechanism: the mechanism that moves; for runs of different mechanisms, a mechanism for each label.
+        mechanism: the mechanism that moves; for runs of different mechanisms, a mechanism for each label. A `ConstrainedSystem`
+            with its `drawing`.
         solution: a `Solution`, or any object with ts (T,), q and v (T, bodies, 3); for several runs a mapping by label, such as
             {"projected": first, "not stabilized": second}. By default the mechanism is shown at rest, as in its scene.
+        drawing: for a `ConstrainedSystem` a function of t and q in jax.numpy that returns x, y (m) and, if it turns, the angle
+            (rad) of each body to be drawn, by name; `shapes` has their outlines.
         measures: curves over time below the motion: any of "violation" (constraint violation in m, with radians as arcs of the
             characteristic length), "energy", "rank" (of the constraint Jacobian) and "effort" (driving torques in N m and forces
             in N), or {"torque (N m)": array} for your own values, and {"torque (N m)": {label: array}} for several runs.
@@ -175,8 +181,14 @@ def animate(
         A failed run is shown up to its failure; a `FailedRunWarning` and the page give the cause.
 
     Raises:
-        ValueError: the solution is a batch, a name is unknown, or a run has no states or cannot be live.
+        ValueError: the solution is a batch, a name is unknown, a run has no states or cannot be live, or a drawing is missing.
     """
+    if isinstance(mechanism, ConstrainedSystem):
+        if drawing is None or solution is None or live:
+            raise ValueError("a ConstrainedSystem has no bodies to draw: give a solution and a drawing, a function of t and q")
+        mechanism, solution, curves = drawn_system(mechanism, solution, drawing)
+        measures = curves if isinstance(measures, Sequence) else measures
+        title = title or "system"
     events = tuple(events) if isinstance(events, Sequence) else (events,)
     if events and not live:
         raise ValueError("events: needed only for a live page; otherwise the events of the solution are shown: leave them out")
