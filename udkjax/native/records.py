@@ -15,8 +15,8 @@ from jaxtyping import Array
 from udkjax.native.operations import Operation
 from udkjax.native.runs import RunCotangents, goes_back
 
-# The largest records of a batch (bytes). To write and read more memory takes longer than to integrate again: for 1,000 runs of
-# the paper's linkage 2.7 times as long over 1 s, and equally long over 20 s; for 64 over 20 s it takes 0.85 times as long.
+# The largest records of a batch (bytes). To write and read more memory takes longer than to integrate again: for 1,000 runs
+# of the paper's linkage 1.9 times as long over 1 s, with 20 steps, and 0.9 times as long over 20 s, with a hundred.
 LARGEST = 2**25
 LARGEST_ON_CARD = 64  # members: the same for records that are copied to a graphics card and back
 GIVEN_RECORD, GIVEN_STEPS = 5, 6  # places of the record and of the number of steps among the inputs, from the last

@@ -67,6 +67,7 @@ class Reverse(Recorded):
         self._write_leave_row()
         if self.plan.sampled:
             self._write_find_rows()
+        self.write_end_record()
         self._write_walk()
 
     # --- backpropagation

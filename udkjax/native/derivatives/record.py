@@ -13,6 +13,7 @@ from functools import partial
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.running import Repeat
+from udkjax.native.base.samples import ARGUMENTS
 from udkjax.native.derivatives.differentiated import Differentiated
 
 STORED = 200  # capacity in points of the record passed to the second call: as much memory as 300 outputs
@@ -91,7 +92,7 @@ class Recorded(Differentiated):
         with f.if_(self.backpropagates(f)):
             s.where(s.due > 0.5, ready=1.0)
         with f.if_(self._returns_record(f)), self.each_lane(f, s.due) as k:
-            self._end_output(f, k)
+            f.call("end_record", f.given["work"], self.call_record(f), k)
 
     # --- memory
 
@@ -100,15 +101,25 @@ class Recorded(Differentiated):
         self.put_lane_entry(f, "record", k, f.at(self.result_address(f, "record", member, length), TITLE), base=POINTER)
         self.put_lane_entry(f, "capacity", k, f.like(f.arithmetic("div", length - TITLE, self.row), DOUBLE, 1))
 
-    def _end_output(self, f: Function, k: Value):
-        """Write the title of lane k's record, without points if they did not fit, and zeros after its points."""
+    def write_end_record(self):
+        """Write `end_record(work, call, lane)`: the title of a record in the output, without points if they did not fit.
+
+        Zeros follow its points. This function writes far more than others at the end of a run, none of which is optimized.
+        """
+        f, _ = self.function("end_record", ARGUMENTS)
+        k = f.given["lane"]
+        vector = 1 if self.has_buffer else self.plan.vector  # on a card vectors are aligned, unlike records
         fits = self.lane_entry(f, "capacity", k) > 0.0
         self.put_lane_entry(f, "points", k, f.select(fits, self.lane_entry(f, "points", k), 0.0))
         length = self.field(f, "record length")
         to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
         for j, name in enumerate(("points", "code", "written")):
             f.store(self.lane_entry(f, name, k), to, j)
-        with f.each(length, self.to_int(f, self.lane_entry(f, "points", k)) * self.row + TITLE) as i:
+        start = self.to_int(f, self.lane_entry(f, "points", k)) * self.row + TITLE
+        registers = f.arithmetic("div", length - start, vector)
+        with f.each(registers) as r:
+            f.store(0.0, to, r * vector + start, vector)
+        with f.each(length, registers * vector + start) as i:
             f.store(0.0, to, i)
 
     def _allocate_record(self, f: Function, k: Value, member: Value):
