@@ -144,3 +144,47 @@ def test_a_singular_mass_matrix_is_named():
     system = own_systems.quaternion_body(np.array([1.0, 2.0, 3.5]), 0.0)
     with pytest.raises(udk.SimulationError, match="mass matrix is not positive definite: its eigenvalues are 0 to 14"):
         run(system, [1.0, 0, 0, 0], [0.0, 0.1, 0.2, 0.3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [udk.Auto(), udk.SVD(), udk.Elimination()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("coupling", [0.0, 0.2])
+def test_a_linkage_that_folds_flat(method, coupling):
+    """A parallelogram by its pins passes its singular configurations, also with a full M: it stays one and keeps its energy."""
+    inertia = np.eye(4) + coupling
+
+    def constraint(t, q):
+        left, right = q[:2], q[2:]
+        crank, bar = right - jnp.array([2.0, 0.0]), right - left
+        return jnp.stack([left @ left - 1.0, crank @ crank - 1.0, bar @ bar - 4.0])
+
+    system = udk.ConstrainedSystem(
+        lambda q: jnp.asarray(inertia), constraint=constraint, potential=lambda t, q: G * (q[1] + q[3])
+    )
+    ts = np.linspace(0.0, 5.0, 101)
+    solution = run(system, [0.0, -1.0, 2.0, -1.0], [8.0, 0.0, 8.0, 0.0], ts, method=method, rtol=1e-9, atol=1e-9)
+    q = np.asarray(solution.q)
+    assert_allclose(q[:, 2:] - q[:, :2], np.tile([2.0, 0.0], (101, 1)), atol=1e-12)
+    assert np.sum(np.diff(np.sign(q[:, 1])) != 0) > 5  # flat many times
+    total = udk.energy(system, solution).total
+    assert_allclose(total, total[0], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_sixty_coordinates():
+    """A chain of twenty point masses: structural zeros keep its programs short; Psi holds, and so does the energy."""
+    count = 20
+    steps = np.random.default_rng(0).normal(size=(count, 3))
+    points = np.cumsum(steps / np.linalg.norm(steps, axis=1)[:, None], 0)
+
+    def constraint(t, q):
+        P = jnp.concatenate([jnp.zeros((1, 3)), q.reshape(count, 3)])
+        return jnp.sum(jnp.square(P[1:] - P[:-1]), 1) - 1.0
+
+    system = udk.ConstrainedSystem(
+        lambda q: jnp.eye(3 * count), constraint=constraint, potential=lambda t, q: G * jnp.sum(q[2::3])
+    )
+    solution = run(system, points.ravel(), 0 * points.ravel(), np.linspace(0.0, 0.5, 6), rtol=1e-9, atol=1e-9)
+    assert_allclose(udk.violation(system, solution), 0.0, atol=1e-13)
+    energy = udk.energy(system, solution)
+    assert_allclose(energy.total, energy.total[0], atol=1e-6 * float(energy.kinetic.max()))
