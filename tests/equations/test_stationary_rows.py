@@ -82,6 +82,27 @@ def test_two_rods_between_the_same_guides():
     )
 
 
+def test_a_square_of_guides():
+    """Blocks on the four sides of a square, opposite ones joined by rods: both rods are held, and one falls."""
+    bodies, joints, a = {}, {}, 3.0
+    for rod, ends, along, across in (("flat", "we", (0, 1), (1, 0)), ("upright", "sn", (1, 0), (0, 1))):
+        along, across = np.array(along), np.array(across)
+        tilt = float(np.arctan2(*across[::-1]))
+        bodies[rod] = udk.Body(1.0, a**2 / 12, along + a / 2 * across, tilt)
+        for x, end in zip((0.0, a), ends, strict=True):
+            bodies[end] = udk.Body(1.0, 0.1, along + x * across)
+            joints[f"guide {end}"] = udk.Prismatic(("ground", end), [x * across, [0, 0]], np.arctan2(*along[::-1]))
+            joints[f"pin {end}"] = udk.Revolute((end, rod), [[0, 0], [x - a / 2, 0]])
+    square = udk.Mechanism(bodies, joints)
+    assert [pin.name for pin in hold_pins(square).pins] == ["pin w", "pin s"]
+    sol = udk.simulate(square, TS)
+    q = np.asarray(square.q0) + np.zeros((len(TS), 1, 1))
+    for body in ("flat", "w", "e"):
+        q[:, square.body_names.index(body), 1] -= 4.905 * TS**2
+    np.testing.assert_allclose(sol.q, q, atol=1e-8)
+    assert udk.diagnose(square).degrees_of_freedom == 2
+
+
 def test_a_rod_at_the_end_of_a_crank():
     """The first block is driven by a crank and a coupler: the rod is held however the blocks move."""
     free = rod_between_guides()
