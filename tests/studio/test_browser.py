@@ -492,3 +492,31 @@ def test_a_text_that_cannot_be_read_is_kept_and_not_saved(studio):
     studio.page.get_by_role("button", name="Back to the text").click()
     studio.until("!studio.source.isBroken && studio.source.area.value === studio.state.text")
     assert studio.document["pins"]["B"] == [70, 130]
+
+
+@pytest.mark.slow
+def test_a_pin_is_given_lengths_and_a_drag_changes_them(studio):
+    studio.link((0, 0), (30, 40))
+    studio.link((30, 40), (120, 90))
+    studio.link((100, 0), (120, 90))
+    studio.tool("v")
+    page = studio.page
+    page.mouse.click(*studio.pin("C"))
+    page.get_by_label("given by").select_option(label="lengths from B and D")
+    page.mouse.click(*studio.pin("B"))
+    page.get_by_label("given by").select_option(label="length and angle from A")
+    pins = studio.document["pins"]
+    assert pins["B"]["length"] == 50 and pins["C"]["from"] == ["B", "D"] and pins["C"]["side"] == "left"
+    page.get_by_label("angle", exact=True).fill("60")
+    page.keyboard.press("Enter")
+    page.get_by_label("from A", exact=True).fill("4 cm")
+    page.keyboard.press("Enter")
+    assert studio.document["pins"]["B"] == {"from": "A", "length": "4 cm", "angle": 60}
+    assert studio.document["pins"]["C"] == pins["C"]  # the coupler and the rocker keep their lengths
+    studio.settle()
+    assert "from = [" in studio.js("studio.state.text") and studio.js("studio.motion.pageEngine.engine !== undefined")
+    studio.drag(studio.pin("B"), studio.pixel(50, 0), pixels=True)
+    moved = studio.document["pins"]["B"]
+    np.testing.assert_allclose([float(moved["length"].split()[0]), moved["angle"]], [5, 0], atol=1e-6)
+    studio.js("studio.select([{kind: 'link', index: 1}])")
+    assert "length B–C 102.956 mm" in page.locator(".properties").inner_text()

@@ -120,6 +120,10 @@ class AbstractDrawing(PrintsTable):
         """Return the lengths of each body and of the ground as text; empty if numbers are traced."""
 
     @abstractmethod
+    def touching_pins(self) -> list[str]:
+        """Return the pins whose places have no derivatives, as circles only touch there. Numbers are concrete."""
+
+    @abstractmethod
     def shapes(self) -> dict[str, Array]:
         """Return the points (n, 2) through which each body is drawn, in the frame of the body (m), by name."""
 

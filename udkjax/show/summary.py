@@ -13,7 +13,7 @@ from udkjax.printing import align_columns, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import Accuracy
 from udkjax.study.report import row_label
-from udkjax.wording import plural
+from udkjax.wording import join_names, plural
 
 
 def check_summary(mech: Mechanism, check: Check) -> str:
@@ -23,6 +23,9 @@ def check_summary(mech: Mechanism, check: Check) -> str:
     lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in check.redundant) or "none"
     lengths = {} if mech.drawing is None or mech.departs_from_drawing else mech.drawing.length_texts()
     lines |= {f"length of {name}": text for name, text in lengths.items()}
+    touching = [] if mech.drawing is None else mech.drawing.touching_pins()
+    if touching:
+        lines["without derivatives"] = f"the places of {join_names(touching)}: circles only touch there"
     return table(mech.name or "mechanism", lines)
 
 

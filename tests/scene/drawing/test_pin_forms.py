@@ -101,6 +101,9 @@ def test_circles_that_touch_have_a_pin_without_derivatives():
         return four_bar(A=udk.polar("O", 40, 180), B=udk.circles(("A", "C"), (r, s), "left")).drawing.pins["B"]
 
     assert_allclose(place(60.0), [0.02, 0.0], atol=1e-12)
+    drawing = four_bar(A=udk.polar("O", 40, 180), B=udk.circles(("A", "C"), (60, 80), "left")).drawing
+    assert drawing.touching_pins() == ["B"] and four_bar().drawing.touching_pins() == []
+    assert slider_crank(50 * np.sin(np.pi / 3) - 10).drawing.touching_pins() == ["P"]
     mech = four_bar(A=udk.polar("O", 40, 0))
     touching = {"pin.B.length": jnp.array([0.03, 0.03]), "pin.A.length": jnp.array(0.04)}
 

@@ -176,6 +176,11 @@ class Drawing(AbstractDrawing):
             for name, lengths in self.lengths().items()
         }
 
+    def touching_pins(self) -> list[str]:
+        """Return the pins at which circles only touch: their places have no derivatives. Numbers are concrete."""
+        places = places_of(self.groups["pin"])
+        return [name for name, pin in self.groups["pin"].items() if pin.touches(places)]
+
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
         """Return the last link at a pin, or the ground, and the pin's position in its frame (m); None for an unknown pin."""
         placement = placement_of(self.groups, self.ground)

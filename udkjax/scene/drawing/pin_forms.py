@@ -45,6 +45,10 @@ class AbstractPin(PrintsLine):
         """Return why the form has no point, or an empty string; numbers are concrete, and `text` shows a length (m)."""
         return ""
 
+    def touches(self, places: Places) -> bool:
+        """Return True if circles only touch, so that the place has no derivative; numbers are concrete."""
+        return False
+
 
 class Pin(AbstractPin):
     """A pin in world coordinates."""
@@ -145,8 +149,7 @@ class CirclesPin(AbstractPin):
         apart = f"{' and '.join(self.from_)} are {text(distance)} apart"
         return f"{apart}; circles of {text(r)} and {text(s)} do not meet: they need {need}"
 
-    def touches(self, places: Places) -> bool:
-        """Return True if the circles touch, so that the pin has no derivative; numbers are concrete."""
+    def touches(self, places):
         start, end = (places[name] for name in self.from_)
         return bool(_heron(float(np.linalg.norm(end - start)), *np.asarray(self.length).tolist())[1])
 
@@ -189,6 +192,11 @@ class RailPin(AbstractPin):
         if square > 0.0 or touches:
             return ""
         return f"{self.from_} is {text(height)} off the line through {self.on}; a length of {text(length)} does not reach it"
+
+    def touches(self, places):
+        along = np.asarray(self.along)
+        height = _left_of(along / norm(along)) @ (places[self.from_] - places[self.on])
+        return bool(_leg(float(np.asarray(self.length)), float(height))[1])
 
 
 class LinePin(AbstractPin):
