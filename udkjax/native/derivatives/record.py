@@ -104,7 +104,7 @@ class Recorded(Differentiated):
     def write_end_record(self):
         """Write `end_record(work, call, lane)`: the title of a record in the output, without points if they did not fit.
 
-        Zeros follow its points. This function writes far more than others at the end of a run, none of which is optimized.
+        Zeros follow its points. `finish_members` would write them slowly, since it is not optimized.
         """
         f, _ = self.function("end_record", ARGUMENTS)
         k = f.given["lane"]
