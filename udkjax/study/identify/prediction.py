@@ -21,6 +21,7 @@ from udkjax.devices import computing_on_host, on_host
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembly import State, close
 from udkjax.positions.channels import Channel, Quantity
+from udkjax.scene.held import Held
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.identify.unknowns import Target, apply_values
@@ -42,7 +43,7 @@ class Runs(NamedTuple):
     q: np.ndarray | None  # (N, bodies, 3) guess of the initial state; None: that of the scene
     v: np.ndarray | None
     bases: np.ndarray  # (N, 2, 3 bodies, S) derivatives of q and v with respect to the unknowns of the initial state
-    conditions: Mapping[str, np.ndarray]  # values by name, (N, ...)
+    conditions: Mapping[str, np.ndarray | Held]  # values by name, (N, ...), or (N, samples, ...)
 
 
 class Members(NamedTuple):

@@ -14,6 +14,7 @@ from udkjax.positions.assembly import State
 from udkjax.positions.channels import Channel, Quantity
 from udkjax.requirements import describe
 from udkjax.scene.checks import Mistakes
+from udkjax.scene.held import Held
 from udkjax.wording import quote
 
 if TYPE_CHECKING:
@@ -73,7 +74,8 @@ class Record:
             residuals of the fit.
         initial_state: the `State` or `Start` at t0; by default that of the scene.
         t0: start of the motion (s); by default the first time.
-        conditions: values of parameters, by name, in this record only, such as a payload or a driver's amplitude.
+        conditions: values of parameters, by name, in this record only, such as a payload or a driver's amplitude; or a `Held`
+            with the samples of a measured torque, whose `dt` and `t0` are those of all records.
         name: name in messages.
 
     Raises:
@@ -87,7 +89,7 @@ class Record:
         noise: Noise = None,
         initial_state: Start | State | None = None,
         t0: float | None = None,
-        conditions: Mapping[str, ArrayLike] | None = None,
+        conditions: Mapping[str, ArrayLike | Held] | None = None,
         name: str = "",
     ):
         problems: list[str] = []
@@ -100,7 +102,9 @@ class Record:
         self.t0 = float(self.times[0]) if t0 is None and self.times.size else float(t0 or 0.0)
         self.noise = self._noise(noise, problems)
         self.start = initial_state if isinstance(initial_state, Start) else Start(initial_state)
-        self.conditions = {name: np.asarray(value, float) for name, value in (conditions or {}).items()}
+        self.conditions = {
+            name: value if isinstance(value, Held) else np.asarray(value, float) for name, value in (conditions or {}).items()
+        }
         if not self.values:
             problems.append("there is no channel: nothing was measured")
         for channel, value in self.values.items():

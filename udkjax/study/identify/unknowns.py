@@ -14,12 +14,14 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import qr
 from scipy.special import expit, logit
 
+from udkjax.arrays import make_module
 from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.positions.assembly import State, assemble
 from udkjax.positions.channels import RATES, UNITS
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import SceneError
+from udkjax.scene.held import Held
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
@@ -296,22 +298,43 @@ def guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.
     return q, v
 
 
-def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray]:
-    """Return the values in all records of each parameter that differs between records."""
+def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray | Held]:
+    """Return the values in all records of each parameter that differs between records, stacked; samples as one `Held`."""
     numbers, problems = parameters_of(mechanism), []
-    conditions: dict[str, np.ndarray] = {}
+    conditions: dict[str, np.ndarray | Held] = {}
     for name in dict.fromkeys(name for record in records for name in record.conditions):
         owner, index = split_index(name, numbers)
         if owner not in numbers or numbers[owner].value is None:
             problems.append(f"conditions: no parameter {quote(name)}")
             continue
-        usual = np.asarray(numbers[owner].value)[index]
+        field = numbers[owner]
+        usual = field.value if isinstance(field.value, Held) else np.asarray(field.value)[index]
+        values = [record.conditions.get(name, usual) for record in records]
         try:
-            conditions[name] = np.stack(
-                [np.broadcast_to(np.asarray(r.conditions.get(name, usual), float), usual.shape) for r in records]
-            )
-        except ValueError:
-            problems.append(f"conditions: {quote(name)} must be of shape {usual.shape} in each record")
+            is_sampled = any(isinstance(value, Held) for value in values)
+            conditions[name] = _held_together(values, field.shape) if is_sampled else _stacked(values, np.shape(usual))
+        except ValueError as mistake:
+            problems.append(f"conditions: {quote(name)} must be {mistake}")
     if problems:
         raise IdentificationError(problems)
     return conditions
+
+
+def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        return np.stack([np.broadcast_to(np.asarray(value, float), shape) for value in values])
+    except ValueError:
+        raise ValueError(f"of shape {shape} in each record") from None
+
+
+def _held_together(values: Sequence[Any], shape: tuple[int, ...]) -> Held:
+    """Return one `Held` with the samples of all records; fewer samples are continued by the last one, as is a number."""
+    times = {(value.dt, value.t0) for value in values if isinstance(value, Held)}
+    if len(times) > 1:
+        raise ValueError("held with the same `dt` and `t0` in all records: sample it again at equal times")
+    (dt, t0), samples = times.pop(), [np.asarray(x.values if isinstance(x, Held) else np.asarray(x)[None], float) for x in values]
+    most = max(map(len, samples))
+    if any(x.shape[1:] != shape for x in samples):
+        raise ValueError(f"of shape {shape} at each sample")
+    stacked = np.stack([np.concatenate([x, np.repeat(x[-1:], most - len(x), 0)]) for x in samples])
+    return make_module(Held, values=stacked, dt=dt, t0=t0)

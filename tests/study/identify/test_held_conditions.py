@@ -1,0 +1,35 @@
+"""Records in which a number of the scene was held between samples, each with its own."""
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.study.identify.conftest import ANGLE, NAMES, pendulum
+from udkjax.study.identify.unknowns import conditions_of
+
+SETPOINT = "force.spring.angle"
+TS = np.linspace(0.0, 2.0, 21)
+SAMPLES = 0.5 * np.cos(np.arange(12.0))
+
+
+def record(value, **choices):
+    """A record of the true pendulum whose servo follows a setpoint."""
+    run = udk.simulate(pendulum().with_parameters({SETPOINT: value}), TS, rtol=1e-12, atol=1e-12)
+    return udk.Record(TS, {ANGLE: run.q[:, 0, 2]}, 0.01, conditions={SETPOINT: value}, **choices)
+
+
+def test_parameters_are_found_from_records_with_other_samples():
+    """Also with fewer samples in one record, and a constant number in another."""
+    records = [record(udk.Held(SAMPLES, 0.15)), record(udk.Held(-SAMPLES[:7], 0.15)), record(np.array(0.2))]
+    estimate = udk.identify(pendulum(0.5, 0.1), records, NAMES, progress=False)
+    assert estimate.success
+    assert estimate.values == pytest.approx((0.375, 0.2), rel=1e-8)
+
+
+def test_samples_that_do_not_fit_together_are_named():
+    first, other = record(udk.Held(SAMPLES, 0.15)), record(udk.Held(SAMPLES, 0.1))
+    with pytest.raises(udk.IdentificationError, match=r'"force.spring.angle" must be held with the same `dt` and `t0` in all'):
+        conditions_of(pendulum(), [first, other])
+    vectors = udk.Record(TS, first.values, conditions={SETPOINT: udk.Held(np.zeros((3, 2)), 0.1)})
+    with pytest.raises(udk.IdentificationError, match=r"must be of shape \(\) at each sample"):
+        conditions_of(pendulum(), [vectors])
