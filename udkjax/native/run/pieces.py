@@ -77,7 +77,8 @@ def write_leave(module: Module):
     crossing = where(repeats, expected, where(short, s.crossing, inf))
     crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.point3_t)), crossing)
     aim = where(shortens, beyond, aim)
-    crossing = where(shortens, f.fma(step, 1 - NEAR_END, s.point3_t), crossing)
+    farthest = max(1.0, float(module.method.nodes.max()))  # some methods have stages after the end of the step
+    crossing = where(shortens, f.fma(step, (1 - NEAR_END) / farthest, s.point3_t), crossing)
     repeats = repeats | shortens
     tries = where(repeats, s.tries + 1.0, where(is_accurate, 0.0, s.tries))
     s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
