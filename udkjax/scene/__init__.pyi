@@ -51,7 +51,6 @@ from udkjax.scene.forces import Wrench as Wrench
 from udkjax.scene.held import Held as Held
 from udkjax.scene.held import row_size as row_size
 from udkjax.scene.held import rows_of as rows_of
-from udkjax.scene.held import value_at as value_at
 from udkjax.scene.held import with_row as with_row
 from udkjax.scene.joints import Angle as Angle
 from udkjax.scene.joints import Cam as Cam

@@ -5,6 +5,7 @@ which is given by its index in the mechanism, or -1 for the ground; an `anchor` 
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,7 +17,7 @@ from udkjax.integrate.events.conditions import Gap
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver
 from udkjax.scene.forces import Force, ForceElement, Friction, Spring, Torque, TorsionSpring
-from udkjax.scene.held import value_at
+from udkjax.scene.held import Held
 from udkjax.scene.joints import (
     Cam,
     Distance,
@@ -199,10 +200,10 @@ class _Drawing:
                 self.elements.append({"kind": MarkKind.FRICTION, **self._axle(self.mechanism.joints[force.joint].bodies)})
             case Force():
                 place = self._at(force.body, force.point)
-                vector = np.asarray(value_at(force.vector, 0.0), float).tolist()
+                vector = np.asarray(_at_start(force.vector), float).tolist()
                 self.elements.append({"kind": MarkKind.FORCE, **place, "vector": vector, "turns": force.frame == "body"})
             case Torque():
-                sign = 1 if float(value_at(force.value, 0.0)) >= 0 else -1
+                sign = 1 if float(_at_start(force.value)) >= 0 else -1
                 self.elements.append({"kind": MarkKind.TORQUE, **self._axle(force.bodies), "sign": sign})
 
     def _rail(self, joint: Prismatic | Slot) -> None:
@@ -346,3 +347,8 @@ def _size(drawing: _Drawing) -> float:
     all_points = [to_ground(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
     all_points += [frame[:2] for frame in drawing.poses[0]]
     return float(np.ptp(np.array(all_points), axis=0).max()) or 1.0
+
+
+def _at_start(number: Any) -> Any:
+    """Return the first sample of a held number; return any other number unchanged."""
+    return number(0.0) if isinstance(number, Held) else number

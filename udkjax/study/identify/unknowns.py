@@ -312,7 +312,7 @@ def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, 
         values = [record.conditions.get(name, usual) for record in records]
         try:
             is_sampled = any(isinstance(value, Held) for value in values)
-            conditions[name] = _held_together(values, field.shape) if is_sampled else _stacked(values, np.shape(usual))
+            conditions[name] = _held_together(values, field.shape or ()) if is_sampled else _stacked(values, np.shape(usual))
         except ValueError as mistake:
             problems.append(f"conditions: {quote(name)} must be {mistake}")
     if problems:
