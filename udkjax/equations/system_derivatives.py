@@ -21,7 +21,7 @@ from udkjax.expressions.differential import SparseRow
 from udkjax.expressions.loop_program import ADD, SET, KernelLoop, KernelWriter, LoopProgram, Reset
 
 ONCE = np.zeros((1, 1), int)  # the table of a loop of one iteration
-Outputs = Mapping[str, Sequence[Scalar]]  # the scalars of each array
+WrittenScalars = Mapping[str, Sequence[Scalar]]  # the scalars of each array
 Inputs = Sequence[tuple[Scalar, str, int]]  # with their arrays and indices
 RIGHT, SOLUTION, FACTORS = "right", "x0", "factors"  # arrays; `right1` and `right2` are those of the two corrections
 
@@ -60,7 +60,7 @@ class DifferentiableSystem:
         self,
         graph: Graph,
         inputs: Inputs,
-        of_accelerations: tuple[SystemEquation, SystemFactors, Outputs],
+        of_accelerations: tuple[SystemEquation, SystemFactors, WrittenScalars],
         of_positions: tuple[SystemEquation, SystemFactors],
         of_velocities: SystemEquation,
     ):
@@ -106,7 +106,7 @@ class DifferentiableSystem:
             parts += [self._residual(equation, k, False, **names), self._solve(factors, equation, k, SOLUTION, ADD)]
         return parts
 
-    def _loop(self, *outputs: Outputs, **names: str) -> KernelLoop:
+    def _loop(self, *outputs: WrittenScalars, **names: str) -> KernelLoop:
         w = KernelWriter(self._graph)
         for s, name, k in self._inputs:
             w.bind(s, names.get(name, name), None, k)

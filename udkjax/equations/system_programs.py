@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from udkjax.equations.system_derivatives import ONCE, DifferentiableSystem, Outputs, SystemEquation
+from udkjax.equations.system_derivatives import ONCE, DifferentiableSystem, SystemEquation, WrittenScalars
 from udkjax.equations.system_solver import SystemFactors
 from udkjax.equations.system_terms import SystemTerms, less
 from udkjax.equations.traced_system import MOST_NUMBERS, SystemFunctions, TracedSystem
@@ -42,7 +42,7 @@ class SystemPrograms(SystemTerms):
         numbers = self.functions.number_count
         return f"its functions use {numbers:,} numbers, more than {MOST_NUMBERS:,}" if numbers > MOST_NUMBERS else many
 
-    def _program(self, *outputs: Outputs) -> LoopProgram:
+    def _program(self, *outputs: WrittenScalars) -> LoopProgram:
         w = KernelWriter(self._graph)
         for s, name, k in self._inputs:
             w.bind(s, name, None, k)
@@ -104,11 +104,11 @@ class SystemPrograms(SystemTerms):
         return self._program(*self._end_of_step)
 
     @property
-    def _end_of_step(self) -> list[Outputs]:
+    def _end_of_step(self) -> list[WrittenScalars]:
         v1 = self._corrected_velocity(self._factors)
         return [{"v1": v1, "a": self._accelerations_at(self._factors, v1)}, self._safe(self._factors)]
 
-    def _tangent_parts(self, factors: SystemFactors) -> list[Outputs]:
+    def _tangent_parts(self, factors: SystemFactors) -> list[WrittenScalars]:
         dq1 = factors.tangent_part(self._dq, self.position_rows)
         return [{"dq1": dq1, "dv1": factors.tangent_part(self._dv)}, self._distance(factors)]
 
@@ -133,13 +133,13 @@ class SystemPrograms(SystemTerms):
         return self._program({"psi": self._rate})
 
     @property
-    def _terms(self) -> Outputs:
+    def _terms(self) -> WrittenScalars:
         u = [s * c for s, c in zip(self._rows.mass.forward(self.functions.force), self._rows.compliance, strict=True)]
         b = less(self._c, self._rows.rates(u))
         return {"terms": [*self._rows.mass.backward(u), *b]}
 
     @property
-    def _dense_rows(self) -> Outputs:
+    def _dense_rows(self) -> WrittenScalars:
         entries = [s for row in self._rows.B for s in row.values()]
         root = [self._graph.sqrt(c) for c in self._rows.compliance]
         return {"psi_q": entries, "root": root, "couplings": self._rows.couplings}

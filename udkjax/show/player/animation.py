@@ -18,7 +18,7 @@ from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.named_arguments import require_history
 from udkjax.show.player import pictures
-from udkjax.show.player.drawn_systems import Drawing, drawn_system
+from udkjax.show.player.drawn_systems import PlacesBodies, drawn_system
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
 from udkjax.show.player.marks import BodyPoints
@@ -141,7 +141,7 @@ def animate(
     mechanism: Mechanism | ConstrainedSystem | Mapping[str, Mechanism],
     solution: ShownMotion | Mapping[str, ShownMotion] | None = None,
     *,
-    drawing: Drawing | None = None,
+    drawing: PlacesBodies | None = None,
     measures: Measures = ("violation", "energy", "rank"),
     reactions: bool = False,
     traces: Traces | None = None,

@@ -15,10 +15,10 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.bodies import Body
 from udkjax.scene.mechanism import Mechanism
 
-Drawing: TypeAlias = Callable[[Any, Any], Mapping[str, ArrayLike]]  # (t, q) -> x, y and angle of each drawn body, by name
+PlacesBodies: TypeAlias = Callable[[Any, Any], Mapping[str, ArrayLike]]  # (t, q) -> x, y and angle of each drawn body, by name
 
 
-def drawn_system(system: ConstrainedSystem, solution: Any, drawing: Drawing) -> tuple[Mechanism, Any, dict[str, np.ndarray]]:
+def drawn_system(system: ConstrainedSystem, solution: Any, drawing: PlacesBodies) -> tuple[Mechanism, Any, dict[str, np.ndarray]]:
     """Return the drawn bodies as a mechanism without joints, their motion, and the system's energy and largest violation.
 
     Args:
