@@ -112,9 +112,13 @@ class EventPlan:
         return np.array(self.switches.contacts, int)[:, None] == np.arange(len(self.first))
 
     @cached_property
+    def _switches_of_contacts(self) -> Bool[np.ndarray, "C"]:
+        return self._contacts.any(axis=0)
+
+    @cached_property
     def has_only_contacts(self) -> bool:
         """True if all switches are those of contacts."""
-        return bool(self._contacts.any(axis=0).all())
+        return bool(self._switches_of_contacts.all())
 
     def is_first(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m"]:
         """Return whether a phase is that in which runs begin."""
@@ -122,6 +126,8 @@ class EventPlan:
 
     def held(self, phase: Bool[Any, "*m C"], xp: ModuleType) -> Bool[Any, "*m E"]:
         """Return a mask of the contacts at rest in a phase."""
+        if xp is np and not phase[..., self._switches_of_contacts].any():  # the usual case
+            return np.zeros((*phase.shape[:-1], self.count), bool)
         return xp.any(phase[..., None, :] & self._contacts, axis=-1)
 
     def after(self, phase: Bool[Any, "*m C"], k: Int[Any, "*m"], xp: ModuleType) -> Bool[Any, "*m C"]:
@@ -131,7 +137,7 @@ class EventPlan:
 
     def free(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m C"]:
         """Return the phase that follows when all contacts at rest open."""
-        return phase & ~self._contacts.any(axis=0)
+        return phase & ~self._switches_of_contacts
 
     def with_contacts(self, phase: Bool[Any, "*m C"], held: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m C"]:
         """Return the phase that follows when contacts come to rest."""

@@ -46,7 +46,7 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     after = xp.where(known, xp.sign(values.h).astype(int), sides[:, :E])
     code = xp.where(take(runs.totals, members)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
     unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
-    hits = (event >= 0) & (event < E) & xp.asarray(plan.impacts)[event % E]
+    hits = (event >= 0) & (event < E) & xp.asarray(plan.impacts & ~plan.impacts.all())[event % E]
     if xp is not np or (unknown | hits).any():
         begins, falling = event == BEGIN, plan.impacts | plan.kinks
         is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
