@@ -8,6 +8,8 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from udkjax.positions.curve import NumpyCurve
+from udkjax.statics import linearization
+from udkjax.statics.linearization import NumpyLinearizer, TracedLinearizer
 
 LENGTHS, GROUND = (1.0, 2.5, 2.0), 2.5
 STIFFNESS, FREE_LENGTH = 60.0, 1.2
@@ -23,6 +25,53 @@ def test_the_papers_linkage_hanging():
     np.testing.assert_allclose(np.asarray(found.s.imag), np.sqrt(3.5 * 9.81 / 3.05) * np.array([-1.0, 1.0]), rtol=1e-12)
     shape = np.asarray(found.shapes[0]) / float(found.shapes[0, 0, 2])
     np.testing.assert_allclose(shape, [[0.5, 0, 1], [0.5, 0, 1], [0.5, 0, 1], [1, 0, 0]], atol=1e-10)
+
+
+LOADED = {
+    "linkage": lambda: udk.library.parallelogram(-1.3),
+    "free body": lambda: udk.Mechanism({"a": udk.Body(1.0, 0.1, [0.5, 0.1])}, forces=[spring("a")]),
+    "double pendulum": lambda: double_pendulum(spring("b"), udk.TorsionSpring(["a", "b"], stiffness=2.0, damping=0.3)),
+    "push": lambda: double_pendulum(udk.Force("a", [1.0, 2.0], point=[0.1, 0.2])),
+}
+
+
+def spring(body):
+    return udk.Spring(["ground", body], points=[[2.0, 2.0], [0.1, 0.2]], stiffness=30.0, length=1.0, damping=0.5)
+
+
+def double_pendulum(*forces):
+    bodies = {"a": udk.Body(1.0, 0.1, [0.5, 0.1]), "b": udk.Body(2.0, 0.2, [1.5, 0.0])}
+    joints = {"A": udk.Revolute(["ground", "a"], [[0, 0], [-0.5, 0]]), "B": udk.Revolute(["a", "b"], [[0.5, 0], [-0.5, 0]])}
+    return udk.Mechanism(bodies, joints, forces=list(forces))
+
+
+@pytest.mark.parametrize("name", LOADED)
+def test_linearizations_by_numpy_are_those_of_jax(name):
+    mech = LOADED[name]()
+    q, analysis = np.ravel(udk.assemble(mech).q), udk.analyse(mech)
+    free = analysis.degrees_of_freedom
+    assert free
+    given = mech.without_origin, analysis, free
+    near, traced = NumpyLinearizer(*given), TracedLinearizer(*given)
+    for one, other in ((near.linearize(0.0, q), traced.linearize(0.0, q)), (near.scale(0.0, q), traced.scale(0.0, q))):
+        for x, y in zip(_without_basis(one), _without_basis(other), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-12 * max(1.0, np.abs(y).max(initial=0.0)))
+
+
+def _without_basis(found):
+    """Return what does not depend on the choice of the directions N."""
+    if not hasattr(found, "directions"):
+        return found
+    N = np.asarray(found.directions)
+    matrices = [N @ np.asarray(x) @ N.T for x in (found.mass, found.damping, found.stiffness)]
+    return *matrices, N @ np.asarray(found.force), found.loads, found.multipliers
+
+
+def test_rest_of_concrete_numbers_is_found_without_a_trace(monkeypatch):
+    """A trace takes a second in a chain of a hundred links, as long as all of the search."""
+    traced = []
+    monkeypatch.setattr(linearization, "linearize", lambda *given: traced.append(given))
+    assert bool(udk.equilibrium(udk.library.chain(3, angle=0.1)).stable) and not traced
 
 
 def test_no_step_is_tried_from_a_position_of_rest(monkeypatch):

@@ -33,16 +33,21 @@ class TruncatedPseudoinverse(NamedTuple):
     rank: int
 
     @classmethod
-    def of(cls, D: np.ndarray, tol: float) -> "TruncatedPseudoinverse":
-        """Return the pseudoinverse of a matrix; NaN if the matrix is not finite."""
+    def of(cls, D: np.ndarray, tol: float, full: bool = False) -> "TruncatedPseudoinverse":
+        """Return the pseudoinverse of a matrix, `full` with all right singular vectors; NaN if the matrix is not finite."""
         if not np.all(np.isfinite(D)):  # for which NumPy raises an error
             D, tol = np.zeros_like(D), np.nan
-        u, sigma, vt = np.linalg.svd(D, full_matrices=False)
+        u, sigma, vt = np.linalg.svd(D, full_matrices=full)
         counts = ~(sigma <= tol * sigma[0])
-        return cls(u, np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0) + 0.0 * tol, vt, int(counts.sum()))
+        inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0) + 0.0 * tol
+        return cls(u[:, : len(sigma)], inverse, vt, int(counts.sum()))
 
     def __matmul__(self, b: np.ndarray) -> np.ndarray:
-        return self.vt.T @ (self.inverse * (self.u.T @ b))
+        return self.vt[: len(self.inverse)].T @ ((self.u.T @ b).T * self.inverse).T
+
+    def transposed_times(self, b: np.ndarray) -> np.ndarray:
+        """Return (D^+)^T b of a vector."""
+        return self.u @ (self.inverse * (self.vt[: len(self.inverse)] @ b))
 
 
 def _key(t: Time, q: np.ndarray) -> tuple[bytes, bytes]:

@@ -1,15 +1,18 @@
-"""Quantities of the equations of motion at a state, each compiled as one program: the public functions of `udkjax.equations`.
+"""Quantities of the equations of motion at a state: the public functions of `udkjax.equations`.
 
-Without compilation, JAX would dispatch dozens of operations one by one. Inside the package, larger programs call the uncompiled
-functions.
+Those of concrete numbers are computed by NumPy on the scene's programs (state_arrays.py). With traced numbers each is compiled as
+one program: without compilation, JAX would dispatch dozens of operations one by one. Inside the package, larger programs call the
+uncompiled functions.
 """
 
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import NumberLike
@@ -17,6 +20,7 @@ from udkjax.equations import constraints, determinacy, loads
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import BodyArray
 from udkjax.equations.general import ConstrainedSystem, singular_values_of_rows
+from udkjax.equations.state_arrays import StateArrays, by_numpy, state_arrays
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
@@ -25,13 +29,15 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def compiled(function: Callable[Arguments, Result], numeric: Callable[..., Any] | None = None) -> Callable[Arguments, Result]:
     """Compile a function of a mechanism and of numbers, once for all mechanisms of the same structure.
 
     The result can be transformed like the function itself. An `analysis` argument is computed before the numbers are traced.
 
     Args:
         function: Its first argument is the `mechanism`; all others except `analysis` are numbers or arrays.
+        numeric: The same function of `StateArrays` and the other arguments by name, for concrete numbers: t (1,), q and v
+            (1, n), `rank_tol` a float.
 
     Returns:
         A function with the same arguments and the same result.
@@ -45,24 +51,40 @@ def compiled(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
         mechanism: Mechanism = arguments["mechanism"]
         if "analysis" in parameters.parameters and arguments.get("analysis") is None:
             arguments["analysis"] = analyse(mechanism)
+        arguments["mechanism"] = mechanism.without_origin
+        if numeric is not None and by_numpy(mechanism, list(arguments.values())):
+            bound.apply_defaults()
+            given = {name: _for_numpy(name, value) for name, value in bound.arguments.items() if name != "mechanism"}
+            return jax.device_put(numeric(state_arrays(mechanism.without_origin), **given))
         for name, value in arguments.items():
             if not isinstance(value, Mechanism | Analysis):
                 arguments[name] = jnp.asarray(value, jnp.result_type(float))  # Python numbers would be static
-        arguments["mechanism"] = mechanism.without_origin
         return program(*bound.args, **bound.kwargs)
 
     return checked(run)
 
 
-psi = compiled(constraints.psi)
-psi_q = compiled(constraints.psi_q)
-psi_dot = compiled(constraints.psi_dot)
+def _for_numpy(name: str, value: Any) -> Any:
+    if isinstance(value, Analysis):
+        return value
+    return np.asarray(value, float).reshape((1, -1) if name in ("q", "v") else (1,))
+
+
+def _uniqueness(s: StateArrays, t: Any, q: Any, analysis: Analysis, rank_tol: Any) -> determinacy.Uniqueness:
+    N, rank = s.left_null_space(t, q, analysis, float(rank_tol[0]))
+    share = np.linalg.norm(N[0], axis=1)
+    return determinacy.Uniqueness(share <= determinacy.UNIQUE_TOL, share, rank[0])
+
+
+psi = compiled(constraints.psi, lambda s, t, q: s.psi(t, q)[0])
+psi_q = compiled(constraints.psi_q, lambda s, t, q: s.jacobian(t, q)[0])
+psi_dot = compiled(constraints.psi_dot, lambda s, t, q, v: s.psi_dot(t, q, v)[0])
 gamma = compiled(constraints.gamma)
-force = compiled(loads.force)
-mass = compiled(loads.mass)
-kinetic_energy = compiled(loads.kinetic_energy)
-potential_energy = compiled(loads.potential_energy)
-_singular_values = compiled(determinacy.singular_values)
+force = compiled(loads.force, lambda s, t, q, v: s.force(t, q, v)[0])
+mass = compiled(loads.mass, lambda s: s.mass)
+kinetic_energy = compiled(loads.kinetic_energy, lambda s, v: 0.5 * np.sum(s.mass * v**2))
+potential_energy = compiled(loads.potential_energy, lambda s, t, q, v: s.energy(t, q, v)[0, 1])
+_singular_values = compiled(determinacy.singular_values, lambda s, t, q, analysis: s.singular_values(t, q, analysis)[0])
 
 
 @checked
@@ -91,4 +113,4 @@ def singular_values(
     return singular_values_of_rows(mechanism.traced(q.size), t, q, jnp.zeros_like(q) if v is None else jnp.asarray(v, q.dtype))
 
 
-uniqueness = compiled(determinacy.uniqueness)
+uniqueness = compiled(determinacy.uniqueness, _uniqueness)

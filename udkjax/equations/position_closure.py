@@ -84,17 +84,22 @@ def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -
 
 def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
     """Take one step, halved until the residual falls; return whether it does. At rounding level no step is taken."""
-    step = limited_step(rows, t, q, xp)
-    fixed, current, fixed_step = (rows, q, step) if xp is np else jax.lax.stop_gradient((rows, q, step))
+    fixed, current = (rows, q) if xp is np else jax.lax.stop_gradient((rows, q))
     size = xp.linalg.norm(fixed.residual(t, current))
+    is_open = size > rounding(rows.scales, current, xp)
+    if xp is np and not is_open:
+        return q, is_open
+    step = limited_step(rows, t, q, xp)
+    fixed_step = step if xp is np else jax.lax.stop_gradient(step)
 
     def is_worse(trial: tuple[AnyArray, Any]) -> ArrayLike:
         scale, k = trial
-        return (k < CLOSURE.halvings) & ~(xp.linalg.norm(fixed.residual(t, current + scale * fixed_step)) < size)
+        residual = fixed.residual(t, current + scale * fixed_step)
+        return is_open & (k < CLOSURE.halvings) & ~(xp.linalg.norm(residual) < size)
 
     halve = lambda trial: (0.5 * trial[0], trial[1] + 1)  # noqa: E731
     scale, k = control_flow(xp).while_loop(is_worse, halve, (xp.ones(()), 0))
-    improves = (k < CLOSURE.halvings) & (size > rounding(rows.scales, current, xp))
+    improves = (k < CLOSURE.halvings) & is_open
     return xp.where(improves, q + scale * step, q), improves
 
 

@@ -13,6 +13,7 @@ from udkjax.equations.abstract_system import AbstractSystem, HistoryLike, Mechan
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, GeneralEquations, prepare_general
+from udkjax.equations.state_arrays import by_numpy, history_of, state_arrays
 from udkjax.equations.textbook import prepare
 from udkjax.equations.traced_system import TracedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -125,6 +126,12 @@ def accelerations(
     """
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
+        if formulation is None and by_numpy(mechanism, (t, q, v, analysis, stabilization), method):
+            one_q, one_v = (np.reshape(np.asarray(x, float), (1, -1)) for x in (q, v))
+            time = np.reshape(np.asarray(t, float), 1)
+            found = state_arrays(mechanism).solve(time, one_q, one_v, analysis, method, stabilization)
+            a = found.a.reshape(np.shape(q))
+            return jax.device_put((a, found.multipliers[0]) if multipliers else a)
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
     system = mechanism.traced(q.size) if isinstance(mechanism, ConstrainedSystem) else mechanism
     return _accelerations(system, analysis, t, q, v, method, stabilization, formulation, multipliers)
@@ -142,6 +149,9 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -
         Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers. For a `ConstrainedSystem` the
         rows of Psi, then those of phi.
     """
+    if isinstance(mechanism, Mechanism) and by_numpy(mechanism, (solution.ts, solution.q)):
+        ts, q = history_of(solution)[:2]
+        return jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
     return _evaluate_along(mechanism, solution, _psi if isinstance(mechanism, Mechanism) else _residuals)
 
 
@@ -156,6 +166,8 @@ def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> E
     Returns:
         The `Energy`, kinetic and potential (T,), in J.
     """
+    if by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
+        return Energy(*jax.device_put([*state_arrays(mechanism.without_origin).energy(*history_of(solution)).T]))
     return _evaluate_along(mechanism, solution, _energy)
 
 
@@ -177,8 +189,13 @@ def efforts(
     if not mechanism.driver_names:
         return {}
     analysis, method = analyse(mechanism), SVD() if method is None else method
-    ts, q, v = (jnp.asarray(x) for x in (solution.ts, solution.q, solution.v))
-    multipliers = _multipliers(mechanism.without_origin, analysis, ts, q, v, method, stabilization)
+    if by_numpy(mechanism, (solution.ts, solution.q, solution.v, analysis, stabilization), method):
+        arrays, (ts, q, v) = state_arrays(mechanism.without_origin), history_of(solution)
+        pieces = [arrays.solve(ts[p], q[p], v[p], analysis, method, stabilization) for p in arrays.pieces(len(ts))]
+        multipliers = jax.device_put(np.concatenate([piece.multipliers for piece in pieces]))
+    else:
+        ts, q, v = (jnp.asarray(x) for x in (solution.ts, solution.q, solution.v))
+        multipliers = _multipliers(mechanism.without_origin, analysis, ts, q, v, method, stabilization)
     rows = {owner: k for k, (owner, _) in enumerate(analysis.row_names)}
     return {name: -multipliers[:, rows[name]] for name in mechanism.driver_names}
 

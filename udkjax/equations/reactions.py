@@ -12,6 +12,7 @@ without compliance, loads that remain undetermined are those of least norm.
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -21,12 +22,14 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Number, NumberLike, Time
+from udkjax.arrays import ArrayLibrary, array_namespace
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.abstract_system import HistoryLike
-from udkjax.equations.analysis import analyse
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi_q
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
 from udkjax.equations.general import ConstrainedSystem, prepare_general
+from udkjax.equations.state_arrays import History, StateArrays, by_numpy, history_of, state_arrays
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -87,7 +90,10 @@ def reactions(
         return _of_system(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
-    loads = _loads(mechanism.without_origin, analysis, *states, method, stabilization, soft, frame, about)
+    if soft is None and by_numpy(mechanism, (states, analysis, stabilization), method):
+        loads = _loads_by_numpy(mechanism.without_origin, analysis, history_of(solution), method, stabilization, frame, about)
+    else:
+        loads = _loads(mechanism.without_origin, analysis, *states, method, stabilization, soft, frame, about)
     return _name_by_body(mechanism, loads)
 
 
@@ -114,7 +120,10 @@ def unique_reactions(
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
     analysis, (ts, q, _) = analyse(mechanism), _states(solution)
-    marks = _uniqueness_of_loads(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol), frame, about)
+    if by_numpy(mechanism, (ts, q, analysis, rank_tol)):
+        marks = _uniqueness_by_numpy(mechanism.without_origin, analysis, history_of(solution)[:2], rank_tol, frame, about)
+    else:
+        marks = _uniqueness_of_loads(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol), frame, about)
     return _name_by_body(mechanism, marks)
 
 
@@ -141,18 +150,19 @@ def _name_by_body(mechanism: Mechanism, values: list[list[Array]]) -> ByBody:
 def _split_by_body(
     mechanism: Mechanism,
     row_names: list[str],
-    q: Array,
-    by_row: Float[Array, "T m n"],
-    total: Callable[[Array], Array],
+    q: Any,
+    by_row: Any,
+    total: Callable[[Any], Any],
     frame: Axes,
     about: About,
 ) -> ByBody:
-    """Split the loads of rows by joint and body, (rows, T, 3) each, in the chosen axes and about the chosen point."""
+    """Split the loads of rows (T, m, n) by joint and body, (rows, T, 3) each, in the chosen axes and about the chosen point."""
     body_index = {name: k for k, name in enumerate(mechanism.body_names)}
     body_frames = {name: _frame(q, index) for name, index in body_index.items()} | {GROUND: GROUND_FRAME}
     result: ByBody = {}
+    xp, rows_of = array_namespace(q), _rows_by_owner(row_names)
     for name, element in mechanism.constraints.items():
-        rows = np.array([k for k, owner in enumerate(row_names) if owner == name])
+        rows = np.array(rows_of[name])
         bodies = mechanism.frames_of(element)
         frames = [body_frames[body] for body in bodies]
         axes = _joint_angle(element, frames) if frame == "joint" else 0.0
@@ -160,11 +170,19 @@ def _split_by_body(
         for k, body in enumerate(bodies):
             if body == GROUND:
                 continue
-            load = total(jnp.moveaxis(by_row[:, rows, 3 * body_index[body] : 3 * body_index[body] + 3], 1, 0))
+            load = total(xp.moveaxis(by_row[:, rows, 3 * body_index[body] : 3 * body_index[body] + 3], 1, 0))
             point = _joint_point(element, k, frames) if about == "joint" else None
             angle = frames[k].angle if frame == "body" else axes
             result[name][body] = load if point is None and frame == "ground" else _transform_load(load, frames[k], point, angle)
     return result
+
+
+def _rows_by_owner(row_names: list[str]) -> dict[str, list[int]]:
+    """Return the rows of each constraint."""
+    rows: dict[str, list[int]] = {}
+    for k, owner in enumerate(row_names):
+        rows.setdefault(owner, []).append(k)
+    return rows
 
 
 def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | None, angle: Number) -> Float[Array, "... 3"]:
@@ -172,13 +190,14 @@ def _transform_load(load: Float[Array, "... 3"], body: Frame, point: Point | Non
     fx, fy, torque = load[..., 0], load[..., 1], load[..., 2]
     if point is not None:
         torque = torque - (point.x - body.x) * fy + (point.y - body.y) * fx
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([cos * fx + sin * fy, cos * fy - sin * fx, torque], axis=-1)
+    xp = array_namespace(load, angle)
+    cos, sin = xp.cos(angle), xp.sin(angle)
+    return xp.stack([cos * fx + sin * fy, cos * fy - sin * fx, torque], axis=-1)
 
 
 def _frame(q: Float[Array, "T n"], body: int) -> Frame:
-    x, y, angle = (q[:, 3 * body + k] for k in range(3))
-    return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle))
+    xp, (x, y, angle) = array_namespace(q), (q[:, 3 * body + k] for k in range(3))
+    return Frame(x, y, angle, xp.cos(angle), xp.sin(angle))
 
 
 def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
@@ -189,7 +208,7 @@ def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
         return frames[0].angle if element.axis is None else frames[0].angle + element.axis
     if isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance"):
         line = between(element.points, *frames)
-        return jnp.arctan2(line.y, line.x)
+        return array_namespace(line.x).arctan2(line.y, line.x)
     return frames[-1].angle
 
 
@@ -254,6 +273,15 @@ def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about)
     return [list(loads.values()) for loads in by_body.values()]
 
 
+def _is_unique(coefficients: Any, N: Any, unit: Any, xp: ArrayLibrary) -> Any:
+    """Return whether c^T N = 0, from the coefficients c (rows, T, 3) of components and their rows (T, rows, m) of N.
+
+    `unit` are the units of the components: a torque over the length is a force.
+    """
+    size = xp.max(xp.linalg.norm(coefficients, axis=0) / unit, axis=-1, keepdims=True)
+    return xp.linalg.norm(xp.einsum("rtc,trk->tck", coefficients, N), axis=-1) <= UNIQUE_TOL * unit * size
+
+
 @deferred
 def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
     """Return whether equilibrium determines each component of `_loads`, from Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
@@ -263,15 +291,63 @@ def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
 
     Psi_q, N = jax.vmap(terms)(ts, q)
     rows = [name for name, _ in analysis.row_names]
-    unit = jnp.stack([1.0, 1.0, analysis.length])  # units of the components: a torque over the length is a force
-
-    def unique(coefficients: Array, N: Array) -> Array:
-        """Return whether c^T N = 0, from the coefficients c (rows, T, 3) of a component and its rows (T, rows, m) of N."""
-        size = jnp.max(jnp.linalg.norm(coefficients, axis=0) / unit, axis=-1, keepdims=True)
-        return jnp.linalg.norm(jnp.einsum("rtc,trk->tck", coefficients, N), axis=-1) <= UNIQUE_TOL * unit * size
-
+    unit = jnp.stack([1.0, 1.0, analysis.length])
+    unique, rows_of = partial(_is_unique, unit=unit, xp=jnp), _rows_by_owner(rows)
     by_body = _split_by_body(mechanism, rows, q, Psi_q / analysis.scales.rows[:, None], lambda c: c, frame, about)
     return [
-        [unique(coefficients, N[:, [k for k, n in enumerate(rows) if n == name]]) for coefficients in loads.values()]
+        [unique(coefficients, N[:, np.array(rows_of[name])]) for coefficients in loads.values()]
         for name, loads in by_body.items()
     ]
+
+
+# --- by NumPy, in pieces
+
+
+def _loads_by_numpy(
+    mechanism: Mechanism,
+    analysis: Analysis,
+    history: History,
+    method: Pseudoinverse,
+    baumgarte: Baumgarte | None,
+    frame: Axes,
+    about: About,
+) -> list[list[Array]]:
+    """Compute what `_loads` computes."""
+    arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
+
+    def of_piece(ts: np.ndarray, q: np.ndarray, v: np.ndarray) -> ByBody:
+        found = arrays.solve(ts, q, v, analysis, method, baumgarte)
+        by_row = -arrays.dense(found.entries) * found.multipliers[:, :, None]
+        return _split_by_body(numbers, rows, q, by_row, lambda load: load.sum(0), frame, about)
+
+    numbers = jax.tree.map(np.asarray, mechanism)
+    return _joined(arrays, history, of_piece)
+
+
+def _uniqueness_by_numpy(
+    mechanism: Mechanism, analysis: Analysis, history: tuple[np.ndarray, np.ndarray], rank_tol: Any, frame: Axes, about: About
+) -> list[list[Array]]:
+    """Return what `_uniqueness_of_loads` returns."""
+    arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
+    rows_of, scales = _rows_by_owner(rows), np.asarray(analysis.scales.rows)
+    unit = np.stack([1.0, 1.0, float(analysis.length)])
+
+    def of_piece(ts: np.ndarray, q: np.ndarray) -> ByBody:
+        N, _ = arrays.left_null_space(ts, q, analysis, float(rank_tol))
+        by_row = arrays.jacobian(ts, q) / scales[:, None]
+        by_body = _split_by_body(numbers, rows, q, by_row, lambda c: c, frame, about)
+        return {
+            name: {body: _is_unique(c, N[:, rows_of[name]], unit, np) for body, c in loads.items()}
+            for name, loads in by_body.items()
+        }
+
+    numbers = jax.tree.map(np.asarray, mechanism)
+    return _joined(arrays, history, of_piece)
+
+
+def _joined(arrays: StateArrays, history: tuple[np.ndarray, ...], of_piece: Callable[..., ByBody]) -> list[list[Array]]:
+    """Evaluate a quantity of each constraint and body in pieces of a history, and join them."""
+    pieces = [of_piece(*(x[p] for x in history)) for p in arrays.pieces(len(history[0]))]
+    return jax.device_put(
+        [[np.concatenate([piece[name][body] for piece in pieces]) for body in loads] for name, loads in pieces[0].items()]
+    )

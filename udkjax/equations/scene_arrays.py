@@ -2,22 +2,24 @@
 
 from collections.abc import Callable
 from functools import lru_cache
+from operator import attrgetter
 from typing import Generic
 
 import numpy as np
 
 from udkjax.annotations import AnyArray, Time
 from udkjax.arrays import ArrayLibrary
+from udkjax.equations.rest_program import CURVATURE
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.scene.mechanism import Mechanism
 
-ROWS_AND_LOADS = ("psi", "psi_dot", "psi_q", "terms")
+ROWS_AND_LOADS = ("psi", "psi_dot", "psi_q", "terms", "energy")
 
 
 class SceneArrays(Generic[AnyArray]):
-    """Psi, Psi_dot, Psi_q and loads of a mechanism.
+    """Psi, Psi_dot, Psi_q and loads of a mechanism at a state, or by NumPy at many: t (T,), q and v (n, T), results (..., T).
 
     Args:
         programs: The programs of the mechanism's scene.
@@ -37,20 +39,37 @@ class SceneArrays(Generic[AnyArray]):
         """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q in the order of `ScenePrograms.psi_q_entries`."""
         arrays = self._run("geometry", t, q, v)
         _, _, places, factors = self.programs.psi_q_entries
-        return arrays["psi"], arrays["psi_dot"], arrays["psi_q"][places] * factors
+        entries = (arrays["psi_q"][places].T * factors).T
+        return arrays["psi"], arrays["psi_dot"], entries
 
     def loads(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return a_F (n,), and b (m,)."""
         terms = self._run("equation_terms", t, q, v)["terms"]
         return terms[: self.programs.coordinate_count], terms[self.programs.coordinate_count :]
 
-    def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
+    def energy(self, t: Time, q: AnyArray, v: AnyArray) -> AnyArray:
+        """Return the kinetic and the potential energy (2,)."""
+        return self._run("energy", t, q, v)["energy"]
+
+    def loads_at_rest(self, t: Time, q: AnyArray) -> dict[str, AnyArray]:
+        """Return the entries of the loads of force elements and of their derivatives, as `RestProgram.places` orders them."""
+        return self._run("at_rest.loads", t, q, self._xp.zeros_like(q))
+
+    def curvature(self, t: Time, q: AnyArray, multipliers: AnyArray) -> AnyArray:
+        """Return the entries of (lambda^T Psi)_qq, as `RestProgram.places` orders them."""
+        return self._run("at_rest.curvature", t, q, q, multipliers=multipliers)[CURVATURE]
+
+    def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
         """Run a program whose loops have independent iterations."""
         p, xp = self.programs, self._xp
         evaluate, arrays = _evaluator(p, name, xp)
-        sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count}
-        blank = {x: xp.zeros(size) for x, size in sizes.items() if x in arrays}
-        return evaluate(blank | {"constants": self._constants, "t": xp.reshape(xp.asarray(t, float), (1,)), "q": q, "v": v})
+        sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count, "energy": 2}
+        sizes |= p.at_rest.sizes if name.startswith("at_rest.") else {}
+        many = q.shape[1:]
+        blank = {x: xp.zeros((size, *many)) for x, size in sizes.items() if x in arrays}
+        constants = self._constants[:, None] if many else self._constants
+        state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}
+        return evaluate(blank | state | given)
 
 
 def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndarray]]:
@@ -74,5 +93,5 @@ def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -
 @lru_cache(maxsize=256)
 def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[ArrayLoops, set[str]]:
     """Return a program as a function of its arrays, and the names of these arrays."""
-    program = getattr(programs, name)
+    program = attrgetter(name)(programs)
     return ArrayLoops(program, xp), program.arrays | set(ROWS_AND_LOADS)

@@ -13,6 +13,7 @@ import numpy as np
 
 from udkjax.annotations import TreeDef
 from udkjax.equations.differentiable_programs import DifferentiablePrograms
+from udkjax.equations.rest_program import RestProgram, write_rest_program
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
@@ -53,6 +54,8 @@ class ScenePrograms(RunPrograms):
         self._solver = SceneSolver(self._terms, policy)
         self.scratch, self.row_names, self.has_piecewise_loads = layout.sizes, layout.row_names, layout.has_piecewise_loads
         self.coordinate_count, self.row_count = layout.coordinate_count, layout.row_count
+        # The numbers of values that `equation_terms` and `scales` return.
+        self.term_count, self.scale_count = self.coordinate_count + self.row_count, ROWS + self.row_count
         self.constants = range(layout.constant_count)
         starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])
         places = [np.arange(a, b).reshape(s) for a, b, (s, _) in zip(starts, starts[1:], shapes, strict=False)]
@@ -64,11 +67,6 @@ class ScenePrograms(RunPrograms):
         """The sizes of all arrays of a state that derivatives may need."""
         n = self.coordinate_count
         return self.scratch | {"q1": n, "v1": n}
-
-    @property
-    def scale_count(self) -> int:
-        """The number of values that `scales` returns."""
-        return ROWS + self.row_count
 
     @property
     def piece_count(self) -> int:
@@ -301,6 +299,11 @@ class ScenePrograms(RunPrograms):
     def scales(self) -> ScaleProgram:
         """Compute scales, the characteristic scales at the guess, from `numbers`: those of the scene and the two thresholds."""
         return write_scales(self._terms, self._places, self._number_count, self.prologue)
+
+    @cached_property
+    def at_rest(self) -> RestProgram:
+        """The programs for statics."""
+        return write_rest_program(self._terms)
 
     @cached_property
     def differentiable(self) -> DifferentiablePrograms:

@@ -29,6 +29,7 @@ _BY_FLOATS = {  # NaN propagates
 }
 _NEUTRAL = {ADD: 0.0, MAXIMUM: -math.inf, ALL: math.inf}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
+_NOT_USED = np.zeros(1)  # value of an input that a program does not use
 MAX_UPDATES = 8  # number of updates of one place that JAX unrolls; more become a loop
 
 
@@ -125,7 +126,8 @@ class LaidOutPart(NamedTuple):
 class ArrayLoops:
     """A loop program as a function of its arrays, by NumPy or JAX; no row of a loop may read a number that another row writes.
 
-    The indices of all numbers are computed once, for all calls.
+    The indices of all numbers are computed once, for all calls. By NumPy, arrays may have a second axis of many states, or of
+    length one if they are the same for all.
     """
 
     def __init__(self, program: LoopProgram, xp: ModuleType):
@@ -143,7 +145,7 @@ class ArrayLoops:
             for part in self._parts:
                 _run_by_jax(part, results)
             return results
-        if self._short_parts:
+        if self._short_parts and all(np.ndim(x) < 2 for x in arrays.values()):
             try:
                 return self._run_on_floats(arrays, self._short_parts)
             except (ArithmeticError, ValueError):  # a number is not finite
@@ -188,12 +190,16 @@ def _run_by_numpy(part: LaidOutPart, arrays: dict[str, np.ndarray]) -> None:
         return
     results: Any = [part.run]
     if isinstance(part.run, ScalarProgram):
-        results = part.run.by_numpy([arrays[name][places] if name else places for name, places in part.inputs])
+        results = part.run.by_numpy([arrays[name][places] if name else _NOT_USED for name, places in part.inputs])
     for x, (name, places, update) in zip(results, part.outputs, strict=True):
+        target = arrays[name]
         if update == SET:
-            arrays[name][places] = x
-        else:
-            _BY_ARRAYS[update].at(arrays[name], places, x)
+            target[places] = x
+        elif target.ndim == 1:
+            _BY_ARRAYS[update].at(target, places, x)
+        else:  # row by row: `at` is slow with a second axis
+            for k, row in zip(places, np.broadcast_to(x, (part.count, *np.shape(x)[1:])), strict=True):
+                target[k] = _BY_ARRAYS[update](target[k], row)
 
 
 def _run_on_floats(part: LaidOutPart, arrays: dict[str, list[float]]) -> None:

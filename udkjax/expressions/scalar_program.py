@@ -91,12 +91,14 @@ class ScalarProgram:
         return self._traced(self._typed(values))
 
     def by_numpy(self, values: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Evaluate the program on arrays (rows,), element by element, without compiling anything."""
-        shape = (len(values[0]) if values else 1,)
+        """Evaluate the program on arrays of compatible shapes, element by element, without compiling anything."""
+        shapes = {np.shape(x) for x in values} or {(1,)}
+        shape = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
         with np.errstate(all="ignore"):
-            if self._calls_arrays:  # row by row
-                results = [self([float(v[k]) for v in values]) for k in range(shape[0])]
-                return [np.array(x, float) for x in zip(*results, strict=True)]
+            if self._calls_arrays:  # one element after another
+                columns = [np.broadcast_to(v, shape).ravel().tolist() for v in values]
+                results = [self(row) for row in zip(*columns, strict=True)] if columns else [self([])]
+                return [np.array(x, float).reshape(shape) for x in zip(*results, strict=True)]
             results = self._steps_on_arrays(values)
         return [x if np.shape(x) == shape else np.broadcast_to(x, shape) for x in results]
 

@@ -8,7 +8,7 @@ then computed as |A^T u|, so that squaring A does not lose digits.
 from typing import Any, TypeAlias
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import eigsh, splu
 
 SparseMatrix: TypeAlias = Any  # SciPy's type stubs lack the shape
@@ -35,13 +35,12 @@ class SmallSingularValues:
         start: left singular vectors of a similar matrix, (m, k), from which fewer iterations are needed.
     """
 
-    def __init__(self, A: csr_array, tol: float, start: np.ndarray | None = None):
+    def __init__(self, A: SparseMatrix, tol: float, start: np.ndarray | None = None):
         self._A, self._tol = A, tol
-        squares = A.multiply(A).sum(axis=1)
-        self._bounds = (
-            float(np.sqrt(squares.max(initial=0.0))),
-            float(np.sqrt(abs(A).sum(axis=0).max(initial=0.0) * abs(A).sum(axis=1).max(initial=0.0))),
-        )  # of the largest singular value
+        self._rows = A.shape[0]
+        squares, *sums = (np.asarray(x) for x in (A.multiply(A).sum(axis=1), abs(A).sum(axis=0), abs(A).sum(axis=1)))
+        lengths, (across, down) = np.sqrt(squares), (float(x.max(initial=0.0)) for x in sums)
+        self._bounds = float(lengths.max(initial=0.0)), float(np.sqrt(across * down))  # of the largest singular value
         self._damping = (tol * self._bounds[1]) ** 2
         self._largest: float | None = None
         self.values, self.vectors = self._iterate(start)
@@ -52,7 +51,8 @@ class SmallSingularValues:
         """The largest singular value."""
         if self._largest is None:
             A = self._A
-            square = eigsh(A @ A.T, k=1, v0=np.ones(A.shape[0]), tol=LARGEST_TOL, return_eigenvectors=False)
+            tol: Any = LARGEST_TOL  # an int according to SciPy's type stubs
+            square = eigsh(A @ A.T, k=1, v0=np.ones(self._rows), tol=tol, return_eigenvectors=False)
             self._largest = float(np.sqrt(square[0]))
         return self._largest
 
@@ -75,7 +75,7 @@ class SmallSingularValues:
 
     def _iterate(self, start: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest values, ascending, with one above zero at least, and the left singular vectors (m, k)."""
-        random, rows, factor = np.random.default_rng(0), self._A.shape[0], factor_gram(self._A, self._damping)
+        random, rows, factor = np.random.default_rng(0), self._rows, factor_gram(self._A, self._damping)
         X = random.standard_normal((rows, min(rows, 1 + SPARE))) if start is None else start
         while True:
             values, X, converged = self._iterate_block(factor, X)

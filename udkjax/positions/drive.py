@@ -23,6 +23,7 @@ from udkjax.equations.dense_rows import DenseTerms, KinematicRows
 from udkjax.equations.redundancy import holders_of_driver
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.coordinates import Coordinate, constant_motion, named_element, value_of
+from udkjax.programs.identity_cache import cached_within_trace
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial
 from udkjax.scene.forces import ForceElement
@@ -132,6 +133,15 @@ def only_driver(mechanism: Mechanism) -> str:
 
 def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
     """Return the mechanism without its drivers, with these forces instead of its own if any are given."""
+    return _without_drivers(mechanism) if forces is None else _with_forces_alone(mechanism, forces)
+
+
+@cached_within_trace  # so that later calls reuse its analysis
+def _without_drivers(mechanism: Mechanism) -> Mechanism:
+    return _with_forces_alone(mechanism, None)
+
+
+def _with_forces_alone(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None) -> Mechanism:
     with jax.ensure_compile_time_eval():
         origin = mechanism.origin and Origin(with_drivers(mechanism.origin.mechanism, {}))
     return with_drivers(mechanism, {}, forces, origin)

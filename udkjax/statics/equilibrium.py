@@ -23,8 +23,8 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.mechanism import Mechanism
-from udkjax.statics.linearization import Linearization, linearize, with_unit_mass
-from udkjax.statics.load_scale import LoadScale, load_scale
+from udkjax.statics.linearization import Linearization, Linearizer, TracedLinearizer, linearizer, with_unit_mass
+from udkjax.statics.load_scale import LoadScale
 from udkjax.transforms.gradients import stop_gradients
 
 MOST_NEWTON_STEPS = 100  # steps of limited length: ten are usual, a hundred cross any scene
@@ -186,16 +186,14 @@ def _omega2(at: Linearization, by: ControlFlow) -> Float[Array, "f"]:
 def _equilibrium(
     mechanism: Mechanism, analysis: Analysis, t: Any, start: Any, free: int, stable: bool, by: ControlFlow
 ) -> Equilibrium:
-    curve = _rest_curve(mechanism, analysis, by)
-    scale = by.call(load_scale, mechanism, analysis.scales, t, start)
+    curve, near = _rest_curve(mechanism, analysis, by), linearizer(mechanism, analysis, free, by)
     if by is BY_NUMPY:
-        q = _settle(curve, mechanism, analysis, scale, t, start, free, stable)
+        q = _settle(curve, near, t, start, free, stable)
     else:
-        q = sequential(_settle, *stop_gradients((curve, mechanism, analysis, scale, t, start)), free, stable)
+        q = sequential(_settle, *stop_gradients((curve, near, t, start)), free, stable)
         assert isinstance(curve, Curve)
         q = _rest_position(curve, analysis, t, q, free)
-    xp, scale = by.xp, by.call(load_scale, mechanism, analysis.scales, t, q)
-    at = by.call(linearize, mechanism, analysis, free, t, q)
+    xp, scale, at = by.xp, near.scale(t, q), near.linearize(t, q)
     unbalanced = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
     balanced = curve.is_closed(xp.append(q, t) / curve.units) & (unbalanced <= FORCE_TOL)
     neutral, bodies = SMALLEST_STIFFNESS * scale.stiffness, mechanism.body_names
@@ -203,22 +201,15 @@ def _equilibrium(
 
 
 def _settle(
-    curve: AbstractCurve,
-    mechanism: Mechanism,
-    analysis: Analysis,
-    scale: LoadScale,
-    t: Float[Array, ""],
-    q: Float[Array, "n"],
-    free: int,
-    stable: bool,
+    curve: AbstractCurve, near: Linearizer, t: Float[Array, ""], q: Float[Array, "n"], free: int, stable: bool
 ) -> Float[Array, "n"]:
     """Take Newton steps until a step no longer improves the position."""
     if not free:
         return q
-    by, xp = curve.by, curve.by.xp
+    by, xp, scale = curve.by, curve.by.xp, near.scale(t, q)
 
     def at(q: Float[Array, "n"]) -> Linearization:
-        return by.call(linearize, mechanism, analysis, free, t, q)
+        return near.linearize(t, q)
 
     def is_unsettled(state: Settling) -> Bool[Array, ""]:
         _, current, k, better = state
@@ -282,7 +273,8 @@ def _(primals, tangents):
         closed = ((X - curve.plus(E) @ curve.residual(X)) * curve.units)[:-1]
         if not free:
             return closed
-        linear, scale = linearize(curve.mechanism, analysis, free, t, closed), load_scale(curve.mechanism, analysis.scales, t, q)
+        near = TracedLinearizer(curve.mechanism, analysis, free)
+        linear, scale = near.linearize(t, closed), near.scale(t, q)
         return closed + linear.directions @ _towards_rest(linear, scale, False, curve)
 
     given = (curve, t)

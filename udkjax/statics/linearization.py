@@ -21,9 +21,12 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
+from udkjax.equations.dense_rows import TruncatedPseudoinverse
+from udkjax.equations.rest_terms import RestTerms
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.scene.mechanism import Mechanism
+from udkjax.statics.load_scale import LoadScale, load_scale, scale_of
 
 
 class Linearization(NamedTuple):
@@ -73,6 +76,63 @@ def _null_space(J: Float[Array, "m n"], free: int) -> Float[Array, "n free"]:
     J = jax.lax.stop_gradient(J)
     n = J.shape[1]
     return jnp.linalg.svd(J, full_matrices=True)[2][n - free :].T if len(J) else jnp.eye(n)
+
+
+class NumpyLinearizer:
+    """`linearize` and `load_scale` of a mechanism with concrete numbers, by NumPy, without traces and compilation."""
+
+    def __init__(self, mechanism: Mechanism, analysis: Analysis, free: int):
+        self._terms, self._free = RestTerms(mechanism), free
+        scales = jax.tree.map(np.asarray, analysis.scales)
+        self._weights, self._tol = scales.weights, float(scales.rank_tol)
+        self._units = scales.coordinates(self._terms.size)
+        self._root = 1 / np.sqrt(self._terms.mass)
+
+    def linearize(self, t: Any, q: Any) -> Any:
+        """Return the linearization at rest in a closed position q at time t (s)."""
+        terms, root, w = self._terms, self._root, self._weights
+        loads = terms.loads(t, q)
+        if terms.count:
+            D = w[:, None] * terms.slopes(t, q)[0] * root
+            plus = TruncatedPseudoinverse.of(D, self._tol, full=True)
+            V = plus.vt[terms.size - self._free :].T
+            N = root[:, None] * (V - plus @ (D @ V))
+            multipliers = w * plus.transposed_times(root * loads.force)
+            K = loads.stiffness + terms.curvature(t, q, multipliers)
+        else:
+            N, multipliers, K = np.diag(root), np.zeros(0), loads.stiffness
+        reduced = N.T @ (terms.mass[:, None] * N), N.T @ loads.damping @ N, N.T @ K @ N, N.T @ loads.force
+        found: tuple[Any, ...] = N, *reduced, loads.force, multipliers
+        return Linearization._make(found)
+
+    def scale(self, t: Any, q: Any) -> LoadScale:
+        """Return the scales of forces and stiffnesses at rest."""
+        loads = self._terms.loads(t, q)
+        return scale_of(loads.sizes, loads.stiffness, np.asarray(self._terms.mass), self._units, np)
+
+
+class TracedLinearizer(NamedTuple):
+    """`linearize` and `load_scale` of a mechanism whose numbers may be traced."""
+
+    mechanism: Mechanism
+    analysis: Analysis
+    free: int
+
+    def linearize(self, t: ArrayLike, q: Float[Array, "n"]) -> Linearization:
+        """Return the linearization at rest in a closed position q at time t (s)."""
+        return linearize(self.mechanism, self.analysis, self.free, t, q)
+
+    def scale(self, t: ArrayLike, q: Float[Array, "n"]) -> LoadScale:
+        """Return the scales of forces and stiffnesses at rest."""
+        return load_scale(self.mechanism, self.analysis.scales, t, q)
+
+
+Linearizer = NumpyLinearizer | TracedLinearizer
+
+
+def linearizer(mechanism: Mechanism, analysis: Analysis, free: int, by: ControlFlow) -> Linearizer:
+    """Return the linearizer of a mechanism with `free` degrees of freedom."""
+    return (TracedLinearizer if by is BY_JAX else NumpyLinearizer)(mechanism, analysis, free)
 
 
 def with_unit_mass(at: Linearization, by: ControlFlow) -> tuple[Array, Array]:

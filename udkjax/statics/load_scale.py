@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.annotations import Time
+from udkjax.annotations import AnyArray, Time
+from udkjax.arrays import ArrayLibrary
 from udkjax.equations import loads
 from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
@@ -27,10 +28,16 @@ class LoadScale(NamedTuple):
 def load_scale(mechanism: Mechanism, scales: Scales, t: Time, q: Float[Array, "n"]) -> LoadScale:
     """Return the scales of forces and stiffnesses at rest in a position q at time t (s), without derivatives."""
     mechanism, scales, t, q = jax.lax.stop_gradient((mechanism, scales, t, q))
-    at_rest, root, units = jnp.zeros_like(q), jnp.sqrt(loads.mass(mechanism)), scales.coordinates(len(q))
-    change = jnp.abs(jax.jacfwd(lambda q: loads.force(mechanism, t, q, at_rest))(q)) @ units
-    force = jnp.linalg.norm((load_sizes(mechanism, t, q, at_rest) + change) / root)
-    return LoadScale(force, force / jnp.linalg.norm(root * units))
+    at_rest = jnp.zeros_like(q)
+    slopes = jax.jacfwd(lambda q: loads.force(mechanism, t, q, at_rest))(q)
+    return scale_of(load_sizes(mechanism, t, q, at_rest), slopes, loads.mass(mechanism), scales.coordinates(len(q)), jnp)
+
+
+def scale_of(sizes: AnyArray, slopes: AnyArray, mass: AnyArray, units: AnyArray, xp: ArrayLibrary) -> LoadScale:
+    """Return the scales from absolute loads (n,), F_q (n, n), the diagonal of M and the units of coordinates."""
+    root = xp.sqrt(mass)
+    force = xp.linalg.norm((sizes + xp.abs(slopes) @ units) / root)
+    return LoadScale(force, force / xp.linalg.norm(root * units))
 
 
 def load_sizes(mechanism: Mechanism, t: Time, q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "n"]:

@@ -16,7 +16,7 @@ from udkjax.programs.control_flow import ControlFlow, solve
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.equilibrium import degrees_of_freedom, equilibrium
-from udkjax.statics.linearization import linearize, solver_of_mass, with_unit_mass
+from udkjax.statics.linearization import linearizer, solver_of_mass, with_unit_mass
 from udkjax.transforms.gradients import stop_gradients
 
 
@@ -94,7 +94,7 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
 
 
 def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, by: ControlFlow) -> Modes:
-    xp, at, position = by.xp, by.call(linearize, mechanism, analysis, free, t, q), q.reshape(-1, 3)
+    xp, at, position = by.xp, linearizer(mechanism, analysis, free, by).linearize(t, q), q.reshape(-1, 3)
     if not free:
         no_shapes = xp.zeros((0, *position.shape))
         return Modes(xp.zeros(0), no_shapes, xp.zeros(0, complex), no_shapes + 0j, position, xp.zeros(()), mechanism.body_names)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from udkjax.equations.reactions import reactions, unique_reactions
 from udkjax.positions.channels import StateHistory, has_point
 from udkjax.printing import prints_table, units
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Cam, Revolute
@@ -86,7 +87,8 @@ def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any)
     if len(ts) < 3:
         raise ValueError(f"a peak needs at least 3 output times, not {len(ts)}")
     loads_of_joint = reactions(mechanism, solution, **{"about": "joint", **choices})
-    return {name: {body: _peak(ts, load) for body, load in loads.items()} for name, loads in loads_of_joint.items()}
+    peaks = iter(_peaks(ts, [load for loads in loads_of_joint.values() for load in loads.values()]))
+    return {name: {body: next(peaks) for body in loads} for name, loads in loads_of_joint.items()}
 
 
 @checked
@@ -169,6 +171,14 @@ def envelope(cases: Peaks | Sequence[Peaks]) -> dict[str, dict[str, Envelope]]:
     """
     batch: Peaks = cases if isinstance(cases, Mapping) else jax.tree.map(lambda *xs: jnp.stack(xs), *cases)
     return {name: {body: _envelope(peak) for body, peak in loads.items()} for name, loads in batch.items()}
+
+
+@deferred
+def _peaks(ts: Array, loads: Sequence[Float[Array, "T 3"]]) -> list[Peak]:
+    if not loads:
+        return []
+    found = jax.vmap(_peak, in_axes=(None, 0))(ts, jnp.stack(loads))
+    return [jax.tree.map(lambda x, k=k: x[k], found) for k in range(len(loads))]
 
 
 def _peak(ts: Array, load: Float[Array, "T 3"]) -> Peak:
