@@ -13,6 +13,7 @@ from udkjax.arrays import ROUNDING
 from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.position_rows import PositionRows
+from udkjax.equations.rest_program import CURVATURE, DAMPING, LOADS, STIFFNESS
 from udkjax.equations.scales import Scales, concrete_scales
 from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
@@ -78,8 +79,22 @@ class RowTerms:
         return results[0] if position == _key(t, q) else self._arrays_at(t).psi(t, q)
 
 
+class RestingLoads(NamedTuple):
+    """Loads of a mechanism at rest, and their derivatives."""
+
+    force: np.ndarray  # F (n,)
+    sizes: np.ndarray  # (n,) the sum of the absolute loads of gravity and of each force element
+    stiffness: np.ndarray  # -F_q (n, n)
+    damping: np.ndarray  # -F_v (n, n)
+
+
 class DenseTerms(RowTerms):
-    """Psi and its derivatives, of a mechanism with concrete numbers, as dense matrices."""
+    """Psi and its derivatives, and loads at rest, of a mechanism with concrete numbers, as dense matrices."""
+
+    def __init__(self, mechanism: Mechanism):
+        super().__init__(mechanism)
+        self.mass = np.asarray(mass_of(mechanism, np))  # the diagonal of M
+        self._gravity, self._programs = mechanism.gravity, scene_programs(mechanism)
 
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
@@ -93,6 +108,30 @@ class DenseTerms(RowTerms):
         free, b = self._arrays_at(t).loads(t, q, v)
         return b + self.slopes(t, q)[0] @ free
 
+    def loads_at_rest(self, t: Time, q: np.ndarray) -> RestingLoads:
+        """Return the loads at rest in a position, and their derivatives."""
+        entries, weight = self._arrays_at(t).loads_at_rest(t, q), self._weight
+        force, sizes = weight.copy(), np.abs(weight)
+        if LOADS in entries:
+            rows = self._programs.at_rest.places[LOADS].rows
+            np.add.at(force, rows, entries[LOADS])
+            np.add.at(sizes, rows, np.abs(entries[LOADS]))
+        return RestingLoads(force, sizes, *(self._matrix(name, entries.get(name)) for name in (STIFFNESS, DAMPING)))
+
+    def curvature(self, t: Time, q: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        """Return (lambda^T Psi)_qq (n, n)."""
+        return self._matrix(CURVATURE, self._arrays_at(t).curvature(t, q, multipliers))
+
+    @property
+    def _weight(self) -> np.ndarray:
+        return self.mass * np.tile([*np.asarray(self._gravity, float), 0.0], self.size // 3)
+
+    def _matrix(self, name: str, entries: np.ndarray | None) -> np.ndarray:
+        matrix = np.zeros((self.size, self.size))
+        if entries is not None:
+            np.add.at(matrix, tuple(self._programs.at_rest.places[name]), entries)
+        return matrix
+
 
 class DenseRows(DenseTerms):
     """The rows of a mechanism with concrete numbers, by NumPy on the scene's programs. The metric is M^(-1/2)."""
@@ -100,7 +139,7 @@ class DenseRows(DenseTerms):
     def __init__(self, mechanism: Mechanism, scales: Scales):
         super().__init__(mechanism)
         self.scales = jax.tree.map(np.asarray, scales)
-        self.metric, self._tol = 1 / np.sqrt(mass_of(mechanism, np)), float(scales.rank_tol)
+        self.metric, self._tol = 1 / np.sqrt(self.mass), float(scales.rank_tol)
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi and Psi_dot."""

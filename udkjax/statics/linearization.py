@@ -21,8 +21,7 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.dense_rows import TruncatedPseudoinverse
-from udkjax.equations.rest_terms import RestTerms
+from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.scene.mechanism import Mechanism
@@ -82,7 +81,7 @@ class NumpyLinearizer:
     """`linearize` and `load_scale` of a mechanism with concrete numbers, by NumPy, without traces and compilation."""
 
     def __init__(self, mechanism: Mechanism, analysis: Analysis, free: int):
-        self._terms, self._free = RestTerms(mechanism), free
+        self._terms, self._free = DenseTerms(mechanism), free
         scales = jax.tree.map(np.asarray, analysis.scales)
         self._weights, self._tol = scales.weights, float(scales.rank_tol)
         self._units = scales.coordinates(self._terms.size)
@@ -91,24 +90,24 @@ class NumpyLinearizer:
     def linearize(self, t: Any, q: Any) -> Any:
         """Return the linearization at rest in a closed position q at time t (s)."""
         terms, root, w = self._terms, self._root, self._weights
-        loads = terms.loads(t, q)
+        at_rest = terms.loads_at_rest(t, q)
         if terms.count:
             D = w[:, None] * terms.slopes(t, q)[0] * root
             plus = TruncatedPseudoinverse.of(D, self._tol, full=True)
             V = plus.vt[terms.size - self._free :].T
             N = root[:, None] * (V - plus @ (D @ V))
-            multipliers = w * plus.transposed_times(root * loads.force)
-            K = loads.stiffness + terms.curvature(t, q, multipliers)
+            multipliers = w * plus.transposed_times(root * at_rest.force)
+            K = at_rest.stiffness + terms.curvature(t, q, multipliers)
         else:
-            N, multipliers, K = np.diag(root), np.zeros(0), loads.stiffness
-        reduced = N.T @ (terms.mass[:, None] * N), N.T @ loads.damping @ N, N.T @ K @ N, N.T @ loads.force
-        found: tuple[Any, ...] = N, *reduced, loads.force, multipliers
+            N, multipliers, K = np.diag(root), np.zeros(0), at_rest.stiffness
+        reduced = N.T @ (terms.mass[:, None] * N), N.T @ at_rest.damping @ N, N.T @ K @ N, N.T @ at_rest.force
+        found: tuple[Any, ...] = N, *reduced, at_rest.force, multipliers
         return Linearization._make(found)
 
     def scale(self, t: Any, q: Any) -> LoadScale:
         """Return the scales of forces and stiffnesses at rest."""
-        loads = self._terms.loads(t, q)
-        return scale_of(loads.sizes, loads.stiffness, np.asarray(self._terms.mass), self._units, np)
+        at_rest = self._terms.loads_at_rest(t, q)
+        return scale_of(at_rest.sizes, at_rest.stiffness, self._terms.mass, self._units, np)
 
 
 class TracedLinearizer(NamedTuple):
