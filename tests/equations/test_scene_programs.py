@@ -12,8 +12,8 @@ import udkjax as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations.dense_rows import DenseTerms
-from udkjax.equations.scene_arrays import SceneArrays, _evaluator, arrays_in_time
-from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
+from udkjax.equations.scene_programs import _scene_programs, scene_programs
 from udkjax.expressions import loop_program
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.deferred import deferred
@@ -268,7 +268,7 @@ def test_floats_and_arrays_find_the_same(monkeypatch):
 
     def evaluate(few):
         monkeypatch.setattr(loop_program, "FEW_ROWS", few)
-        _evaluator.cache_clear()
+        _scene_programs.cache_clear()
         at = arrays_in_time(mechanism)(0.3)
         return [np.concatenate([at.psi(0.3, q), *at.geometry(0.3, q, v), *at.loads(0.3, q, v)]) for q, v in states]
 

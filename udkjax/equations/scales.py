@@ -4,7 +4,6 @@ analysis.py defines them. One program (scale_program.py) computes them: NumPy ru
 a trace, and JAX on other devices.
 """
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +21,7 @@ from udkjax.equations.structure import join_concrete_numbers, numbers_as_vector
 from udkjax.expressions.loop_program import ArrayLoops
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
 from udkjax.scene.mechanism import Mechanism
@@ -99,7 +99,7 @@ def _evaluate(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> A
         return _loops(programs, xp)(arrays | {"numbers": numbers})["scales"]
 
 
-@lru_cache(maxsize=256)
+@cached_by_identity
 def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
     return ArrayLoops(programs.scales.program, xp)
 

@@ -1,7 +1,6 @@
 """The programs of a scene on arrays, without machine code: by NumPy, without compilation, or by JAX."""
 
 from collections.abc import Callable
-from functools import lru_cache
 from operator import attrgetter
 from typing import Generic
 
@@ -13,6 +12,7 @@ from udkjax.equations.rest_program import CURVATURE
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.expressions.loop_program import ArrayLoops
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 ROWS_AND_LOADS = ("psi", "psi_dot", "psi_q", "terms", "energy")
@@ -57,7 +57,8 @@ class SceneArrays(Generic[AnyArray]):
 
     def curvature(self, t: Time, q: AnyArray, multipliers: AnyArray) -> AnyArray:
         """Return the entries of (lambda^T Psi)_qq, as `RestProgram.places` orders them."""
-        return self._run("at_rest.curvature", t, q, q, multipliers=multipliers)[CURVATURE]
+        found = self._run("at_rest.curvature", t, q, q, multipliers=multipliers)
+        return found[CURVATURE] if CURVATURE in found else self._xp.zeros(0)
 
     def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
         """Run a program whose loops have independent iterations."""
@@ -90,7 +91,7 @@ def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -
     return evaluate(arrays)["constants"]
 
 
-@lru_cache(maxsize=256)
+@cached_by_identity
 def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[ArrayLoops, set[str]]:
     """Return a program as a function of its arrays, and the names of these arrays."""
     program = attrgetter(name)(programs)

@@ -32,10 +32,13 @@ from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
 from udkjax.native.runs import RunCotangents, goes_back
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.numpy_program import evaluate_as
+from udkjax.programs.sized_cache import cached_by_size
 from udkjax.programs.varying_axes import result_type
 from udkjax.threads import cores, thread_count
 
+CODE_BYTES = 2  # memory of loaded code, with its text and the programs of its scene, for each character of the text
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
@@ -43,7 +46,7 @@ TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
 FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=8)  # the code of the host and of a graphics card share a module, which takes ten times as much memory
 def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
     """Write the module of an operation in `width` lanes; raise `UnsupportedError` if machine code does not support it.
 
@@ -55,7 +58,7 @@ def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
     return module
 
 
-@lru_cache(maxsize=256)
+@cached_by_identity
 def unsupported(code: RunPrograms) -> str:
     """Return the unsupported operations of a scene; empty if there are none.
 
@@ -78,13 +81,19 @@ class LoadedCode:
     """
 
     def __init__(self, operation: Operation, width: int, tangent_lanes: int):
-        self._operation, self._module = operation, generate(operation, width, tangent_lanes)
-        self._field_count, self._share = len(self._module.call_fields), operation.share
+        self._operation, module = operation, generate(operation, width, tangent_lanes)
+        self._text, self._directions_in = module.written_text, module.directions_in
+        self._field_count, self._share = len(module.call_fields), operation.share
         settings = operation.all_settings
         self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
-        self._seconds = QUICK_SECONDS_OF_LINE * self._module.written_text.count("\n") if operation.code.is_small else 0.0
-        names = (*INPUTS, *self._module.inputs, *self._module.results, *self._module.outputs)
-        self._lengths = [names.index(name) for name in self._module.lengths]
+        self._seconds = QUICK_SECONDS_OF_LINE * self._text.count("\n") if operation.code.is_small else 0.0
+        names = (*INPUTS, *module.inputs, *module.results, *module.outputs)
+        self._lengths = [names.index(name) for name in module.lengths]
+
+    @property
+    def size(self) -> int:
+        """An estimate of its memory in bytes, with that of the scene's programs."""
+        return CODE_BYTES * len(self._text)
 
     @property
     def name(self) -> str:
@@ -99,11 +108,11 @@ class LoadedCode:
     @cached_property
     def _optimized(self) -> Code:
         self._seconds = 0.0
-        return load(self._module.written_text)
+        return load(self._text)
 
     @cached_property
     def _quick(self) -> Code:
-        return load(self._module.written_text, machine.QUICK)
+        return load(self._text, machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
@@ -149,7 +158,7 @@ class LoadedCode:
         members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
         arrays, following = (*inputs, *outputs), (ctypes.c_int64 * 2)()
         record = (  # the fields in the order of `Memory.call_fields`
-            *(members, times, knots, inputs[-1].shape[self._module.directions_in]),
+            *(members, times, knots, inputs[-1].shape[self._directions_in]),
             *(x.__array_interface__["data"][0] for x in inputs),
             *(x.size // len(x) if len(x) > 1 else 0 for x in inputs),
             *(x.__array_interface__["data"][0] for x in outputs),
@@ -191,7 +200,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(cores())
 
 
-@lru_cache(maxsize=256)
+@cached_by_size(lambda code: code.size)
 def machine_code(operation: Operation, width: int, tangent_lanes: int) -> LoadedCode:
     """Return the machine code of an operation."""
     return LoadedCode(operation, width, tangent_lanes)
