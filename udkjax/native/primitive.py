@@ -3,6 +3,7 @@
 import ctypes
 import math
 import time
+import zlib
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -38,7 +39,7 @@ from udkjax.programs.sized_cache import cached_by_size
 from udkjax.programs.varying_axes import result_type
 from udkjax.threads import cores, thread_count
 
-CODE_BYTES = 2  # memory of loaded code, with its text and the programs of its scene, for each character of the text
+CODE_BYTES = 1  # memory of loaded code, with the programs of its scene, for each character of the text
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
@@ -82,18 +83,16 @@ class LoadedCode:
 
     def __init__(self, operation: Operation, width: int, tangent_lanes: int):
         self._operation, module = operation, generate(operation, width, tangent_lanes)
-        self._text, self._directions_in = module.written_text, module.directions_in
+        self._packed_text, self._directions_in = zlib.compress((text := module.written_text).encode(), 1), module.directions_in
         self._field_count, self._share = len(module.call_fields), operation.share
-        settings = operation.all_settings
-        self._step_limit = settings.index("max_steps") if "max_steps" in settings else None
-        self._seconds = QUICK_SECONDS_OF_LINE * self._text.count("\n") if operation.code.is_small else 0.0
+        self._step_limit = {name: k for k, name in enumerate(operation.all_settings)}.get("max_steps")
+        self._seconds = QUICK_SECONDS_OF_LINE * text.count("\n") if operation.code.is_small else 0.0
         names = (*INPUTS, *module.inputs, *module.results, *module.outputs)
         self._lengths = [names.index(name) for name in module.lengths]
+        self.size = CODE_BYTES * len(text)  # an estimate of its memory, with that of the scene's programs
 
-    @property
-    def size(self) -> int:
-        """An estimate of its memory in bytes, with that of the scene's programs."""
-        return CODE_BYTES * len(self._text)
+    def _load(self, level: int) -> Code:
+        return load(zlib.decompress(self._packed_text).decode(), level)
 
     @property
     def name(self) -> str:
@@ -108,11 +107,11 @@ class LoadedCode:
     @cached_property
     def _optimized(self) -> Code:
         self._seconds = 0.0
-        return load(self._text)
+        return self._load(machine.LEVEL)
 
     @cached_property
     def _quick(self) -> Code:
-        return load(self._text, machine.QUICK)
+        return self._load(machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""

@@ -16,6 +16,7 @@ All means of avoiding repeated work in the package, and their uses:
     native call_seldom              a rarely reached part of a compiled program: NumPy evaluates it there
     cached_by_identity              a result that does not depend on numbers: cached by the identity of objects
     cached_within_trace             a result whose numbers may be traced: cached likewise, within the trace
+    cached_by_size                  programs and machine code, which take megabytes: bounded by their memory in all
 """
 
 from collections.abc import Callable, Hashable, Sequence

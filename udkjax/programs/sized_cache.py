@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar, cast
 Arguments = ParamSpec("Arguments")
 Result_co = TypeVar("Result_co", covariant=True)
 
-MOST_BYTES = 2**27  # of all results together, by the estimates that the functions give
+MOST_BYTES = 2**26  # of all results together, by the estimates that the functions give
 
 
 class SizedFunction(Protocol[Arguments, Result_co]):
