@@ -1,6 +1,8 @@
 """The number of threads that computations use: the cores of this process, or fewer as set by `UDKJAX_THREADS`."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 from udkjax.requirements import ArgumentError
 
@@ -26,3 +28,9 @@ def thread_count() -> int:
     """Return the number of threads that a computation may use."""
     limit = thread_limit()
     return cores() if limit is None else min(limit, cores())
+
+
+@cache
+def shared_threads() -> ThreadPoolExecutor:
+    """Return the threads that calls of machine code share, as starting a thread takes longer than short runs."""
+    return ThreadPoolExecutor(cores())

@@ -9,14 +9,14 @@ import pytest
 import udkjax as udk
 from udkjax.native import primitive
 from udkjax.native.base import loading
-from udkjax.programs import sized_cache
-from udkjax.programs.sized_cache import cached_by_size
+from udkjax.programs import identity_cache
+from udkjax.programs.identity_cache import cached_by_size
 
 
 @pytest.fixture
 def most(monkeypatch):
-    monkeypatch.setattr(sized_cache, "_STORED", type(sized_cache._STORED)())
-    monkeypatch.setattr(sized_cache, "MOST_BYTES", 100)
+    monkeypatch.setattr(identity_cache, "_STORED", type(identity_cache._STORED)())
+    monkeypatch.setattr(identity_cache, "MOST_BYTES", 100)
 
 
 def test_the_least_recently_used_results_of_all_functions_are_dropped(most):
@@ -32,16 +32,16 @@ def test_the_least_recently_used_results_of_all_functions_are_dropped(most):
 
     one, other = sized("one"), sized("other")
     one(40), other(41), one(40), one(42)  # 41 has to go: 40 was used after it
-    assert sized_cache.stored_bytes() == 82
+    assert identity_cache.stored_bytes() == 82
     one(40), one(42)
     assert made == [("one", 40), ("other", 41), ("one", 42)]
     other(41)
-    assert made[-1] == ("other", 41) and sized_cache.stored_bytes() <= 100
-    assert other(1000) == 1000 and sized_cache.stored_bytes() == 1000  # the latest stays, whatever its size
+    assert made[-1] == ("other", 41) and identity_cache.stored_bytes() <= 100
+    assert other(1000) == 1000 and identity_cache.stored_bytes() == 1000  # the latest stays, whatever its size
     info = one.cache_info()
     assert (info.hits, info.misses, info.currsize) == (3, 2, 0)
     other.cache_clear()
-    assert sized_cache.stored_bytes() == 0
+    assert identity_cache.stored_bytes() == 0
 
 
 def test_machine_code_that_is_dropped_is_unloaded_unless_compiled_programs_call_it(most):
@@ -50,7 +50,7 @@ def test_machine_code_that_is_dropped_is_unloaded_unless_compiled_programs_call_
     def run(count):
         bodies = {f"b{k}": udk.Body(1.0, 0.1, [k + 0.5, 0.0]) for k in range(count)}
         udk.simulate(udk.Mechanism(bodies, {"A": udk.Revolute(["ground", "b0"], [[0, 0], [-0.5, 0]])}), np.array([0.0, 0.1]))
-        (code,) = (x for x, _ in sized_cache._STORED.values() if isinstance(x, primitive.LoadedCode))
+        (code,) = (x for x, _ in identity_cache._STORED.values() if isinstance(x, primitive.LoadedCode))
         return code
 
     code = run(1)

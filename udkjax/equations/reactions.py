@@ -91,7 +91,9 @@ def reactions(
     soft = None if compliances is None else _compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
     if soft is None and by_numpy(mechanism, (states, analysis, stabilization), method):
-        loads = _loads_by_numpy(mechanism.without_origin, analysis, history_of(solution), method, stabilization, frame, about)
+        loads = _loads_by_numpy(
+            mechanism.without_origin, analysis, history_of(solution), method, stabilization, frame=frame, about=about
+        )
     else:
         loads = _loads(mechanism.without_origin, analysis, *states, method, stabilization, soft, frame, about)
     return _name_by_body(mechanism, loads)
@@ -304,19 +306,13 @@ def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
 
 
 def _loads_by_numpy(
-    mechanism: Mechanism,
-    analysis: Analysis,
-    history: History,
-    method: Pseudoinverse,
-    baumgarte: Baumgarte | None,
-    frame: Axes,
-    about: About,
+    mechanism: Mechanism, analysis: Analysis, history: History, *choices: Any, frame: Axes, about: About
 ) -> list[list[Array]]:
     """Compute what `_loads` computes."""
     arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
 
     def of_piece(ts: np.ndarray, q: np.ndarray, v: np.ndarray) -> ByBody:
-        found = arrays.solve(ts, q, v, analysis, method, baumgarte)
+        found = arrays.solve(ts, q, v, analysis, *choices)
         by_row = -arrays.dense(found.entries) * found.multipliers[:, :, None]
         return _split_by_body(numbers, rows, q, by_row, lambda load: load.sum(0), frame, about)
 

@@ -6,8 +6,7 @@ import time
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, cached_property, lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -33,11 +32,10 @@ from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
 from udkjax.native.runs import RunCotangents, goes_back
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity, cached_by_size
 from udkjax.programs.numpy_program import evaluate_as
-from udkjax.programs.sized_cache import cached_by_size
 from udkjax.programs.varying_axes import result_type
-from udkjax.threads import cores, thread_count
+from udkjax.threads import shared_threads, thread_count
 
 CODE_BYTES = 1  # memory of loaded code, with the programs of its scene, for each character of the text
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
@@ -184,19 +182,13 @@ class PreparedCall(NamedTuple):
     def __call__(self) -> list[np.ndarray]:
         """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
         self.shared[:], address = (0, 0), ctypes.addressof(self.record)
-        others = [_pool().submit(self.run, address) for _ in range(self.threads - 1)]
+        others = [shared_threads().submit(self.run, address) for _ in range(self.threads - 1)]
         self.run(address)
         for other in others:
             other.result()
         if self.shared[1]:
             raise MemoryError("no memory for a computation by machine code")
         return self.outputs
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    """Return the threads that calls share, as starting a thread takes longer than short runs."""
-    return ThreadPoolExecutor(cores())
 
 
 @cached_by_size(lambda code: code.size)
