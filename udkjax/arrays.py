@@ -108,7 +108,9 @@ class QuickMethods(eqx.Module):
             found = object.__getattribute__(self, name)
             if type(found) is MethodType and found.__self__ is self and not name.startswith("__"):
                 described = {key: getattr(found, key) for key in _DESCRIPTION if hasattr(found, key)}
-                return make_module(_METHOD, **described, __func__=found.__func__, __self__=self)
+                method = object.__new__(_METHOD)
+                vars(method).update(described, __func__=found.__func__, __self__=self)
+                return method
             return found
 
 

@@ -190,7 +190,7 @@ def _choice(known: tuple[Any, ...]) -> ArgumentCheck:
 
 def require_single(name: str, value: Any, given: GivenArguments) -> None:
     """Require a single mechanism, not a batch."""
-    if isinstance(value, Mechanism) and (shape := np.shape(value.gravity)) != (2,):
+    if isinstance(value, Mechanism) and (shape := np.shape(value._source.gravity)) != (2,):
         cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
         raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
 
