@@ -12,7 +12,7 @@ from udkjax.positions.coordinates import Coordinate, element_of
 from udkjax.positions.counting import Count, count_of
 from udkjax.positions.drive import Drive, only_driver
 from udkjax.positions.linkage_type import FourBarType, Mobility, Pins, four_bars, mobility, pins_with_bodies
-from udkjax.positions.turning_points import Cycle, TurningPoint, Weights
+from udkjax.positions.turning_points import Combination, Cycle, TurningPoint
 from udkjax.printing import PrintedTable, PrintsTable, format_number
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
@@ -121,7 +121,7 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
     return Characteristics(mobility(mechanism), bars, cycle.turns, limits, outputs, angles, ratios, count_of(mechanism, driver))
 
 
-def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, Weights]]:
+def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, Combination]]:
     """Return the angle or the displacement of each link that a joint connects to the ground, apart from the driven one."""
     found = {}
     for name, joint in mechanism.joints.items():
@@ -133,20 +133,20 @@ def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, W
         if isinstance(joint, Revolute):
             weights[k, 2] = 1.0
             if not (driven.coordinate == "angle" and {*driven.bodies} == {GROUND, body}):
-                found[body] = ("swings", Weights(weights))
+                found[body] = ("swings", Combination(weights))
         elif isinstance(joint, Prismatic):
             axis = float(np.asarray(joint.axis)) if joint.bodies[0] == GROUND else None
             if axis is not None and driven.bodies != joint.bodies:
                 weights[k, :2] = np.cos(axis), np.sin(axis)
-                found[body] = ("slides", Weights(weights))
+                found[body] = ("slides", Combination(weights))
         elif joint.bodies[0] == GROUND and not np.any(np.asarray(joint.points)[1]):
             axis = float(np.asarray(joint.axis))
             weights[k, :2] = np.cos(axis), np.sin(axis)
-            found.setdefault(name, ("slides", Weights(weights)))
+            found.setdefault(name, ("slides", Combination(weights)))
     return found
 
 
-def _output(cycle: Cycle, kind: str, weights: Weights, turning: list[TurningPoint]) -> Output:
+def _output(cycle: Cycle, kind: str, weights: Combination, turning: list[TurningPoint]) -> Output:
     heights = cycle.heights(weights, turning)
     extent = float(np.ptp(heights))
     if kind == "swings" and extent >= 2 * np.pi * (1 - 1e-9) and not turning:
@@ -172,7 +172,7 @@ def _transmission_angles(mechanism: Mechanism, driven: Coordinate, cycle: Cycle,
             other = next(p for p in of_body[body] if p != pin)
             arm = pins[other][body] - at[body]
             directions.append(np.arctan2(arm[1], arm[0]))
-        between = Weights(weights)
+        between = Combination(weights)
         heights = cycle.heights(between, cycle.turning_points([between])[0]) + directions[1] - directions[0]
         found[pin] = acute_range(float(np.min(heights)), float(np.max(heights)))
     return found

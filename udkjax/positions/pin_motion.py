@@ -20,7 +20,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
-Rows = Sequence[Sequence[float]] | np.ndarray  # of a table, (T, columns)
+TableRows = Sequence[Sequence[float]] | np.ndarray  # of a table, (T, columns)
 
 
 class PinMotion(PrintsTable):
@@ -83,7 +83,7 @@ class PinMotion(PrintsTable):
         at = f"at {ends[0]}" if len(self.values) == 1 else f"from {ends[0]} to {ends[1]}"
         return f"{at}, {count.words}; {rate_text(float(self.rate[0]), count)}"
 
-    def _rows(self, count: Count, title: str, heads: list[str], rows: Mapping[str, Rows]) -> PrintedTable:
+    def _rows(self, count: Count, title: str, heads: list[str], rows: Mapping[str, TableRows]) -> PrintedTable:
         """Return a table with a row for each name and value; the driver's values are a column if there are several."""
         many = len(self.values) > 1
         sizes = np.abs(np.array([row for motion in rows.values() for row in motion]).reshape(-1, len(heads) - 1))

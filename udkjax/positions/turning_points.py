@@ -17,7 +17,7 @@ STILL = 1e-9  # relative to the fastest: slower is rounding
 NEWTON_STEPS = 5  # from a secant of the grid to rounding
 
 
-class Weights(NamedTuple):
+class Combination(NamedTuple):
     """A combination of the coordinates of bodies, such as the angle of a body, or its displacement along a line.
 
     Attributes:
@@ -77,7 +77,7 @@ class Cycle:
         good = np.isin(np.asarray(motion.status), [Reached.closed])
         return tuple(np.asarray(x)[good] for x in (motion.values, motion.q, motion.v, motion.a))
 
-    def turning_points(self, measured: Sequence[Weights]) -> list[list[TurningPoint]]:
+    def turning_points(self, measured: Sequence[Combination]) -> list[list[TurningPoint]]:
         """Return the places where each combination turns back, in the order of the driver's values."""
         found = [(k, i) for k, one in enumerate(measured) for i in _sign_changes(one.of(self.dq))]
         if not found:
@@ -103,7 +103,7 @@ class Cycle:
         points = [TurningPoint(float(v), float(h), bool(d)) for v, h, d in zip(value, height, dwells, strict=True)]
         return [[point for point, k in zip(points, which, strict=True) if k == number] for number in range(len(measured))]
 
-    def heights(self, one: Weights, turning: Sequence[TurningPoint]) -> np.ndarray:
+    def heights(self, one: Combination, turning: Sequence[TurningPoint]) -> np.ndarray:
         """Return the values of a combination among which are its least and its largest."""
         at_ends = [one.of(q[None])[0] for _, q in self.ends]
         inner = [] if turning else one.of(self.q[[0, -1]]).tolist()
