@@ -3,6 +3,7 @@
 import pickle
 from collections.abc import Callable
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -145,8 +146,16 @@ LAWS = {
     "grows": (lambda t, _: 1.0 / (0.55 - t) ** 2, {}, 'force "wind" grows without bound'),
     "not finite": (lambda t, _: jnp.where(t < 0.45, 0.1, jnp.nan), {}, 'force "wind" is not finite from about 0.45'),
     "dry": (lambda t, f: -50.0 * jnp.sign(f.vx), {"max_steps": 3000}, 'force "wind" jumps with the velocity'),
-    "stiff": (lambda t, f: -1e7 * f.vx, {"max_steps": 500}, 'force "wind" damps at a rate of 1e+07 1/s'),
-    "stiff without stabilization": (lambda t, f: -1e7 * f.vx, {"max_steps": 3000}, 'force "wind" damps at a rate of 1e+07 1/s'),
+    "stiff": (
+        lambda t, f: -1e7 * f.vx,
+        {"max_steps": 500, "solver": diffrax.Dopri8()},
+        'force "wind" damps at a rate of 1e+07 1/s',
+    ),
+    "stiff without stabilization": (
+        lambda t, f: -1e7 * f.vx,
+        {"max_steps": 3000, "solver": diffrax.Dopri8()},
+        'force "wind" damps at a rate of 1e+07 1/s',
+    ),
     "slow": (lambda t, f: -f.x, {"max_steps": 2}, "steps made .* % of the way; at this pace"),
 }
 

@@ -214,6 +214,7 @@ def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, brea
         breaks=breakpoints is not None or _is_piecewise(mechanism),
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
         **_method_code(equations)._asdict(),
+        changes=solver is None,
     )
 
 

@@ -68,7 +68,7 @@ def integrate_by_diffrax(
     right_hand_sides = jnp.where(count == NOT_COUNTED, NOT_COUNTED, count + (problem.h is None))  # one chooses the step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
-    output = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides)
+    output = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides, jnp.array(0))
     q, v = (jnp.where(output.kept[:, None], y, jnp.nan) for y in (q, v))
     return output._replace(q=q, v=v)
 

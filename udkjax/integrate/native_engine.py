@@ -238,8 +238,8 @@ def mark_rows(
 
 def _output(results: Sequence[Any]) -> IntegratorOutput:
     q, v, _, info = [x[0] for x in results]
-    code, t, tried, accepted, evaluations, written, lost = [info[k] for k in range(len(RunStates.info_names))]
+    code, t, tried, accepted, evaluations, written, lost, implicit = [info[k] for k in range(len(RunStates.info_names))]
     number = np.arange(len(q))
     reached = (number <= written) & (number < len(q) - 1) | (code == Status.DONE)
-    counts = [x.astype(int) for x in (tried, accepted, evaluations)]
+    counts = [x.astype(int) for x in (tried, accepted, evaluations, implicit)]
     return IntegratorOutput(q, v, reached, lost, code.astype(int), t, info[len(RunStates.info_names) :], *counts)

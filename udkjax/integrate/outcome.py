@@ -80,11 +80,15 @@ def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Arra
 
 
 def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: ModuleType = jnp) -> dict[str, Int[Array, ""]]:
-    """Return counts of steps, right-hand sides and projections; right-hand sides are -1 if unknown."""
+    """Return counts of steps, right-hand sides and projections; right-hand sides are -1 if unknown.
+
+    `implicit` counts the accepted steps by an implicit method of machine code.
+    """
     return {
         "steps": raw.tried,
         "accepted": raw.accepted,
         "rejected": raw.tried - raw.accepted,
+        "implicit": raw.implicit,
         "right_hand_sides": raw.evaluations,
         "projections": raw.tried + 2 * (outputs - 1) if projected else xp.zeros_like(raw.tried),
     }

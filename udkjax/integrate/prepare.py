@@ -78,12 +78,16 @@ class Choices(NamedTuple):
         return self._replace(rtol=number(self.rtol), atol=number(self.atol), drift_tol=number(self.drift_tol), dt0=dt0)
 
     def settings(self, why_not_native: str) -> tuple[tuple[str, str], ...]:
-        """Return pairs of names and values, as strings, of the choices of a run."""
+        """Return pairs of names and values, as strings, of the choices of a run.
+
+        `stiff_solver` is the implicit method with which a run by the default method goes on where it is stiff.
+        """
         return (
             ("method", type(self.method).__name__),
             ("formulation", "UdwadiaKalaba" if self.formulation is None else type(self.formulation).__name__),
             ("stabilization", type(self.stabilization).__name__),
             ("solver", "Dopri8" if self.solver is None else type(self.solver).__name__),
+            *([("stiff_solver", "Kvaerno5")] if self.solver is None and not why_not_native else []),
             ("max_steps", str(self.max_steps)),
             ("first_step", "chosen" if self.dt0 is None else "given"),
             ("engine", f"{self.integrator}: {why_not_native}" if why_not_native else "native"),

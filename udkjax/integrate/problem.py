@@ -66,6 +66,7 @@ class IntegratorOutput(NamedTuple):
     tried: Int[Array, ""]  # steps
     accepted: Int[Array, ""]
     evaluations: Int[Array, ""]
+    implicit: Int[Array, ""]  # accepted steps by the implicit method of a default run
 
     @property
     def kept(self) -> Bool[Array, "T"]:

@@ -98,7 +98,9 @@ def simulate(
         method: the pseudoinverse; by default `Auto()`.
         stabilization: `Projection()`, a `Baumgarte`, or None.
         solver: any diffrax solver for ordinary differential equations; by default Dopri8, the fastest at equal error in
-            benchmarks/, except for the tightest tolerances through singular configurations.
+            benchmarks/, except for the tightest tolerances through singular configurations. Where a stiff force, not the
+            tolerance, would limit its steps, machine code goes on with Kvaerno5, and returns where that does not pay:
+            `Solution.stats["implicit"]` counts these steps.
         adjoint: an adjoint of diffrax; by default JAX differentiates the run.
         max_steps: the largest number of steps tried.
         drift_tol: the largest violation of Psi, relative to L or in rad.

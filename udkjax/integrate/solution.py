@@ -82,7 +82,9 @@ CAUSES = {
 }
 
 
-_ORDER = "steps rejected right_hand_sides projections events kinks"  # order of counts in texts, since jit sorts the names
+_ORDER = (
+    "steps rejected implicit right_hand_sides projections events kinks"  # order of counts in texts, since jit sorts the names
+)
 
 
 class SimulationError(RuntimeError):
@@ -122,7 +124,7 @@ class Solution(PrintsTable):
     v: Float[Array, "T bodies 3"]
     code: Int[Array, ""]
     time: Float[Array, ""]
-    stats: dict[str, Int[Array, ""]]  # steps, accepted, rejected, right_hand_sides, projections
+    stats: dict[str, Int[Array, ""]]  # steps, accepted, rejected, implicit, right_hand_sides, projections
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
     bodies: tuple[str, ...] = eqx.field(static=True)
@@ -230,6 +232,8 @@ def format_work(stats: Mapping[str, ArrayLike]) -> str:
     """Return the counts of a run as text; a count of -1 is unknown."""
     words = {name: name.replace("_", " ") for name in stats} | {"right_hand_sides": "right-hand sides"}
     counts = {name: int(np.asarray(count)) for name, count in stats.items() if name != "accepted"}
+    if not counts.get("implicit", 1):
+        del counts["implicit"]
     return ", ".join(f"{counts[name]:,} {words[name]}" for name in sorted(counts, key=_ORDER.find) if counts[name] >= 0)
 
 

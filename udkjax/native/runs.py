@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from udkjax.native.base.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
 from udkjax.native.base.module import Module
-from udkjax.native.base.tableau import Method
+from udkjax.native.base.tableau import KVAERNO5, Method
 from udkjax.native.derivatives import record
 from udkjax.native.derivatives.backpropagation import Reverse
 from udkjax.native.derivatives.second_tangents import ForwardTwice
@@ -29,6 +29,7 @@ class RunStates(Operation):
     sampled: tuple[int, ...] = ()  # indices of the numbers that have samples
     pseudoinverse: DenseMethod | None = None  # None: elimination
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
+    changes: bool = False  # whether a run goes on by an implicit method, Kvaerno's, where stability limits an explicit one
 
     info_names: ClassVar[tuple[str, ...]] = INFO  # names of the first numbers of the output "info", before the last q and v
 
@@ -49,6 +50,7 @@ class RunStates(Operation):
             sampled=self.sampled,
             pseudoinverse=self.pseudoinverse,
             formulation=self.formulation,
+            stiff=KVAERNO5 if self.changes else None,
         )
 
     @property

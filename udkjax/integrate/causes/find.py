@@ -246,7 +246,7 @@ def _stiff(run: FailedRun) -> str:
         return ""
     return (
         f'force "{loads.names[k]}" {verb} at a rate of {rate:.2g} 1/s, which limits an explicit solver to steps of {step:.2g} s: '
-        "use an implicit one, such as solver=diffrax.Kvaerno5(), or make it softer"
+        "use an implicit one, such as solver=diffrax.Kvaerno5(), or the default, which changes to it by itself, or make it softer"
     )
 
 
@@ -320,7 +320,8 @@ def explained(
         atol=float(solution.atol),
         drift_tol=float(drift_tol),
         stabilization=settings["stabilization"],
-        is_explicit=is_explicit(solver) or settings["solver"] == "Adams",  # the corrector of Adams is applied once, not solved
+        # The corrector of Adams is applied once, not solved; a run by the default method of machine code goes on implicitly.
+        is_explicit=(is_explicit(solver) or settings["solver"] == "Adams") and "stiff_solver" not in settings,
         drops_rows=settings["method"] in ("Auto", "Elimination"),
         formulation=settings["formulation"],
     )

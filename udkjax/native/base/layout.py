@@ -33,7 +33,7 @@ SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_to
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
 SHARE = 32  # minimum number of members of a thread: waking a thread takes 50 us, the shortest runs take 1 or 2 us each
-INFO = ("code", "t", "tried", "accepted", "evaluations", "written", "lost")  # then the last q and v
+INFO = ("code", "t", "tried", "accepted", "evaluations", "written", "lost", "implicit")  # then the last q and v
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,12 @@ class Plan:
     sampled: tuple[int, ...] = ()  # indices of the numbers of the scene that have samples
     pseudoinverse: Any = None  # the `DenseMethod` that solves; None: elimination
     formulation: Any = None  # the `FormulationCode` of accelerations; None: the Udwadia-Kalaba equation
+    stiff: Method | None = None  # the implicit method to which an explicit run changes where it is stiff
+
+    @property
+    def implicit(self) -> Method | None:
+        """The implicit method of the module; None if it has none."""
+        return self.method if self.method.is_implicit else self.stiff
 
 
 @dataclass
@@ -87,7 +93,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "h": "step length chosen by the controller (s)",
     "t1": "end of the attempted step (s)",
     "step": "length of the attempted step (s); 0 at the beginning of a run",
-    "begin": "whether the run begins at point 3: at the start, or anew after a breakpoint",
+    "begin": "1 if the run begins at point 3, at the start or anew after a breakpoint; -1 if the attempt is implicit, else 0",
     "last": "whether the attempted step ends at the end of the run",
     "lands": "whether the attempted step ends at a breakpoint",
     "behind": "time just after the breakpoints at the current time (s)",
@@ -111,8 +117,19 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "iterating": "whether Newton's method continues",
     "violated": "largest violation of Psi at an output, over the row's scale",
     "open": "whether the output violates Psi after its projection",
+    "stiff": "whether the next step is taken by an implicit method",
+    "speed": "length of an explicit step times the largest rate of the equations",
+    "growth": "largest magnitude of an eigenvalue of I - D (stage_equations.py)",
+    "limited": "explicit steps near the limit of stability, since the last few that were not",
+    "calm": "consecutive explicit steps far from the limit of stability, or consecutive implicit steps that do not pay",
+    "patience": "explicit steps near the limit of stability after which the run goes on implicitly",
+    **{f"point{k}_solved": "whether the step to an accepted state was implicit" for k in range(POINTS)},
+    "implicit": "accepted implicit steps so far",
     "contraction": "rate of convergence of the stages of an implicit step",
     "size": "size of the last correction of a stage, relative to the tolerance",
+    "renew": "whether the matrix of the stages is computed anew",
+    "renewals": "how often it was in this stage",
+    "eager": "number of steps in which each stage begins with a new matrix",
     "iterations": "corrections of all stages of an implicit step",
     "diverged": "whether a stage of the attempted step did not converge",
     "next": "next output time (s)",

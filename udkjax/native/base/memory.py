@@ -31,6 +31,7 @@ class Memory:
     plan: Plan
     places: Layout
     tangents: Layout  # memory of one direction of a derivative
+    unused: tuple[int, int] = (0, 0)  # range of the places of arrays that are not cleared until they are used
     begins: list[Callable[[Function], None]]  # write the numbers that are stored once per run
     n: int  # coordinates
     m: int  # rows of Psi

@@ -1,6 +1,6 @@
 """One module of machine code: its functions, and the arrays in the memory of a run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.expressions.loop_derivative import FORWARD
@@ -10,8 +10,9 @@ from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.running import Running
 from udkjax.native.base.steps import POINTS
+from udkjax.native.base.tableau import Method
 
-# Rarely called functions: once per run, near singular configurations, or where a piece may end.
+# Rarely called functions: once per run, near singular configurations, where a piece may end, or once in an implicit step.
 COLD = (
     "leave",
     "along_motion",
@@ -26,6 +27,8 @@ COLD = (
     "accelerate_by_fallback",
     "equation_terms",
     "newton_v_and_psi",
+    "evaluation_slopes",
+    "measure_speed",
 )
 
 
@@ -42,7 +45,8 @@ class Module(Running):
     shares_constants = False  # whether the members of a block of threads have the same constants, in its shared memory
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
-        self.plan, self.code, self.method = plan, plan.code, plan.method
+        self.plan, self.code, self.method, self.implicit = plan, plan.code, plan.method, plan.implicit
+        self.stages = max(plan.method.stages, plan.implicit.stages if plan.implicit else 0)
         code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
         self.n, self.m = n, m
         if plan.sampled:
@@ -65,11 +69,11 @@ class Module(Running):
         self.functions: list[Function] = []
         self.begins = []
         self.loops = LoopWriter(plan.width, cold=plan.unrolled)
-        self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, plan.method.stages))]
+        self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, self.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
 
     def _unroll(self, differentiated: Sequence[str], active: Sequence[bool]) -> Unrolled:
-        return Unrolled(self.code, list(self.programs), differentiated, active, self.mode, self.method.is_implicit)
+        return Unrolled(self.code, list(self.programs), differentiated, active, self.mode, self.implicit is not None)
 
     def _lay_out(self):
         """Reserve memory for all arrays; layout.py describes them."""
@@ -97,7 +101,7 @@ class Module(Running):
         for k in range(POINTS):
             for x in "qva":
                 p.add(f"point{k} {x}", n)
-        for i in range(1, plan.method.stages):
+        for i in range(1, self.stages):
             p.add(f"stage{i} a", n)
         for k in range(3 * POINTS):
             p.add(f"difference{k}", n)
@@ -262,6 +266,17 @@ class Module(Running):
 
     def record_stage(self, f: Function, s: Lane, i: int):
         """Hook: called at the state of stage i of a step, after its accelerations have been computed."""
+
+    def record_solved_stage(self, f: Function, s: Lane, i: int):
+        """Hook: called at the state of stage i of an implicit step, after it has been solved in lanes that are `stepping`."""
+
+    def methods(self, f: Function, s: Lane) -> Iterator[tuple[Method, Value | None]]:
+        """Run the block for each method of the module, with the mask of the lanes whose attempt it makes; None: all lanes."""
+        yield self.method, None
+        if self.plan.stiff:
+            mask = s.begin < -0.5
+            with f.if_(f.any_of(mask)):
+                yield self.plan.stiff, mask
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         """Hook: called after a step, when its end has become point 3 in lanes that `accept`."""

@@ -77,8 +77,10 @@ class Running(Memory):
         """Clear the memory at `work`, and store what all members share, and numbers with which lanes that stay empty compute."""
         work, width = f.given["work"], self.plan.width
         s = Lane(f, self.places)
-        with f.each(self._memory_size) as i:
-            f.store(0.0, work, i)
+        start, end = (place * width for place in self.unused)
+        for first, count in ((0, start), (end, self._memory_size - end)):
+            with f.each(count) as i:
+                f.store(0.0, work, i + first)
         f.store(f.given["call"], work, self.start("call", "work"), base=POINTER)
         self.begin_memory(f)
         for name in ("length", "omega", "rtol", "atol", "smallest"):

@@ -53,10 +53,18 @@ AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
 HALVINGS = 40  # bisections that locate the end of a piece within a step
 TRIES = 8  # successive attempts to end a step at the end of a piece; for a state at rest there, rounding decides between pieces
 
-# Stages of implicit methods. A correction below STAGE_TOL of the tolerance of a step is the last. One that is DIVERGING times the
-# one before shows that the iteration diverges; so does one still too large after STAGE_ITERATIONS. The step is then repeated with
-# STAGE_SHRINK of its length.
-STAGE_TOL, STAGE_ITERATIONS, DIVERGING, STAGE_SHRINK = 1e-3, 8, 1.0, 0.4
+# Stages of implicit methods. A correction below STAGE_TOL of the tolerance of a step is the last. The rate of convergence, the
+# ratio of a correction to the one before, counts for later stages, FADING with each correction. Where it exceeds SLOW, the matrix
+# is renewed, at most RENEWALS times in a stage, and for EAGER steps at the beginning of each stage. If the rate exceeds DIVERGING
+# nevertheless, or a correction is too large after STAGE_ITERATIONS, the step is repeated with STAGE_SHRINK of its length.
+STAGE_TOL, STAGE_ITERATIONS, FADING, SLOW, RENEWALS, EAGER, DIVERGING, STAGE_SHRINK = 1e-3, 10, 0.3, 0.3, 3.0, 10.0, 1.0, 0.4
+
+# Change to an implicit method. An explicit step is limited by stability if its length times the largest rate exceeds LIMIT:
+# Dopri8 is stable up to STABLE. After PATIENCE such steps, without CALM others in succession, the run goes on implicitly. It
+# returns after UNPAID implicit steps in succession that are less than GAIN times as long as stability allows, since they take
+# several times as long; the next time, it is twice as patient.
+LIMIT, PATIENCE, CALM, UNPAID, GAIN, STABLE = 4.0, 15.0, 6.0, 25.0, 2.0, 5.2
+WATCH_EVERY = 32  # the rate is measured in one of so many attempts: in all, it would take a tenth of the time of small scenes
 
 POINTS = 4  # states that the interpolating polynomial passes through; with three, velocities between steps are less accurate
 # Fraction of a step. If less than this would remain for the last step, the remaining time is halved instead. Outputs of the

@@ -24,6 +24,7 @@ from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.base.running import Repeat
 from udkjax.native.base.samples import ARGUMENTS, count_breakpoints, numbers_of_row
 from udkjax.native.base.steps import POINTS, Status
+from udkjax.native.base.tableau import Method
 from udkjax.native.derivatives.record import Recorded
 from udkjax.native.run.dense_output import write_differences_back
 from udkjax.native.run.runge_kutta import stage_state
@@ -50,7 +51,7 @@ class Reverse(Recorded):
         for k in range(POINTS):
             for x in "qva":
                 p.add(f"bar point{k} {x}", n)
-        for j in range(plan.method.stages):
+        for j in range(self.stages):
             p.add(f"bar stage{j} a", n)
         for k in range(3 * POINTS):
             p.add(f"bar difference{k}", n)
@@ -61,8 +62,8 @@ class Reverse(Recorded):
         if self.count:
             write_prologue_derivative(self, self.active, REVERSE)
         write_differences_back(self)
-        if self.stages:
-            self.stages.write_stages("point2")
+        if self.stage_equations:
+            self.stage_equations.write_stages("point2")
         self._write_step_back()
         self._write_leave_row()
         if self.plan.sampled:
@@ -99,65 +100,66 @@ class Reverse(Recorded):
         active = s.at > 0.5
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.point3_t - s.point2_t)
         h, last = self.broadcast(f, step), self.last
-        stages = range(1, last)
-        steps = f.any_of(active & (s.begin < 0.5))  # the beginning of a run has no stages
-        with f.if_(steps):
-            if self.stages:
-                s.step, s.stepping = step, f.select(active, f.const(1.0, DOUBLE, f.width), 0.0)
+        explicit, solved = active & (s.begin > -0.5) & (s.begin < 0.5), active & (s.begin < -0.5)
+        if not self.method.is_implicit:
+            with f.if_(f.any_of(explicit)):  # the beginning of a run has no stages
+                for i in range(1, last):
+                    stage_state(self, f, s, i, "point2", step)
+                    self.evaluate_stage(f, i)
+        if self.implicit:
+            with f.if_(f.any_of(solved)):
+                s.step, s.stepping = step, f.select(solved, f.const(1.0, DOUBLE, f.width), 0.0)
                 f.call("take_stages_from_point2", f.given["work"])
-            for i in () if self.stages else stages:
-                stage_state(self, f, s, i, "point2", step)
-                self.evaluate_stage(f, i)
         setattr(s, "state t", s.point3_t)
         with f.each(self.rowcount) as r:
             for x in "qv":
                 self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
         self._evaluate_end(f)
-        if self.stages:
-            self._pull_accelerations_at_beginning(f, s, active)
-        else:
-            self._pull_accelerations(f, f"stage{last} linearization", "bar point3 a", active)
+        bar_of_end = "bar point3 a"
+        if self.implicit:  # the accelerations at the end of an implicit step are those of its last stage
+            bar_of_end = "residual a"
+            with f.each(self.rowcount) as r:
+                self.put(f, bar_of_end, r, f.select(solved, 0.0, self.vector(f, "bar point3 a", r)))
+        self._pull_accelerations(f, f"stage{last} linearization", bar_of_end, active)
         with f.each(self.rowcount) as r:
             for x in "qv":
                 self.put(f, f"bar result {x}", r, self.vector(f, f"bar point3 {x}", r) + self.vector(f, f"bar state {x}", r))
         self._pull_projection(f, active)
-        self._accumulate_stage(f, h, last, range(last), active, first=True)
-        if self.stages:  # the accelerations at the end of a step are those of its last stage
-            with f.each(self.rowcount) as r:
-                old, bar = (self.vector(f, name, r) for name in (f"bar stage{last - 1} a", "bar point3 a"))
-                self.put(f, f"bar stage{last - 1} a", r, f.select(active & (s.begin < 0.5), old + bar, old))
-        with f.if_(steps):
-            for i in reversed(stages):
-                stage_state(self, f, s, i, "point2", step)
-                if self.stages:
-                    self._evaluate_solved(f, i)
-                    self._solve_transposed(f, f"bar stage{i} a")
-                self._pull_accelerations(f, f"stage{i} linearization", f"bar stage{i} a", active)
-                self._accumulate_stage(f, h, i, range(i), active)
+        if self.implicit:
+            count = self.implicit.stages
+            self._accumulate_stage(f, h, self.implicit, count, range(count), solved, first=True)
+        if not self.method.is_implicit:
+            self._accumulate_stage(f, h, self.method, last, range(last), active & ~solved, first=True)
+            with f.if_(f.any_of(explicit)):
+                for i in reversed(range(1, last)):
+                    stage_state(self, f, s, i, "point2", step)
+                    self._pull_accelerations(f, f"stage{i} linearization", f"bar stage{i} a", explicit)
+                    self._accumulate_stage(f, h, self.method, i, range(i), explicit)
+        if self.implicit:
+            with f.if_(f.any_of(solved)):
+                self._pull_solved_stages(f, s, h, self.implicit, solved, step)
         with f.each(self.rowcount) as r:
             old = self.vector(f, "bar point2 a", r)
             self.put(f, "bar point2 a", r, f.select(active, old + self.vector(f, "bar stage0 a", r), old))
 
-    def _pull_accelerations_at_beginning(self, f: Function, s: Lane, active: Value):
-        """Pull the cotangents of point 3's accelerations where a run begins; elsewhere they are those of a stage."""
+    def _pull_solved_stages(self, f: Function, s: Lane, h: Value, method: Method, solved: Value, step: Value):
+        """Pull cotangents of the stages of an implicit step back to the point before."""
+        last = method.stages
         with f.each(self.rowcount) as r:
-            bar = self.vector(f, "bar point3 a", r)
-            self.put(f, "residual a", r, f.select(active & (s.begin > 0.5), bar, 0.0))
-        self._pull_accelerations(f, f"stage{self.last} linearization", "residual a", active)
+            old, bar = (self.vector(f, name, r) for name in (f"bar stage{last - 1} a", "bar point3 a"))
+            self.put(f, f"bar stage{last - 1} a", r, f.select(solved, old + bar, old))
+        for i in reversed(range(1, last)):
+            stage_state(self, f, s, i, "point2", step, method)
+            self._evaluate_solved(f, i)
+            self._solve_transposed(f, f"bar stage{i} a")
+            self._pull_accelerations(f, f"stage{i} linearization", f"bar stage{i} a", solved)
+            self._accumulate_stage(f, h, method, i, range(i), solved)
 
-    def _solve_transposed(self, f: Function, name: str):
-        """Replace cotangents w of the accelerations of a solved stage by D^(-T) w."""
-        assert self.stages is not None
-        d = self.stages.exact(f)
-        with f.each(self.rowcount) as r:
-            d.row("x")[r] = self.vector(f, name, r)
-        f.call("solve_exact_transposed", f.given["work"])
-        with f.each(self.rowcount) as r:
-            self.put(f, name, r, d.row("b")[r])
-
-    def _accumulate_stage(self, f: Function, h: Value, i: int, stages: Sequence[int], active: Value, first: bool = False):
-        """Add `bar state` of stage i to the cotangents of the point before and of the earlier stages."""
-        method, zero = self.method, f.const(0.0, DOUBLE, self.plan.vector)
+    def _accumulate_stage(
+        self, f: Function, h: Value, method: Method, i: int, stages: Sequence[int], active: Value, first: bool = False
+    ):
+        """Add `bar state` of stage i of a method to the cotangents of the point before and of the earlier stages."""
+        zero = f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
             of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
             hq = h * of_q
@@ -171,7 +173,7 @@ class Reverse(Recorded):
                 total = f.fma(hhq, a2, total) if a2 else total
                 total = f.fma(hv, a, total) if a else total
                 if first or a2 or a:
-                    self.put(f, f"bar stage{j} a", r, total)
+                    self.put(f, f"bar stage{j} a", r, f.select(active, total, self.vector(f, f"bar stage{j} a", r)))
 
     def walk(self, f: Function, s: Lane, repeat: Repeat):
         arguments = f.given["work"], f.given["call"]
@@ -293,7 +295,8 @@ class Reverse(Recorded):
                         new = self.vector(f, f"{name}{k - 1} {x}", r) if k else zero
                         self.put(f, f"{name}{k} {x}", r, f.select(active, new, self.vector(f, f"{name}{k} {x}", r)))
         for k in reversed(range(1, POINTS)):
-            s.where(active, **{f"point{k}_t": getattr(s, f"point{k - 1}_t")})
+            for x in ("t", "solved"):
+                s.where(active, **{f"point{k}_{x}": getattr(s, f"point{k - 1}_{x}")})
         s.where(active, at=s.at - 1.0)
         with self.each_lane(f, active) as k:
             self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1), "point0")

@@ -36,6 +36,16 @@ class Differentiated(Trajectory):
         f.call("evaluation", f.given["work"], self.address(f, "residual a"), self.address(f, f"stage{i} linearization"))
         f.call("factor_exact", f.given["work"])
 
+    def _solve_transposed(self, f: Function, name: str):
+        """Replace cotangents w of the accelerations of a solved stage by D^(-T) w."""
+        assert self.stage_equations is not None
+        d = self.stage_equations.exact(f)
+        with f.each(self.rowcount) as r:
+            d.row("x")[r] = self.vector(f, name, r)
+        f.call("solve_exact_transposed", f.given["work"])
+        with f.each(self.rowcount) as r:
+            self.put(f, name, r, d.row("b")[r])
+
     def write_programs(self):
         super().write_programs()
         for derivative in self._linearizations:

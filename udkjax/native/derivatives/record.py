@@ -20,7 +20,7 @@ STORED = 200  # capacity in points of the record passed to the second call: as m
 PER_BREAKPOINT = 3  # additional capacity for each breakpoint: the beginning of a new run, and two steps
 FIRST_POINTS = 2  # points before the first step: the state as given, and projected
 TITLE = 3  # numbers of a record before its points: the number of points, how the run ended, the number of outputs written
-HEAD = 3  # numbers of a point before its state: its time, the number of outputs before its step, whether a run begins
+HEAD = 3  # numbers of a point before its state: its time, the number of outputs before its step, `begin` of its step (layout.py)
 # For threads of a GPU, whose records are in one buffer: its address, the capacity of each record, and the first of its members.
 BUFFER = ("records", "capacity", "first")
 
@@ -223,6 +223,7 @@ class Recorded(Differentiated):
         """Load a point of lane k from its record; negative indices mean the first point."""
         row = f.at(self._record(f, k), self.to_int(f, f.max(number, 0.0)) * self.row)
         self.put_lane_entry(f, f"{point}_t", k, f.load(row, 0))
+        self.put_lane_entry(f, f"{point}_solved", k, f.max(-f.load(row, 2), 0.0))
         for j, x in enumerate("qva"):
             with f.each(self.n) as i:
                 self.put_lane_entry(f, f"{point} {x}", k, f.load(row, i + (HEAD + j * self.n)), i)

@@ -22,6 +22,7 @@ from udkjax.native.base.program_derivative import GIVEN
 from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.base.samples import row_address
 from udkjax.native.base.steps import POINTS
+from udkjax.native.base.tableau import Method
 from udkjax.native.derivatives.differentiated import Differentiated
 from udkjax.native.run.dense_output import write_between, write_differences
 
@@ -55,7 +56,7 @@ class Forward(Differentiated):
         for k in range(POINTS):
             for x in "qva":
                 w.add(f"point{k} {x}", self.n)
-        for i in range(1, plan.method.stages):
+        for i in range(1, self.stages):
             w.add(f"stage{i} a", self.n)
         for k in range(3 * POINTS):
             w.add(f"difference{k}", self.n)
@@ -115,68 +116,61 @@ class Forward(Differentiated):
     def record_stage(self, f: Function, s: Lane, i: int):
         """Compute the tangents of the stage's accelerations."""
         h = self.broadcast(f, s.step)
-        if self.stages:
-            self._change_solved_stage(f, i, h)
-            return
         with self._each_tangent(f):
             self._change_stage(f, i, h, "point3")
         with self._each_group(f):
             self._call_derivative(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
 
-    def _change_solved_stage(self, f: Function, i: int, h: Value):
+    def record_solved_stage(self, f: Function, s: Lane, i: int):
         """Compute the tangents of the accelerations of a solved stage; second derivatives from those along each direction."""
-        name, stored = f"stage{i} a", f"stage{i} linearization"
+        name, method, h, mask = f"stage{i} a", self.implicit, self.broadcast(f, s.step), s.stepping > 0.5
         self._evaluate_solved(f, i)
-        with self._each_tangent(f):
-            self._clear(f, name)
-            self._change_stage(f, i, h, "point3")
-        with self._each_group(f) as p:
-            self._call_derivative(f, self.mode, stored, self._tangent_address(f, name))
-            self._solve(f, p, name, [way for way in self.ways if way in GIVEN])
-        if len(self.ways) == 1:
-            return
-        with self._each_group(f) as p:
-            group = f.given["tangent"]
-            f.given["tangent"] = self._way(f, self.ways[-1])
-            self._clear(f, name)
-            f.given["tangent"] = group
-        with self._each_tangent(f):
-            self._change_stage(f, i, h, "point3")
-        with self._each_group(f) as p:
-            self._call_derivative(f, self.mode, stored, self._tangent_address(f, "difference0"))
-            group = f.given["tangent"]
-            f.given["tangent"] = self._way(f, self.ways[-1])
-            with f.each(self.registers("tangent")) as r:
-                self.put(f, name, r, self.vector(f, "difference0", r, "tangent"), "tangent")
-            f.given["tangent"] = group
-            self._solve(f, p, name, self.ways[-1:])
+        for ways in ([way for way in self.ways if way in GIVEN], self.ways[-1:]):
+            with self._each_group(f):
+                for way in ways:  # without their own contribution
+                    with self._in_way(f, way), f.each(self.registers("tangent")) as r:
+                        self.put(f, name, r, f.select(mask, 0.0, self.vector(f, name, r, "tangent")), "tangent")
+            with self._each_tangent(f):
+                self._change_stage(f, i, h, "point3", method)
+            with self._each_group(f) as p:
+                stored, solved = f"stage{i} linearization", "difference0"
+                self._call_derivative(f, self.mode, stored, self._tangent_address(f, solved))
+                self._solve(f, p, solved, ways)
+                for way in ways:
+                    with self._in_way(f, way), f.each(self.registers("tangent")) as r:
+                        new, old = (self.vector(f, x, r, "tangent") for x in (solved, name))
+                        self.put(f, name, r, f.select(mask, new, old), "tangent")
+            if len(self.ways) == 1:
+                break
 
-    def _clear(self, f: Function, name: str):
-        with f.each(self.registers("tangent")) as r:
-            self.put(f, name, r, f.const(0.0, DOUBLE, self.plan.vector), "tangent")
+    @contextmanager
+    def _in_way(self, f: Function, way: str) -> Iterator[None]:
+        """Run the block with one of the tangents of a group."""
+        group = f.given["tangent"]
+        f.given["tangent"] = self._way(f, way)
+        yield
+        f.given["tangent"] = group
 
     def _solve(self, f: Function, p: Value, name: str, ways: Sequence[str]):
         """Solve D x = b in some tangents of group p, in place of the array b."""
-        assert self.stages is not None
-        d, group = self.stages.exact(f), f.given["tangent"]
+        assert self.stage_equations is not None
+        d = self.stage_equations.exact(f)
         b, x = d.row("b"), d.row("x")
         for way in ways:
-            f.given["tangent"] = group
-            f.given["tangent"] = self._way(f, way)
-            if self.group == 1:
-                with f.each(self.rowcount) as r:
-                    b[r] = self.vector(f, name, r, "tangent")
-                f.call("solve_exact", f.given["work"])
-                with f.each(self.rowcount) as r:
-                    self.put(f, name, r, x[r], "tangent")
-                continue
-            with self._each_direction(f, p, f.const(0, INT)) as (_, lane):  # all have the same matrix
-                with f.each(self.n) as i:
-                    b.put(i, self.lane_entry(f, name, lane, i, "tangent"))
-                f.call("solve_exact", f.given["work"])
-                with f.each(self.n) as i:
-                    self.put_lane_entry(f, name, lane, x.entry(i), i, "tangent")
-        f.given["tangent"] = group
+            with self._in_way(f, way):
+                if self.group == 1:
+                    with f.each(self.rowcount) as r:
+                        b[r] = self.vector(f, name, r, "tangent")
+                    f.call("solve_exact", f.given["work"])
+                    with f.each(self.rowcount) as r:
+                        self.put(f, name, r, x[r], "tangent")
+                    continue
+                with self._each_direction(f, p, f.const(0, INT)) as (_, lane):  # all have the same matrix
+                    with f.each(self.n) as i:
+                        b.put(i, self.lane_entry(f, name, lane, i, "tangent"))
+                    f.call("solve_exact", f.given["work"])
+                    with f.each(self.n) as i:
+                        self.put_lane_entry(f, name, lane, x.entry(i), i, "tangent")
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         with f.if_(f.any_of(accept)):
@@ -196,23 +190,25 @@ class Forward(Differentiated):
             for x in "qv":
                 self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
         self._evaluate_end(f)
-        with self._each_tangent(f):
-            self._change_stage(f, self.last, h, "point2")
-            with f.each(self.registers("tangent")) as r:
-                for x in "qv":
-                    new = f.select(begin, self.vector(f, f"point2 {x}", r, "tangent"), self.vector(f, f"state {x}", r, "tangent"))
-                    self.put(f, f"state {x}", r, new, "tangent")
+        for method, mask in self.methods(f, s):
+            with self._each_tangent(f):
+                self._change_stage(f, method.stages, h, "point2", method, mask)
+        with self._each_tangent(f), f.each(self.registers("tangent")) as r:
+            for x in "qv":
+                new = f.select(begin, self.vector(f, f"point2 {x}", r, "tangent"), self.vector(f, f"state {x}", r, "tangent"))
+                self.put(f, f"state {x}", r, new, "tangent")
         self._project_end(f, begin)
         # The accelerations at the end of an implicit step are those of its last stage.
         is_new = begin | (s.crosses > 0.5) if self.pieces else begin
-        with f.if_(f.any_of(is_new)) if self.stages else nullcontext(), self._each_group(f):
+        with f.if_(f.any_of(is_new)) if self.method.is_implicit else nullcontext(), self._each_group(f):
             self._call_derivative(f, self.mode, f"stage{self.last} linearization", self._tangent_address(f, "difference0"))
         self._finish_change(f, s, accept)
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
                 old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
-                if self.stages and x == "a":
-                    new = f.select(begin, new, self.vector(f, f"stage{self.last - 1} a", r, "tangent"))
+                if self.implicit and x == "a":
+                    of_stage = self.vector(f, f"stage{self.implicit.stages - 1} a", r, "tangent")
+                    new = f.select(s.begin < -0.5, of_stage, new)
                 self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
 
     def _project_end(self, f: Function, begin: Value):
@@ -227,15 +223,17 @@ class Forward(Differentiated):
     def _finish_change(self, f: Function, s: Lane, accept: Value):
         """Hook: change the tangents of the end of a step, `result q` and `result v`."""
 
-    def _change_stage(self, f: Function, i: int, h: Value, start: str):
-        """Compute the state of stage i in a tangent, for the step from a point."""
-        node, names = float(self.method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
+    def _change_stage(self, f: Function, i: int, h: Value, start: str, method: Method | None = None, mask: Value | None = None):
+        """Compute the state of stage i in a tangent, for the step from a point by a method, in all or some lanes."""
+        method = method or self.method
+        node, names = float(method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
         with f.each(self.registers("tangent")) as r:
             q, v = self.vector(f, f"{start} q", r, "tangent"), self.vector(f, f"{start} v", r, "tangent")
-            sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "tangent") for row in (self.method.q, self.method.v))
+            sum_q, sum_v = (self.weighted_sum(f, row[i], r, names, "tangent") for row in (method.q, method.v))
             slope = v * node if sum_q is None else f.fma(h, sum_q, v * node)
-            self.put(f, "state q", r, f.fma(h, slope, q), "tangent")
-            self.put(f, "state v", r, v if sum_v is None else f.fma(h, sum_v, v), "tangent")
+            for x, new in (("q", f.fma(h, slope, q)), ("v", v if sum_v is None else f.fma(h, sum_v, v))):
+                new = new if mask is None else f.select(mask, new, self.vector(f, f"state {x}", r, "tangent"))
+                self.put(f, f"state {x}", r, new, "tangent")
 
     def _tangent_address(self, f: Function, name: str) -> Value:
         return f.at(f.given["tangent"], self.start(name, "tangent"))
@@ -300,7 +298,7 @@ class Forward(Differentiated):
                 tangent = self._way(f, way)
                 self._read_state(f, way, member, direction, tangent, place, [f"point{k}" for k in range(POINTS)])
                 with f.each(self.n) as i:
-                    for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.last))):
+                    for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.stages))):
                         f.store(0.0, tangent, place + self.place(name, i, "tangent"))
 
     def _read_state(

@@ -6,7 +6,7 @@ warps of a multiprocessor then run the same functions at about the same time, wh
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from udkjax.native.base.ir import SHARED_SPACE
@@ -16,6 +16,7 @@ from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.text import external_functions, text_of_module, with_evaluated
 from udkjax.native.derivatives.record import Recorded
 from udkjax.native.operations import Operation
+from udkjax.native.runs import RunStates
 
 NAME = "run_members"  # of the kernel
 # Coordinates whose numbers are read together, as a thread waits for memory most of the time. The paper's linkage is slower with 4
@@ -81,6 +82,8 @@ def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool 
         shares_numbers: Whether all members have the same numbers. Their constants are then in the shared memory of a block,
             which leaves room for other numbers in the caches.
     """
+    if isinstance(operation, RunStates):  # the matrix of implicit steps would take most of the memory of a thread
+        operation = replace(operation, changes=False)
     module = operation.module(1, 1, VECTOR)
     constants = 0
     if isinstance(module, Recorded):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
 from udkjax.native.base.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SHORTEST_LAST
@@ -29,8 +29,8 @@ def aim(module: Module, f: Function, s: Lane):
         split = start + rest / parts
         splits = (s.steps < float(POINTS - 2)) & (t1 > split) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
         splits = splits & (s.next < stop - s.smallest)  # only if outputs are due in between
-        if module.method.is_implicit:  # a step suffices for its outputs
-            splits = f.const(False, BOOL, f.width)
+        if module.implicit:  # a step suffices for its outputs
+            splits = splits & (s.stiff < 0.5)
         if module.pieces:
             splits = splits & s.aim.is_not(float(AIM_ACROSS))
         t1 = where(splits, split, t1 if module.pieces else halve(f, s, t1, begin | last | splits))
@@ -43,7 +43,7 @@ def aim(module: Module, f: Function, s: Lane):
     t1 = where(begin, s.behind if module.plan.breaks else s.point3_t, t1)
     s.t1 = t1
     s.step = where((s.stepping > 0.5) & ~begin, t1 - s.point3_t, 0.0)
-    s.begin = where(begin, yes, 0.0)
+    s.begin = where(begin, yes, -s.stiff)
     s.last = where(last, yes, 0.0)
 
 

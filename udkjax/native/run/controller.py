@@ -20,16 +20,21 @@ from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
 from udkjax.native.base.power import power
 from udkjax.native.base.steps import (
+    CALM,
     EXPECTED,
     FACTORS,
+    GAIN,
     GAP,
+    LIMIT,
     LOST_TOL,
     NEAREST_STAGE,
     POINTS,
     RESTART_FACTOR,
     RETRIES,
     ROUNDING_GROWTH,
+    STABLE,
     SURE,
+    UNPAID,
     Status,
 )
 from udkjax.native.run.manifold import largest_violation, velocity_tolerance
@@ -77,12 +82,35 @@ def write_decide(module: Module):
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)
-    per_step = s.iterations + 1.0 if module.method.is_implicit else f.const(float(module.method.stages), DOUBLE, f.width)
+    implicit, per_step = s.begin < -0.5, f.const(float(module.method.stages), DOUBLE, f.width)
+    per_step = where(implicit, s.iterations + 1.0, per_step) if module.implicit else per_step
     cost = where(begin, f.const(1.0, DOUBLE, f.width), per_step)
     cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
     s.until = _due_until(module, f, s, accept, stepping & begin)
     s.where(accept, accepted=s.accepted + 1.0)
+    if module.implicit:
+        s.where(accept & implicit, implicit=s.implicit + 1.0)
+    if module.plan.stiff:
+        _choose_method(module, f, s, stepping, accept)
+
+
+def _choose_method(module: Module, f: Function, s: Lane, stepping: Value, accept: Value):
+    """Choose the method of the next step: an implicit one where stability limits the explicit one, as long as it pays."""
+    assert module.plan.stiff is not None
+    implicit = s.begin < -0.5
+    explicit = stepping & (s.begin < 0.5) & ~implicit
+    is_near = explicit & (s.speed > LIMIT)
+    with f.if_(f.any_of(is_near | (s.limited > 0.0) | implicit)):
+        longest = (module.plan.stiff.diagonal * STABLE * GAIN) ** 2  # the largest growth of steps that do not pay
+        is_calm = (explicit & (s.speed <= LIMIT)) | (stepping & implicit & (s.growth < longest))
+        s.where(stepping, calm=f.select(is_calm, s.calm + 1.0, 0.0))
+        s.where(is_near, limited=s.limited + 1.0)
+        s.where(explicit & (s.calm >= CALM), limited=0.0)
+        stiffens, returns = explicit & (s.limited >= s.patience), implicit & (s.calm >= UNPAID)
+        s.where(stiffens, stiff=1.0)
+        s.where(returns, stiff=0.0, patience=s.patience * 2.0)
+        s.where(stiffens | returns, limited=0.0, calm=0.0, rate=np.inf)
 
 
 def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value) -> tuple[Value, Value, Value]:
@@ -109,7 +137,15 @@ def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value) -> 
 
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value) -> tuple[Value, Value]:
     """Return the ratio of the next step to this one, and the error divided by (length of the step)^order."""
-    where, order, error = f.select, module.method.order, s.error
+    chosen, used = (f.variable(0.0), f.variable(0.0))
+    for method, mask in module.methods(f, s):
+        for variable, new in zip((chosen, used), _factor_of_order(f, s, accept, step, method.order), strict=True):
+            variable.value = new if mask is None else f.select(mask, new, variable.value)
+    return chosen.value, used.value
+
+
+def _factor_of_order(f: Function, s: Lane, accept: Value, step: Value, order: float) -> tuple[Value, Value]:
+    where, error = f.select, s.error
     # Errors are bounded below by the error at which a step grows by `grow`, as smaller errors may be rounding.
     size = where(f.is_finite(error), f.max(error, FACTORS.grow ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
@@ -131,6 +167,10 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
             s.where(accept, **{f"point{k}_t": getattr(s, f"point{k + 1}_t")})
         module.copy_point(f, accept, ("state q", "result v", "result a"), f"point{POINTS - 1}")
         s.where(accept, point3_t=s.t1)
+        if module.plan.stiff:
+            for k in range(POINTS - 1):
+                s.where(accept, **{f"point{k}_solved": getattr(s, f"point{k + 1}_solved")})
+            s.where(accept, point3_solved=f.max(-s.begin, 0.0))
         s.where(accept, distance0=s.distance1)
         s.where(accept, distance1=s.distance2)
         s.where(accept, distance2=s.distance)
@@ -163,15 +203,13 @@ def _judge_drift(module: Module, f: Function, s: Lane, accept: Value) -> Value:
 
 def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value) -> Value:
     """Return the time up to which outputs are due."""
-    begin, implicit = s.begin > 0.5, module.method.is_implicit
+    begin, alone = s.begin > 0.5, s.begin < -0.5
     # Outputs of the first step are interpolated after the second; by an implicit method each step serves its own.
-    ready = accept & (~begin if implicit else (s.accepted > 0.0) | (~begin & (s.last > 0.5)))
+    ready = accept & ((s.accepted > 0.0) | (~begin & (s.last > 0.5)) | alone)
     # The last step may end slightly before a breakpoint at the end of the run, where outputs are also due.
     until = f.select(ready, f.select(s.last > 0.5, f.max(s.t1, s.end), s.t1), -np.inf)
-    if implicit:
-        return until + f.select(s.lands > 0.5, s.smallest * GAP, 0.0)
     if module.plan.breaks:
-        enough = ~begun & ((s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
+        enough = ~begun & (alone | (s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
         until = f.select(enough, until + f.select(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
     return until
 

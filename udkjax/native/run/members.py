@@ -8,7 +8,7 @@ from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.base.module import Module
 from udkjax.native.base.samples import enter_first_row, write_enter
-from udkjax.native.base.steps import LOOK_AHEAD, POINTS, Status
+from udkjax.native.base.steps import LOOK_AHEAD, PATIENCE, POINTS, Status
 from udkjax.native.run.manifold import largest_violation, project_output
 
 
@@ -64,6 +64,8 @@ def write_begin(module: Module):
         put(f"point{j}_t", start)
     for name in (f"distance{j}" for j in range(POINTS - 1)):
         put(name, np.inf)
+    put("stiff", float(module.method.is_implicit))
+    put("patience", PATIENCE)
     for name in ("tried", "accepted", "steps"):
         put(name, -1.0)
     put("active", 1.0)

@@ -5,7 +5,8 @@ import numpy as np
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
-from udkjax.native.base.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
+from udkjax.native.base.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK, WATCH_EVERY
+from udkjax.native.base.tableau import Method
 from udkjax.native.run.manifold import newton, with_threshold
 
 
@@ -14,6 +15,8 @@ def write_attempt(module: Module):
 
     It computes the state at `t1` as `state q`, `result v` and `result a`, with its `error` and `distance`.
     """
+    if module.plan.stiff:
+        write_measure_speed(module)
     f, s = module.function("attempt")
     method, stages = module.method, module.method.stages
     ones = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
@@ -22,36 +25,51 @@ def write_attempt(module: Module):
     begins = f.all_of((s.begin > 0.5) | (s.stepping < 0.5))
 
     def take_stages():
-        if method.is_implicit:
-            f.call("take_stages_from_point3", f.given["work"])
-            return
         for i in range(1, stages):
             stage_state(module, f, s, i)
             module.accelerate_stage(f, i)
             check_pivots(module, f, s, f"stage{i} a")
             module.record_stage(f, s, i)
+        if module.plan.stiff:
+            _watch_speed(module, f, s)
+
+    def take_stages_by_method():
+        if not module.implicit:
+            take_stages()
+            return
+        stepping = s.stepping
+        for take, mask in ((take_stages, s.begin > -0.5), (lambda: f.call("take_stages_from_point3", f.given["work"]), implicit)):
+            if take is take_stages and method.is_implicit:
+                continue
+            mask = (stepping > 0.5) & mask
+            with f.if_(f.any_of(mask)):
+                s.stepping = f.select(mask, ones(), 0.0)
+                take()
+        s.stepping = stepping
 
     def clear_stages():
         # Stages may hold NaN of a failed member, which would survive multiplication by a step of zero.
         with f.each(module.rowcount) as r:
-            for i in range(1, stages):
+            for i in range(1, module.stages):
                 module.put(f, f"stage{i} a", r, f.const(0.0, DOUBLE, module.plan.vector))
 
-    f.choose(begins, clear_stages, take_stages)
-    stage_state(module, f, s, stages)
+    implicit = s.begin < -0.5
+    f.choose(begins, clear_stages, take_stages_by_method)
+    for each_method, mask in module.methods(f, s):
+        stage_state(module, f, s, each_method.stages, method=each_method, mask=mask)
     setattr(s, "state t", s.t1)
     if not module.plan.projected:
         module.accelerate_and_measure(f)
         check_pivots(module, f, s, "result a")
         with f.each(module.rowcount) as r:
             module.put(f, "result v", r, module.vector(f, "state v", r))
-        estimate_errors(module, f, s, "result a", "result dq", "result dv")
+        _estimate_errors(module, f, s, "result a", "result dq", "result dv")
         with f.each(module.rowcount) as r:
             for d in ("dq", "dv"):
                 module.put(f, f"state {d}", r, module.vector(f, f"result {d}", r))
     else:
         if not method.ends:
-            estimate_errors(module, f, s, None, "state dq", "state dv")
+            _estimate_errors(module, f, s, None, "state dq", "state dv")
         newton(module, f, s)
         module.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
         module.accelerate_end(f)
@@ -59,7 +77,7 @@ def write_attempt(module: Module):
         if module.falls_back:
             s.where(unsafe, ok=0.0)
         if method.ends:
-            estimate_errors(module, f, s, "result a", "state dq", "state dv")
+            _estimate_errors(module, f, s, "result a", "state dq", "state dv")
             threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
             with_threshold(f, module.drop_tol_place, threshold, lambda: module.invoke(f, "tangent_part"))
         if module.falls_back:
@@ -68,12 +86,46 @@ def write_attempt(module: Module):
                 module.invoke(f, "finish_by_fallback")
                 module.accelerate_end(f)
                 s.where(by_fallback, ok=1.0)
-    if method.is_implicit:  # at the beginning of a run there are no stages
-        module.copy(f, f"stage{stages - 1} a", "result a", s.begin < 0.5)
+    if module.implicit:
+        with f.if_(f.any_of(implicit)):
+            module.copy(f, f"stage{module.implicit.stages - 1} a", "result a", implicit)
     _measure_error(module, f, s)
-    if method.is_implicit:
-        repeated = (FACTORS.safety / STAGE_SHRINK) ** method.order
-        s.where((s.diverged > 0.5) & (s.begin < 0.5) & (s.stepping > 0.5), error=repeated)
+    if module.implicit:
+        repeated = (FACTORS.safety / STAGE_SHRINK) ** module.implicit.order
+        s.where((s.diverged > 0.5) & implicit & (s.stepping > 0.5), error=repeated)
+
+
+def _watch_speed(module: Module, f: Function, s: Lane):
+    """Set `speed` of an explicit step: in every WATCH_EVERY-th attempt and as long as it is near the limit; otherwise zero."""
+    part = s.tried * (1 / WATCH_EVERY)
+    is_due = (s.stepping > 0.5) & ((s.limited > 0.0) | (part - f.intrinsic("floor", part)).is_(1 - 1 / WATCH_EVERY))
+    s.speed = f.const(0.0, DOUBLE, f.width)
+    with f.if_(f.any_of(is_due)):
+        f.call("measure_speed", f.given["work"])
+        s.where(~is_due, speed=0.0)
+
+
+def write_measure_speed(module: Module):
+    """Write `measure_speed`: `speed`, the length of an explicit step times the largest rate, from its last two stages.
+
+    Both are at the end of the step, and their states differ by errors of the stages, in which the fastest motions dominate: the
+    ratio of the change of (v, a) to the change of (q, v) is close to the largest rate (Hairer and Wanner, IV.2).
+    """
+    f, s = module.function("measure_speed")
+    method, h, omega = module.method, module.broadcast(f, s.step), module.broadcast(f, s.omega)
+    last = method.stages - 1
+    row_q, row_v = (row[last] - row[last - 1] for row in (method.q, method.v))
+    change, rate = (f.variable(0.0, width=module.plan.vector) for _ in range(2))
+    with f.each(module.rowcount) as r:
+        sum_q, sum_v = module.weighted_sum(f, row_q, r), module.weighted_sum(f, row_v, r)
+        assert sum_q is not None and sum_v is not None
+        unit = module.vector(f, "inverse unit", r)
+        of_q, of_v = f.abs(h * (h * sum_q)) * omega * unit, f.abs(h * sum_v) * unit
+        of_a = f.abs(module.vector(f, f"stage{last} a", r) - module.vector(f, f"stage{last - 1} a", r)) * unit
+        change.value = f.max(change.value, f.max(of_q, of_v))
+        rate.value = f.max(rate.value, f.max(of_v * omega, of_a))
+    rate_of_lane, change_of_lane = (x.value if module.plan.width > 1 else f.largest_of(x.value) for x in (rate, change))
+    s.speed = s.step * rate_of_lane / change_of_lane
 
 
 def _measure_error(module: Module, f: Function, s: Lane):
@@ -106,17 +158,27 @@ def _measure_error(module: Module, f: Function, s: Lane):
     s.where(~(s.distance >= 0.0), distance=0.0)
 
 
-def stage_state(module: Module, f: Function, s: Lane, i: int, start: str = "point3", step: Value | None = None):
-    """Compute the state of stage i of the step from a point."""
-    step = s.step if step is None else step
-    method, h, names = module.method, module.broadcast(f, step), [f"{start} a", *module.stage_accelerations[1:]]
+def stage_state(
+    module: Module,
+    f: Function,
+    s: Lane,
+    i: int,
+    start: str = "point3",
+    step: Value | None = None,
+    method: Method | None = None,
+    mask: Value | None = None,
+):
+    """Compute the state of stage i of the step from a point, by one of the module's methods, in all or some lanes."""
+    step, method = s.step if step is None else step, method or module.method
+    h, names = module.broadcast(f, step), [f"{start} a", *module.stage_accelerations[1:]]
     setattr(s, "state t", f.fma(step, float(method.nodes[i]), getattr(s, f"{start}_t")))
     with f.each(module.rowcount) as r:
         q, v = module.vector(f, f"{start} q", r), module.vector(f, f"{start} v", r)
         sum_q, sum_v = module.weighted_sum(f, method.q[i], r, names), module.weighted_sum(f, method.v[i], r, names)
         slope = v * float(method.nodes[i]) if sum_q is None else f.fma(h, sum_q, v * float(method.nodes[i]))
-        module.put(f, "state q", r, f.fma(h, slope, q))
-        module.put(f, "state v", r, v if sum_v is None else f.fma(h, sum_v, v))
+        for x, new in (("q", f.fma(h, slope, q)), ("v", v if sum_v is None else f.fma(h, sum_v, v))):
+            old = None if mask is None else module.vector(f, f"state {x}", r)
+            module.put(f, f"state {x}", r, new if mask is None or old is None else f.select(mask, new, old))
 
 
 def check_pivots(module: Module, f: Function, s: Lane, name: str):
@@ -132,16 +194,15 @@ def check_pivots(module: Module, f: Function, s: Lane, name: str):
         )
 
 
-def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
+def _estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
     """Estimate the errors of q and v from the accelerations of all stages; `end` names those of the last stage."""
-    h = module.broadcast(f, s.step)
-    names = list(module.stage_accelerations)
-    if module.method.ends and end:
-        names[-1] = end
-    saved, module.stage_accelerations = module.stage_accelerations, names
-    with f.each(module.rowcount) as r:
-        error_q, error_v = module.weighted_sum(f, module.method.error_q, r), module.weighted_sum(f, module.method.error_v, r)
-        zero = f.const(0.0, DOUBLE, module.plan.vector)
-        module.put(f, to_q, r, zero if error_q is None else h * (h * error_q))
-        module.put(f, to_v, r, zero if error_v is None else h * error_v)
-    module.stage_accelerations = saved
+    h, zero = module.broadcast(f, s.step), f.const(0.0, DOUBLE, module.plan.vector)
+    for method, mask in module.methods(f, s):
+        names = list(module.stage_accelerations)
+        if method.ends and end:
+            names[-1] = end
+        with f.each(module.rowcount) as r:
+            error_q, error_v = (module.weighted_sum(f, weights, r, names) for weights in (method.error_q, method.error_v))
+            new_q = zero if error_q is None else h * (h * error_q)
+            for to, new in ((to_q, new_q), (to_v, zero if error_v is None else h * error_v)):
+                module.put(f, to, r, new if mask is None else f.select(mask, new, module.vector(f, to, r)))

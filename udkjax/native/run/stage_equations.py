@@ -8,27 +8,30 @@ where Q_i and V_i follow from the stages before. A correction d of a_i solves D 
 
     D = I - h g a_v - h^2 g^2 a_q,
 
-whose slopes are those at the beginning of the step. Its columns are derivatives along n directions, as many at a time as there
-are lanes for them. The correction changes q_i and v_i as well: their rounding errors are thus those of the state, not those of
-the accelerations, which a stiff force multiplies. For the same reason the accelerations at the end of a step are those of its
-last stage, and not those of the projected state.
+whose slopes are those at the beginning of the step. If the iteration converges slowly, as it does where the direction of a stiff
+force turns, they are those at the latest state, for this stage and for some steps. Columns of D are derivatives along n
+directions, as many at a time as there are lanes for them. The correction changes q_i and v_i as well: their rounding errors are
+thus those of the state, not those of the accelerations, which a stiff force multiplies. For the same reason the accelerations at
+the end of a step are those of its last stage, and not those of the projected state.
 
 The iteration ends when the next correction of the state, from the rate of convergence, is below `STAGE_TOL` of the tolerance. A
 lane whose iteration does not converge repeats its step with a shorter one.
 """
 
+import numpy as np
+
 from udkjax.native.base.ir import DOUBLE, INT, Function, Operand, Value
-from udkjax.native.base.layout import Layout
+from udkjax.native.base.layout import Lane, Layout
 from udkjax.native.base.module import Module
 from udkjax.native.base.program_derivative import SLOPES, ProgramDerivative
-from udkjax.native.base.steps import DIVERGING, STAGE_ITERATIONS, STAGE_TOL
+from udkjax.native.base.steps import DIVERGING, EAGER, FADING, RENEWALS, SLOW, STAGE_ITERATIONS, STAGE_TOL
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 from udkjax.native.pseudoinverses.lu import OrderedLUCode
 from udkjax.native.run.runge_kutta import check_pivots, stage_state
 
 
 class StageEquations:
-    """The functions of a module that solve stages.
+    """The functions of a module that solve stages, in lanes that are `stepping`.
 
         take_stages_from_point3(work)    the accelerations of all stages of the step `step` from point 3
         factor_stage(work)               the LU factors of D, from the slopes at the state
@@ -43,7 +46,8 @@ class StageEquations:
     """
 
     def __init__(self, module: Module, exact: bool = False):
-        self._in, plan, n = module, module.plan, module.n
+        assert module.implicit is not None  # checked by the caller
+        self._in, self._method, plan, n = module, module.implicit, module.plan, module.n
         lanes = plan.vector if plan.width == 1 and plan.unrolled else plan.width
         self._group = lanes // plan.width  # directions of a tangent
         self._tangent = w = Layout(lanes, plan.vector)
@@ -53,23 +57,28 @@ class StageEquations:
         p = module.places
         p.add("slopes linearization", self._slopes.stored)
         p.add("slope tangent", w.size * self._group)
+        begin = p.size
         for name in ("residual a", "guess a", "weight q", "weight v"):
             p.add(name, n)
         self._lu = OrderedLUCode(relative=True)
         shapes = self._lu.matrices(n, n)
-        self._layout = DenseLayout(module, shapes, (n, n), "stage")
+        self._layout = DenseLayout(module, shapes | {"kept": (n, n)}, (n, n), "stage")
         self._exact = DenseLayout(module, shapes, (n, n), "exact") if exact else None
+        if plan.stiff:
+            p.add("fastest", n)
+        module.unused = begin, p.size  # the matrix of a large scene takes more memory than all else
+        p.add("cleared")
 
     def write(self):
         """Write all functions."""
         self._slopes.evaluation()
         self._slopes.forward()
-        self._write_factor("factor_stage", self._layout)
+        self._write_factor("factor_stage", self._layout, "kept")
         self._write_solve()
         self.write_stages("point3")
         if self._exact is None:
             return
-        self._write_factor("factor_exact", self._exact)
+        self._write_factor("factor_exact", self._exact, "D")
         for name, solve in (("solve_exact", self._lu.solve), ("solve_exact_transposed", self._lu.solve_transposed)):
             f, _ = self._in.function(name)
             solve(DenseMatrices(self._exact, f))
@@ -79,14 +88,17 @@ class StageEquations:
         assert self._exact is not None
         return DenseMatrices(self._exact, f)
 
-    def _write_factor(self, name: str, layout: DenseLayout):
-        """Write the computation of D, from the slopes at the state, and of its LU factors."""
+    def _write_factor(self, name: str, layout: DenseLayout, to: str):
+        """Write the computation of D, from the slopes at the state, and of its LU factors.
+
+        If D is `kept`, only lanes that are to `renew` it change; the others factorize what they had, with equal results.
+        """
         module = self._in
         f, s = module.function(name)
         work, d, lanes = f.given["work"], DenseMatrices(layout, f), self._tangent.width
         tangent = f.given["tangent"] = module.address(f, "slope tangent")
         f.call(f"evaluation_{SLOPES}", work, module.address(f, "residual a"), module.address(f, "slopes linearization"))
-        hg = s.step * module.method.diagonal
+        hg = s.step * self._method.diagonal
         of_v = hg if module.plan.width > 1 else f.repeat(hg, lanes) if lanes > 1 else hg
         of_q = of_v * of_v
         with f.each(-(-module.n // self._group)) as group:
@@ -95,8 +107,32 @@ class StageEquations:
                 f.store(0.0, tangent, k * lanes, lanes)
             self._seed(f, first, of_q, of_v)
             f.call(f"forward_{SLOPES}", work, module.address(f, "slopes linearization"), tangent, self._slope_address(f))
-            self._enter_columns(f, d, first)
+            self._enter_columns(f, d, first, to, None if to == "D" else s.renew > 0.5)
+        if to != "D":
+            with f.each(module.n) as i:
+                d.copy(d.row(to, i), d.row("D", i))
         self._lu.factor(d)
+
+    def _measure_growth(self, f: Function, s: Lane, d: DenseMatrices):
+        """Take a step of the power iteration for the largest eigenvalue of I - D, from the direction found in the step before.
+
+        All sums are in the order of the columns, so that results do not depend on the number of lanes.
+        """
+        module, x = self._in, d.row("x")
+        norms = [f.variable(0.0) for _ in range(2)]
+        with f.each(module.n) as i:
+            total = f.variable(module.entry(f, "fastest", i))
+            with f.each(module.n) as k:
+                total.value = f.fma(-d.row("kept", i).entry(k), module.entry(f, "fastest", k), total.value)
+            x.put(i, total.value)
+            for norm, entry in zip(norms, (total.value, module.entry(f, "fastest", i)), strict=True):
+                norm.value = f.max(norm.value, f.abs(entry) * module.entry(f, "inverse unit", i))
+        new, old = (norm.value for norm in norms)
+        s.growth = new / old
+        usable = (new > 0.0) & (new < float("inf"))
+        with f.each(module.n) as i:
+            unit = 1.0 / module.entry(f, "inverse unit", i)
+            module.put_entry(f, "fastest", i, f.select(usable, x.entry(i) / f.select(usable, new, 1.0), unit))
 
     def _place(self, name: str, i: Operand) -> Operand:
         return i * self._tangent.width + self._tangent[name] * self._tangent.width
@@ -115,22 +151,28 @@ class StageEquations:
             for name, x in (("state q", of_q), ("state v", of_v)):
                 f.store(f.lane(x, j), tangent, self._place(name, first + j) + j)
 
-    def _enter_columns(self, f: Function, d: DenseMatrices, first: Value):
+    def _enter_columns(self, f: Function, d: DenseMatrices, first: Value, to: str, mask: Value | None):
         """Enter the columns of D along directions from `first` on; those beyond the last are zero."""
         tangent, n, lanes = f.given["tangent"], self._in.n, self._tangent.width
+
+        def chosen(new: Value, old: Value) -> Value:
+            return new if mask is None else f.select(mask, new, old)
+
         with f.each(n) as i:
-            f.store(-f.load(tangent, self._place("slope a", i), lanes), d.row("D", i).address, first * f.width, lanes)
+            address, place = d.row(to, i).address, first * f.width
+            new = -f.load(tangent, self._place("slope a", i), lanes)
+            f.store(chosen(new, f.load(address, place, lanes)), address, place, lanes)
         with f.each(self._group) as j, f.if_(first + j < n):
-            row = d.row("D", first + j)
-            row.put(first + j, row.entry(first + j) + 1.0)
+            row = d.row(to, first + j)
+            row.put(first + j, chosen(row.entry(first + j) + 1.0, row.entry(first + j)))
 
     def _write_solve(self):
         """Write `solve_stage(work)`: correct `guess a` with the state until they agree, in lanes that are `stepping`."""
         module = self._in
         f, s = module.function("solve_stage")
-        diagonal, width = module.method.diagonal, f.width
+        diagonal, width = self._method.diagonal, f.width
         yes, d = f.const(1.0, DOUBLE, width), DenseMatrices(self._layout, f)
-        s.iterating, s.size = s.stepping, f.const(1.0, DOUBLE, width)
+        s.iterating, s.size, s.renewals = s.stepping, f.const(np.inf, DOUBLE, width), f.const(0.0, DOUBLE, width)
         k = f.variable(0, INT, 1)
         with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < STAGE_ITERATIONS)):
             module.accelerate(f, "residual a")
@@ -149,13 +191,19 @@ class StageEquations:
                 return ratios
 
             size = module.largest(f, change)
-            is_first = k.value.is_(0)
-            rate = f.select(is_first, s.contraction, f.max(s.contraction * 0.3, size / f.max(s.size, 1e-300)))
+            is_first = s.size.is_(np.inf)
+            rate = f.select(is_first, s.contraction, f.max(s.contraction * FADING, size / f.max(s.size, 1e-300)))
             converged = size * f.min(rate, 1.0) <= STAGE_TOL
-            diverges = ~(size < float("inf")) | (~is_first & (size > s.size * DIVERGING))
+            is_slow = active & ~converged & ~is_first & (rate > SLOW)
+            renews = is_slow & (size < float("inf")) & (s.renewals < RENEWALS)
+            diverges = ~(size < float("inf")) | (is_slow & (rate > DIVERGING) & ~renews)
             s.where(active, contraction=f.min(rate, 1.0), size=size, iterations=s.iterations + 1.0)
             s.where(active & diverges & ~converged, diverged=1.0)
             s.iterating = f.select(active & ~converged & ~diverges, yes, 0.0)
+            s.renew = f.select(renews, yes, 0.0)
+            with f.if_(f.any_of(renews)):
+                f.call("factor_stage", f.given["work"])
+                s.where(renews, renewals=s.renewals + 1.0, eager=EAGER, size=np.inf, contraction=SLOW)
             k.value = k.value + 1
         s.where(s.iterating > 0.5, diverged=1.0)
 
@@ -171,8 +219,14 @@ class StageEquations:
 
     def write_stages(self, start: str):
         """Write the accelerations of all stages after the first, of the step from a point."""
-        module, method = self._in, self._in.method
+        module, method = self._in, self._method
         f, s = module.function(f"take_stages_from_{start}")
+        f.cold = module.plan.stiff is not None  # few runs need it, and its time is that of the functions that it calls
+        with f.if_(~f.any_of(s.cleared > 0.5)):
+            start_place, end = (place * module.plan.width for place in module.unused)
+            with f.each(end - start_place) as k:
+                f.store(0.0, f.given["work"], k + start_place)
+            s.cleared = f.const(1.0, DOUBLE, f.width)
         s.contraction, s.diverged, s.iterations = f.const(1.0, DOUBLE, f.width), *(f.const(0.0, DOUBLE, f.width),) * 2
         setattr(s, "state t", getattr(s, f"{start}_t"))
         rtol, names = module.broadcast(f, s.rtol), [f"{start} a", *module.stage_accelerations[1:]]
@@ -181,15 +235,23 @@ class StageEquations:
                 old = module.vector(f, f"{start} {x}", r)
                 module.put(f, f"state {x}", r, old)
                 module.put(f, f"weight {x}", r, 1.0 / f.fma(rtol, f.abs(old), module.vector(f, f"scale {x}", r)))
+        s.renew, s.eager = s.stepping, f.max(s.eager - 1.0, 0.0)
         f.call("factor_stage", f.given["work"])
+        if start == "point3" and module.plan.stiff:
+            self._measure_growth(f, s, DenseMatrices(self._layout, f))
         for i in range(1, method.stages):
             with f.each(module.rowcount) as r:
                 guess = module.weighted_sum(f, method.predictor[i], r, names)
                 guess = f.const(0.0, DOUBLE, module.plan.vector) if guess is None else guess
-                module.put(f, f"stage{i} a", r, guess)
+                old = module.vector(f, f"stage{i} a", r)
+                module.put(f, f"stage{i} a", r, f.select(s.stepping > 0.5, guess, old))
                 module.put(f, "guess a", r, guess)
-            stage_state(module, f, s, i, start)
+            stage_state(module, f, s, i, start, method=method)
+            renews = (s.stepping > 0.5) & (s.eager > 0.0)
+            with f.if_(f.any_of(renews)):
+                s.renew = f.select(renews, f.const(1.0, DOUBLE, f.width), 0.0)
+                f.call("factor_stage", f.given["work"])
             f.call("solve_stage", f.given["work"])
-            module.copy(f, "guess a", f"stage{i} a")
+            module.copy(f, "guess a", f"stage{i} a", s.stepping > 0.5)
             if start == "point3":
-                module.record_stage(f, s, i)
+                module.record_solved_stage(f, s, i)

@@ -4,7 +4,9 @@ A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages only need ac
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j,        a_i = a(t + c_i h, q_i, v_i).
 
-The stages of an implicit method are solved one after another (stage_equations.py).
+The stages of an implicit method are solved one after another (stage_equations.py). A run by the default method, which is
+explicit, goes on with an implicit one where it is stiff, and returns where that does not pay (controller.py); one module has
+both, so that each lane chooses for its next step.
 Each accepted step is projected onto the constraint manifold. Outputs lie on the polynomial of degree 11 through the positions,
 velocities and accelerations of four consecutive accepted states, which is as accurate as the states and costs no evaluation, and
 are projected as well. Where the motion is not smooth, a step ends and the run begins anew.
@@ -43,7 +45,7 @@ class Trajectory(Module):
         super().__init__(plan, differentiated, active)
         self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
         self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
-        self.stages = StageEquations(self, bool(differentiated)) if plan.steps and plan.method.is_implicit else None
+        self.stage_equations = StageEquations(self, bool(differentiated)) if plan.steps and plan.implicit else None
 
     def write_programs(self):
         super().write_programs()
@@ -79,8 +81,8 @@ class Trajectory(Module):
 
     def write_functions(self):
         self.write_programs()
-        if self.stages:
-            self.stages.write()
+        if self.stage_equations:
+            self.stage_equations.write()
         write_attempt(self)
         if self.pieces:
             write_leave(self)

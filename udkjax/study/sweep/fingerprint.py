@@ -22,7 +22,7 @@ from udkjax.wording import abbreviate
 JsonValue: TypeAlias = "str | int | float | bool | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
 MOST_LINES = 24  # largest number of printed differences; further ones are counted
 MOST_NUMBERS = 64  # largest array written in full; larger arrays by shape, first and last number, and a digest
-STATS = ("steps", "accepted", "rejected", "right_hand_sides", "projections")
+STATS = ("steps", "accepted", "rejected", "implicit", "right_hand_sides", "projections")
 
 
 def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:

@@ -1,0 +1,111 @@
+"""The default method notices stiffness and goes on implicitly; where nothing is stiff, it is what it was."""
+
+from dataclasses import replace
+from importlib import import_module
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from tests.native.test_implicit_stages import TS, by_radau, damped
+
+
+def run(mechanism, tol=1e-6, ts=TS, **choices):
+    return udk.simulate(mechanism, ts, rtol=tol, atol=tol, **choices)
+
+
+@pytest.mark.parametrize("damping", [10.0, 1e5, pytest.param(1e7, marks=pytest.mark.slow), 1e9])
+def test_stiff_dampers(damping):
+    """Explicitly, 1e5 would take ten thousand steps, and 1e9 end at the limit of steps."""
+    mechanism = damped(damping)
+    solution = run(mechanism)
+    q, v = by_radau(mechanism, TS)
+    assert_allclose(solution.q, q, atol=1e-6 * min(1.0, 1e3 / damping))
+    assert_allclose(solution.v[1:], v[1:], atol=1e-5 * min(1.0, 1e3 / damping))
+    assert solution.settings["solver"] == "Dopri8" and solution.settings["stiff_solver"] == "Kvaerno5"
+    assert int(solution.stats["steps"]) < 120
+    assert (int(solution.stats["implicit"]) > 3) == (damping > 100)
+
+
+class Relaxing(udk.ForceElement):
+    """A torque against the rotation of a body that is stiff for half a second and weak afterwards."""
+
+    def loads(self, t, body):
+        return [(0.0, 0.0, -(1e5 * 0.5 * (1 + jnp.tanh(40 * (0.5 - t))) + 0.01) * body.omega)]
+
+
+def test_a_run_returns_to_the_explicit_method():
+    """Where the implicit one does not pay: a damper is soft again, and the pendulum swings."""
+    scene = udk.library.compound_pendulum()
+    mechanism = udk.Mechanism(scene.bodies, scene.joints, forces={"damper": Relaxing(["rod"])})
+    ts = np.linspace(0.0, 6.0, 13)
+    solution = run(mechanism, 1e-9, ts)
+    _, v = by_radau(mechanism, ts)
+    assert_allclose(solution.v, v, atol=3e-6)
+    assert 10 < int(solution.stats["implicit"]) < int(solution.stats["accepted"]) - 60
+
+
+def test_members_in_lanes_are_those_alone():
+    """Bit for bit, whether they go on implicitly sooner, later or never."""
+    mechanism, ts = damped(1.0), np.linspace(0.0, 1.0, 5)
+    analysis, state = udk.analyse(mechanism), udk.assemble(mechanism)
+
+    def motion(damping):
+        moved = mechanism.with_parameters({"force.damper.damping": damping})
+        found = run(moved, ts=ts, state=state, analysis=analysis, throw=False)
+        return found.q, found.v, found.stats["steps"], found.stats["implicit"]
+
+    dampings = np.geomspace(0.1, 1e9, 11)
+    together = jax.jit(jax.vmap(motion))(dampings)
+    assert (together[3] > 0).any() and (together[3] == 0).any()
+    for k, damping in enumerate(dampings):
+        for x, y in zip(together, motion(damping), strict=True):
+            np.testing.assert_array_equal(x[k], y)
+
+
+@pytest.mark.parametrize("damping", [1e4, pytest.param(1e7, marks=pytest.mark.slow)])
+def test_first_derivatives(damping):
+    """Through the change of the method, forward and reverse, and by differences; also of members in lanes."""
+    mechanism = damped(damping)
+    analysis, state = udk.analyse(mechanism), udk.assemble(mechanism)
+
+    def end(x):
+        moved = mechanism.with_parameters({"force.damper.damping": x})
+        found = run(moved, 1e-9, state=state, analysis=analysis, throw=False)
+        return found.q[5, 0, 2] + found.v[-1, 0, 2]
+
+    forward = jax.jvp(end, (damping,), (1.0,))[1]
+    assert_allclose(jax.grad(end)(damping), forward, rtol=1e-10)
+    assert_allclose(forward, (end(damping * 1.01) - end(damping * 0.99)) / (0.02 * damping), rtol=1e-3)
+
+
+def texts(changes):
+    """The text of the default run of a double pendulum, by functions, with or without the implicit method."""
+    engine = import_module("udkjax.integrate.compiled_mechanism")
+    compiled = engine.compile_concrete(SCENE, udk.analyse(SCENE), udk.Auto(), udk.Projection())
+    module = replace(compiled.plan.operation, changes=changes).module(1, 1, 8)
+    module.text()
+    return {f.name: f.text().count("\n") for f in module.functions}
+
+
+SCENE = udk.library.double_pendulum()
+
+
+def test_a_step_that_is_not_stiff_takes_hardly_more_operations():
+    """Programs of the scene are the same; the functions of a step have a few more operations, most of them behind a branch."""
+    one, other = texts(True), texts(False)
+    own = {"attempt", "decide", "differences", "begin", "run", "outputs", "finish_members"}
+    assert {name for name in other if one[name] != other[name]} <= own
+    assert one["decide"] - other["decide"] < 240 and one["attempt"] - other["attempt"] < 340
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["parallelogram", "four_bar", "double_pendulum", "chain", "slider_crank"])
+def test_motions_that_are_not_stiff_take_no_implicit_step(name):
+    mechanism = getattr(udk.library, name)()
+    ts = np.linspace(0.0, 8 * float(udk.analyse(mechanism).time), 5)
+    for tol in (1e-3, 1e-6, 1e-10):
+        assert int(run(mechanism, tol, ts, throw=False).stats["implicit"]) == 0
