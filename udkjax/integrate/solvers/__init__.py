@@ -58,7 +58,8 @@ def has_method(solver: "diffrax.AbstractSolver | None") -> bool:
     tableau: Any = getattr(solver, "tableau", None)
     if not isinstance(solver, diffrax.AbstractESDIRK) or not isinstance(tableau, diffrax.ButcherTableau):
         return False
-    last = np.append(tableau.a_lower[-1], tableau.a_diagonal[-1])
+    diagonal: Any = tableau.a_diagonal
+    last = np.append(tableau.a_lower[-1], diagonal[-1])
     return bool(np.array_equal(last, tableau.b_sol)) and tableau.a_predictor is not None
 
 
