@@ -14,7 +14,7 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.pinv import Auto, AutoOfRows, Elimination, Pseudoinverse
+from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.mechanism import Mechanism
 
@@ -34,7 +34,7 @@ class TextbookEquations(MechanismSystem):
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """Return a = a_F + M^(-1/2) D^+ b."""
-        return uk.accelerations(self.mechanism, t, q, v, self.inverse, self.baumgarte, self.weights)
+        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights)
 
     def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         """Return lambda = -(D^+)^T D^+ b."""
@@ -46,12 +46,12 @@ class TextbookEquations(MechanismSystem):
 
     def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Take a Newton step in position and one in velocity; on the manifold the result has the derivatives of a projection."""
-        return uk.project(self.mechanism, t, q, v, self.inverse, self.weights, steps=1)
+        return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """Return (I - M^(-1/2) D^+ D M^(1/2)) times dq and dv, the tangent parts of small changes at q."""
         mechanism, w = self.mechanism, self.weights
-        tangent = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.inverse, w))  # with one D^+ for both
+        tangent = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return TangentPart(*tangent(jnp.stack([dq, dv])))
 
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
@@ -84,7 +84,7 @@ class TextbookEquations(MechanismSystem):
     def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
         mechanism, w = self.mechanism, self.weights
         return (
-            uk.pseudoinverse(self.inverse, uk.D(mechanism, t, q, w)),
+            uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)),
             uk.weigh(w, constraints.psi(mechanism, t, q)),
             uk.inverse_sqrt_mass(mechanism),
         )
@@ -92,15 +92,7 @@ class TextbookEquations(MechanismSystem):
     def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
         mechanism, w = self.mechanism, self.weights
         rate = uk.weigh(w, constraints.psi_dot(mechanism, t, q, v))
-        return uk.pseudoinverse(self.inverse, uk.D(mechanism, t, q, w)), rate, uk.inverse_sqrt_mass(mechanism)
-
-    @property
-    def inverse(self) -> Pseudoinverse:
-        """The method as it is applied in JAX, where all rows of a product count: the multipliers do not."""
-        if type(self.method) is not Auto or self.redundant is None:
-            return self.method
-        method = self.method
-        return AutoOfRows(method.rank_tol, method.relative, branch_tol=method.branch_tol, dispensable=self.redundant)
+        return uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)), rate, uk.inverse_sqrt_mass(mechanism)
 
     @property
     def weights(self) -> Float[Array, "m"]:
@@ -169,7 +161,7 @@ def prepare(
 
 @jax.custom_jvp
 def _project(equations: TextbookEquations, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-    return uk.project(equations.mechanism, t, q, v, equations.inverse, equations.weights)
+    return uk.project(equations.mechanism, t, q, v, equations.method, equations.weights)
 
 
 @_project.defjvp

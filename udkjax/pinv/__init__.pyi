@@ -3,7 +3,6 @@
 from udkjax import pinv as pinv
 from udkjax.pinv.auto import NEAREST as NEAREST
 from udkjax.pinv.auto import Auto as Auto
-from udkjax.pinv.auto import AutoOfRows as AutoOfRows
 from udkjax.pinv.elimination import Elimination as Elimination
 from udkjax.pinv.elimination import default_rank_tol as default_rank_tol
 from udkjax.pinv.elimination_order import Fronts as Fronts

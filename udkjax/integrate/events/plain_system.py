@@ -94,7 +94,7 @@ class PlainSystem:
         def of_mechanism(which: int, at: RunState) -> tuple[Array, Array]:
             # Velocities jump, so `equations.project`, whose derivatives hold for small corrections, cannot be used.
             equations = self.hybrid.textbook(which, at)
-            return uk.project(equations.mechanism, *at[:3], equations.inverse, equations.weights)
+            return uk.project(equations.mechanism, *at[:3], equations.method, equations.weights)
 
         state = without_member(at)
         q, v = self.hybrid.in_phase(state.phase, of_mechanism, state, is_free=is_free)
