@@ -14,7 +14,7 @@ from udkjax.equations import state_arrays
 SCENES = {
     "redundant": lambda: udk.library.parallelogram(),
     "driven": lambda: udk.library.planetary_gear(),
-    "loaded": lambda: udk.library.andrews_squeezer(),
+    "loaded": lambda: udk.library.andrews(),
     "unconstrained": lambda: udk.Mechanism({"a": udk.Body(1.0, 0.1, [0.5, 0.1])}),
 }
 
@@ -32,15 +32,15 @@ def test_quantities_of_concrete_numbers_are_those_of_the_textbook(name, monkeypa
     mech = SCENES[name]()
     states = history(mech, 4)
     t, q, v = 0.3, states.q[1], states.v[1]
-    stabilization = udk.Baumgarte(3.0, 4.0)
+    stabilized = {"stabilization": udk.Baumgarte(3.0, 4.0)}
 
     def found():
         return (
             udk.violation(mech, states),
             udk.energy(mech, states),
             udk.efforts(mech, states),
-            udk.accelerations(mech, t, q, v, udk.SVD(), stabilization, multipliers=True),
-            udk.reactions(mech, states, stabilization=stabilization),
+            udk.accelerations(mech, t, q, v, multipliers=True, **stabilized),
+            udk.reactions(mech, states, **stabilized),
             udk.reactions(mech, states, frame="joint", about="joint"),
             udk.unique_reactions(mech, states, frame="body"),
             udk.singular_values(mech, t, q),

@@ -1,7 +1,5 @@
 """Equilibria and vibration compared with closed forms and with a reduction to one coordinate."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,8 +48,7 @@ def double_pendulum(*forces):
 @pytest.mark.parametrize("name", LOADED)
 def test_linearizations_by_numpy_are_those_of_jax(name):
     mech = LOADED[name]()
-    q: Any = np.ravel(udk.assemble(mech).q)
-    analysis = udk.analyse(mech)
+    q, analysis = np.ravel(udk.assemble(mech).q), udk.analyse(mech)
     free = analysis.degrees_of_freedom
     assert free
     given = mech.without_origin, analysis, free

@@ -126,7 +126,7 @@ def accelerations(
     """
     if isinstance(mechanism, Mechanism):
         analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
-        if formulation is None and method is not None and by_numpy(mechanism, (t, q, v, analysis, stabilization), method):
+        if formulation is None and by_numpy(mechanism, (t, q, v, analysis, stabilization), method):
             one_q, one_v = (np.reshape(np.asarray(x, float), (1, -1)) for x in (q, v))
             time = np.reshape(np.asarray(t, float), 1)
             found = state_arrays(mechanism).solve(time, one_q, one_v, analysis, method, stabilization)
@@ -166,7 +166,7 @@ def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> E
     Returns:
         The `Energy`, kinetic and potential (T,), in J.
     """
-    if isinstance(mechanism, Mechanism) and by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
+    if by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
         return Energy(*jax.device_put([*state_arrays(mechanism.without_origin).energy(*history_of(solution)).T]))
     return _evaluate_along(mechanism, solution, _energy)
 

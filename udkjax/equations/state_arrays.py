@@ -18,7 +18,7 @@ from udkjax.equations.analysis import Analysis
 from udkjax.equations.loads import mass_of
 from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.udwadia_kalaba import Baumgarte
-from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -29,13 +29,13 @@ DENSE_ARRAYS = 8  # of the size of Psi_q, which a state needs at once
 def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = None) -> bool:
     """Return whether `StateArrays` has the quantities of a mechanism: its numbers and the given ones are concrete.
 
-    `method` must be the SVD; numbers of the mechanism must not be samples over time.
+    `method` must be the SVD, or what stands for it; numbers of the mechanism must not be samples over time.
     """
     config = jax.config
     return (
         isinstance(mechanism, Mechanism)
         and mechanism.is_concrete
-        and (method is None or (type(method) is SVD and method.relative and not is_traced(method)))
+        and (method is None or (type(method) in (SVD, Auto) and method.relative and not is_traced(method)))
         and not (is_traced(numbers) or is_within_jit() or mechanism.samples)
         and config.jax_enable_x64
         and not (config.jax_disable_jit or config.jax_debug_nans)
