@@ -48,7 +48,7 @@ def test_wrong_input_of_a_report_is_refused_before_anything_is_run(tmp_path, mon
 def test_a_file_of_something_else_is_no_report(tmp_path, capsys):
     xarray.Dataset({"q": ("time", [1.0])}).to_netcdf(tmp_path / "run.nc", engine="h5netcdf")
     assert udkjax("report", "--from", tmp_path / "run.nc", "--out", tmp_path / "page.html") == 2
-    assert "no data of a report" in capsys.readouterr().err
+    assert "not the data of a report" in capsys.readouterr().err
     assert not (tmp_path / "page.html").exists()
 
 

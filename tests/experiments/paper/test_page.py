@@ -175,7 +175,7 @@ def test_counts_are_written_in_groups_that_do_not_break():
 def test_other_files_are_refused(tmp_path, study_data):
     file = tmp_path / "other.nc"
     study_data.assign_attrs(format="something else").to_netcdf(file, engine="h5netcdf")
-    with pytest.raises(ValueError, match="no data of a report"):
+    with pytest.raises(ValueError, match="not the data of a report"):
         read(file)
 
 
