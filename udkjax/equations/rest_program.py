@@ -18,7 +18,7 @@ from udkjax.expressions import KernelWriter, LoopProgram, Scalar, tangents
 LOADS, STIFFNESS, DAMPING, CURVATURE = "loads at rest", "stiffness", "damping", "curvature"
 
 
-class Places(NamedTuple):
+class EntryPlaces(NamedTuple):
     """The rows and columns of the entries that elements write to an array."""
 
     rows: np.ndarray
@@ -34,7 +34,7 @@ class RestProgram(NamedTuple):
 
     loads: LoopProgram
     curvature: LoopProgram
-    places: dict[str, Places]  # of the entries in each array
+    places: dict[str, EntryPlaces]  # of the entries in each array
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -58,8 +58,8 @@ class _Entries:
         self.size += len(places) * len(group.table)
         return start
 
-    def places(self) -> Places:
-        return Places(np.concatenate(self._rows), np.concatenate(self._columns))
+    def places(self) -> EntryPlaces:
+        return EntryPlaces(np.concatenate(self._rows), np.concatenate(self._columns))
 
 
 def write_rest_program(terms: SceneTerms) -> RestProgram:
