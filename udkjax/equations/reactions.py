@@ -29,7 +29,7 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import psi_q
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
 from udkjax.equations.general import ConstrainedSystem, prepare_general
-from udkjax.equations.state_arrays import StateArrays, StateHistory, by_numpy, history_of, state_arrays
+from udkjax.equations.state_arrays import StateArrays, StateArraysOverTime, by_numpy, history_of, state_arrays
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -306,7 +306,7 @@ def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
 
 
 def _loads_by_numpy(
-    mechanism: Mechanism, analysis: Analysis, history: StateHistory, *choices: Any, frame: Axes, about: About
+    mechanism: Mechanism, analysis: Analysis, history: StateArraysOverTime, *choices: Any, frame: Axes, about: About
 ) -> list[list[Array]]:
     """Compute what `_loads` computes."""
     arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]

@@ -42,10 +42,10 @@ def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = Non
     )
 
 
-StateHistory: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]  # times (T,), coordinates and velocities (T, n)
+StateArraysOverTime: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]  # times (T,), coordinates and velocities (T, n)
 
 
-def history_of(solution: HistoryLike) -> StateHistory:
+def history_of(solution: HistoryLike) -> StateArraysOverTime:
     """Return times (T,), coordinates and velocities (T, n) as NumPy arrays."""
     ts = np.asarray(solution.ts, float)
     q, v = (np.asarray(x, float).reshape(len(ts), -1) for x in (solution.q, solution.v))
