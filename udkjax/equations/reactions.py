@@ -323,7 +323,7 @@ def _loads_by_numpy(
 def _uniqueness_by_numpy(
     mechanism: Mechanism, analysis: Analysis, history: tuple[np.ndarray, np.ndarray], rank_tol: Any, frame: Axes, about: About
 ) -> list[list[Array]]:
-    """Return what `_uniqueness_of_loads` returns."""
+    """Return the results of `_uniqueness_of_loads`."""
     arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
     rows_of, scales = _rows_by_owner(rows), np.asarray(analysis.scales.rows)
     unit = np.stack([1.0, 1.0, float(analysis.length)])

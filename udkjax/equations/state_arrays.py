@@ -164,4 +164,14 @@ class StateArrays:
         return np.concatenate([self._evaluate(quantity, t[p], q[p], v[p]).T for p in self.pieces(len(t), dense=False)])
 
 
-state_arrays = cached_by_identity(StateArrays)
+@cached_by_identity
+def state_arrays(mechanism: Mechanism) -> StateArrays:
+    """Return the quantities of a mechanism by NumPy, made once for each mechanism.
+
+    Args:
+        mechanism: The scene; its numbers are concrete.
+
+    Returns:
+        Functions of states (T, n).
+    """
+    return StateArrays(mechanism)

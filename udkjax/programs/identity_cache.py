@@ -127,7 +127,7 @@ class SizedFunction(Protocol[Arguments, Produced_co]):
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Produced_co: ...
 
     def cache_info(self) -> _CacheInfo:
-        """Return what `functools.lru_cache` returns; the maximum is in bytes, of all caches."""
+        """Return the record of `functools.lru_cache`; its maximum is in bytes, of all caches."""
         ...
 
     def cache_clear(self) -> None:
