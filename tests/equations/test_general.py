@@ -203,7 +203,7 @@ def test_a_mass_matrix_that_is_not_diagonal():
     """The added coordinate weighs 1e-3 along the sum of the angles: explicitly M + 1e-3 u u^T."""
     q, v = jnp.array([1.0, -0.4]), jnp.array([0.3, 1.2])
     u = jnp.ones(2)
-    plain = double(False)
+    plain: Any = double(False)
     expected = jnp.linalg.solve(plain.mass(q) + 1e-3 * jnp.outer(u, u), plain.force(0.0, q, v))
     by_both = deferred(lambda q, v: [udk.accelerations(double(True), 0.0, q, v, method) for method in (udk.Auto(), udk.Varga())])
     for a in by_both(jnp.append(q, q.sum()), jnp.append(v, v.sum())):

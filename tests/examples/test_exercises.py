@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from numpy.testing import assert_allclose
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "exercises.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
 MOST_LINES = 15
-TOLERANCE = {"rtol": 1e-9, "atol": 1e-9}
+TOLERANCE: Any = {"rtol": 1e-9, "atol": 1e-9}
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """Systems of the user's own with known motions, for tests."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -135,7 +137,7 @@ def spinning(p, dp):
     return 2 * E @ dp, 2 * p @ dp
 
 
-def quaternion_body(inertia, along=1.0):
+def quaternion_body(inertia, along: Any = 1.0):
     """A free rigid body by a unit quaternion. The kinetic energy of rotation alone has a singular mass matrix: the rate of the
     norm, which the constraint sets to zero, gets an inertia of its own."""
 

@@ -240,7 +240,7 @@ def test_control_intervals():
 class Pushed(eqx.Module):
     """A pendulum that a force pushes until a breakpoint."""
 
-    push: jax.Array
+    push: Any
 
     def force(self, t, q, v):
         return jnp.where(t < 0.5, self.push, 0.0) * jnp.array([1.0, 0.0, 0.0])

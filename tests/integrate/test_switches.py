@@ -1,5 +1,7 @@
 """Constraints that events switch on and off: limits of all joints of a machine, joints that come and go, contacts at rest."""
 
+# pyright: reportOptionalMemberAccess=false
+
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,7 @@
 """Motions of pins and links, types, dead points, time ratios and transmission against closed formulas of textbooks."""
 
+# pyright: reportOptionalMemberAccess=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportArgumentType=false
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose

@@ -150,7 +150,7 @@ def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, capsys):
 
 def test_verdicts():
     """Errors of other kinds, from other places, or without a place count as faults."""
-    assert "no documented error" in verdict(Case("", lambda: {}["x"]))[0]
+    assert "not a documented error" in verdict(Case("", lambda: {}["x"]))[0]
     assert "from json/decoder.py" in verdict(Case("", lambda: json.loads("{")))[0]
     assert "place" in verdict(Case("", lambda: udk.loads("format = 1"), ["nowhere"]))[0]
     assert verdict(Case("", lambda: udk.loads("format = 1"), ["body"]))[0] == ""

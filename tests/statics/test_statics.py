@@ -1,5 +1,7 @@
 """Equilibria and vibration compared with closed forms and with a reduction to one coordinate."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +50,8 @@ def double_pendulum(*forces):
 @pytest.mark.parametrize("name", LOADED)
 def test_linearizations_by_numpy_are_those_of_jax(name):
     mech = LOADED[name]()
-    q, analysis = np.ravel(udk.assemble(mech).q), udk.analyse(mech)
+    analysis = udk.analyse(mech)
+    q: Any = np.ravel(udk.assemble(mech).q)
     free = analysis.degrees_of_freedom
     assert free
     given = mech.without_origin, analysis, free

@@ -166,7 +166,7 @@ def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> E
     Returns:
         The `Energy`, kinetic and potential (T,), in J.
     """
-    if by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
+    if isinstance(mechanism, Mechanism) and by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
         return Energy(*jax.device_put([*state_arrays(mechanism.without_origin).energy(*history_of(solution)).T]))
     return _evaluate_along(mechanism, solution, _energy)
 

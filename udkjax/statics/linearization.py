@@ -84,7 +84,7 @@ class NumpyLinearizer:
         self._terms, self._free = DenseTerms(mechanism), free
         scales = jax.tree.map(np.asarray, analysis.scales)
         self._weights, self._tol = scales.weights, float(scales.rank_tol)
-        self._units = scales.coordinates(self._terms.size)
+        self._units = np.asarray(scales.coordinates(self._terms.size))
         self._root = 1 / np.sqrt(self._terms.mass)
 
     def linearize(self, t: Any, q: Any) -> Any:

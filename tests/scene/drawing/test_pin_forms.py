@@ -1,5 +1,7 @@
 """Pins by lengths and angles: their places, exact derivatives, files, and mistakes by name."""
 
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportAttributeAccessIssue=false
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -128,7 +128,7 @@ def test_singular_values_and_rank_of_the_papers_linkage():
     assert rank.values[0] == 11 and np.isnan(rank.values[1])
     expected = udk.singular_values(mech, 0.0, poses[0])
     assert smallest.name == "singular value 11" and expected[11] < 1e-14
-    np.testing.assert_allclose(smallest.values, [expected[10], np.nan], rtol=1e-12)
+    np.testing.assert_allclose(smallest.values, [float(expected[10]), np.nan], rtol=1e-12)
 
 
 def test_the_rank_of_a_large_mechanism_is_found_without_dense_matrices():

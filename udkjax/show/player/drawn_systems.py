@@ -7,7 +7,6 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.quantities import energy, violation
@@ -15,7 +14,7 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.bodies import Body
 from udkjax.scene.mechanism import Mechanism
 
-PlacesBodies: TypeAlias = Callable[[Any, Any], Mapping[str, ArrayLike]]  # (t, q) -> x, y and angle of each drawn body, by name
+PlacesBodies: TypeAlias = Callable[[Any, Any], Mapping[str, Any]]  # (t, q) -> x, y and angle of each drawn body, by name
 
 
 def drawn_system(system: ConstrainedSystem, solution: Any, drawing: PlacesBodies) -> tuple[Mechanism, Any, dict[str, np.ndarray]]:
