@@ -683,7 +683,7 @@ function hit(engine, numbers, settings, at, watch, k, held) {
   const isSlow = Math.abs(rate[k]) < tol.rest * unit(k) && isPressed(rate2[k]);
   const impulse = Math.max(0, -(1 + (isSlow ? 0 : events.restitution[k])) * rate[k] / W), after = rate[k] + W * impulse;
   const moved = size => at.v.map((x, i) => x + size * directions[k][i]), v = moved(impulse), hits = !isSlow && rate[k] < -floor;
-  const stays = after <= Math.max(floor, tol.still * Math.abs(rate[k])) || (isSlow && rate[k] > 0);
+  const stays = after <= Math.max(floor, tol.still * Math.abs(rate[k]), tol.rest * unit(k));
   const rests = stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k]);
   return {v: rests ? moved(-rate[k] / W) : v, hits, rests};
 }
