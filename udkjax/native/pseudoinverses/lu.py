@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from udkjax.native.base.ir import Operand, Value
-from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
+from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import reversed_each
 
 
@@ -70,13 +70,18 @@ class LUCode(DenseMethod):
         d.over_registers(largest.registers, include)
         return f.select(size > largest.entry(k) * (d.m * float(np.finfo(float).eps)), inverse, float("nan"))
 
-    def solve(self, d: DenseMatrices):
-        f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
-        with f.each(d.m) as k:
+    def _forward(self, d: DenseMatrices) -> tuple[MatrixRow, MatrixRow]:
+        """Solve L y = P b; return the rows `x`, which is zero, and `y`."""
+        b, x, y = d.row("b"), d.row("x"), d.row("y")
+        with d.f.each(d.m) as k:
             entry = b.at(d.whole(d.row("order").entry(k)))
             y.put(k, entry)
             d.axpy(-entry, d.row("lower", k), b)
         x.clear()
+        return x, y
+
+    def solve(self, d: DenseMatrices):
+        x, y = self._forward(d)
         with reversed_each(d, d.m) as k:  # entries left of the diagonal multiply coordinates that are still zero
             x.put(k, (y.entry(k) - d.dot(d.row("upper", k), x)) * d.row("inverse").entry(k))
 
@@ -119,12 +124,7 @@ class OrderedLUCode(LUCode):
                 d.row("columns", j).put(k, upper.entry(j))
 
     def solve(self, d: DenseMatrices):
-        f, b, x, y = d.f, d.row("b"), d.row("x"), d.row("y")
-        with f.each(d.m) as k:
-            entry = b.at(d.whole(d.row("order").entry(k)))
-            y.put(k, entry)
-            d.axpy(-entry, d.row("lower", k), b)
-        x.clear()
+        x, y = self._forward(d)
         with reversed_each(d, d.m) as k:  # entries below the diagonal change numbers that have been used
             entry = y.entry(k) * d.row("inverse").entry(k)
             x.put(k, entry)
