@@ -108,7 +108,7 @@ class DifferentiableRun(DifferentiableFunction):
     def fast(self, inputs: list[Array]) -> IntegratorOutput:
         """Return the run without derivatives: by machine code if it can integrate the problem, else by diffrax."""
         problem = self.problem(inputs)
-        return native_engine.integrate(problem) if self.native else _integrate_by_diffrax(problem)
+        return native_engine.integrate(problem) if self.native else integrate_by_diffrax(problem)
 
     def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
         del run
@@ -126,7 +126,7 @@ class DifferentiableRun(DifferentiableFunction):
             return self.pull(inputs, active, cotangents)
 
         def function(active_inputs: list[Array]) -> list[Array]:
-            raw = _integrate_by_diffrax(self.problem(replaced(inputs, active, active_inputs)), "RecursiveCheckpointAdjoint")
+            raw = integrate_by_diffrax(self.problem(replaced(inputs, active, active_inputs)), "RecursiveCheckpointAdjoint")
             return [raw[k] for k in SMOOTH]
 
         return jax.vjp(function, select(inputs, active))[1](cotangents)[0]
@@ -162,7 +162,7 @@ class DifferentiableRun(DifferentiableFunction):
             change = self.problem.changes(active, tangents)
             raw, changes = native_engine.jvp(self.problem(inputs), self.problem.marks(active), change)
             return raw, list(changes)
-        raw, change = change_along(lambda inputs: _integrate_by_diffrax(self.problem(inputs)), inputs, active, tangents)
+        raw, change = change_along(lambda inputs: integrate_by_diffrax(self.problem(inputs)), inputs, active, tangents)
         return raw, [change[k] for k in SMOOTH]
 
     def recorded(self, inputs: list[Array], active: Mask) -> tuple[IntegratorOutput, "native_engine.RecordedRun | tuple[()]"]:
@@ -172,13 +172,13 @@ class DifferentiableRun(DifferentiableFunction):
         """
         if self._is_native(inputs, active):
             return native_engine.integrate_for_vjp(self.problem(inputs), self.problem.marks(active))
-        return _integrate_by_diffrax(self.problem(inputs)), ()
+        return integrate_by_diffrax(self.problem(inputs)), ()
 
     def _is_native(self, inputs: list[Array], active: Mask) -> bool:
         return self.native and native_engine.serves_derivatives(self.problem.marks(active))
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
-        raw = _integrate_by_diffrax(self.problem(inputs))
+        raw = integrate_by_diffrax(self.problem(inputs))
         return [raw[k] for k in SMOOTH]
 
     def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
@@ -187,9 +187,17 @@ class DifferentiableRun(DifferentiableFunction):
         return [(times, n), (times, n), (2 * n,)]
 
 
-def _integrate_by_diffrax(problem: Problem, adjoint: str = "ForwardMode") -> IntegratorOutput:
+def integrate_by_diffrax(problem: Problem, adjoint: Any = "ForwardMode", meter: Any = None) -> IntegratorOutput:
+    """Integrate by diffrax (diffrax_engine.py), imported only here, since its import takes as long as that of JAX.
+
+    Args:
+        problem: the problem.
+        adjoint: an adjoint of diffrax, the name of its class, or None for the engine's default.
+        meter: a progress meter of diffrax, or None.
+    """
     import diffrax
 
-    from udkjax.integrate.diffrax_engine import integrate_by_diffrax
+    from udkjax.integrate import diffrax_engine
 
-    return integrate_by_diffrax(problem, getattr(diffrax, adjoint)())
+    chosen = getattr(diffrax, adjoint)() if isinstance(adjoint, str) else adjoint
+    return diffrax_engine.integrate_by_diffrax(problem, chosen, meter)

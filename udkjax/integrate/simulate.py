@@ -22,7 +22,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.causes.find import explained
 from udkjax.integrate.causes.system_causes import explained_system
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
-from udkjax.integrate.derivatives import differentiable
+from udkjax.integrate.derivatives import differentiable, integrate_by_diffrax
 from udkjax.integrate.native_engine import integrate_concrete
 from udkjax.integrate.outcome import LEAST_ATOL, FinishedRun, counts, outcome
 from udkjax.integrate.prepare import (
@@ -35,7 +35,7 @@ from udkjax.integrate.prepare import (
     begin_concrete,
     prepare_run,
 )
-from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
 from udkjax.pinv import Pseudoinverse
@@ -327,13 +327,6 @@ def _finish(
         found_cause=None,
     )
     return solution, run.has_missed_rows, (raw.t, raw.y), code_found
-
-
-def integrate_by_diffrax(problem: Problem, adjoint: Any, meter: Any) -> Any:
-    """Integrate by diffrax (diffrax_engine.py), imported only here, since its import takes as long as that of JAX."""
-    from udkjax.integrate.diffrax_engine import integrate_by_diffrax
-
-    return integrate_by_diffrax(problem, adjoint, meter)
 
 
 def _adjoint(adjoint: Any) -> Any:
