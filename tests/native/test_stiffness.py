@@ -3,6 +3,7 @@
 from dataclasses import replace
 from importlib import import_module
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.native.test_implicit_stages import TS, assert_motion_is_that_by_radau, by_radau, damped
+from udkjax.native import primitive
+from udkjax.native.run import controller, members
 
 
 def run(mechanism, tol=1e-6, ts=TS, **choices):
@@ -99,10 +102,62 @@ def test_a_step_that_is_not_stiff_takes_hardly_more_operations():
     assert one["decide"] - other["decide"] < 240 and one["attempt"] - other["attempt"] < 340
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["parallelogram", "four_bar", "double_pendulum", "chain", "slider_crank"])
+def spans(mechanism, count=20):
+    """Times of a run of `count` characteristic times."""
+    return np.linspace(0.0, count * float(udk.analyse(mechanism).time), 3)
+
+
+SLOW = ["andrews_squeezer", "n_four_bar", "peaucellier", "planetary_gear", "scissor_lift", "slider_crank", "chain"]
+
+
+@pytest.mark.parametrize("name", ["parallelogram", "excavator", *(pytest.param(x, marks=pytest.mark.slow) for x in SLOW)])
 def test_motions_that_are_not_stiff_take_no_implicit_step(name):
+    """They are those by the explicit method, bit for bit, also if longer implicit steps have been tried in vain."""
     mechanism = getattr(udk.library, name)()
-    ts = np.linspace(0.0, 8 * float(udk.analyse(mechanism).time), 5)
-    for tol in (1e-3, 1e-6, 1e-10):
-        assert int(run(mechanism, tol, ts, throw=False).stats["implicit"]) == 0
+    for tol in (1e-3, 1e-6, 1e-9):
+        choices = {"tol": tol, "ts": spans(mechanism), "throw": False}
+        default, explicit = run(mechanism, **choices), run(mechanism, solver=diffrax.Dopri8(), **choices)
+        assert int(default.stats["implicit"]) == 0
+        np.testing.assert_array_equal(default.q, explicit.q)
+        np.testing.assert_array_equal(default.v, explicit.v)
+
+
+def test_a_visible_vibration_is_followed_explicitly():
+    """The oil of the excavator swings at the limit of stability; implicit steps would have to follow it as well."""
+    mechanism, ts = udk.library.excavator(), np.linspace(0.0, 20.0, 3)
+    default, explicit = run(mechanism, ts=ts), run(mechanism, ts=ts, solver=diffrax.Dopri8())
+    assert int(default.stats["implicit"]) == 0
+    assert int(explicit.stats["steps"]) < int(default.stats["steps"]) < int(explicit.stats["steps"]) + 8  # trials
+    loose = run(mechanism, 1e-3, ts)  # the vibration has soon decayed below the tolerance
+    assert int(loose.stats["implicit"]) > 10
+    assert int(loose.stats["steps"]) < 0.6 * int(run(mechanism, 1e-3, ts, solver=diffrax.Dopri8()).stats["steps"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_thresholds_matter_little(factor, monkeypatch):
+    """With counts of steps ten times as large or as small the same runs go on implicitly, to the same motion."""
+    scenes = {  # tolerance, whether the run is stiff
+        "four_bar": (damped(1e5), 1e-6, True),
+        "pendulum": (damped(1e7, scene=udk.library.compound_pendulum()), 1e-6, True),
+        "slider_crank": (damped(1e6, scene=udk.library.slider_crank()), 1e-6, True),
+        "excavator": (udk.library.excavator(), 1e-6, False),
+        "parallelogram": (udk.library.parallelogram(), 1e-3, False),
+        "double_pendulum": (udk.library.double_pendulum(), 1e-9, False),
+    }
+
+    def runs():
+        primitive.generate.cache_clear()
+        primitive.machine_code.cache_clear()
+        return {name: run(mechanism, tol, throw=False) for name, (mechanism, tol, _) in scenes.items()}
+
+    usual = runs()
+    monkeypatch.setattr(members, "PATIENCE", members.PATIENCE * factor)
+    monkeypatch.setattr(controller, "UNPAID", controller.UNPAID * factor)
+    other = runs()
+    monkeypatch.undo()
+    primitive.generate.cache_clear()
+    primitive.machine_code.cache_clear()
+    for name, (_, tol, is_stiff) in scenes.items():
+        assert (int(usual[name].stats["implicit"]) > 0) == (int(other[name].stats["implicit"]) > 0) == is_stiff, name
+        assert_allclose(other[name].q, usual[name].q, atol=30 * tol if is_stiff else 0, rtol=0)

@@ -59,12 +59,16 @@ TRIES = 8  # successive attempts to end a step at the end of a piece; for a stat
 # nevertheless, or a correction is too large after STAGE_ITERATIONS, the step is repeated with STAGE_SHRINK of its length.
 STAGE_TOL, STAGE_ITERATIONS, FADING, SLOW, RENEWALS, EAGER, DIVERGING, STAGE_SHRINK = 1e-3, 10, 0.3, 0.3, 3.0, 10.0, 1.0, 0.4
 
-# Change to an implicit method. An explicit step is limited by stability if its length times the largest rate exceeds LIMIT:
-# Dopri8 is stable up to STABLE. After PATIENCE such steps, without CALM others in succession, the run goes on implicitly. It
-# returns after UNPAID implicit steps in succession that are less than GAIN times as long as stability allows, since they take
-# several times as long; the next time, it is twice as patient.
-LIMIT, PATIENCE, CALM, UNPAID, GAIN, STABLE = 4.0, 15.0, 6.0, 25.0, 2.0, 5.2
-WATCH_EVERY = 32  # the rate is measured in one of so many attempts: in all, it would take a tenth of the time of small scenes
+# Change to an implicit method. The largest rate of the equations is measured in one of PATIENCE attempts: in all, it would take a
+# tenth of the time of small scenes. Where the length of an explicit step times this rate exceeds LIMIT, stability may limit it:
+# Dopri8 damps fast motions up to STABLE, and keeps undamped oscillations up to LIMIT. But steps as long may be due to a visible
+# vibration, which every method must follow. Therefore the next attempt is an implicit step that is CLEARLY longer than one has to
+# be to pay. If its error is below the tolerance, the run goes on implicitly, until UNPAID steps in succession do not pay. After
+# each failure of either kind the run waits twice as many attempts until the next measurement.
+LIMIT, STABLE, PATIENCE, CLEARLY, UNPAID = 4.0, 5.2, 32.0, 2.0, 25.0
+# The cost of an implicit step in evaluations of accelerations: CORRECTIONS for each of its stages, and the slopes along n
+# directions, each of which takes as long as SLOPE evaluations, or SLOPE_IN_LANES where some directions share a register.
+CORRECTIONS, SLOPE, SLOPE_IN_LANES = 3.0, 2.0, 0.5
 
 POINTS = 4  # states that the interpolating polynomial passes through; with three, velocities between steps are less accurate
 # Fraction of a step. If less than this would remain for the last step, the remaining time is halved instead. Outputs of the

@@ -12,18 +12,23 @@ def aim(module: Module, f: Function, s: Lane):
     """Set `t1`, `step`, `begin`, `last` and `lands` for the next step of each lane."""
     where, yes = f.select, f.const(1.0, DOUBLE, f.width)
     begin = (s.steps if module.plan.breaks else s.tried) < 0.0
-    t1 = s.point3_t + s.h
+    start, end, stop = s.point3_t, s.end, s.end
+    crossing = s.crossing if module.pieces else f.const(np.inf, DOUBLE, f.width)
+    if module.plan.breaks:
+        s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), start
+        next_breakpoint(module, f, s, start)
+        end = s.t1
+        stop = f.min(end, crossing)
+    length = s.h
+    if module.plan.stiff:  # a trial that has to end earlier would not show whether longer steps pay
+        s.trial = where(begin | (start + s.trial >= f.min(stop, s.end) - s.smallest), f.const(0.0, DOUBLE, f.width), s.trial)
+        length = where(s.trial > 0.0, s.trial, length)
+    t1 = start + length
     last = (t1 >= s.end - s.smallest) & ~begin
     if not module.plan.breaks:
         t1 = where(last, s.end, halve(f, s, t1, begin | last))
         s.lands = f.const(0.0, DOUBLE, f.width)
     else:
-        start = s.point3_t
-        s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), start
-        next_breakpoint(module, f, s, start)
-        end = s.t1
-        crossing = s.crossing if module.pieces else f.const(np.inf, DOUBLE, f.width)
-        stop = f.min(end, crossing)
         rest = f.min(stop, s.end) - start
         parts = f.max(float(POINTS - 1) - s.steps, 1.0)
         split = start + rest / parts
@@ -31,6 +36,8 @@ def aim(module: Module, f: Function, s: Lane):
         splits = splits & (s.next < stop - s.smallest)  # only if outputs are due in between
         if module.implicit:  # a step suffices for its outputs
             splits = splits & (s.stiff < 0.5)
+        if module.plan.stiff:
+            splits = splits & (s.trial <= 0.0)
         if module.pieces:
             splits = splits & s.aim.is_not(float(AIM_ACROSS))
         t1 = where(splits, split, t1 if module.pieces else halve(f, s, t1, begin | last | splits))
@@ -43,7 +50,7 @@ def aim(module: Module, f: Function, s: Lane):
     t1 = where(begin, s.behind if module.plan.breaks else s.point3_t, t1)
     s.t1 = t1
     s.step = where((s.stepping > 0.5) & ~begin, t1 - s.point3_t, 0.0)
-    s.begin = where(begin, yes, -s.stiff)
+    s.begin = where(begin, yes, where(s.trial > 0.0, -yes, -s.stiff) if module.plan.stiff else -s.stiff)
     s.last = where(last, yes, 0.0)
 
 

@@ -20,10 +20,10 @@ from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
 from udkjax.native.base.power import power
 from udkjax.native.base.steps import (
-    CALM,
+    CLEARLY,
+    CORRECTIONS,
     EXPECTED,
     FACTORS,
-    GAIN,
     GAP,
     LIMIT,
     LOST_TOL,
@@ -32,6 +32,8 @@ from udkjax.native.base.steps import (
     RESTART_FACTOR,
     RETRIES,
     ROUNDING_GROWTH,
+    SLOPE,
+    SLOPE_IN_LANES,
     STABLE,
     SURE,
     UNPAID,
@@ -47,9 +49,10 @@ def write_decide(module: Module):
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
     stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
     failed = stepping & ~(error < np.inf)
+    tries = stepping & (s.trial > 0.0) if module.plan.stiff else None
     shortens, repeats, time_left = f.const(False, BOOL, f.width), f.const(False, BOOL, f.width), inf
     if module.falls_back:
-        stepping, shortens, time_left = _retry_or_fall_back(module, f, s, failed)
+        stepping, shortens, time_left = _retry_or_fall_back(module, f, s, failed, tries)
     else:
         s.fallback_due = f.const(0.0, DOUBLE, f.width)
     tried = where(stepping, s.tried + 1.0, s.tried)
@@ -59,11 +62,13 @@ def write_decide(module: Module):
         repeats = s.again > 0.5
     accept = stepping & (error < 1.0) & ~shortens & ~repeats
     stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
-    factor, rate = _step_factor(module, f, s, accept, step)
+    factor, rate = _step_factor(module, f, s, accept, step, tries)
     h = where(stepping, step * where(shortens, f.const(FACTORS.safety, DOUBLE, f.width), factor), s.h)
     h = where(repeats, s.h, h)
     if module.falls_back:
         h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, time_left, step, h), h)
+    if tries is not None:  # a trial that fails leaves no trace
+        h = where(tries & ~accept, s.h, h)
     s.behind = h
     with f.if_(f.any_of(begun)):
         s.behind = where(begun, first_step(module, f, s), s.behind)
@@ -91,29 +96,41 @@ def write_decide(module: Module):
     s.where(accept, accepted=s.accepted + 1.0)
     if module.implicit:
         s.where(accept & implicit, implicit=s.implicit + 1.0)
-    if module.plan.stiff:
-        _choose_method(module, f, s, stepping, accept)
+    if tries is not None:
+        _choose_method(module, f, s, stepping, accept, tries)
 
 
-def _choose_method(module: Module, f: Function, s: Lane, stepping: Value, accept: Value):
-    """Choose the method of the next step: an implicit one where stability limits the explicit one, as long as it pays."""
+def _choose_method(module: Module, f: Function, s: Lane, stepping: Value, accept: Value, tries: Value):
+    """Choose the method of the next step: an implicit one where stability limits the explicit one, as long as it pays.
+
+    `tries`: lanes whose attempt is a trial of an implicit step.
+    """
     assert module.plan.stiff is not None
-    implicit = s.begin < -0.5
-    explicit = stepping & (s.begin < 0.5) & ~implicit
-    is_near = explicit & (s.speed > LIMIT)
-    with f.if_(f.any_of(is_near | (s.limited > 0.0) | implicit)):
-        longest = (module.plan.stiff.diagonal * STABLE * GAIN) ** 2  # the largest growth of steps that do not pay
-        is_calm = (explicit & (s.speed <= LIMIT)) | (stepping & implicit & (s.growth < longest))
-        s.where(stepping, calm=f.select(is_calm, s.calm + 1.0, 0.0))
-        s.where(is_near, limited=s.limited + 1.0)
-        s.where(explicit & (s.calm >= CALM), limited=0.0)
-        stiffens, returns = explicit & (s.limited >= s.patience), implicit & (s.calm >= UNPAID)
-        s.where(stiffens, stiff=1.0)
-        s.where(returns, stiff=0.0, patience=s.patience * 2.0)
-        s.where(stiffens | returns, limited=0.0, calm=0.0, rate=np.inf)
+    implicit = stepping & (s.begin < -0.5)
+    measured = accept & (s.begin < 0.5) & (s.begin > -0.5) & (s.tried > s.watch)
+    with f.if_(f.any_of(measured | implicit)):
+        length = STABLE * gain(module)  # length of a step that pays, times the largest rate
+        s.where(accept & tries, stiff=1.0)
+        pays = s.growth >= (module.plan.stiff.diagonal * length) ** 2  # at least: the growth is less where dampers are stiff
+        s.where(implicit, unpaid=f.select(pays | tries, f.const(0.0, DOUBLE, f.width), s.unpaid + 1.0))
+        returns = implicit & (s.unpaid >= UNPAID)
+        fails = returns | (tries & ~accept)
+        s.where(returns, stiff=0.0, rate=np.inf)
+        s.where(fails, patience=s.patience * 2.0)
+        s.where(fails | measured, watch=s.tried + s.patience)
+        is_near = measured & (s.speed > LIMIT)
+        trial = f.select(is_near, s.step * (length * CLEARLY) / f.select(is_near, s.speed, 1.0), 0.0)
+        s.where(stepping, trial=trial)
 
 
-def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value) -> tuple[Value, Value, Value]:
+def gain(module: Module) -> float:
+    """Return the least ratio of the length of an implicit step to that of an explicit one at which it pays."""
+    assert module.plan.stiff is not None
+    slopes = module.n * (SLOPE_IN_LANES if module.plan.unrolled else SLOPE)
+    return (CORRECTIONS * (module.plan.stiff.stages - 1) + slopes) / module.method.stages
+
+
+def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value, tries: Value | None) -> tuple[Value, Value, Value]:
     """Shorten a step that encountered a pivot too small for elimination, or leave it to the fallback.
 
     Returns:
@@ -129,27 +146,30 @@ def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value) -> 
     )
     is_near = is_near & ~(has_passed & (s.distance > NEAREST_STAGE))
     shortens = (fallback_due | is_near) & was_clear & (s.retries < float(RETRIES)) & (s.begin < 0.5)
-    s.where(stepping, retries=where(shortens, s.retries + 1.0, where(error < 1.0, 0.0, s.retries)))
+    retries = where(shortens, s.retries + 1.0, where(error < 1.0, 0.0, s.retries))
+    s.where(stepping if tries is None else stepping & ~tries, retries=retries)
     fallback_due = fallback_due & ~shortens
     s.fallback_due = where(fallback_due, f.const(1.0, DOUBLE, f.width), 0.0)
     return stepping & ~fallback_due, shortens, time_left
 
 
-def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value) -> tuple[Value, Value]:
+def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value, tries: Value | None) -> tuple[Value, Value]:
     """Return the ratio of the next step to this one, and the error divided by (length of the step)^order."""
     chosen, used = (f.variable(0.0), f.variable(0.0))
+    # A trial is by another method than the step before.
+    before = s.rate if tries is None else f.select(tries, f.const(np.inf, DOUBLE, f.width), s.rate)
     for method, mask in module.methods(f, s):
-        for variable, new in zip((chosen, used), _factor_of_order(f, s, accept, step, method.order), strict=True):
+        for variable, new in zip((chosen, used), _factor_of_order(f, before, s.error, accept, step, method.order), strict=True):
             variable.value = new if mask is None else f.select(mask, new, variable.value)
     return chosen.value, used.value
 
 
-def _factor_of_order(f: Function, s: Lane, accept: Value, step: Value, order: float) -> tuple[Value, Value]:
-    where, error = f.select, s.error
+def _factor_of_order(f: Function, before: Value, error: Value, accept: Value, step: Value, order: float) -> tuple[Value, Value]:
+    where = f.select
     # Errors are bounded below by the error at which a step grows by `grow`, as smaller errors may be rounding.
     size = where(f.is_finite(error), f.max(error, FACTORS.grow ** -float(order)), 1e30)
     rate = size / power(f, step, float(int(order)), whole=True)
-    foreseen = size * (rate / s.rate)  # the error of an equal step if errors continue to grow (Gustafsson 1994)
+    foreseen = size * (rate / before)  # the error of an equal step if errors continue to grow (Gustafsson 1994)
     grows = accept & (foreseen > 1.0)
     factor = power(f, where(grows, foreseen, size), -1.0 / order) * FACTORS.safety
     factor = f.max(factor, where(accept & ~grows, f.const(1.0, DOUBLE, f.width), FACTORS.shrink))

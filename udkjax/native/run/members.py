@@ -65,7 +65,8 @@ def write_begin(module: Module):
     for name in (f"distance{j}" for j in range(POINTS - 1)):
         put(name, np.inf)
     put("stiff", float(module.method.is_implicit))
-    put("patience", PATIENCE)
+    for name in ("patience", "watch"):
+        put(name, PATIENCE)
     for name in ("tried", "accepted", "steps"):
         put(name, -1.0)
     put("active", 1.0)

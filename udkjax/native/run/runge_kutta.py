@@ -1,11 +1,13 @@
 """One step of a Runge-Kutta method with error estimate."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
-from udkjax.native.base.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK, WATCH_EVERY
+from udkjax.native.base.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
 from udkjax.native.base.tableau import Method
 from udkjax.native.run.manifold import newton, with_threshold
 
@@ -92,13 +94,15 @@ def write_attempt(module: Module):
     _measure_error(module, f, s)
     if module.implicit:
         repeated = (FACTORS.safety / STAGE_SHRINK) ** module.implicit.order
-        s.where((s.diverged > 0.5) & implicit & (s.stepping > 0.5), error=repeated)
+        fails = s.diverged > 0.5
+        if module.plan.stiff:
+            fails = fails | ((s.trial > 0.0) & ~(s.error < np.inf))
+        s.where(fails & implicit & (s.stepping > 0.5), error=repeated)
 
 
 def _watch_speed(module: Module, f: Function, s: Lane):
-    """Set `speed` of an explicit step: in every WATCH_EVERY-th attempt and as long as it is near the limit; otherwise zero."""
-    part = s.tried * (1 / WATCH_EVERY)
-    is_due = (s.stepping > 0.5) & ((s.limited > 0.0) | (part - f.intrinsic("floor", part)).is_(1 - 1 / WATCH_EVERY))
+    """Set `speed` of an explicit step in attempts in which it is to be measured, otherwise zero."""
+    is_due = (s.stepping > 0.5) & (s.tried >= s.watch)
     s.speed = f.const(0.0, DOUBLE, f.width)
     with f.if_(f.any_of(is_due)):
         f.call("measure_speed", f.given["work"])
@@ -106,26 +110,52 @@ def _watch_speed(module: Module, f: Function, s: Lane):
 
 
 def write_measure_speed(module: Module):
-    """Write `measure_speed`: `speed`, the length of an explicit step times the largest rate, from its last two stages.
+    """Write `measure_speed`: `speed`, the length of an explicit step times the largest rate of the equations.
 
-    Both are at the end of the step, and their states differ by errors of the stages, in which the fastest motions dominate: the
-    ratio of the change of (v, a) to the change of (q, v) is close to the largest rate (Hairer and Wanner, IV.2).
+    The last two stages are both at the end of the step, and their states differ by errors in which the fastest motions dominate
+    (Hairer and Wanner, IV.2). With J the Jacobian of (q, v) -> (v, a), the rate is the root of |J J x| / |x| for this difference
+    x: that is right for a motion that decays as well as for one that swings, where |J x| / |x| would depend on the phase.
     """
     f, s = module.function("measure_speed")
     method, h, omega = module.method, module.broadcast(f, s.step), module.broadcast(f, s.omega)
     last = method.stages - 1
     row_q, row_v = (row[last] - row[last - 1] for row in (method.q, method.v))
-    change, rate = (f.variable(0.0, width=module.plan.vector) for _ in range(2))
+
+    def norm(of_q: Callable[[Value], Value], of_v: Callable[[Value], Value]) -> Value:
+        def sizes(r: Value) -> list[Value]:
+            unit = module.vector(f, "inverse unit", r)
+            return [f.abs(of_q(r)) * omega * unit, f.abs(of_v(r)) * unit]
+
+        return module.largest(f, sizes)
+
+    def of_stages(row: np.ndarray, r: Value) -> Value:
+        total = module.weighted_sum(f, row, r)
+        assert total is not None
+        return h * total
+
+    def change_q(r: Value) -> Value:
+        return h * of_stages(row_q, r)
+
+    def change_v(r: Value) -> Value:
+        return of_stages(row_v, r)
+
+    def change_a(r: Value) -> Value:
+        return module.vector(f, f"stage{last} a", r) - module.vector(f, f"stage{last - 1} a", r)
+
+    def change_of_rate(r: Value) -> Value:
+        return (module.vector(f, "result a", r) - module.vector(f, f"stage{last} a", r)) / scale
+
+    distance, safe = s.distance, s.safe
+    size = norm(change_q, change_v)
+    s.speed = size / norm(change_v, change_a)  # (s), a change J x times this is as large as x
+    scale = module.broadcast(f, s.speed)
+    stage_state(module, f, s, last)
     with f.each(module.rowcount) as r:
-        sum_q, sum_v = module.weighted_sum(f, row_q, r), module.weighted_sum(f, row_v, r)
-        assert sum_q is not None and sum_v is not None
-        unit = module.vector(f, "inverse unit", r)
-        of_q, of_v = f.abs(h * (h * sum_q)) * omega * unit, f.abs(h * sum_v) * unit
-        of_a = f.abs(module.vector(f, f"stage{last} a", r) - module.vector(f, f"stage{last - 1} a", r)) * unit
-        change.value = f.max(change.value, f.max(of_q, of_v))
-        rate.value = f.max(rate.value, f.max(of_v * omega, of_a))
-    rate_of_lane, change_of_lane = (x.value if module.plan.width > 1 else f.largest_of(x.value) for x in (rate, change))
-    s.speed = s.step * rate_of_lane / change_of_lane
+        for x, change in (("q", change_v), ("v", change_a)):
+            module.put(f, f"state {x}", r, f.fma(scale, change(r), module.vector(f, f"state {x}", r)))
+    module.accelerate(f, "result a")
+    s.distance, s.safe = distance, safe
+    s.speed = s.step * f.intrinsic("sqrt", norm(change_a, change_of_rate) / size)
 
 
 def _measure_error(module: Module, f: Function, s: Lane):

@@ -5,8 +5,8 @@ A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages only need ac
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j,        a_i = a(t + c_i h, q_i, v_i).
 
 The stages of an implicit method are solved one after another (stage_equations.py). A run by the default method, which is
-explicit, goes on with an implicit one where it is stiff, and returns where that does not pay (controller.py); one module has
-both, so that each lane chooses for its next step.
+explicit, goes on with an implicit one where long implicit steps turn out to be accurate, and returns where they do not pay
+(controller.py); one module has both, so that each lane chooses for its next step.
 Each accepted step is projected onto the constraint manifold. Outputs lie on the polynomial of degree 11 through the positions,
 velocities and accelerations of four consecutive accepted states, which is as accurate as the states and costs no evaluation, and
 are projected as well. Where the motion is not smooth, a step ends and the run begins anew.
