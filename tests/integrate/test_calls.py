@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -157,3 +158,22 @@ def test_an_event_that_is_written_in_the_function_it_serves_is_traced_once():
     h = 1e-5
     difference = (crossed(0.1 + h, start - 0.02) - crossed(0.1 - h, start - 0.02)) / (2 * h)
     assert_allclose(other, difference, rtol=1e-6)
+
+
+class Told(udk.ForceElement):
+    """A constant force that calls `told` whenever it is evaluated."""
+
+    told: Callable[[object], None] = eqx.field(static=True)
+
+    def loads(self, t, body):
+        jax.debug.callback(self.told, t)
+        return [(0.0, 1.0, 0.0)]
+
+
+def test_a_force_that_calls_back_is_run_by_diffrax():
+    """`jax.debug.print` shows what a force is evaluated at, as in any other JAX function."""
+    rod, times = udk.library.compound_pendulum(), []
+    run = udk.simulate(udk.Mechanism(rod.bodies, rod.joints, forces=[Told(("rod",), lambda t: times.append(float(t)))]), TS)
+    lifted = udk.simulate(udk.Mechanism(rod.bodies, rod.joints, forces=[udk.Force("rod", (0.0, 1.0))]), TS)
+    assert_allclose(run.q, lifted.q, atol=1e-9)
+    assert "debug_callback" in run.settings["engine"] and max(times) == pytest.approx(TS[-1])

@@ -66,6 +66,9 @@ def agree(mechanism, chosen, stabilization=Projection(), closed=False, atol=1e-1
         formulated = isinstance(method, Formulation)  # which changes accelerations alone
         a, tangent = (native.accelerations(t, q, v), ()) if formulated else evaluate(native, t, q, v, dq, dv)
         expected = free + root * (plus @ b)
+        if isinstance(method, udk.Augmented) and method.method is None and np.linalg.matrix_rank(D, 1e-8) < len(D):
+            assert np.isnan(a).all()  # LU demands independent rows
+            continue
         assert_allclose(a, expected, rtol=0, atol=atol * max(1.0, np.abs(expected).max()), err_msg=str(method))
         for found, x in zip(tangent, (dq, dv), strict=not formulated):
             assert_allclose(

@@ -279,8 +279,9 @@ class Expressions(Protocol):
 class BoundPrimitive:
     """A primitive with its parameters and, for arrays, the shapes of its arguments; equal if the computations are equal."""
 
-    def __init__(self, primitive: Primitive, parameters: dict, shapes: tuple = ()):
+    def __init__(self, primitive: Primitive, parameters: dict, shapes: tuple = (), name: str = ""):
         self.primitive, self.parameters, self.shapes = primitive, parameters, shapes
+        self._name = name or primitive.name
         self._key = (primitive.name, shapes, tuple(sorted((k, str(v)) for k, v in parameters.items())))
 
     def __eq__(self, other):
@@ -290,4 +291,4 @@ class BoundPrimitive:
         return hash(self._key)
 
     def __repr__(self):
-        return self.primitive.name
+        return self._name

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 from jax.extend import core
+from jax.extend.core.primitives import closed_call_p
 from jax.typing import ArrayLike
 
 from udkjax.expressions.array_rules import RULES, choose, choose_branch, select_unknown
@@ -98,10 +99,31 @@ def _read(graph: Graph, jaxpr: core.Jaxpr, constants: Sequence[np.ndarray], argu
     def value(atom):
         return _constants(graph, atom.val) if isinstance(atom, core.Literal) else known[atom]
 
+    effects: list[tuple[Equation, list[np.ndarray]]] = []
     for equation in jaxpr.eqns:
-        outputs = _equation(graph, equation, [value(a) for a in equation.invars])
-        known.update(zip(equation.outvars, outputs, strict=True))
-    return [value(a) for a in jaxpr.outvars]
+        inputs = [value(a) for a in equation.invars]
+        if equation.outvars:
+            known.update(zip(equation.outvars, _equation(graph, equation, inputs), strict=True))
+        else:  # such as `jax.debug.print`
+            effects.append((equation, inputs))
+    outputs = [value(a) for a in jaxpr.outvars]
+    for equation, inputs in effects if outputs else []:
+        outputs[0] = _after(graph, equation, inputs, outputs[0])
+    return outputs
+
+
+def _after(graph: Graph, equation: Equation, inputs: list[np.ndarray], output: np.ndarray) -> np.ndarray:
+    """Return an output that is computed after an equation without outputs, whose effect takes place with it."""
+
+    def function(output: jax.Array, *inputs: jax.Array) -> jax.Array:
+        equation.primitive.bind(*inputs, **equation.params)
+        return output
+
+    arrays = [output, *inputs]
+    dtypes = [np.result_type(float, *(s.node.dtype for s in output.flat)), *(v.aval.dtype for v in equation.invars)]
+    closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(a.shape, d) for a, d in zip(arrays, dtypes, strict=True)))
+    details = BoundPrimitive(closed_call_p, {"call_jaxpr": closed}, tuple(a.shape for a in arrays), equation.primitive.name)
+    return graph.call(details, tuple(s for a in arrays for s in a.flat), [(output.shape, dtypes[0])])[0]
 
 
 def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
