@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import equinox.internal as eqxi
 import jax
@@ -30,7 +31,14 @@ def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Ca
         The primitive, for `equinox.internal.filter_primitive_bind`.
     """
     rule = eqxi.filter_primitive_def(apply)
-    member = eqxi.create_vprim(name, rule, shape, derivative, transpose)
+
+    def transpose_unless_zero(cotangents: Sequence[Any], *inputs: Any, **params: object) -> Sequence[Any]:
+        # A result that nothing uses has a zero cotangent, which batches pass as None.
+        if all(x is None or type(x) is ad.Zero for x in cotangents):
+            return [None] * len(inputs)
+        return transpose(cotangents, *inputs, **params)
+
+    member = eqxi.create_vprim(name, rule, shape, derivative, transpose_unless_zero)
 
     def batch(inputs: Sequence[Array], axes: Sequence[int | None], **params: object) -> tuple[list[Array], list[int]]:
         *operator, vector = inputs
@@ -46,7 +54,7 @@ def linear_primitive(name: str, apply: Callable, shape: Callable, derivative: Ca
     primitive.def_impl(rule)
     primitive.def_abstract_eval(shape)
     ad.primitive_jvps[primitive] = derivative
-    ad.primitive_transposes[primitive] = transpose
+    ad.primitive_transposes[primitive] = transpose_unless_zero
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=True))
     return primitive
