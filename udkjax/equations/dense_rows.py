@@ -17,6 +17,7 @@ from udkjax.equations.rest_program import CURVATURE, DAMPING, LOADS, STIFFNESS
 from udkjax.equations.scales import Scales, concrete_scales
 from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 # Thresholds for the singular values of D with unit rows at a closed position, relative to the largest. Values up to the first
@@ -94,7 +95,11 @@ class DenseTerms(RowTerms):
     def __init__(self, mechanism: Mechanism):
         super().__init__(mechanism)
         self.mass = np.asarray(mass_of(mechanism, np))  # the diagonal of M
-        self._gravity, self._programs = mechanism.gravity, scene_programs(mechanism)
+        self._gravity, self._programs, self._has_forces = (
+            mechanism.gravity,
+            scene_programs(mechanism),
+            bool(mechanism.force_names),
+        )
 
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
@@ -110,7 +115,10 @@ class DenseTerms(RowTerms):
 
     def loads_at_rest(self, t: Time, q: np.ndarray) -> RestingLoads:
         """Return the loads at rest in a position, and their derivatives."""
-        entries, weight = self._arrays_at(t).loads_at_rest(t, q), self._weight
+        weight = self._weight
+        if not self._has_forces:
+            return RestingLoads(weight, np.abs(weight), *np.zeros((2, self.size, self.size)))
+        entries = self._arrays_at(t).element_loads(t, q, np.zeros_like(q))
         force, sizes = weight.copy(), np.abs(weight)
         if LOADS in entries:
             rows = self._programs.at_rest.places[LOADS].rows
@@ -131,6 +139,12 @@ class DenseTerms(RowTerms):
         if entries is not None:
             np.add.at(matrix, tuple(self._programs.at_rest.places[name]), entries)
         return matrix
+
+
+@cached_by_identity
+def dense_terms(mechanism: Mechanism) -> DenseTerms:
+    """Return the `DenseTerms` of a mechanism, made once for each mechanism."""
+    return DenseTerms(mechanism)
 
 
 class DenseRows(DenseTerms):

@@ -51,9 +51,9 @@ class SceneArrays(Generic[AnyArray]):
         """Return the kinetic and the potential energy (2,)."""
         return self._run("energy", t, q, v)["energy"]
 
-    def loads_at_rest(self, t: Time, q: AnyArray) -> dict[str, AnyArray]:
+    def element_loads(self, t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
         """Return the entries of the loads of force elements and of their derivatives, as `RestProgram.places` orders them."""
-        return self._run("at_rest.loads", t, q, self._xp.zeros_like(q))
+        return self._run("at_rest.loads", t, q, v)
 
     def curvature(self, t: Time, q: AnyArray, multipliers: AnyArray) -> AnyArray:
         """Return the entries of (lambda^T Psi)_qq, as `RestProgram.places` orders them."""

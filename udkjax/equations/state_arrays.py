@@ -16,6 +16,7 @@ from udkjax.arrays import is_traced, is_within_jit
 from udkjax.equations.abstract_system import HistoryLike
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.loads import mass_of
+from udkjax.equations.rest_program import LOADS
 from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Pseudoinverse
@@ -70,6 +71,7 @@ class StateArrays:
         self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
         self.mass = np.asarray(mass_of(mechanism, np))
         self.root = 1 / np.sqrt(self.mass)
+        self._weight = self.mass * np.tile([*np.asarray(mechanism.gravity, float), 0.0], self.size // 3)
 
     def pieces(self, count: int, dense: bool = True) -> Iterator[slice]:
         """Iterate over pieces of `count` states, by their memory; `dense` if Psi_q is a dense matrix."""
@@ -94,6 +96,15 @@ class StateArrays:
     def force(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return F (T, n)."""
         return self.mass * self._along(lambda t, q, v: self._at.loads(t, q, v)[0], t, q, v)
+
+    def load_sizes(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the sums of the absolute loads of gravity and of each force element (T, n)."""
+        sizes = np.tile(np.abs(self._weight), (len(t), 1))
+        rows = self._at.programs.at_rest.places[LOADS].rows
+        if len(rows):
+            loads = self._along(lambda t, q, v: self._at.element_loads(t, q, v)[LOADS], t, q, v)
+            np.add.at(sizes.T, rows, np.abs(loads).T)
+        return sizes
 
     def energy(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the kinetic and the potential energy (T, 2)."""

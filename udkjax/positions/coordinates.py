@@ -16,7 +16,7 @@ from udkjax.positions.channels import channel_of, point_of_pin
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.checks import SceneError
-from udkjax.scene.drivers import Driver, Motion, Polynomial
+from udkjax.scene.drivers import Driver, Motion, Polynomial, effort_unit
 from udkjax.scene.fields import names
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote, suggestion
@@ -54,7 +54,7 @@ class Coordinate(PrintsLine):
     @property
     def effort_unit(self) -> str:
         """The unit of the effort along the coordinate."""
-        return self.driver(constant_motion(0.0)).effort_unit
+        return effort_unit(self.coordinate)
 
 
 def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:

@@ -4,9 +4,10 @@ With a driver that prescribes `coordinate = t`, Psi(s, q) = 0 are the positions,
 gives d2q/ds2, as for any other mechanism.
 """
 
+import itertools
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,11 +20,11 @@ from udkjax.annotations import NumberLike
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.dense_rows import DenseTerms, KinematicRows
+from udkjax.equations.dense_rows import KinematicRows, dense_terms
 from udkjax.equations.redundancy import holders_of_driver
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.coordinates import Coordinate, constant_motion, named_element, value_of
-from udkjax.programs.identity_cache import cached_within_trace
+from udkjax.programs.identity_cache import cached_by_identity, cached_within_trace
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial
 from udkjax.scene.forces import ForceElement
@@ -67,7 +68,7 @@ class Driven(NamedTuple):
         """Return the value of the coordinate (rad, m) in a position, by NumPy if all numbers are concrete."""
         if is_traced((self.mechanism, q)):
             return constraints.psi(self.mechanism, 0.0, q)[self.row]
-        return DenseTerms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
+        return dense_terms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
 
 
 def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mapping[str, NumberLike] | None = None) -> Driven:
@@ -77,8 +78,19 @@ def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mappin
     coordinate, or positions do not follow from its value.
     """
     given = mechanism, driver, t, held
-    with _at_once(given):
+    if is_traced(given):
         return _drive(*given)
+    with jax.ensure_compile_time_eval():  # concrete even while something else is traced
+        if driver is None:
+            return _drive(*given)
+        pairs = [(name, np.asarray(value, float).item()) for name, value in (held or {}).items()]
+        return _drive_concrete(mechanism, driver, np.asarray(t, float).item(), *itertools.chain(*pairs))
+
+
+@cached_by_identity
+def _drive_concrete(mechanism: Mechanism, driver: str | Coordinate, t: float, *held: Any) -> Driven:
+    """Return the driven mechanism; `held` has names and values in turn, which the cache compares by value."""
+    return _drive(mechanism, driver, t, dict(zip(held[::2], held[1::2], strict=True)))
 
 
 def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str, NumberLike] | None) -> Driven:

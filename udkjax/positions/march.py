@@ -20,6 +20,8 @@ from udkjax.scene.mechanism import Mechanism
 
 APPROACH = 16  # steps from the initial position to the first value
 MOST_KNOTS = 100  # largest number of knots of spline motions: compiling their programs takes 10 ms per knot
+FINER, FINEST = 8, 64  # factor of values that are followed where a march ends, and the largest number between two values
+FIRST_PIECE = 32  # values of the first such march; it doubles, so that little work is lost at a toggle
 DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; a march ends long before
 
 
@@ -60,11 +62,33 @@ def march(
 def march_at_once(
     mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
 ) -> MarchResult:
-    """Follow positions as `march` does, for concrete numbers, by NumPy; nothing is traced or compiled."""
+    """Follow positions as `march` does, for concrete numbers, by NumPy; nothing is traced or compiled.
+
+    Where values are too far apart, values between them are followed as well.
+    """
     operation = _operation(mechanism, analysis)
     mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
-    inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
-    return _march(call_concrete(operation, inputs, APPROACH + len(values)), np)
+
+    def march_on(s: NumberLike, q: NumericArray, values: NumericArray) -> MarchResult:
+        inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
+        return _march(call_concrete(operation, inputs, APPROACH + len(values)), np)
+
+    found, parts, piece = march_on(s, q, values), FINER, FIRST_PIECE
+    count = int(found.trusted)
+    arrays = [np.array(x) for x in found[:4]]
+    while count < len(values) and parts <= FINEST:
+        s, q = (values[count - 1], arrays[0][count - 1]) if count else (s, q)
+        ends = values[count : count + piece]
+        shares = np.arange(1, parts + 1) / parts
+        before = np.append(s, ends[:-1])[:, None]
+        more = march_on(s, q, (before + shares * (ends[:, None] - before)).ravel())
+        reached = int(more.trusted) // parts
+        for x, new in zip(arrays, more[:4], strict=True):
+            x[count : count + reached] = new[parts - 1 :: parts][:reached]
+        count += reached
+        parts, piece = (parts, 2 * piece) if reached == len(ends) else (parts * FINER, FIRST_PIECE)
+    q, dq, ddq, side = arrays
+    return found._replace(q=q, dq=dq, ddq=ddq, side=side, trusted=np.asarray(count))
 
 
 def _by_numpy(x: PyTree) -> PyTree:

@@ -15,6 +15,7 @@ from jaxtyping import PyTree
 
 from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit
 from udkjax.programs.deferred import deferred
+from udkjax.programs.identity_cache import cached_by_identity
 
 Carry = TypeVar("Carry")
 Result = TypeVar("Result")
@@ -104,8 +105,17 @@ def solve(function: Callable[..., Result], *arguments: Any) -> Result:
     if is_traced(arguments):
         return _compiled(_by_jax, function, *arguments)
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
-        concrete = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, arguments)
+        concrete = jax.tree.map(_concrete, arguments, is_leaf=lambda x: isinstance(x, eqx.Module))
         return jax.device_put(function(*concrete, BY_NUMPY))
+
+
+def _concrete(x: Any) -> Any:
+    return _concrete_module(x) if isinstance(x, eqx.Module) else np.asarray(x) if eqx.is_array(x) else x
+
+
+@cached_by_identity  # the same object for the same module, so that what is computed from it is found again
+def _concrete_module(module: eqx.Module) -> eqx.Module:
+    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, module)
 
 
 def _by_jax(function: Callable[..., Result], *arguments: Any) -> Result:

@@ -86,6 +86,18 @@ class Spline(Motion):
         return self.times if self.times.size > 2 else ()  # two points: a straight line
 
 
+def effort_unit(coordinate: str) -> str:
+    """Return the unit of the effort along a coordinate of this kind.
+
+    Args:
+        coordinate: the kind, as of a `Driver`.
+
+    Returns:
+        "N m" along an angle, else "N".
+    """
+    return "N m" if coordinate == "angle" else "N"
+
+
 class Driver(Constraint):
     """Prescribe one `coordinate` of body 2 relative to body 1. 1 row: the coordinate minus motion(t).
 
@@ -130,7 +142,7 @@ class Driver(Constraint):
     @property
     def effort_unit(self) -> str:
         """The unit of the effort along the coordinate."""
-        return "N m" if self.coordinate == "angle" else "N"
+        return effort_unit(self.coordinate)
 
     @fills("points")
     def complete(self, *frames):

@@ -12,8 +12,8 @@ carry load too; with one degree of freedom, N is therefore replaced by the direc
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, Protocol, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Literal, Protocol
 
 import equinox as eqx
 import jax
@@ -23,24 +23,20 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import number, number_called
-from udkjax.equations import constraints, loads
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.scale_program import RANK_TOL
-from udkjax.pinv import SVD
+from udkjax.arrays import library_for, number, number_called
+from udkjax.equations.analysis import analyse
 from udkjax.positions.channels import StateHistory
-from udkjax.positions.coordinates import Coordinate, choose_name, coordinate_value, element_of, value_of
+from udkjax.positions.coordinates import Coordinate, choose_name, coordinate_value, element_of
 from udkjax.positions.drive import without_drivers
 from udkjax.positions.kinematics import Kinematics, kinematics
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
-from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import CALLED
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
-from udkjax.statics.load_scale import load_sizes
+from udkjax.study.driver_efforts import driver_efforts
 from udkjax.wording import quote
 
 
@@ -108,9 +104,6 @@ class InverseDynamics(PrintsTable):
     def power(self) -> Float[Array, "T"]:
         """Power (W) of all drivers together."""
         return sum(self.powers.values(), jnp.zeros_like(self.ts))
-
-
-States: TypeAlias = Float[Array, "T bodies 3"]
 
 
 class AcceleratedTrajectory(StateHistory, Protocol):
@@ -183,16 +176,18 @@ def inverse_dynamics(
     unknown = [name for name in weights or {} if name not in named]
     if unknown:
         raise SceneError([f"weights: {quote(name)} is not among the drivers" for name in unknown], mechanism.name)
-    w = jnp.stack([number((weights or {}).get(name, 1.0)) for name in named])
+    xp = library_for((weights, ts))
+    w = xp.stack([xp.asarray((weights or {}).get(name, 1.0), float) for name in named])
     values = tuple(element_of(mechanism, d) for d in named.values())
-    joints = without_drivers(mechanism)
-    analysis = analyse(joints)
-    q, v, a = (jnp.asarray(x) for x in (motion.q, motion.v, motion.a))
+    joints, q = without_drivers(mechanism), motion.q
     if len(q) != len(ts):
         raise ValueError(f"motion has {len(q)} states, but ts has {len(ts)} times: give the times of the motion")
-    efforts, rates, residual = _efforts(joints.without_origin, analysis, values, w, ts, q, v, a)
+    efforts, rates, residual = driver_efforts(
+        mechanism, joints, analyse(joints), tuple(named.values()), values, w, ts, (q, motion.v, motion.a)
+    )
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
+    columns, powers, residual = jax.device_put((columns, powers, residual))
     effort_units = tuple((name, value.effort_unit) for name, value in zip(named, values, strict=True))
     return InverseDynamics(ts, computed, columns, powers, residual, effort_units)
 
@@ -226,44 +221,3 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
         e = elements[name]
         forces[choose_name(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points, e.axis)
     return without_drivers(mechanism, forces)
-
-
-@deferred
-def _efforts(
-    mechanism: Mechanism, analysis: Analysis, values: Sequence[Coordinate], w: Array, ts: Array, q: States, v: States, a: States
-) -> tuple[Array, Array, Array]:
-    """Return efforts (T, k), rates of their coordinates (T, k), and the unbalanced part (T,)."""
-    scales = analysis.scales
-    units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
-    coordinates = [value_of(mechanism, element) for element in values]
-
-    def at(t: Array, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
-        q, v, a = q.ravel(), v.ravel(), a.ravel()
-        C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
-        J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
-        free, determined = _free_part(J), jnp.asarray(True)
-        missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))
-        if analysis.rank is not None:  # otherwise the number of degrees of freedom is unknown
-            deficient = SVD(RANK_TOL).plus(J).rank < analysis.rank if len(J) else jnp.asarray(False)
-            u = v / units
-            speed = jnp.linalg.norm(jnp.where(deficient, u, 1.0))
-            u = u / jnp.where(speed > 0, speed, 1.0)
-            everywhere, determined = free, ~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0))
-            free = lambda x: jnp.where(deficient, jnp.tensordot(u, u @ x, 0), everywhere(x))  # noqa: E731
-        required, A = free(missing), free((C * units).T * share)
-        f = share * (SVD(RANK_TOL).plus(A) @ required)
-        # Relative to the single terms, since their sum may be a rounding error.
-        parts = units * (loads.mass(mechanism) * jnp.abs(a) + load_sizes(mechanism, t, q, v))
-        size = jnp.maximum(jnp.max(parts), scales.mass * (scales.length * scales.rate) ** 2)
-        residual = jnp.max(jnp.abs(required - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)
-        return jnp.where(determined, f, jnp.nan), C @ v, residual
-
-    return jax.vmap(at)(ts, q, v, a)
-
-
-def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
-    """Return x -> (I - J^+ J) x for vectors (n,) or columns (n, k): the projection onto J's null space; differentiable."""
-    if not len(J):
-        return lambda x: x
-    plus = SVD(RANK_TOL).plus(J)
-    return lambda x: x - plus @ (J @ x)

@@ -1,0 +1,85 @@
+"""Questions about a small mechanism, asked again, take few calls of functions; a call of Python takes 0.1 us or more.
+
+Calls are counted, as times depend on what else the machine does.
+"""
+
+import sys
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from tests.choices import fast
+from udkjax.study import driver_efforts
+
+TIMES = np.linspace(0.0, 1.0, 11)
+ANGLES = 1.0 + 0.2 * TIMES
+LINKAGE = udk.library.parallelogram(np.deg2rad(45.0))
+LOADED = udk.Mechanism(
+    dict(LINKAGE.bodies),
+    dict(LINKAGE.joints),
+    forces={"spring": udk.TorsionSpring(["ground", "link1"], stiffness=3.0, damping=0.2)},
+)
+MOTORS = ("body.link1.angle", "body.link2.angle", "body.link3.angle")
+
+
+def calls_of(question):
+    """Return how many functions are called when a question is asked for the 30th time."""
+    for _ in range(29):
+        question()
+    count = 0
+
+    def listen(frame, event, argument):
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    sys.setprofile(listen)
+    try:
+        question()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+def test_calls_of_kinematics_and_inverse_dynamics():
+    crank = udk.library.slider_crank()
+    motion = udk.kinematics(crank, None, TIMES)
+    four_bar = udk.library.four_bar()
+    assert calls_of(lambda: udk.kinematics(crank, None, TIMES)) < 10_000
+    assert calls_of(lambda: udk.kinematics(four_bar, "body.crank.angle", ANGLES)) < 10_000
+    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES, motion)) < 3_500
+
+
+@pytest.mark.parametrize("drivers", fast([MOTORS[:1]], [MOTORS[:1], MOTORS]))
+def test_efforts_by_numpy_are_those_by_jax(drivers, monkeypatch):
+    """Also in the parallelogram's singular position, where branches meet, and beyond it."""
+    angles = np.append(ANGLES, [np.pi, 3.4])
+    motion = udk.kinematics(LOADED, MOTORS[0], angles, rate=2.0, acceleration=0.3)
+    found = udk.inverse_dynamics(LOADED, angles, motion, list(drivers))
+    monkeypatch.setattr(driver_efforts, "by_numpy", lambda *given: False)
+    expected = udk.inverse_dynamics(LOADED, angles, motion, list(drivers))
+    for name in drivers:
+        assert_allclose(found.efforts[name], expected.efforts[name], rtol=1e-9)
+        assert_allclose(found.powers[name], expected.powers[name], rtol=1e-9)
+    assert np.max(np.asarray(found.residual)) < 1e-12
+
+
+def test_no_effort_where_the_motion_ends():
+    rocker = udk.library.four_bar()
+    motion = udk.kinematics(rocker, "body.rocker.angle", np.linspace(1.6, 4.0, 9))
+    found = udk.inverse_dynamics(rocker, motion.values, motion, ["body.rocker.angle"])
+    ended = ~np.asarray(motion.reached)
+    assert ended.any() and not ended.all()
+    assert_allclose(np.isnan(np.asarray(found.efforts["body.rocker.angle"])), ended)
+
+
+def test_distant_values_are_followed_by_values_between_them():
+    """A whole turn in five steps equals the same in a hundred, at the five."""
+    four_bar = udk.library.four_bar()
+    few, many = (udk.kinematics(four_bar, "body.crank.angle", 1.0 + np.linspace(0.0, 2 * np.pi, n)) for n in (6, 101))
+    for name in ("q", "v", "a"):
+        assert_allclose(getattr(few, name), getattr(many, name)[::20], rtol=1e-9, atol=1e-9)
+    traced = jax.jit(lambda values: udk.kinematics(four_bar, "body.crank.angle", values).q)(few.values)
+    assert_allclose(few.q, traced, rtol=1e-9, atol=1e-9)
