@@ -70,7 +70,6 @@ PROGRAMS = {
     "reverse mode": jax.grad(run),
     **{f"run by {type(method).__name__}": lambda x, method=method: run(x, method=method) for method in DENSE},
     "events": bounced,
-    "events, differentiated": jax.grad(bounced),
     "closing": closed,
     "closing, forward mode": jax.jacfwd(closed),
     "closing, reverse mode": jax.grad(closed),
@@ -78,7 +77,6 @@ PROGRAMS = {
 }
 
 
-SLOW = {"events, differentiated"}  # its program takes JAX seconds
 EXPECTED = {"run": 1, "batch of runs": 1, "forward mode": 1, "second order": 1, "reverse mode": 2, "rarely reached": 1}
 
 
@@ -91,7 +89,7 @@ def targets(text):
     return re.findall(r"custom_call @(udkjax_\w+)", text)
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW)) for x in PROGRAMS])
+@pytest.mark.parametrize("name", PROGRAMS)
 def test_the_host_computes_for_a_graphics_card(name):
     """The operations are those of the CPU, with handlers that copy, and no other integrator is used."""
     traced = jax.jit(PROGRAMS[name]).trace(given(name))

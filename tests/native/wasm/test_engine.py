@@ -122,7 +122,7 @@ def test_marching(monkeypatch):
 def test_forward_tangents(monkeypatch):
     mechanism = udk.library.parallelogram()
     run, inputs, times = concrete_call(monkeypatch, native_engine, lambda: udk.simulate(mechanism, TIMES))
-    n, count = run.coordinates, run.code.number_count
+    n, count = run.code.coordinate_count, run.code.number_count
     operation = run.with_tangents((True,) * count)
     along = np.zeros((1, 1, count))
     along[0, 0, 1] = 1.0  # of gravity, along y
