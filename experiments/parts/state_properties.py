@@ -129,8 +129,8 @@ class Programs:
         programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
         self._unrolled = Unrolled(programs, ["accelerations", "tangent_part", "rows_and_loads"])
         self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
-        own = np.concatenate([np.ravel(x) for x in jax.tree.leaves(mechanism)])
-        rows = _at_start(mechanism, numbers_of(mechanism, tables) if tables else own[None])
+        own = np.concatenate([np.ravel(x) for x in mechanism.numbers])
+        rows = _at_start(mechanism.without_origin, numbers_of(mechanism, tables) if tables else own[None])
         numbers = np.hstack([rows, np.tile([0.0, SAFE], (len(rows), 1))])
         self._constants = _run(self._unrolled.prologue, numbers)
 
@@ -163,10 +163,10 @@ class Programs:
 
 
 def names_of(mechanism: udk.Mechanism) -> list[str]:
-    """Return the names of all leaves of a mechanism, in their order."""
+    """Return the names of all numbers of a mechanism in their order, also of those that follow from others."""
     name_of = {id(value): name for name, value in mechanism.parameters().items()}
     name_of |= {id(j.constant): f"joint.{n}.constant" for n, j in mechanism.joints.items() if hasattr(j, "constant")}
-    return [name_of[id(leaf)] for leaf in jax.tree.leaves(mechanism)]
+    return [name_of[id(leaf)] for leaf in mechanism.numbers]
 
 
 def _at_start(mechanism: udk.Mechanism, rows: np.ndarray) -> np.ndarray:
