@@ -51,6 +51,16 @@ class Operation(ABC):
         """The number of inputs with directions, which come last."""
         return 0
 
+    @property
+    def first(self) -> "Operation":
+        """The same operation, whose module may leave members to that of `later`, which is loaded when one needs it."""
+        return self
+
+    @property
+    def later(self) -> "Operation | None":
+        """The operation whose module runs the members that leave this one's; None if none leaves."""
+        return None
+
     @abstractmethod
     def module(self, width: int, tangent_lanes: int, vector: int) -> Memory:
         """Return the module for a number of lanes.

@@ -1,7 +1,7 @@
 """The operations of machine code that integrate: a run, a run up to an event, and runs with derivatives."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 from udkjax.native.base.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
@@ -30,6 +30,7 @@ class RunStates(Operation):
     pseudoinverse: DenseMethod | None = None  # None: elimination
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
     changes: bool = False  # whether a run goes on by an implicit method, Kvaerno's, where stability limits an explicit one
+    leaves: bool = False  # whether it does so by the module of `later`
 
     info_names: ClassVar[tuple[str, ...]] = INFO  # names of the first numbers of the output "info", before the last q and v
 
@@ -50,8 +51,17 @@ class RunStates(Operation):
             sampled=self.sampled,
             pseudoinverse=self.pseudoinverse,
             formulation=self.formulation,
-            stiff=KVAERNO5 if self.changes else None,
+            stiff=KVAERNO5 if self.changes and not self.leaves else None,
+            leaves=self.leaves,
         )
+
+    @property
+    def first(self) -> "RunStates":
+        return replace(self, leaves=self.changes)
+
+    @property
+    def later(self) -> "RunStates | None":
+        return replace(self, leaves=False) if self.leaves else None
 
     @property
     def accelerations(self) -> Accelerate:

@@ -52,6 +52,12 @@ class Plan:
     pseudoinverse: Any = None  # the `DenseMethod` that solves; None: elimination
     formulation: Any = None  # the `FormulationCode` of accelerations; None: the Udwadia-Kalaba equation
     stiff: Method | None = None  # the implicit method to which an explicit run changes where it is stiff
+    leaves: bool = False  # whether a run leaves the module where it may be stiff, for one that has the implicit method
+
+    @property
+    def measures_speed(self) -> bool:
+        """True if the rate of the equations is measured."""
+        return self.leaves or self.stiff is not None
 
     @property
     def implicit(self) -> Method | None:
@@ -117,7 +123,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "iterating": "whether Newton's method continues",
     "violated": "largest violation of Psi at an output, over the row's scale",
     "open": "whether the output violates Psi after its projection",
-    "stiff": "whether the next step is taken by an implicit method",
+    "stiff": "whether the next step is taken by an implicit method, or the run leaves the module for one that has it",
     "speed": "length of an explicit step times the largest rate of the equations",
     "growth": "largest magnitude of an eigenvalue of I - D (stage_equations.py)",
     "watch": "number of attempts after which the rate is measured",

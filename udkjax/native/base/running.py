@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 
+from udkjax.native.base import leaving
 from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.loops import LoopWriter
@@ -31,7 +32,8 @@ class Running(Memory):
         """LLVM's text of the whole module."""
         self.write_functions()
         self._write_run()
-        return text_of_module([*self.functions, *self.loops.functions], self.loops.globals, ALLOCATION)
+        pointers = leaving.GLOBALS if self.plan.leaves else []
+        return text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION)
 
     def thread_code(self) -> ThreadCode:
         self.write_functions()
@@ -43,9 +45,9 @@ class Running(Memory):
     def write_functions(self):
         """Write all functions but `run`."""
 
-    def goes_on(self, f: Function, s: Lane) -> Value:
-        """Return whether any lane is active."""
-        return f.any_of(s.active > 0.5)
+    def present(self, f: Function, s: Lane) -> Value:
+        """Return which lanes have a member."""
+        return s.active > 0.5
 
     @abstractmethod
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
@@ -57,11 +59,14 @@ class Running(Memory):
 
     def write_member(self, f: Function, s: Lane, repeat: Repeat):
         """Take the member of a thread of a GPU through all its steps."""
-        repeat(lambda: self.goes_on(f, s), lambda: self.step_all(f, s, lambda: None))
+        repeat(lambda: f.any_of(self.present(f, s)), lambda: self.step_all(f, s, lambda: None))
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Fill the lanes of completed members with the next members."""
         fill()
+
+    def release(self, f: Function, s: Lane):
+        """Hook: frees the memory of the members in lanes when they leave the module."""
 
     def begin_memory(self, f: Function):
         """Store the numbers that all members share, once per run, in zeroed memory."""
@@ -90,28 +95,60 @@ class Running(Memory):
                 self.put_entry(f, name, i, 1.0)
 
     def _write_run(self):
-        """Write `run(call)`: run all members."""
-        f = Function("run", [(POINTER, "call")], self.plan.width)
+        """Write `run(call)`: run all members; or `resume(call, members)` (leaving.py), and `run`, which calls it."""
+        plan, width = self.plan, self.plan.width
+        resumes = plan.stiff is not None
+        arguments = [(POINTER, x) for x in ("call", *(["members"] if resumes else []))]
+        f = Function(leaving.RESUME if resumes else "run", arguments, width)
         self.functions.append(f)
-        call, width = f.given["call"], self.plan.width
+        call = f.given["call"]
+        if plan.leaves:
+            leaving.go_on_if_loaded(f)
         block, work = self.allocate(f, f.const(self._memory_size, INT))
         f.given["work"], s = work, Lane(f, self.places)
         self._clear_memory(f)
         blocks = [block, *self.allocate_tangents(f, block)]
         members, following = self.field(f, "members"), self.field(f, "next", POINTER)
 
+        def take() -> Value:
+            # Threads share the index of the next member.
+            return f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
+
+        def begin(k: Value, member: Value):
+            with f.if_(member < members):
+                f.call("begin", work, call, k, member)
+
         def fill():
             with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
-                # Threads share the index of the next member.
-                member = f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
-                with f.if_(member < members):
-                    f.call("begin", work, call, k, member)
+                begin(k, take())
 
-        fill()
-        with f.while_(lambda: self.goes_on(f, s)):
+        if resumes:
+            with f.each(width) as k:
+                member = f.variable(f.load(f.given["members"], k, base=INT), INT, 1)
+                with f.if_(member.value < 0):
+                    member.value = take()
+                begin(k, member.value)
+        else:
+            fill()
+
+        def leaves() -> Value:
+            return f.any_of(self.present(f, s) & (s.stiff > 0.5))
+
+        with f.while_(lambda: f.any_of(self.present(f, s)) & ~leaves() if plan.leaves else f.any_of(self.present(f, s))):
             self.step_all(f, s, fill)
+        left = leaving.members_in_lanes(self, f, s, self.present(f, s)) if plan.leaves else None
+        is_left = leaves() if plan.leaves else None
+        if left is not None:
+            self.release(f, s)
         for block in blocks:
             f.line(f"call void @free(ptr {block.name})")
+        if left is not None and is_left is not None:
+            with f.if_(is_left):
+                leaving.go_on(self, f, left)
+        if resumes:
+            run = Function("run", [(POINTER, "call")], width)
+            leaving.write_run(run)
+            self.functions.append(run)
 
     def _write_run_member(self):
         """Write `run_member(call, work, thread)`: run the member of a thread in the memory at `work`.

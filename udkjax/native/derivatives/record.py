@@ -21,6 +21,7 @@ PER_BREAKPOINT = 3  # additional capacity for each breakpoint: the beginning of 
 FIRST_POINTS = 2  # points before the first step: the state as given, and projected
 TITLE = 3  # numbers of a record before its points: the number of points, how the run ended, the number of outputs written
 HEAD = 3  # numbers of a point before its state: its time, the number of outputs before its step, `begin` of its step (layout.py)
+BEGIN = 2  # place of the last of them
 # For threads of a GPU, whose records are in one buffer: its address, the capacity of each record, and the first of its members.
 BUFFER = ("records", "capacity", "first")
 
@@ -72,6 +73,8 @@ class Recorded(Differentiated):
                 for k, name in enumerate(("points", "code", "written")):
                     self.put_lane_entry(f, name, lane, f.load(given, k))
                 self.put_lane_entry(f, "record", lane, f.at(given, TITLE), base=POINTER)
+                if self.plan.leaves:
+                    self._leave_for_implicit_steps(f, lane)
                 for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
                     self.put_lane_entry(f, name, lane, x)
         with f.if_((self.lane_entry(f, "given", lane) < 0.5) & (self.backpropagates(f) | self._returns_record(f))):
@@ -83,6 +86,12 @@ class Recorded(Differentiated):
             )
             with f.if_(self.lane_entry(f, "active", lane) > 0.5):
                 self._store_point(f, Lane(f, self.places), lane)
+
+    def _leave_for_implicit_steps(self, f: Function, k: Value):
+        """Let lane k leave the module if a step of its record is implicit."""
+        points = self.to_int(f, self.lane_entry(f, "points", k))
+        with f.each(points) as i, f.if_(f.load(self._record(f, k), i * self.row + BEGIN) < -0.5):
+            self.put_lane_entry(f, "stiff", k, 1.0)
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         with f.if_(self.backpropagates(f) | self._returns_record(f)), self.each_lane(f, accept) as k:
@@ -168,8 +177,12 @@ class Recorded(Differentiated):
 
     # --- order of members
 
-    def goes_on(self, f: Function, s: Lane) -> Value:
-        return f.any_of(s.active > 0.5) | f.any_of(s.ready > 0.5)
+    def present(self, f: Function, s: Lane) -> Value:
+        return (s.active > 0.5) | (s.ready > 0.5)
+
+    def release(self, f: Function, s: Lane):
+        with f.if_(self.backpropagates(f)), self.each_lane(f, self.present(f, s)) as k:
+            self.free_record(f, k)
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
         with f.if_(~self.backpropagates(f)):

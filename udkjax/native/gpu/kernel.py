@@ -83,7 +83,7 @@ def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool 
             which leaves room for other numbers in the caches.
     """
     if isinstance(operation, RunStates):  # the matrix of implicit steps would take most of the memory of a thread
-        operation = replace(operation, changes=False)
+        operation = replace(operation, changes=False, leaves=False)
     module = operation.module(1, 1, VECTOR)
     constants = 0
     if isinstance(module, Recorded):

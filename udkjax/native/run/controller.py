@@ -28,6 +28,7 @@ from udkjax.native.base.steps import (
     LIMIT,
     LOST_TOL,
     NEAREST_STAGE,
+    PATIENCE,
     POINTS,
     RESTART_FACTOR,
     RETRIES,
@@ -98,6 +99,16 @@ def write_decide(module: Module):
         s.where(accept & implicit, implicit=s.implicit + 1.0)
     if tries is not None:
         _choose_method(module, f, s, stepping, accept, tries)
+    if module.plan.leaves:
+        _notice_speed(f, s, accept)
+
+
+def _notice_speed(f: Function, s: Lane, accept: Value):
+    """Mark runs as stiff for which a module with an implicit method would try an implicit step."""
+    measured = accept & (s.begin < 0.5) & (s.tried > s.watch)
+    with f.if_(f.any_of(measured)):
+        s.where(measured, watch=s.tried + PATIENCE)
+        s.where(measured & (s.speed > LIMIT), stiff=1.0)
 
 
 def _choose_method(module: Module, f: Function, s: Lane, stepping: Value, accept: Value, tries: Value):

@@ -1,7 +1,5 @@
 """One step of a Runge-Kutta method with error estimate."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from udkjax.native.base.ir import DOUBLE, Function, Value
@@ -17,7 +15,7 @@ def write_attempt(module: Module):
 
     It computes the state at `t1` as `state q`, `result v` and `result a`, with its `error` and `distance`.
     """
-    if module.plan.stiff:
+    if module.plan.measures_speed:
         write_measure_speed(module)
     f, s = module.function("attempt")
     method, stages = module.method, module.method.stages
@@ -32,7 +30,7 @@ def write_attempt(module: Module):
             module.accelerate_stage(f, i)
             check_pivots(module, f, s, f"stage{i} a")
             module.record_stage(f, s, i)
-        if module.plan.stiff:
+        if module.plan.measures_speed:
             _watch_speed(module, f, s)
 
     def take_stages_by_method():
@@ -119,43 +117,35 @@ def write_measure_speed(module: Module):
     f, s = module.function("measure_speed")
     method, h, omega = module.method, module.broadcast(f, s.step), module.broadcast(f, s.omega)
     last = method.stages - 1
-    row_q, row_v = (row[last] - row[last - 1] for row in (method.q, method.v))
+    end, distance, safe = f"stage{last} a", s.distance, s.safe
+    in_q, in_v, in_a = "state dq", "state dv", "result dv"  # x and J x
+    with f.each(module.rowcount) as r:
+        sum_q, sum_v = (module.weighted_sum(f, row[last] - row[last - 1], r) for row in (method.q, method.v))
+        assert sum_q is not None and sum_v is not None
+        change_a = module.vector(f, end, r) - module.vector(f, f"stage{last - 1} a", r)
+        for name, change in ((in_q, h * (h * sum_q)), (in_v, h * sum_v), (in_a, change_a)):
+            module.put(f, name, r, change)
 
-    def norm(of_q: Callable[[Value], Value], of_v: Callable[[Value], Value]) -> Value:
+    def norm(of_q: str, of_v: str) -> Value:
         def sizes(r: Value) -> list[Value]:
             unit = module.vector(f, "inverse unit", r)
-            return [f.abs(of_q(r)) * omega * unit, f.abs(of_v(r)) * unit]
+            return [f.abs(module.vector(f, of_q, r)) * omega * unit, f.abs(module.vector(f, of_v, r)) * unit]
 
         return module.largest(f, sizes)
 
-    def of_stages(row: np.ndarray, r: Value) -> Value:
-        total = module.weighted_sum(f, row, r)
-        assert total is not None
-        return h * total
-
-    def change_q(r: Value) -> Value:
-        return h * of_stages(row_q, r)
-
-    def change_v(r: Value) -> Value:
-        return of_stages(row_v, r)
-
-    def change_a(r: Value) -> Value:
-        return module.vector(f, f"stage{last} a", r) - module.vector(f, f"stage{last - 1} a", r)
-
-    def change_of_rate(r: Value) -> Value:
-        return (module.vector(f, "result a", r) - module.vector(f, f"stage{last} a", r)) / scale
-
-    distance, safe = s.distance, s.safe
-    size = norm(change_q, change_v)
-    s.speed = size / norm(change_v, change_a)  # (s), a change J x times this is as large as x
-    scale = module.broadcast(f, s.speed)
+    size = norm(in_q, in_v)
+    s.speed = size / norm(in_v, in_a)  # the time in which J x changes the state by as much as x does
     stage_state(module, f, s, last)
     with f.each(module.rowcount) as r:
-        for x, change in (("q", change_v), ("v", change_a)):
-            module.put(f, f"state {x}", r, f.fma(scale, change(r), module.vector(f, f"state {x}", r)))
+        for x, change in (("state q", in_v), ("state v", in_a)):
+            scaled = module.broadcast(f, s.speed) * module.vector(f, change, r)
+            module.put(f, x, r, module.vector(f, x, r) + scaled)
     module.accelerate(f, "result a")
+    with f.each(module.rowcount) as r:
+        change = module.vector(f, "result a", r) - module.vector(f, end, r)
+        module.put(f, "result a", r, change / module.broadcast(f, s.speed))
     s.distance, s.safe = distance, safe
-    s.speed = s.step * f.intrinsic("sqrt", norm(change_a, change_of_rate) / size)
+    s.speed = s.step * f.intrinsic("sqrt", norm(in_a, "result a") / size)
 
 
 def _measure_error(module: Module, f: Function, s: Lane):

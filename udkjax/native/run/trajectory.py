@@ -6,7 +6,8 @@ A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages only need ac
 
 The stages of an implicit method are solved one after another (stage_equations.py). A run by the default method, which is
 explicit, goes on with an implicit one where long implicit steps turn out to be accurate, and returns where they do not pay
-(controller.py); one module has both, so that each lane chooses for its next step.
+(controller.py). Runs begin in a module without the implicit method, and leave it for one that has both when they first need it
+(base/leaving.py); there each lane chooses for its next step.
 Each accepted step is projected onto the constraint manifold. Outputs lie on the polynomial of degree 11 through the positions,
 velocities and accelerations of four consecutive accepted states, which is as accurate as the states and costs no evaluation, and
 are projected as well. Where the motion is not smooth, a step ends and the run begins anew.

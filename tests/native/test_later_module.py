@@ -1,0 +1,102 @@
+"""The module with the implicit method, which is loaded when a run first needs it."""
+
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
+
+import jax
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.native.test_implicit_stages import damped
+from udkjax.native import primitive
+from udkjax.native.base import loading, machine
+
+TS = np.linspace(0.0, 0.5, 3)
+STIFF, SOFT = 1e5, 0.1
+
+
+@pytest.fixture
+def motion(monkeypatch, tmp_path):
+    """The motion of a damped pendulum, whose modules nobody has loaded; after the test they are forgotten."""
+    mechanism = damped(1.0, scene=udk.library.compound_pendulum())
+    analysis, state = udk.analyse(mechanism), udk.assemble(mechanism)
+
+    def forget():
+        primitive.generate.cache_clear()
+        primitive.machine_code.cache_clear()
+        jax.clear_caches()
+
+    def of_damping(damping):
+        moved = mechanism.with_parameters({"force.damper.damping": damping})
+        found = udk.simulate(moved, TS, state=state, analysis=analysis, rtol=1e-6, atol=1e-6, throw=False)
+        return found.q, found.v, found.stats["implicit"]
+
+    forget()
+    monkeypatch.setattr(machine, "_compiler", lambda: str(tmp_path))  # whose code nobody has loaded
+    monkeypatch.setattr(loading, "_LOADED", {})
+    yield of_damping
+    forget()
+
+
+def later_codes():
+    return [code.later.code for code in loading._LOADED.values() if code.later]
+
+
+def assert_equal(found, expected):
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_it_is_loaded_when_a_run_needs_it(motion):
+    jitted = jax.jit(motion)
+    assert jitted(SOFT)[2] == 0
+    assert later_codes() == [None]
+    found = jitted(STIFF)
+    assert found[2] > 0
+    assert sum(x is not None for x in later_codes()) == 1
+    assert_equal(found, jitted(STIFF))  # by the later module from the beginning
+    assert_equal(found, motion(STIFF))
+    assert_equal(jitted(SOFT), motion(SOFT))
+
+
+def test_members_in_lanes_leave_together(motion):
+    """Members before them are complete, and members after them have not begun: all are run once."""
+    dampings = np.array([*[SOFT] * 11, STIFF, *[SOFT] * 5, 10 * STIFF, *[SOFT] * 3])
+    found = jax.jit(jax.vmap(motion))(dampings)
+    for k, damping in enumerate(dampings):
+        assert_equal([x[k] for x in found], motion(damping))
+
+
+def test_threads_load_it_once(motion, monkeypatch):
+    loaded, library = [], machine.library
+    monkeypatch.setattr(machine, "library", lambda text, names, *level: loaded.append(names) or library(text, names, *level))
+    jitted = jax.jit(motion).lower(STIFF).compile()
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(jitted, [STIFF] * 4))
+    assert sum("resume" in names for names in loaded) == 1
+    for other in found[1:]:
+        assert_equal(other, found[0])
+
+
+def test_if_it_cannot_be_loaded_the_call_is_refused(motion, monkeypatch, capfd):
+    def fail(*arguments):
+        raise OSError("no module")
+
+    monkeypatch.setattr(primitive, "_later_code", fail)
+    jitted = jax.jit(motion)
+    assert jitted(SOFT)[2] == 0
+    with pytest.raises((ValueError, jax.errors.JaxRuntimeError), match="no memory for a computation by machine code"):
+        jax.block_until_ready(jitted(STIFF))
+    assert "no module" in capfd.readouterr().err
+
+
+def test_the_first_module_has_no_implicit_method():
+    scene = udk.library.double_pendulum()
+    engine = import_module("udkjax.integrate.compiled_mechanism")
+    operation = engine.compile_concrete(scene, udk.analyse(scene), udk.Auto(), udk.Projection()).plan.operation
+    assert operation.changes and not operation.leaves
+    first, later = (primitive.generate(x, 1, 1).written_text for x in (operation.first, operation))
+    assert "@take_stages_from_point3(" in later and "@take_stages_from_point3(" not in first
+    assert "_slopes(" in later and "_slopes(" not in first
+    assert len(first) < 0.8 * len(later)
