@@ -11,7 +11,8 @@ import udkjax as udk
 from tests.command_line import udkjax
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-PENDULUM, EXAMPLE = EXAMPLES / "compound_pendulum.toml", EXAMPLES / "grids" / "parallelogram.toml"
+PENDULUM = EXAMPLES / "compound_pendulum.toml"
+THE_EXAMPLE = ("sweep", EXAMPLES / "parallelogram.toml", EXAMPLES / "grids" / "parallelogram.toml")
 GRID = """
 t1 = 0.5
 measures = ["final", "violation"]
@@ -96,18 +97,20 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys, grid):
     assert "run the same command to continue" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_the_example_on_workers_of_dask(tmp_path, capsys):
-    pytest.importorskip("distributed", reason="dask is not installed: pip install '.[dask]'")
-    arguments = ("sweep", EXAMPLES / "parallelogram.toml", EXAMPLE)
-    assert udkjax(*arguments, "--dry-run") == 0
+def test_what_the_example_takes(tmp_path, capsys):
+    assert udkjax(*THE_EXAMPLE, "--dry-run") == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for part in ("members 288: 9 body.coupler.mass x 8 tolerance x 2 start x 2 stabilization", "2 programs", "q_end"):
+    for part in ("members 288: 9 body.coupler.mass x 8 tol x 2 start x 2 stabilization", "2 programs", "q_end"):
         assert part in shown
     (chunks,) = re.findall(r"chunks (\d+)", shown)
     assert 2 <= int(chunks) <= 32  # one of each program at least; more where more compute at a time
     assert list(tmp_path.iterdir()) == []
-    assert udkjax(*arguments, "--out", tmp_path / "sweep", "--engine", "dask") == 0
+
+
+@pytest.mark.slow
+def test_the_example_on_workers_of_dask(tmp_path, capsys):
+    pytest.importorskip("distributed", reason="dask is not installed: pip install '.[dask]'")
+    assert udkjax(*THE_EXAMPLE, "--out", tmp_path / "sweep", "--engine", "dask") == 0
     assert "288 successful" in capsys.readouterr().out
     with xarray.open_dataset(tmp_path / "sweep" / "sweep.nc", engine="h5netcdf") as data:
         assert float(data.violation.sel(stabilization="Projection").max()) < 1e-12

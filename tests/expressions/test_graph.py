@@ -1,6 +1,8 @@
 """Simplifications of a graph while it is built."""
 
 import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -224,3 +226,22 @@ def test_no_operation_is_emitted_twice(first, second):
     keys = [(n.kind, tuple((a.index, a.sign) for a in n.arguments), n.detail) for n in (graph.nodes[i] for i in program.order)]
     assert len(set(keys)) == len(keys)
     assert all(isinstance(s, Scalar) for s in results)
+
+
+def test_threads_may_write_into_one_graph():
+    """Sweeps compile their groups in threads, whose kernels may be of one cached element."""
+
+    def write(graph: Graph) -> list[Scalar]:
+        x = [graph.input(k, "q") for k in range(3)]
+        return [(x[k % 3] + float(k)) * (x[(k + 1) % 3] - float(k)) for k in range(2_000)]
+
+    before, graph = sys.getswitchinterval(), Graph()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(write, [graph] * 4))
+    finally:
+        sys.setswitchinterval(before)
+    alone = Graph()
+    assert len(graph.nodes) == len({tuple(node[:4]) for node in graph.nodes}) == [write(alone), len(alone.nodes)][1]
+    assert all(a.index == b.index and a.node.kind == "mul" for other in found[1:] for a, b in zip(found[0], other, strict=True))

@@ -7,6 +7,7 @@ never emitted (scalar_program.py), so a caller may build more nodes than it need
 
 import math
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from threading import Lock
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -86,6 +87,9 @@ class Scalar:
     def __repr__(self):
         node = self.node
         return f"{'-' if self.sign < 0 else ''}%{self.index}:{node.kind}{'' if node.detail is None else f'[{node.detail}]'}"
+
+
+_ADDING = Lock()  # kernels of cached graphs are written by several threads, such as those of a sweep
 
 
 class Graph:
@@ -263,8 +267,12 @@ class Graph:
         key = (kind, tuple([(a.index, a.sign) for a in arguments]), detail, dtype)
         index = self._known.get(key)
         if index is None:
-            index = self._known[key] = len(self.nodes)
-            self.nodes.append(Node(kind, arguments, detail, dtype, depends))
+            with _ADDING:
+                index = self._known.get(key)
+                if index is None:
+                    index = len(self.nodes)
+                    self.nodes.append(Node(kind, arguments, detail, dtype, depends))
+                    self._known[key] = index  # last, since other threads look here without the lock
         return index
 
 

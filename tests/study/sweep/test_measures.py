@@ -99,9 +99,10 @@ def test_measures_by_name_are_what_one_would_compute():
         assert_allclose(member.energy_drift, np.abs(total - total[0]).max(), rtol=0, atol=1e-12)
         assert_allclose(member.position_error, np.abs(solution.q - exact)[..., :2].max(), rtol=0, atol=1e-12)
         assert np.all(member["rank"] == 11)
-    lost = data.isel(stabilization=0, rank_tol=1)  # no row counts: the bodies fall apart, and that is seen at the first output
-    assert int(lost.result) == udk.Result.drift and lost["rank"].values.tolist()[2:] == [RANK_NOT_REACHED] * 4
-    assert np.all(lost["rank"].values[:2] == 0)
+    lost = data.isel(stabilization=0, rank_tol=1)  # no row counts: the bodies fall apart, and that is seen after a few steps
+    reached = float(lost.end_time) >= TS
+    assert int(lost.result) == udk.Result.drift and not reached[2:].any()
+    assert lost["rank"].values.tolist() == np.where(reached, 0, RANK_NOT_REACHED).tolist()
 
 
 @pytest.mark.slow

@@ -39,6 +39,6 @@ def test_it_has_all_runs_and_each_is_what_it_is_alone(tmp_path):
             dt0=0.66e-2,
             drift_tol=np.inf,
         )
-        one = data.isel(method=method, stabilization=gains).sel(tol=tol)
+        one = data.isel(pseudoinverse=method, stabilization=gains).sel(tol=tol)
         for count in ("accepted", "rejected", "right_hand_sides"):
             assert int(one[count]) == int(alone.stats[count])
