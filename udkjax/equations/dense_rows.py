@@ -101,6 +101,12 @@ class DenseTerms(RowTerms):
             bool(mechanism.force_names),
         )
 
+    @staticmethod
+    @cached_by_identity
+    def of(mechanism: Mechanism) -> "DenseTerms":
+        """Return the terms of a mechanism, made once for each mechanism."""
+        return DenseTerms(mechanism)
+
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
         _, rate, entries = self.geometry(t, q, np.zeros_like(q))
@@ -139,12 +145,6 @@ class DenseTerms(RowTerms):
         if entries is not None:
             np.add.at(matrix, tuple(self._programs.at_rest.places[name]), entries)
         return matrix
-
-
-@cached_by_identity
-def dense_terms(mechanism: Mechanism) -> DenseTerms:
-    """Return the `DenseTerms` of a mechanism, made once for each mechanism."""
-    return DenseTerms(mechanism)
 
 
 class DenseRows(DenseTerms):

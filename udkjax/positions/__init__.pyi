@@ -34,8 +34,10 @@ from udkjax.positions.characteristics import instant_centres as instant_centres
 from udkjax.positions.continuation import Reached as Reached
 from udkjax.positions.coordinates import Coordinate as Coordinate
 from udkjax.positions.coordinates import choose_name as choose_name
+from udkjax.positions.coordinates import constant_motion as constant_motion
 from udkjax.positions.coordinates import coordinate_value as coordinate_value
 from udkjax.positions.coordinates import element_of as element_of
+from udkjax.positions.coordinates import named_element as named_element
 from udkjax.positions.coordinates import value_of as value_of
 from udkjax.positions.counting import Count as Count
 from udkjax.positions.counting import count_of as count_of
@@ -51,6 +53,7 @@ from udkjax.positions.drive import constant_speed as constant_speed
 from udkjax.positions.drive import drive as drive
 from udkjax.positions.drive import only_driver as only_driver
 from udkjax.positions.drive import suggested_coordinate as suggested_coordinate
+from udkjax.positions.drive import with_drivers as with_drivers
 from udkjax.positions.drive import with_halted_drivers as with_halted_drivers
 from udkjax.positions.drive import without_drivers as without_drivers
 from udkjax.positions.free_numbers import FreeNumbers as FreeNumbers

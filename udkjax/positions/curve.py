@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
-from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse, dense_terms
+from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD, Plus
@@ -176,7 +176,7 @@ class NumpyCurve(AbstractCurve):
         scales = jax.tree.map(np.asarray, driven.analysis.scales)
         units = np.append(np.tile([scales.length, scales.length, 1.0], driven.analysis.coordinates // 3), driven.unit)
         independent = driven.analysis.independent_rows
-        return cls(dense_terms(driven.mechanism), scales.weights, units, scales.rows, independent)
+        return cls(DenseTerms.of(driven.mechanism), scales.weights, units, scales.rows, independent)
 
     def residual(self, X: Any) -> Any:
         x = X * self.units

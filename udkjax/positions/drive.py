@@ -20,7 +20,7 @@ from udkjax.annotations import NumberLike
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.dense_rows import KinematicRows, dense_terms
+from udkjax.equations.dense_rows import DenseTerms, KinematicRows
 from udkjax.equations.redundancy import holders_of_driver
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.coordinates import Coordinate, constant_motion, named_element, value_of
@@ -68,7 +68,7 @@ class Driven(NamedTuple):
         """Return the value of the coordinate (rad, m) in a position, by NumPy if all numbers are concrete."""
         if is_traced((self.mechanism, q)):
             return constraints.psi(self.mechanism, 0.0, q)[self.row]
-        return dense_terms(self.mechanism).psi(0.0, np.ravel(q))[self.row]
+        return DenseTerms.of(self.mechanism).psi(0.0, np.ravel(q))[self.row]
 
 
 def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mapping[str, NumberLike] | None = None) -> Driven:

@@ -32,6 +32,7 @@ from udkjax.scene.drivers import Motion as Motion
 from udkjax.scene.drivers import Polynomial as Polynomial
 from udkjax.scene.drivers import Sine as Sine
 from udkjax.scene.drivers import Spline as Spline
+from udkjax.scene.drivers import effort_unit as effort_unit
 from udkjax.scene.element_setup import attached_bodies as attached_bodies
 from udkjax.scene.fields import CALLED as CALLED
 from udkjax.scene.fields import NOT_NEGATIVE as NOT_NEGATIVE

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.dense_rows import TruncatedPseudoinverse, dense_terms
+from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.scene.mechanism import Mechanism
@@ -81,7 +81,7 @@ class NumpyLinearizer:
     """`linearize` and `load_scale` of a mechanism with concrete numbers, by NumPy, without traces and compilation."""
 
     def __init__(self, mechanism: Mechanism, analysis: Analysis, free: int):
-        self._terms, self._free = dense_terms(mechanism), free
+        self._terms, self._free = DenseTerms.of(mechanism), free
         scales = jax.tree.map(np.asarray, analysis.scales)
         self._weights, self._tol = scales.weights, float(scales.rank_tol)
         self._units = np.asarray(scales.coordinates(self._terms.size))

@@ -5,25 +5,25 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumericArray
+from udkjax.arrays import is_traced
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis
+from udkjax.equations.effort_arrays import efforts_by_numpy
 from udkjax.equations.scale_program import RANK_TOL
-from udkjax.equations.state_arrays import StateArrays, by_numpy, state_arrays
 from udkjax.pinv import SVD
 from udkjax.positions.coordinates import Coordinate, choose_name, constant_motion, named_element, value_of
 from udkjax.positions.drive import with_drivers
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.scene.drivers import Driver
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.load_scale import load_sizes
 
 States: TypeAlias = Float[Array, "T bodies 3"]
-# Efforts (T, k), rates of their coordinates (T, k), unbalanced parts of the loads (T,).
-EffortArrays: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]
+Efforts: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]  # as `efforts_by_numpy` returns
 
 
 def driver_efforts(
@@ -35,7 +35,7 @@ def driver_efforts(
     weights: Float[Array, "k"],
     ts: Float[Array, "T"],
     motion: tuple[States, States, States],
-) -> EffortArrays:
+) -> Efforts:
     """Return the efforts of drivers of least weighted norm, the rates of their coordinates, and the unbalanced part of the loads.
 
     Args:
@@ -51,17 +51,16 @@ def driver_efforts(
     Returns:
         Efforts (N m, N), rates (rad/s, m/s), and the part of M a - F that nothing exerts, relative to M a and the loads.
     """
-    if by_numpy(joints, (analysis, values, weights, ts, motion)):
-        equations = _with_rows(mechanism, *drivers)
-        states = (np.asarray(x, float).reshape(len(ts), -1) for x in motion)
-        return _by_numpy(equations, analysis, np.asarray(weights, float), np.asarray(ts, float), *states)
-    return _by_jax(joints.without_origin, analysis, values, jnp.asarray(weights), ts, *map(jnp.asarray, motion))
+    found = None
+    if joints.is_concrete and not is_traced(values):
+        found = efforts_by_numpy(_with_rows(mechanism, *drivers), analysis, weights, ts, motion)
+    return found or _by_jax(joints.without_origin, analysis, values, jnp.asarray(weights), ts, *map(jnp.asarray, motion))
 
 
 @deferred
 def _by_jax(
     mechanism: Mechanism, analysis: Analysis, values: Sequence[Coordinate], w: Array, ts: Array, q: States, v: States, a: States
-) -> EffortArrays:
+) -> Efforts:
     scales = analysis.scales
     units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
     coordinates = [value_of(mechanism, element) for element in values]
@@ -98,80 +97,12 @@ def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
     return lambda x: x - plus @ (J @ x)
 
 
-# --- the same by NumPy, at all times at once
-
-
 @cached_by_identity
-def _with_rows(mechanism: Mechanism, *drivers: str | Coordinate) -> StateArrays:
-    """Return the equations of a mechanism whose last rows of Psi are the coordinates of these drivers, in this order."""
-    names, rows = dict[str, None](), {}
+def _with_rows(mechanism: Mechanism, *drivers: str | Coordinate) -> Mechanism:
+    """Return a mechanism whose last rows of Psi are the coordinates of these drivers, in this order."""
+    rows: dict[str, Driver] = {}
     for driver in drivers:
         name, element = named_element(mechanism, driver)
-        name = choose_name(name, names)
-        names[name] = None
-        rows[name] = element.driver(constant_motion(0.0))
+        rows[choose_name(name, rows)] = element.driver(constant_motion(0.0))
     with jax.ensure_compile_time_eval():
-        return state_arrays(with_drivers(mechanism.without_origin, rows).without_origin)
-
-
-@np.errstate(all="ignore")  # states that are not finite have no efforts
-def _by_numpy(
-    equations: StateArrays, analysis: Analysis, w: np.ndarray, ts: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray
-) -> EffortArrays:
-    columns = (_efforts_at(equations, analysis, w, *(x[p] for x in (ts, q, v, a))) for p in equations.pieces(len(ts)))
-    efforts, rates, unbalanced = (np.concatenate(x) for x in zip(*columns, strict=True))
-    return efforts, rates, unbalanced
-
-
-def _efforts_at(equations: StateArrays, analysis: Analysis, w: np.ndarray, t: np.ndarray, *motion: np.ndarray) -> EffortArrays:
-    q, v, a = motion
-    scales, joints = jax.tree.map(np.asarray, analysis.scales), len(analysis.row_names)
-    units, share = np.asarray(scales.coordinates(equations.size)), 1 / np.sqrt(w)
-    rows = equations.jacobian(t, q)
-    C, J = rows[:, joints:], scales.weights[:, None] * rows[:, :joints] * units
-    missing = units * (equations.mass * a - equations.force(t, q, v))
-    reached = np.isfinite(rows).all((1, 2)) & np.isfinite(missing).all(1)
-    C, J, missing = (np.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0) for x in (C, J, missing))
-    held, rank = _row_space(J)
-    determined = reached
-    if analysis.rank is not None:  # otherwise the number of degrees of freedom is unknown
-        deficient = rank < analysis.rank
-        u = v / units
-        speed = np.linalg.norm(u, axis=1)
-        determined = reached & (~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0)))
-
-    def free(x: np.ndarray) -> np.ndarray:
-        """Return the part of columns (T, n, k) that the joints do not hold: in deficient positions, along the motion."""
-        result = x - held.transpose(0, 2, 1) @ (held @ x)
-        if analysis.rank is not None and deficient.any():
-            along = np.where(speed > 0, u.T / speed, 0.0).T[deficient, :, None]
-            result[deficient] = along @ (along.transpose(0, 2, 1) @ x[deficient])
-        return result
-
-    pull = (C * units).transpose(0, 2, 1)
-    required = free(missing[:, :, None])
-    A = free(pull * share)
-    V, U, inverse = _decompose(A)
-    f = share[:, None] * (V.transpose(0, 2, 1) @ (inverse[:, :, None] * (U.transpose(0, 2, 1) @ required)))
-    # Relative to the single terms, since their sum may be a rounding error.
-    parts = units * (equations.mass * np.abs(a) + equations.load_sizes(t, q, v))
-    size = np.maximum(parts.max(1), scales.mass * (scales.length * scales.rate) ** 2)
-    residual = np.abs(required - free(pull @ f)).max((1, 2)) / np.where(size > 0, size, 1.0)
-    rates = np.einsum("tkn,tn->tk", C, v)
-    efforts = np.where(determined[:, None], f[:, :, 0], np.nan)
-    return efforts, np.where(reached[:, None], rates, np.nan), np.where(reached, residual, np.nan)
-
-
-def _row_space(J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return orthonormal rows (T, k, n) that span those of matrices (T, m, n), zero beyond the rank, and the rank (T,)."""
-    if not J.shape[1]:
-        return np.zeros((len(J), 0, J.shape[2])), np.zeros(len(J), int)
-    vt, _, inverse = _decompose(J)
-    return np.where(inverse[:, :, None] > 0, vt, 0.0), np.count_nonzero(inverse, axis=1)
-
-
-def _decompose(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return V^T, U and 1/sigma of matrices (T, m, n), zero where sigma is zero up to rounding."""
-    u, sigma, vt = np.linalg.svd(A, full_matrices=False)
-    counts = sigma > RANK_TOL * sigma[:, :1]
-    return vt, u, np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)
+        return with_drivers(mechanism.without_origin, rows).without_origin
