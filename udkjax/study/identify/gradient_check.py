@@ -32,6 +32,9 @@ from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.wording import join_names
 
 AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
+# Largest floor, relative to the least one, of steps whose differences count, too: noise grows four times from a step to the next
+# finer one, by which truncation is estimated, and up to whose noise it is therefore unknown.
+ALIKE = 4.5
 USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which agreement is meaningful
 RANDOM_DIRECTIONS = 3  # number of directions in which all unknowns change
 OTHER_TOL = 0.01, 10.0  # tolerances, relative to the given one, to estimate errors; the second is used if runs fail at the first
@@ -118,9 +121,15 @@ class GradientCheck:
 
     @property
     def ratio(self) -> Float[np.ndarray, "D S"]:
-        """The ratio of the discrepancy to the floor; NaN where either is unknown."""
-        discrepancy, floor = self.at_best(self.discrepancy), self.floor
-        return np.where(discrepancy == 0.0, 0.0, discrepancy / np.where(floor == 0.0, np.finfo(float).tiny, floor))
+        """The least ratio of the discrepancy to the floor, of the steps that are about as accurate as the best; NaN if unknown.
+
+        A derivative that is wrong is wrong at all of these steps, while a difference may be off at one of them.
+        """
+        floors = self.noise + self.truncation + self.derivative_error[..., None]
+        alike = floors <= ALIKE * self.floor[..., None]
+        ratios = np.where(self.discrepancy == 0.0, 0.0, self.discrepancy / np.where(floors == 0.0, np.finfo(float).tiny, floors))
+        least = np.min(np.where(alike & ~np.isnan(ratios), ratios, np.inf), -1)
+        return np.where(np.isinf(least), self.at_best(ratios), least)
 
     @property
     def worst(self) -> Int[np.ndarray, "D"]:
