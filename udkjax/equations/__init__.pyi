@@ -35,6 +35,7 @@ from udkjax.equations.formulations import FormulatedSystem as FormulatedSystem
 from udkjax.equations.formulations import Formulation as Formulation
 from udkjax.equations.formulations import NullSpaceQR as NullSpaceQR
 from udkjax.equations.formulations import NullSpaceSVD as NullSpaceSVD
+from udkjax.equations.formulations import PointwiseFormulation as PointwiseFormulation
 from udkjax.equations.formulations import WrappedSystem as WrappedSystem
 from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations.loads import mass_of as mass_of

@@ -33,6 +33,8 @@ from udkjax.integrate.solvers import solver_named as solver_named
 from udkjax.integrate.solvers.adams import Adams as Adams
 from udkjax.integrate.solvers.bdf import BDF as BDF
 from udkjax.integrate.solvers.verner import Verner65 as Verner65
+from udkjax.integrate.stabilization import ConstraintState as ConstraintState
+from udkjax.integrate.stabilization import Stabilization as Stabilization
 from udkjax.integrate.stepping import step as step
 
 __all__: list[str]

@@ -20,6 +20,7 @@ from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import has_method, method_of
+from udkjax.integrate.stabilization import Stabilization
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
@@ -91,12 +92,13 @@ def compile_mechanism(
     system: Any,
     analysis: Analysis | None,
     method: Pseudoinverse,
-    stabilization: Projection | Baumgarte | None,
+    stabilization: Projection | Baumgarte | Stabilization | None,
     formulation: Formulation | None = None,
     solver: "diffrax.AbstractSolver | None" = None,
     adjoint: "diffrax.AbstractAdjoint | None" = None,
     meter: "diffrax.AbstractProgressMeter | None" = None,
     engine: str = "auto",
+    stepper: Any = None,
 ) -> CompiledMechanism:
     """Prepare a mechanism, or a user-defined system, for runs; the arguments are those of `simulate`.
 
@@ -108,7 +110,12 @@ def compile_mechanism(
     projects = isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem)
     projected, breakpoints = equations.constrained and projects, system.breakpoints
     operation, evaluation, rows = None, None, 0
-    why = "it was asked for" if engine in ("diffrax", "jax") else _reason_for_diffrax(equations, solver, adjoint, meter)
+    if engine in ("diffrax", "jax"):
+        why = "it was asked for"
+    elif isinstance(stabilization, Stabilization):
+        why = f"it does not know {type(stabilization).__name__}"
+    else:
+        why = _reason_for_diffrax(equations, solver, adjoint, meter, stepper)
     if not why:
         operation = _run_operation(equations, solver, projected, breakpoints)
         textbook = textbook_of(equations)
@@ -151,12 +158,15 @@ def _reason_for_diffrax(
     solver: "diffrax.AbstractSolver | None",
     adjoint: "diffrax.AbstractAdjoint | None",
     meter: "diffrax.AbstractProgressMeter | None",
+    stepper: Any,
 ) -> str:
     """Return why machine code cannot integrate such equations, whatever the scene; empty if it can."""
     if adjoint is not None:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
         return "a progress meter is diffrax's"
+    if stepper is not None:
+        return f"{type(stepper).__name__} is a step size controller of diffrax"
     if not has_method(solver):
         return f"{type(solver).__name__} is not a Runge-Kutta method with one tableau, explicit or singly diagonally implicit"
     return _reason_for_equations(equations)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.integrate.projection import error_after_projection, project
 from udkjax.integrate.solvers.counting import Wrapper, tally
 from udkjax.integrate.solvers.multistep import Multistep
+from udkjax.integrate.stabilization import Stabilization, StabilizedEquations
 
 
 class Constrained(Wrapper):
@@ -20,15 +21,19 @@ class Constrained(Wrapper):
     (A multistep method would discard its whole history: its `made_jump` is unchanged, since it detects that its newest point
     moved.) The part of an error that projection removes has a small weight. If only some coordinates are integrated, only their
     errors count.
-    Error estimates, with their counts, and interpolation are those of the wrapped solver.
+    Error estimates, with their counts, and interpolation are those of the wrapped solver. A `Stabilization` of the user's own
+    changes the rates within a step, or the state at its end.
     """
 
     solver: diffrax.AbstractSolver
     projected: bool
+    stabilization: Stabilization | None = None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        if self.projected and not isinstance(self.solver, Multistep):
+        if (self.projected or self.stabilization is not None) and not isinstance(self.solver, Multistep):
             made_jump = jnp.array(True)
+        if self.stabilization is not None:
+            args = StabilizedEquations(args, self.stabilization, jnp.asarray(t1 - t0))
         equations, solver = args.fix_partition(t0, *jnp.split(y0, 2)), self.solver
         controlled = None if equations.independent is None else jnp.tile(equations.independent, 2)
         if controlled is not None:
@@ -38,6 +43,8 @@ class Constrained(Wrapper):
             y1 = project(equations, t1, y1)
             if error is not None and not isinstance(self.solver, Multistep):
                 error = jnp.concatenate(error_after_projection(equations, t1, *jnp.split(y1, 2), *jnp.split(error, 2))[:2])
+        if self.stabilization is not None:
+            y1 = jnp.concatenate(self.stabilization.end_of_step(args.at(t1, *jnp.split(y1, 2))))
         if controlled is not None:
             error = jnp.where(controlled, jnp.asarray(error), jnp.where(jnp.isfinite(y1), 0.0, jnp.nan))
         return y1, tally(self.solver, error, solver_state, state, made_jump), dense, state, result

@@ -1,5 +1,6 @@
 """Integration by `diffrax.diffeqsolve`, with any of its solvers, adjoints and progress meters."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -32,10 +33,10 @@ def integrate_by_diffrax(
     if problem.compiled.plan.projected:  # as machine code does, whose derivatives are combined with those of this engine
         y0 = project(equations, ts[0], y0)
     measures_drift = equations.constrained and not problem.compiled.plan.projected
-    controller = CountingController(_controller(problem))
+    controller = CountingController(_given_controller(problem) or _controller(problem))
     run = diffrax.diffeqsolve(
         diffrax.ODETerm(derivative),
-        Constrained(problem.compiled.plan.solver or diffrax.Dopri8(), problem.compiled.plan.projected),
+        Constrained(problem.compiled.plan.solver or diffrax.Dopri8(), problem.compiled.plan.projected, problem.stabilization),
         t0=ts[0],
         t1=ts[-1],
         dt0=_first_step(problem, equations, y0) if problem.h is None else problem.h,
@@ -122,6 +123,36 @@ def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
     if problem.compiled.breakpoints is None:
         return diffrax.PIDController(**tolerances, **settings)
     return diffrax.ClipStepSizeController(_FrozenSteps(**tolerances, **settings), jump_ts=problem.compiled.breakpoints)
+
+
+def _given_controller(problem: Problem) -> diffrax.AbstractStepSizeController | None:
+    """Return the step size controller that was given; adaptive ones also step to breakpoints."""
+    given, breakpoints = problem.stepper, problem.compiled.breakpoints
+    if given is not None and not isinstance(given, diffrax.AbstractAdaptiveStepSizeController):
+        return _WithTolerances(
+            controller=given, rtol=problem.rtol, atol=problem.atol * jnp.concatenate(problem.units()), norm=optx.max_norm
+        )
+    if given is None or breakpoints is None:
+        return given
+    return diffrax.ClipStepSizeController(given, jump_ts=breakpoints)
+
+
+class _WithTolerances(diffrax.AbstractAdaptiveStepSizeController):
+    """A step size controller without tolerances, such as that of constant steps, with those of the root finders of solvers."""
+
+    controller: diffrax.AbstractStepSizeController
+    rtol: Array
+    atol: Array
+    norm: Callable[[Any], Any]
+
+    def wrap(self, direction: Any) -> "_WithTolerances":
+        return _WithTolerances(controller=self.controller.wrap(direction), rtol=self.rtol, atol=self.atol, norm=self.norm)
+
+    def init(self, *args: Any, **kwargs: Any) -> Any:
+        return self.controller.init(*args, **kwargs)
+
+    def adapt_step_size(self, *args: Any, **kwargs: Any) -> Any:
+        return self.controller.adapt_step_size(*args, **kwargs)
 
 
 class _FrozenSteps(diffrax.PIDController):

@@ -18,10 +18,12 @@ from udkjax.integrate.outcome import LEAST_ATOL, increases, usable
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import has_method
+from udkjax.integrate.stabilization import Stabilization
 from udkjax.native.base.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.requirements import ArgumentTypeError, describe
 from udkjax.scene.checks import traced_numbers_are_valid
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
@@ -46,7 +48,7 @@ class Choices(NamedTuple):
     drift_tol: Any
     dt0: Any
     method: Pseudoinverse
-    stabilization: Projection | Baumgarte | None
+    stabilization: Projection | Baumgarte | Stabilization | None
     formulation: Formulation | None = None
     solver: "diffrax.AbstractSolver | None" = None
     adjoint: "diffrax.AbstractAdjoint | None" = None
@@ -54,18 +56,25 @@ class Choices(NamedTuple):
     max_steps: int = 100_000
     engine: str = "auto"
     held: str = ""  # pins whose angles are held, as the constraints hold them to second order only
+    stepper: "diffrax.AbstractStepSizeController | None" = None
     kinks: str = ""  # whether kinks of forces are located, and which are not; empty without any
 
     @property
     def of_mechanism(self) -> tuple[Any, ...]:
         """The arguments of `compile_mechanism` except the mechanism and its analysis."""
-        return self.method, self.stabilization, self.formulation, self.solver, self.adjoint, self.meter, self.engine
+        return self.method, self.stabilization, self.formulation, self.solver, self.adjoint, self.meter, self.engine, self.stepper
 
     @property
     def take_diffrax(self) -> bool:
         """True if diffrax integrates every mechanism with these choices."""
-        others = self.adjoint is not None or self.meter is not None or not has_method(self.solver)
+        others = self.adjoint is not None or self.meter is not None or not has_method(self.solver) or bool(self.only_by_diffrax)
         return self.engine in ("diffrax", "jax") or others
+
+    @property
+    def only_by_diffrax(self) -> str:
+        """The argument of the user's own that neither machine code nor runs with events take; empty if there is none."""
+        own = "a stabilization of your own" if isinstance(self.stabilization, Stabilization) else ""
+        return "a step size controller" if self.stepper is not None else own
 
     @property
     def integrator(self) -> str:
@@ -88,6 +97,7 @@ class Choices(NamedTuple):
             ("stabilization", type(self.stabilization).__name__),
             ("solver", "Dopri8" if self.solver is None else type(self.solver).__name__),
             *([("stiff_solver", "Kvaerno5")] if self.solver is None and not why_not_native else []),
+            *([("stepsize_controller", type(self.stepper).__name__)] if self.stepper is not None else []),
             ("max_steps", str(self.max_steps)),
             ("first_step", "chosen" if self.dt0 is None else "given"),
             ("engine", f"{self.integrator}: {why_not_native}" if why_not_native else "native"),
@@ -181,6 +191,8 @@ def prepare_run(
         length=length,
         rate=rate,
         max_steps=choices.max_steps,
+        stepper=choices.stepper,
+        stabilization=choices.stabilization if isinstance(choices.stabilization, Stabilization) else None,
         drift_tol=xp.where(runs & ~start.has_missed_rows, choices.drift_tol, NO_DRIFT),
         marks=mark_rows(compiled, ts[0], start.q, start.v, length, rate, xp) if compiled.plan.marks_rows else None,
     )
@@ -221,3 +233,22 @@ def _concrete_start(
 ) -> RunStart:
     """Return the start of a run with concrete numbers, by NumPy."""
     return _start(compiled, analysis, state, closure, np)
+
+
+def jax_adjoint(adjoint: Any) -> Any:
+    """Return an adjoint of diffrax; None for `ForwardMode`, since JAX then differentiates the steps by default."""
+    import diffrax
+
+    return None if type(adjoint) is diffrax.ForwardMode else adjoint
+
+
+def progress_meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
+    """Return the progress meter of an argument `progress`."""
+    if progress is False:
+        return None
+    import diffrax
+
+    if not isinstance(progress, bool | diffrax.AbstractProgressMeter):
+        raise ArgumentTypeError(f"progress must be True, False or a diffrax progress meter, {describe(progress)}")
+    meter: Any = diffrax.TextProgressMeter() if progress is True else progress
+    return None if isinstance(meter, diffrax.NoProgressMeter) else meter

@@ -13,6 +13,7 @@ from udkjax.pinv.greville import Greville as Greville
 from udkjax.pinv.householder import Householder as Householder
 from udkjax.pinv.householder import complete_qr as complete_qr
 from udkjax.pinv.linear_primitive import linear_primitive as linear_primitive
+from udkjax.pinv.matrix_pseudoinverse import MatrixPseudoinverse as MatrixPseudoinverse
 from udkjax.pinv.one_of import OneOf as OneOf
 from udkjax.pinv.rank_policy import RankPolicy as RankPolicy
 from udkjax.pinv.row_spaces import SMALLEST_COEFFICIENT as SMALLEST_COEFFICIENT

@@ -114,12 +114,22 @@ def _of_diffrax(kind: str, example: str) -> ArgumentCheck:
 def _check_solver(name: str, value: Any, given: GivenArguments) -> None:
     """Require a solver that estimates its errors, since these decide the steps."""
     _of_diffrax("AbstractSolver", "diffrax.Tsit5()")(name, value, given)
-    if not isinstance(value, sys.modules["diffrax"].AbstractAdaptiveSolver):
+    diffrax, controller = sys.modules["diffrax"], given.get("stepsize_controller")
+    is_adaptive = controller is None or isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    if is_adaptive and not isinstance(value, diffrax.AbstractAdaptiveSolver):
         kind = type(value).__name__
-        cure = f"give a solver such as diffrax.Tsit5(), or diffrax.HalfSolver(diffrax.{kind}()), which estimates them"
+        estimated = f"give a solver such as diffrax.Tsit5(), or diffrax.HalfSolver(diffrax.{kind}()), which estimates them"
+        cure = f"{estimated}, or constant steps, stepsize_controller=diffrax.ConstantStepSize() with dt0"
         raise ArgumentError(
             f"{name}: steps follow from estimated errors, even with dt0, and {kind} does not estimate any; {cure}"
         )
+
+
+def _check_controller(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a step size controller, and a first step for constant ones."""
+    _of_diffrax("AbstractStepSizeController", "diffrax.ConstantStepSize()")(name, value, given)
+    if isinstance(value, sys.modules["diffrax"].ConstantStepSize) and given.get("dt0") is None:
+        raise ArgumentError(f"{name}: constant steps need their length: dt0=1e-3")
 
 
 def _of_kind(condition: str, is_valid: Callable[[Any], bool]) -> ArgumentCheck:
@@ -243,5 +253,6 @@ CHECKS: dict[str, ArgumentCheck] = {
     "point": _require_point,
     "bodies": _of_kind("be the name of a body, or a list of names", lambda x: isinstance(x, str) or _are_names(x)),
     "solver": _check_solver,
+    "stepsize_controller": _check_controller,
     "adjoint": _of_diffrax("AbstractAdjoint", "diffrax.ForwardMode()"),
 }
