@@ -9,6 +9,7 @@ from udkjax.equations import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations import CoordinatePartitioning as CoordinatePartitioning
 from udkjax.equations import NullSpaceQR as NullSpaceQR
 from udkjax.equations import NullSpaceSVD as NullSpaceSVD
+from udkjax.equations import PointwiseFormulation as PointwiseFormulation
 from udkjax.equations import accelerations as accelerations
 from udkjax.equations import analyse as analyse
 from udkjax.equations import efforts as efforts
@@ -20,10 +21,12 @@ from udkjax.equations import uniqueness as uniqueness
 from udkjax.equations import violation as violation
 from udkjax.integrate import BDF as BDF
 from udkjax.integrate import Adams as Adams
+from udkjax.integrate import ConstraintState as ConstraintState
 from udkjax.integrate import Projection as Projection
 from udkjax.integrate import Result as Result
 from udkjax.integrate import SimulationError as SimulationError
 from udkjax.integrate import Solution as Solution
+from udkjax.integrate import Stabilization as Stabilization
 from udkjax.integrate import Verner65 as Verner65
 from udkjax.integrate import simulate as simulate
 from udkjax.integrate import step as step
@@ -43,12 +46,12 @@ from udkjax.pinv import Elimination as Elimination
 from udkjax.pinv import GramSchmidt as GramSchmidt
 from udkjax.pinv import Greville as Greville
 from udkjax.pinv import Householder as Householder
+from udkjax.pinv import MatrixPseudoinverse as MatrixPseudoinverse
 from udkjax.pinv import OneOf as OneOf
 from udkjax.pinv import Varga as Varga
 from udkjax.positions.assembly import AssemblyError as AssemblyError
 from udkjax.positions.assembly import State as State
 from udkjax.positions.assembly import assemble as assemble
-from udkjax.positions.assembly import check as check
 from udkjax.positions.branches import branches as branches
 from udkjax.positions.characteristics import Characteristics as Characteristics
 from udkjax.positions.characteristics import characteristics as characteristics
@@ -66,6 +69,7 @@ from udkjax.positions.pin_motion import motion_at as motion_at
 from udkjax.positions.pin_motion import pin_motion as pin_motion
 from udkjax.positions.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.position_batch import PositionBatch as PositionBatch
+from udkjax.positions.scene_check import check as check
 from udkjax.positions.transmission import Workspace as Workspace
 from udkjax.positions.transmission import coupler_curve as coupler_curve
 from udkjax.positions.transmission import mechanical_advantage as mechanical_advantage
@@ -130,6 +134,7 @@ from udkjax.statics.reaction_peaks import pin_reactions as pin_reactions
 from udkjax.statics.reaction_peaks import reaction_peaks as reaction_peaks
 from udkjax.study.channel_values import path as path
 from udkjax.study.diagnosis import Diagnosis as Diagnosis
+from udkjax.study.diagnosis import SystemDiagnosis as SystemDiagnosis
 from udkjax.study.diagnosis import diagnose as diagnose
 from udkjax.study.explain import explain as explain
 from udkjax.study.explanation import Explanation as Explanation

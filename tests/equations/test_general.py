@@ -226,5 +226,5 @@ def test_without_constraints_it_is_an_ordinary_equation():
 
 
 def test_it_needs_a_state():
-    with pytest.raises(ValueError, match="initial state"):
+    with pytest.raises(ValueError, match="no initial guess"):
         udk.simulate(BALL.system(), TS)

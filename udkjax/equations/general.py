@@ -1,6 +1,6 @@
 """User-defined constrained systems by the same equation, with any coordinates and masses and with nonholonomic constraints."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -8,21 +8,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from typing_extensions import TypeAliasType
 
-from udkjax.annotations import Time, Vector
-from udkjax.arrays import number, number_called
+from udkjax.annotations import Numbers, Time, Vector
+from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import RANK_TOL
-from udkjax.equations.scales import Scales
+from udkjax.equations.scales import Scales, UnitScales
+from udkjax.equations.system_numbers import fields_of_system, numbers_by_name, with_numbers
 from udkjax.equations.system_programs import system_programs
-from udkjax.equations.traced_system import TracedSystem, load, trace_system
+from udkjax.equations.traced_system import TracedSystem, joined_rows, load, trace_system
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.printing import PrintsLine
 from udkjax.programs.deferred import deferred
+
+ConstraintRows = TypeAliasType("ConstraintRows", Float[ArrayLike, "m"] | Mapping[str, ArrayLike])  # also by name
 
 
 class ConstrainedSystem(PrintsLine):
@@ -36,19 +40,27 @@ class ConstrainedSystem(PrintsLine):
     Args:
         mass: q -> M (n, n).
         force: (t, q, v) -> F (n,), or None.
-        constraint: (t, q) -> Psi (m,), or None.
-        velocity_constraint: (t, q, v) -> phi (k,), or None.
+        constraint: (t, q) -> Psi (m,), or None. Rows may be given by name, as a dict, for `diagnose`.
+        velocity_constraint: (t, q, v) -> phi (k,), or None; rows by name as well.
         breakpoints: times (s) where force or constraints are not smooth.
         potential: (t, q) -> V (); -V_q is added to F, and `energy` returns V.
+        q0: coordinates (n,) from which `assemble` starts, or None: states are then given.
+        v0: velocities (n,) with them; by default zero.
     """
 
     mass: Callable[[Vector], Float[ArrayLike, "n n"]]
     force: Callable[[Time, Vector, Vector], Float[ArrayLike, "n"]] | None = None
-    constraint: Callable[[Time, Vector], Float[ArrayLike, "m"]] | None = None
-    velocity_constraint: Callable[[Time, Vector, Vector], Float[ArrayLike, "k"]] | None = None
+    constraint: Callable[[Time, Vector], ConstraintRows] | None = None
+    velocity_constraint: Callable[[Time, Vector, Vector], ConstraintRows] | None = None
     breakpoints: Float[Array, "k"] | None = eqx.field(converter=number_called("breakpoints", optional=True), default=None)
 
     potential: Callable[[Time, Vector], Float[ArrayLike, ""]] | None = None
+    q0: Vector | None = eqx.field(converter=number_called("q0", optional=True), default=None)
+    v0: Vector | None = eqx.field(converter=number_called("v0", optional=True), default=None)
+
+    def __post_init__(self):
+        if self.q0 is not None and self.v0 is None:
+            self.v0 = number(np.zeros(np.shape(self.q0)))
 
     @classmethod
     def of_energy(
@@ -66,10 +78,34 @@ class ConstrainedSystem(PrintsLine):
         """
         return cls(MassOfEnergy(kinetic), ForceOfEnergy(kinetic, force), **others)
 
-    cure: ClassVar[str] = (
-        ", which has no bodies and joints: map simulate over its numbers by jax.vmap, fit them by an optimizer, and find its "
-        "rank by singular_values"
-    )
+    name: ClassVar[str] = "system"  # in titles, where mechanisms have names of their own
+    cure: ClassVar[str] = ", which has no bodies and joints"
+
+    def parameters(self) -> dict[str, Array]:
+        """Return the numbers of the system by name: arrays that are fields of the modules whose methods its functions are.
+
+        A field has its own name, `length`, and the field of a field a name with a dot, `rod.length`. Where functions of different
+        modules have fields of the same name, it begins with the function: `force.length`. `q0` and `v0` are the initial guess.
+        Arrays that plain functions close over have no names.
+        """
+        return numbers_by_name(self)
+
+    def with_parameters(self, values: Mapping[str, Numbers]) -> "ConstrainedSystem":
+        """Return the system with new values of some numbers, or of their entries (`q0[2]`). The values may be traced.
+
+        Raises `SceneError` if a name is unknown, or a value has another shape.
+        """
+        return with_numbers(self, values)
+
+    def number_fields(self) -> dict[str, Any]:
+        """Return the numbers of the system, with their shapes, by name."""
+        return fields_of_system(self)
+
+    @property
+    def is_concrete(self) -> bool:
+        """True if no number is traced, neither a field nor one that a function closes over."""
+        size = np.size(self.q0) if self.q0 is not None else None
+        return not is_traced(self) and (size is None or bool(getattr(self.traced(size), "is_concrete", True)))
 
     def traced(self, n: int) -> Any:
         """Return the system with functions that are traced for n coordinates; unchanged without float64, for JAX alone.
@@ -130,12 +166,17 @@ class GeneralEquations(AbstractSystem):
         return system_programs(self.system, False).with_all_rows if isinstance(self.system, TracedSystem) else None
 
     @property
+    def programs_of_marked_rows(self) -> RunPrograms:
+        """The programs that find independent rows among those that numbers mark."""
+        return system_programs(self.system, True, policy=RankPolicy.FALL_BACK)
+
+    @property
     def scales(self) -> Scales:
         """Units of one: coordinates are of order one."""
         one: Any = np.ones(())  # NumPy's numbers, since each run asks for them
-        rows: Any = np.ones(sum(self.system.functions.row_counts))
+        rows: Any = np.ones(sum(self.system.functions.row_counts) if isinstance(self.system, TracedSystem) else 0)
         tol: Any = np.asarray(RANK_TOL)
-        return Scales(length=one, arm=one, rate=one, mass=one, rows=rows, rank_tol=tol)
+        return UnitScales(length=one, arm=one, rate=one, mass=one, rows=rows, rank_tol=tol)
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         free, weight, plus, b = self._equation(t, q, v)
@@ -184,6 +225,12 @@ class GeneralEquations(AbstractSystem):
             dv = dv - weight(plus @ (slopes @ dv))
         return TangentPart(dq, dv)
 
+    def impulse(self, t: Time, q: Vector, v: Vector, normal: Vector) -> tuple[Vector, Vector]:
+        """Return M^(-1) n, and its part that all rows allow: the change of velocities by a unit impulse along n."""
+        factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.system.mass(q)), lower=True)
+        mobility = jax.scipy.linalg.cho_solve(factor, normal)
+        return mobility, self.tangent_part(t, q, v, jnp.zeros_like(q), mobility).dv
+
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Return v^T M v / 2 and V, zero without a potential."""
         potential = self.system.potential
@@ -197,6 +244,10 @@ class GeneralEquations(AbstractSystem):
     def jacobian(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m n"]:
         """Return A = (Psi_q; phi_v)."""
         return self._slopes(t, q, v)
+
+    def rank(self, q: Vector, rows: Float[Array, "m n"]) -> Int[Array, ""]:
+        """Return the rank of rows A M^(-1/2), by the method."""
+        return self._plus(q, rows)[0].rank if len(rows) else jnp.zeros((), int)
 
     def loads(self, t: Time, q: Vector, v: Vector) -> Float[Array, "2 n"]:
         """Return the loads of the constraints, -Psi_q^T lambda and -phi_v^T lambda."""
@@ -253,11 +304,12 @@ class GeneralEquations(AbstractSystem):
         return jnp.concatenate([jax.jacfwd(self._psi, 1)(t, q), jax.jacfwd(self._phi, 2)(t, q, v)])
 
     def _psi(self, t: Time, q: Vector) -> Array:
-        return jnp.zeros(0) if self.system.constraint is None else jnp.atleast_1d(jnp.asarray(self.system.constraint(t, q)))
+        constraint = self.system.constraint
+        return jnp.zeros(0) if constraint is None else jnp.atleast_1d(jnp.asarray(joined_rows(constraint(t, q))))
 
     def _phi(self, t: Time, q: Vector, v: Vector) -> Array:
         constraint = self.system.velocity_constraint
-        return jnp.zeros(0) if constraint is None else jnp.atleast_1d(jnp.asarray(constraint(t, q, v)))
+        return jnp.zeros(0) if constraint is None else jnp.atleast_1d(jnp.asarray(joined_rows(constraint(t, q, v))))
 
     def _psi_dot(self, t: Time, q: Vector, v: Vector) -> Array:
         return jax.jvp(self._psi, (t, q), (jnp.ones_like(t), v))[1]

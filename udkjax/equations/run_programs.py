@@ -25,6 +25,8 @@ class RunPrograms:
     """The object whose functions the programs contain, for messages."""
     excess: str = ""
     """The reason why the programs are too long for machine code; empty if they are not."""
+    has_mobility: bool = False
+    """True if there is a program `mobility`, v1 = M^(-1) dv: M is not an input."""
     is_linear: bool = True
     """True if constraints on velocities are linear in them."""
 

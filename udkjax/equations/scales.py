@@ -71,6 +71,18 @@ class Scales(NamedTuple):
         return xp.max(xp.abs(psi) / self.rows, initial=0.0)
 
 
+class UnitScales(Scales):
+    """The scales of a system whose coordinates are all of order one."""
+
+    def coordinates(self, n: int) -> Float[Array, "n"]:
+        """Return the units of coordinates."""
+        return number(np.ones(n))
+
+    def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
+        """Return the largest component of a change of coordinates (n,)."""
+        return xp.max(xp.abs(q), initial=0.0)
+
+
 def concrete_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism with concrete numbers, by NumPy."""
     numbers = np.asarray(numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS]))

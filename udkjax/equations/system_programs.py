@@ -118,6 +118,13 @@ class SystemPrograms(SystemTerms):
         return self._program(*self._tangent_parts(self._factors_dropping))
 
     @cached_property
+    def mobility(self) -> LoopProgram:
+        """Compute dv1, M^(-1) dv."""
+        mass = self._rows.mass
+        scaled = [s * c for s, c in zip(mass.forward(self._dv), self._rows.compliance, strict=True)]
+        return self._program({"dv1": mass.backward(scaled)})
+
+    @cached_property
     def end_of_step(self) -> LoopProgram:
         """Compute the results of `project_and_accelerate` and `tangent_part`, from one factorization."""
         return self._program(*self._end_of_step, *self._tangent_parts(self._factors))

@@ -20,6 +20,7 @@ class SystemTerms(RunPrograms):
 
     is_small = True  # always unrolled
     piece_count = 0
+    has_mobility = True
     owner = "a function of the system"
 
     def __init__(self, functions: SystemFunctions, baumgarte: bool, marks_rows: bool, policy: RankPolicy):

@@ -10,7 +10,7 @@ traced. The functions are read into a graph of scalars, with the terms of the eq
 Two systems whose graphs are equal share their programs, whatever their numbers are.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -80,6 +80,12 @@ class SystemFunctions:
     def row_counts(self) -> tuple[int, int]:
         """The numbers of rows of Psi and of phi."""
         return len(self.psi), len(self.phi)
+
+    @property
+    def text(self) -> str:
+        """The functions as text, without their numbers."""
+        parts = [f"{name} {constants} {closed.jaxpr}" for name, (closed, constants, _) in self._functions.items()]
+        return "\n".join(parts)
 
     def has(self, name: str) -> bool:
         """Return whether the system has a function."""
@@ -157,6 +163,7 @@ class TracedSystem(eqx.Module):
 
     numbers: list[Array]
     functions: SystemFunctions = eqx.field(static=True)
+    row_labels: tuple[str, ...] = eqx.field(static=True, default=())  # of Psi, then of phi
     breakpoints: Float[Array, "k"] | None = None
     samples: dict[Any, Any] = eqx.field(static=True, default_factory=dict)
 
@@ -181,6 +188,11 @@ class TracedSystem(eqx.Module):
 
     def _function(self, name: str) -> Callable[..., Array] | None:
         return partial(self.functions.call, name, self.numbers) if self.functions.has(name) else None
+
+    @property
+    def _forces(self) -> tuple[()]:
+        """The force elements whose kinks are located: none."""
+        return ()
 
     @property
     def without_origin(self) -> "TracedSystem":
@@ -220,20 +232,38 @@ def trace_system(system: Any, n: int) -> TracedSystem:
         return indices[id(x)]
 
     of_leaves = [place(x) for x in listed]
-    count, functions = len(numbers), {}
+    count, functions, labels = len(numbers), {}, {}
     examples = {x: jax.ShapeDtypeStruct(() if x == "t" else (n,), float) for x in "tqv"}
     for name in given:
 
         def function(*arrays: Any, name: str = name) -> Array:
             own: Any = eqx.combine(jax.tree.unflatten(tree, arrays[: len(listed)]), others)
-            return _checked(name, jnp.asarray(own[name](*arrays[len(listed) :]), float), n)
+            value = own[name](*arrays[len(listed) :])
+            labels[name] = labels_of_rows(name, value)
+            return _checked(name, jnp.asarray(joined_rows(value), float), n)
 
         closed = jax.make_jaxpr(function)(*listed, *(examples[x] for x in FUNCTIONS[name]))
         is_number = [isinstance(x, Tracer) or eqx.is_inexact_array_like(x) for x in closed.consts]
         constants = [(place(x), None) if yes else (None, x) for x, yes in zip(closed.consts, is_number, strict=True)]
         functions[name] = closed.replace(consts=[None] * len(constants)), constants, of_leaves
     is_fixed = [k >= count and not isinstance(x, Tracer) for k, x in enumerate(numbers)]
-    return TracedSystem(numbers, SystemFunctions(functions, numbers, is_fixed, n), system.breakpoints)
+    of_rows = tuple(label for name in ("constraint", "velocity_constraint") for label in labels.get(name, ()))
+    return TracedSystem(numbers, SystemFunctions(functions, numbers, is_fixed, n), of_rows, system.breakpoints)
+
+
+def joined_rows(value: Any) -> Any:
+    """Return the rows of a constraint as one vector, if they are given by name."""
+    if not isinstance(value, Mapping):
+        return value
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x, float)) for x in value.values()])
+
+
+def labels_of_rows(name: str, value: Any) -> list[str]:
+    """Return the labels of the rows of a constraint: their names, or its own with an index."""
+    if not isinstance(value, Mapping):
+        return [f"{name}[{k}]" for k in range(np.size(value))]
+    parts = [(label, np.size(x)) for label, x in value.items()]
+    return [str(label) if count == 1 else f"{label}[{k}]" for label, count in parts for k in range(count)]
 
 
 def _checked(name: str, value: Array, n: int) -> Array:

@@ -33,16 +33,19 @@ from udkjax.integrate.prepare import (
     PreparedRun,
     begin,
     begin_concrete,
+    jax_adjoint,
     prepare_run,
+    progress_meter,
 )
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
+from udkjax.integrate.stabilization import Stabilization
 from udkjax.pinv import Pseudoinverse
-from udkjax.positions.assembly import AssemblyWarning, Closure, State, require_closed
+from udkjax.positions.assembly import AssemblyWarning, Closure, State, close, require_closed
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
-from udkjax.requirements import ArgumentError, ArgumentTypeError, describe, require_output_times
+from udkjax.requirements import ArgumentError, require_output_times
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
@@ -62,7 +65,7 @@ def simulate(
     rtol: NumberLike = 1e-8,
     atol: NumberLike = 1e-8,
     method: Pseudoinverse | None = None,
-    stabilization: Projection | Baumgarte | None = Projection(),
+    stabilization: Projection | Baumgarte | Stabilization | None = Projection(),
     solver: "diffrax.AbstractSolver | None" = None,
     adjoint: "diffrax.AbstractAdjoint | None" = None,
     max_steps: int = MAX_STEPS,
@@ -75,6 +78,7 @@ def simulate(
     engine: Literal["auto", "native", "diffrax", "jax"] = "auto",
     events: Any = None,
     max_events: int = MAX_EVENTS,
+    stepsize_controller: "diffrax.AbstractStepSizeController | None" = None,
 ) -> Solution:
     """Integrate the equations of motion q'' = a(t, q, q') of a mechanism; return its states at output times.
 
@@ -88,7 +92,8 @@ def simulate(
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.
         ts: output times (T,) in s, increasing; the motion starts at ts[0].
-        state: the initial `State`, used as given, or the `Closure` of an assembly. By default the scene's guess is assembled.
+        state: the initial `State`, used as given, or the `Closure` of an assembly. By default the scene's guess is assembled, or
+            q0 and v0 of a `ConstrainedSystem`.
         rtol: relative tolerance of every coordinate and velocity. The sizes of steps are not differentiated, so there
             are no derivatives with respect to tolerances or `dt0`.
         atol: tolerance relative to the mechanism's own scales: x may err by rtol |x| + atol L, an angle by rtol |angle| + atol,
@@ -96,7 +101,7 @@ def simulate(
             time, the time in which the initial velocities move the mechanism by L, and the span of `ts`. Equal tolerances thus
             mean equal accuracy at any scale. L = T = 1 for a `ConstrainedSystem`.
         method: the pseudoinverse; by default `Auto()`.
-        stabilization: `Projection()`, a `Baumgarte`, or None.
+        stabilization: `Projection()`, a `Baumgarte`, a `Stabilization` of your own, or None.
         solver: any diffrax solver for ordinary differential equations; by default Dopri8, the fastest at equal error in
             benchmarks/, except for the tightest tolerances through singular configurations. Where a stiff force, not the
             tolerance, would limit its steps, machine code goes on with Kvaerno5, and returns where that does not pay:
@@ -124,6 +129,8 @@ def simulate(
             `abs`, `floor` of the state) are located in the same way, without being listed; `Solution.unlocated` is the time from
             which they are not located.
         max_events: the largest number of events.
+        stepsize_controller: a step size controller of diffrax, for constant steps `diffrax.ConstantStepSize()` with `dt0`; by
+            default a controller of every coordinate and velocity, by rtol and atol.
 
     Returns:
         A `Solution` with q and v (T, bodies, 3): x, y in m and angle in rad, and their rates. `Solution.result` is the
@@ -146,7 +153,8 @@ def simulate(
             f"rtol = {rtol:g} and atol = {atol:g} are below rounding errors, and no step can meet them: raise one of them"
         )
     if state is None and isinstance(mechanism, ConstrainedSystem):
-        raise ValueError("a ConstrainedSystem has no initial guess to assemble: give the initial state, State(q, v)")
+        times: Any = ts
+        state = close(mechanism, times[0])
     if drift_tol is None:
         drift_tol = DRIFT_PROJECTED if isinstance(stabilization, Projection) else DRIFT_FREE
     choices = Choices(
@@ -158,10 +166,11 @@ def simulate(
         stabilization=stabilization,
         formulation=formulation,
         solver=solver,
-        adjoint=None if adjoint is None else _adjoint(adjoint),
-        meter=None if progress is None else _meter(progress),
+        adjoint=None if adjoint is None else jax_adjoint(adjoint),
+        meter=None if progress is None else progress_meter(progress),
         max_steps=max_steps,
         engine=engine,
+        stepper=stepsize_controller,
     )
     if isinstance(mechanism, Mechanism) and not _releases(events):
         holding = hold_pins(mechanism)
@@ -170,8 +179,11 @@ def simulate(
             mechanism, analysis, choices = holding.mechanism, None, choices._replace(held=names)
     system = mechanism
     if isinstance(mechanism, ConstrainedSystem):
-        assert isinstance(state, State)  # checked above
-        system = mechanism.traced(np.size(state.q))
+        assert state is not None  # closed above
+        start = state.state if isinstance(state, Closure) else state
+        system = mechanism.traced(np.size(start.q))
+        if throw and isinstance(state, Closure):
+            require_closed(mechanism, state)
     is_concrete = not isinstance(system, ConstrainedSystem) and system.is_concrete
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     all_concrete = is_concrete and not is_traced((ts, analysis, state, closure, choices))
@@ -190,19 +202,22 @@ def simulate(
 
         found = kinks_of(mechanism)
         by_steps = "with a diffrax adjoint" if choices.adjoint else "with a progress meter" if choices.meter else ""
+        by_steps = f"with {choices.only_by_diffrax}" if choices.only_by_diffrax else by_steps
         is_located = is_located or (found.are_held and not by_steps)
         choices = choices._replace(kinks=found.remark(by_steps))
     if is_located:
-        if not isinstance(mechanism, Mechanism) or choices.adjoint is not None or choices.meter is not None:
-            others = "a diffrax adjoint" if choices.adjoint else "progress"
-            what = others if isinstance(mechanism, Mechanism) else "a ConstrainedSystem"
-            raise ValueError(f"a run with events needs a Mechanism, JAX's own derivatives and no progress meter: not {what}")
+        if choices.adjoint is not None or choices.meter is not None or choices.only_by_diffrax:
+            others = choices.only_by_diffrax or ("a diffrax adjoint" if choices.adjoint else "progress")
+            raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {others}")
+        if isinstance(system, ConstrainedSystem):
+            raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX")
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
-        assert analysis is not None  # a mechanism has one
-        solution = simulate_events(mechanism, events, analysis, ts, state, closure, choices, max_events)
+        solution = simulate_events(system, events, analysis, ts, state, closure, choices, max_events)
         if not _has_failed(solution.code) or not is_concrete or int(solution.stats.get("events", 0)):
             return _required(solution, throw)  # events may have changed what moved
+        if not isinstance(mechanism, Mechanism):
+            return _required(solution, throw)
         if events is not None:
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
         located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
@@ -327,21 +342,3 @@ def _finish(
         found_cause=None,
     )
     return solution, run.has_missed_rows, (raw.t, raw.y), code_found
-
-
-def _adjoint(adjoint: Any) -> Any:
-    """Return an adjoint of diffrax; None for `ForwardMode`, since JAX then differentiates the steps by default."""
-    import diffrax
-
-    return None if type(adjoint) is diffrax.ForwardMode else adjoint
-
-
-def _meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
-    if progress is False:
-        return None
-    import diffrax
-
-    if not isinstance(progress, bool | diffrax.AbstractProgressMeter):
-        raise ArgumentTypeError(f"progress must be True, False or a diffrax progress meter, {describe(progress)}")
-    meter: Any = diffrax.TextProgressMeter() if progress is True else progress
-    return None if isinstance(meter, diffrax.NoProgressMeter) else meter

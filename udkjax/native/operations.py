@@ -183,7 +183,7 @@ class EvaluateEvents(StateOperation):
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         assert self.conditions is not None
-        directions = len(self.impacts) * self.code.coordinate_count
+        directions = len(self.impacts) * self.code.coordinate_count * (2 if self.code.has_mobility else 1)
         return [(self.code.coordinate_count + len(self.conditions.at_state.outputs) + directions,)]
 
 

@@ -2,16 +2,12 @@
 
 from udkjax.positions.assembly import AssemblyError as AssemblyError
 from udkjax.positions.assembly import AssemblyWarning as AssemblyWarning
-from udkjax.positions.assembly import Check as Check
 from udkjax.positions.assembly import Closure as Closure
 from udkjax.positions.assembly import State as State
 from udkjax.positions.assembly import assemble as assemble
-from udkjax.positions.assembly import check as check
-from udkjax.positions.assembly import check_lines as check_lines
 from udkjax.positions.assembly import close as close
 from udkjax.positions.assembly import moves_from_guess as moves_from_guess
 from udkjax.positions.assembly import moves_of_assembly as moves_of_assembly
-from udkjax.positions.assembly import numbered as numbered
 from udkjax.positions.assembly import require_closed as require_closed
 from udkjax.positions.branches import branches as branches
 from udkjax.positions.branches import distinct_positions as distinct_positions
@@ -85,6 +81,10 @@ from udkjax.positions.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.position_batch import PositionBatch as PositionBatch
 from udkjax.positions.position_batch import compile_programs as compile_programs
 from udkjax.positions.position_batch import position_code as position_code
+from udkjax.positions.scene_check import Check as Check
+from udkjax.positions.scene_check import check as check
+from udkjax.positions.scene_check import check_lines as check_lines
+from udkjax.positions.scene_check import numbered as numbered
 from udkjax.positions.transmission import Workspace as Workspace
 from udkjax.positions.transmission import coupler_curve as coupler_curve
 from udkjax.positions.transmission import mechanical_advantage as mechanical_advantage

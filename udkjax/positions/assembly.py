@@ -22,26 +22,24 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import ROUNDING, is_traced, is_within_jit, number, number_called
-from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.element_programs import has_rheonomic_joints
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.position_closure import CLOSURE, is_closed
-from udkjax.equations.redundancy import dependent_constraints
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.positions import native_closing
 from udkjax.positions.closure import close_by_jax, close_by_machine_code, from_moment
 from udkjax.positions.open_rows import explain_open
 from udkjax.positions.system_closure import close_system
-from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, prints_table, units
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import size_of
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.suspicions import body_sizes, suspicions
+from udkjax.scene.suspicions import body_sizes
 
 
 class State(PrintsTable):
@@ -106,9 +104,9 @@ def assemble(
     respect to every number of the mechanism and of the guess, even with redundant constraints.
 
     Args:
-        mechanism: the mechanism, or a `ConstrainedSystem`; this has no guess of its own, and first derivatives only.
+        mechanism: the mechanism, or a `ConstrainedSystem`, which has first derivatives only.
         t: time (s).
-        state: the state to start from; by default the initial guess of the bodies.
+        state: the state to start from; by default the initial guess of the bodies, or q0 and v0 of the system.
         throw: whether a mechanism that cannot be closed raises; with False, or where numbers are traced, the best state found is
             returned instead.
         analysis: the mechanism's `Analysis`; by default computed here.
@@ -128,30 +126,40 @@ def assemble(
 
 
 def _assemble_system(system: ConstrainedSystem, t: NumberLike, state: State | None, throw: bool) -> State:
-    if state is None:
-        raise ValueError("a ConstrainedSystem has no initial guess: give a state near a closed one, State(q, v)")
-    closed = close_system(
-        system.traced(np.size(state.q)), *(jnp.asarray(x, jnp.result_type(float)) for x in (t, state.q, state.v))
-    )
-    found = State(closed.q, closed.v)
-    if throw and not is_traced(closed):
-        worst = max(float(closed.position), float(closed.velocity))
-        if not worst <= CLOSURE.tol * max(1.0, float(jnp.max(jnp.abs(closed.v), initial=0.0))):
-            message = f"the constraints stay violated, Psi by {float(closed.position):.3g} and velocities by"
-            raise AssemblyError(f"{message} {float(closed.velocity):.3g}: start nearer to a state that satisfies them", found)
-    return found
+    closure = close_system_guess(system, t, state)
+    if throw:
+        require_closed(system, closure, t, state)
+    return closure.state
+
+
+def close_system_guess(system: ConstrainedSystem, t: NumberLike, state: State | None = None) -> Closure:
+    """Close a user-defined system as `close` does, from a state or its own guess, without derivatives of the rank.
+
+    Raises:
+        ValueError: there is neither a state nor a guess.
+    """
+    if state is None and system.q0 is None:
+        raise ValueError("a ConstrainedSystem without q0 has no initial guess: give a state near a closed one, State(q, v)")
+    q, v = (system.q0, system.v0) if state is None else (state.q, state.v)
+    traced = system.traced(np.size(q))
+    found = close_system(traced, *(jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v)))
+    sizes = jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in (found.psi, found.rates)])
+    closed = jnp.max(sizes) <= CLOSURE.tol * jnp.maximum(1.0, jnp.max(jnp.abs(found.v), initial=0.0))
+    return Closure(State(found.q, found.v), found.psi, found.rates, found.rank, found.scales, closed)
 
 
 def close(
-    mechanism: Mechanism,
+    mechanism: Mechanism | ConstrainedSystem,
     t: NumberLike = 0.0,
     state: State | None = None,
     analysis: Analysis | None = None,
 ) -> Closure:
     """Close a mechanism as `assemble` does, and return the residuals with the state instead of raising.
 
-    The closure of concrete numbers is concrete, even while something else is traced.
+    The closure of concrete numbers of a mechanism is concrete, even while something else is traced.
     """
+    if isinstance(mechanism, ConstrainedSystem):
+        return close_system_guess(mechanism, t, state)
     if not mechanism.is_concrete or is_traced((t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
         close = _close if is_within_jit() else _close_compiled  # under jit concrete numbers become tracers, too
@@ -201,102 +209,22 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: NumberLike, state: State
 _close_compiled = deferred(_close)
 
 
-def require_closed(mechanism: Mechanism, closure: Closure, t: NumberLike = 0.0, guess: State | None = None) -> None:
+def require_closed(
+    mechanism: Mechanism | ConstrainedSystem, closure: Closure, t: NumberLike = 0.0, guess: State | None = None
+) -> None:
     """Raise an `AssemblyError` if the closure of a guess at time t (s) is not closed; traced values are not checked."""
     closed = closure.is_closed
     if isinstance(closed, Tracer) or closed:
         return
+    if isinstance(mechanism, ConstrainedSystem):
+        worst = [float(jnp.max(jnp.abs(x), initial=0.0)) for x in (closure.psi, closure.psi_dot)]
+        message = f"the constraints stay violated, Psi by {worst[0]:.3g} and velocities by {worst[1]:.3g}"
+        raise AssemblyError(f"{message}: start nearer to a state that satisfies them", closure.state)
     mechanism.with_parameters({})  # numbers changed as leaves of a tree have not been checked: raises an error that names them
     names = [name for name, _ in analyse(mechanism).row_names]
     psi, psi_dot, rows = (np.asarray(x) for x in (closure.psi, closure.psi_dot, closure.scales.rows))
     q = np.asarray(mechanism.q0 if guess is None else guess.q).ravel()
     raise AssemblyError(explain_open(mechanism, np.asarray(t).item(), q, names, psi, psi_dot, rows), closure.state)
-
-
-@prints_table
-class Check(NamedTuple):
-    """Findings of `check` on a mechanism's constraints."""
-
-    bodies: int
-    coordinates: int
-    rows: int
-    rank: int  # away from singular configurations
-    degrees_of_freedom: int
-    redundant: tuple[tuple[str, int], ...]  # rows that can be left out: the constraint and the row within it
-    dependent: tuple[str, ...]  # constraints that depend on each other
-    residual_before: float  # the largest |Psi| (m, rad) as given, and assembled
-    residual_after: float
-    closed: bool
-    length: float  # characteristic length (m), as in `analyse`
-    time: float  # characteristic time (s)
-    mass: float  # characteristic mass (kg)
-    moved: tuple[str, ...] = ()  # bodies moved far by assembly, relative to their sizes
-    suspicious: tuple[str, ...] = ()  # likely mistakes
-
-    def _table(self) -> PrintedTable:
-        return PrintedTable("mechanism, checked", list(check_lines(self).items()))
-
-
-@checked
-def check(mechanism: Mechanism) -> Check:
-    """Count rows, rank and degrees of freedom, name redundant rows, and measure how well the initial guess closes.
-
-    Names bodies that assembly moves by more than a hundredth of their size, and likely mistakes: points far outside all bodies,
-    angles that look like degrees, bodies without a joint.
-
-    Args:
-        mechanism: a mechanism of concrete numbers.
-
-    Returns:
-        A `Check`: the counts, |Psi| before and after assembly (m, rad), and the findings as text.
-    """
-    closure = close(mechanism)
-    before = constraints.psi(mechanism, 0.0, mechanism.q0)
-    rows = len(before)
-    closed = bool(closure.is_closed)
-    found = analyse(mechanism)
-    rank = int(closure.rank) if found.rank is None or not closed else found.rank
-    return Check(
-        bodies=len(mechanism.body_names),
-        coordinates=3 * len(mechanism.body_names),
-        rows=rows,
-        rank=rank,
-        degrees_of_freedom=3 * len(mechanism.body_names) - rank,
-        redundant=found.redundant if closed else (),
-        dependent=dependent_constraints(mechanism, np.asarray(closure.state.q)) if closed else (),
-        residual_before=float(jnp.abs(before).max(initial=0.0)),
-        residual_after=float(jnp.abs(closure.psi).max(initial=0.0)),
-        closed=closed,
-        length=float(found.length),
-        time=float(found.time),
-        mass=float(found.mass),
-        moved=moves_of_assembly(mechanism, closure.state.q) if closed else (),
-        suspicious=tuple(suspicions(mechanism)),
-    )
-
-
-def check_lines(found: Check) -> dict[str, str]:
-    """Return the findings of `check` as texts by title."""
-    lines = {
-        "bodies": f"{found.bodies}",
-        "coordinates": f"{found.coordinates}",
-        "constraint equations": f"{found.rows}",
-        "rank": f"{found.rank}",
-        "degrees of freedom": f"{found.degrees_of_freedom}",
-        "redundant constraints": ", ".join(f"{name} (equation {row + 1})" for name, row in found.redundant) or "none",
-    }
-    if found.dependent:
-        lines["depend on each other"] = ", ".join(found.dependent)
-    lines["length, time, mass"] = f"{found.length:.3g} m, {found.time:.3g} s, {found.mass:.3g} kg"
-    before, after = (format_number(x, "m or rad", found.length) for x in (found.residual_before, found.residual_after))
-    lines |= {"closure, as given": before, "closure, assembled": after + ("" if found.closed else ": it does not close")}
-    more = [text.removeprefix("assembly ") for text in found.moved]
-    return lines | numbered("assembly", more) | numbered("likely a mistake", list(found.suspicious))
-
-
-def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
-    """Return texts by title, numbered if there is more than one."""
-    return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
 
 
 # Fraction of a body's size. Gaps from rough drawings or from numbers of three digits are smaller; larger moves may come from a

@@ -8,6 +8,7 @@
     joint.NAME.BODY.fx  fy  torque                            load of the joint on the named body
     driver.NAME.load                                          load of the driver on its second body along its coordinate
     distance.BODY(px, py).BODY2(px, py)                       between two points; a body may be "ground"
+    q[K]  v[K]                                                coordinate K of a user-defined system, and its rate
 
 Torques are about the centre of mass, those on the ground about the origin. SI units throughout.
 """
@@ -15,12 +16,13 @@ Torques are about the centre of mass, those on the ground about the origin. SI u
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers
 from udkjax.arrays import number
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism
@@ -57,8 +59,8 @@ class Channel:
     name: str
     units: str
     needs: Needs
-    section: str  # body, joint, pin, driver or distance
-    owner: str  # name of the joint or driver; else empty
+    section: str  # body, joint, pin, driver, distance or state
+    owner: str  # name of the joint or driver; q or v of a system; else empty
     bodies: tuple[str, ...]  # names of its bodies: two for an angle at a joint or a distance
     points: tuple[LocalPoint, ...] = ()  # a point of each body
     quantity: str = ""
@@ -75,7 +77,7 @@ class Quantity:
     """
 
     name: str
-    function: Callable[[Mechanism, StateHistory], Float[Array, "T"]]
+    function: Callable[[Any, StateHistory], Float[Array, "T"]]
     units: str = ""
 
     def __repr__(self) -> str:
@@ -154,17 +156,30 @@ def _listed(names: Sequence[str]) -> str:
 # --- names
 
 
-def channel_of(mechanism: Mechanism, text: str) -> Channel:
+def channel_of(mechanism: Mechanism | ConstrainedSystem, text: str) -> Channel:
     """Return the channel with a name; names of bodies and joints may contain dots.
 
     Raises:
         ValueError: no such channel; the message suggests another name.
     """
     text = text.strip()
+    if isinstance(mechanism, ConstrainedSystem):
+        return _channel_of_system(mechanism, text)
     section, _, rest = text.partition(".")
     if section not in _PARSERS:
         raise ValueError(f"begins with none of {', '.join(f'{s}.' for s in _PARSERS)}{suggestion(text, channels_of(mechanism))}")
     return _PARSERS[section](mechanism, rest)
+
+
+def _channel_of_system(system: ConstrainedSystem, text: str) -> Channel:
+    found = re.fullmatch(r"([qv])\[(\d+)\]", text)
+    if found is None:
+        raise ValueError(f"must be a coordinate such as q[0], a velocity such as v[0], or a Quantity; {quote(text)} is not")
+    if system.q0 is not None and int(found[2]) >= len(system.q0):
+        raise ValueError(
+            f"there are {len(system.q0)} coordinates, from q[0] to q[{len(system.q0) - 1}]; {quote(text)} is not one"
+        )
+    return Channel(text, "", "states", "state", found[1], (), (), found[2])
 
 
 def channels_of(mechanism: Mechanism) -> list[str]:

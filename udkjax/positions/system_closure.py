@@ -7,22 +7,14 @@ numbers of the system are exact, those with respect to the guess are those of a 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
-from udkjax.annotations import AnyArray, Time, Vector
-from udkjax.arrays import ArrayLibrary
+from udkjax.annotations import Time, Vector
 from udkjax.equations.position_closure import CLOSURE, close_position
 from udkjax.equations.quantities import equations_of
 from udkjax.pinv import SVD
 from udkjax.programs.deferred import deferred
 from udkjax.transforms.gradients import stop_gradients
-
-
-class UnitScales:
-    """The scales of coordinates and rows of order one."""
-
-    def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-        return xp.max(xp.abs(q), initial=0.0)
 
 
 class SystemRows(NamedTuple):
@@ -32,7 +24,7 @@ class SystemRows(NamedTuple):
 
     @property
     def scales(self) -> Any:
-        return UnitScales()
+        return self.equations.scales
 
     def residual(self, t: Time, q: Array) -> Array:
         return self.equations.violation(t, q, jnp.zeros_like(q))[0]
@@ -42,12 +34,14 @@ class SystemRows(NamedTuple):
 
 
 class ClosedSystem(NamedTuple):
-    """A closed state, and the largest residual of positions and of velocities."""
+    """A closed state with its residuals, and the rank of (Psi_q; phi_v) M^(-1/2)."""
 
     q: Vector
     v: Vector
-    position: Array
-    velocity: Array
+    psi: Float[Array, "m"]
+    rates: Float[Array, "k"]  # Psi_dot and phi
+    rank: Int[Array, ""]
+    scales: Any
 
 
 @deferred
@@ -72,4 +66,5 @@ def close_system(system: Any, t: Array, q: Vector, v: Vector) -> ClosedSystem:
     for _ in range(CLOSURE.velocities + 1):
         velocity = equations.correct_velocity(t, closed, velocity)
     psi, rates = equations.violation(t, closed, velocity)
-    return ClosedSystem(closed, velocity, *(jnp.max(jnp.abs(x), initial=0.0) for x in (psi, rates)))
+    rank = stop_gradients(equations.rank(closed, equations.jacobian(t, closed, velocity)))
+    return ClosedSystem(closed, velocity, psi, rates, rank, fixed.scales)

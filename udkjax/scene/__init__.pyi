@@ -72,6 +72,7 @@ from udkjax.scene.mjcf import MjcfWarning as MjcfWarning
 from udkjax.scene.mjcf import mjcf_text as mjcf_text
 from udkjax.scene.mjcf import read_mjcf as read_mjcf
 from udkjax.scene.named_arguments import require_history as require_history
+from udkjax.scene.number_fields import NumberField as NumberField
 from udkjax.scene.number_fields import must_be_positive as must_be_positive
 from udkjax.scene.number_fields import parameters_of as parameters_of
 from udkjax.scene.number_fields import split_index as split_index

@@ -52,11 +52,20 @@ class NumberField(NamedTuple):
     shape: tuple[int, ...] | None  # None: absent, any shape
 
 
-def parameters_of(mechanism: Sections) -> dict[str, NumberField]:
+class NamesNumbers(Protocol):
+    """A model that names its own numbers, as a user-defined system does."""
+
+    def number_fields(self) -> dict[str, NumberField]: ...
+
+
+def parameters_of(mechanism: Sections | NamesNumbers) -> dict[str, NumberField]:
     """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
-    drawn = {} if mechanism.drawing is None else parameters_in(mechanism.drawing.groups)
-    gravity = {"gravity": NumberField("", "", (), mechanism.gravity, mechanism.gravity.shape)}
-    return gravity | drawn | parameters_in(mechanism.groups)
+    scene: Any = mechanism
+    if hasattr(scene, "number_fields"):
+        return scene.number_fields()
+    drawn = {} if scene.drawing is None else parameters_in(scene.drawing.groups)
+    gravity = {"gravity": NumberField("", "", (), scene.gravity, scene.gravity.shape)}
+    return gravity | drawn | parameters_in(scene.groups)
 
 
 def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
@@ -77,7 +86,7 @@ def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
     return _at(elements[parameter.owner], parameter.path[:-1])
 
 
-def must_be_positive(mechanism: Sections, name: str) -> bool:
+def must_be_positive(mechanism: Any, name: str) -> bool:
     """Return True if a number, or the number that an entry belongs to, must not be negative."""
     known = parameters_of(mechanism)
     field = known[split_index(name, known)[0]]

@@ -6,10 +6,10 @@ would pass for an angular velocity. Here angle is a separate dimension.
 
 import math
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from udkjax.scene.held import Held
-from udkjax.scene.number_fields import Sections, owner_of, parameters_of, split_index
+from udkjax.scene.number_fields import owner_of, parameters_of, split_index
 from udkjax.wording import quote
 
 # Numeric settings of a run; one program serves all values.
@@ -73,7 +73,7 @@ _OF_TYPE = {
 FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the coordinate that it drives
 
 
-def units_of(mechanism: Sections, name: str) -> str:
+def units_of(mechanism: Any, name: str) -> str:
     """Return the unit of a parameter or of a setting; an empty string if unknown."""
     if name in NUMBERS:
         return NUMBERS[name]
@@ -82,7 +82,7 @@ def units_of(mechanism: Sections, name: str) -> str:
     if field is None:
         return ""
     if not field.path:
-        return _FIELDS[name.partition("[")[0]]
+        return _FIELDS.get(name.partition("[")[0], "")
     driven = getattr(mechanism.groups["driver"].get(field.owner), "coordinate", "")
     owner = owner_of(mechanism, field)
     if isinstance(owner, Held):

@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike
 from udkjax.equations.quantities import efforts
 from udkjax.integrate import Solution
 from udkjax.integrate.solution import format_work
-from udkjax.positions.assembly import Check, check_lines, numbered
+from udkjax.positions.scene_check import Check, check_lines, numbered
 from udkjax.printing import align_columns, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import Accuracy

@@ -8,6 +8,7 @@ from udkjax.study.channel_values import measure as measure
 from udkjax.study.channel_values import path as path
 from udkjax.study.choices import choice as choice
 from udkjax.study.diagnosis import Diagnosis as Diagnosis
+from udkjax.study.diagnosis import SystemDiagnosis as SystemDiagnosis
 from udkjax.study.diagnosis import diagnose as diagnose
 from udkjax.study.diagnosis.configuration import RankedPositions as RankedPositions
 from udkjax.study.diagnosis.fixes import Fix as Fix

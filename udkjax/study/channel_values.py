@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.annotations import Numbers
 from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
 from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, LocalPoint, Quantity, StateHistory, locate, point_of_pin
@@ -23,7 +24,9 @@ from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.mechanism import Mechanism
 
 
-def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Channel | Quantity]) -> Float[Array, "T C"]:
+def measure(
+    mechanism: Mechanism | ConstrainedSystem, solution: StateHistory, channels: Sequence[Channel | Quantity]
+) -> Float[Array, "T C"]:
     """Compute the values of channels at the output times of a solution, which may be traced and batched.
 
     Accelerations and reactions are those of the constraints without stabilization,
@@ -34,7 +37,7 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
     of the run's method, because a batch would execute both sides of a branch.
 
     Args:
-        mechanism: the mechanism that moved.
+        mechanism: the mechanism, or the system, that moved.
         solution: a `Solution`, or another pytree with ts (T,), q and v (T, bodies, 3).
         channels: channels to measure.
 
@@ -42,6 +45,8 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
         Values (T, C) in SI units, one column per channel; NaN where the state is NaN, after a run has failed. At a toggle,
         positions, angles and distances are finite, and velocities are NaN. Derivatives of NaN values are zero.
     """
+    if isinstance(mechanism, ConstrainedSystem):
+        return _measure_system(mechanism, solution, channels)
     motion, placed, reached = _fill(mechanism, solution)
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
@@ -49,6 +54,18 @@ def measure(mechanism: Mechanism, solution: StateHistory, channels: Sequence[Cha
         return jnp.zeros((len(motion.q), 0))
     valid = [placed if isinstance(c, Channel) and c.quantity in POSITIONS else reached for c in channels]
     return jnp.where(jnp.stack(valid, -1), jnp.stack(columns, -1), jnp.nan)
+
+
+def _measure_system(system: ConstrainedSystem, solution: StateHistory, channels: Sequence[Channel | Quantity]) -> Array:
+    """Compute channels of a user-defined system; states after a failure are replaced by the first one, or by ones."""
+    reached = jnp.all(jnp.isfinite(solution.q) & jnp.isfinite(solution.v), axis=1)
+    q, v = (
+        jnp.where(reached[:, None], x, jax.lax.stop_gradient(jnp.where(jnp.isfinite(x[0]), x[0], 1.0)))
+        for x in (solution.q, solution.v)
+    )
+    filled, states = eqx.tree_at(lambda s: (s.q, s.v), solution, (q, v)), {"q": q, "v": v}
+    columns = [c.function(system, filled) if isinstance(c, Quantity) else states[c.owner][:, int(c.quantity)] for c in channels]
+    return jnp.where(reached[:, None], jnp.stack(columns, -1) if columns else jnp.zeros((len(q), 0)), jnp.nan)
 
 
 @checked

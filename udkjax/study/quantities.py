@@ -1,18 +1,29 @@
-"""Quantities of a mechanism that are not single parameters: functions of a mechanism and a value, with names in files."""
+"""Models of a study, and quantities of them that are not single parameters: functions of a model and a value."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
-from udkjax.annotations import NumberLike
+from udkjax.annotations import NumberLike, NumericArray
+from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.quantities import equations_of
+from udkjax.pinv import SVD
+from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
 
-Setter = TypeAliasType("Setter", Callable[[Mechanism, NumberLike], Mechanism])  # (mechanism, value) -> mechanism
+StudyModel: TypeAlias = Mechanism | ConstrainedSystem  # the models of studies
+# (mechanism, value) -> mechanism, or the same of systems
+Setter = TypeAliasType(
+    "Setter", Callable[[Mechanism, NumberLike], Mechanism] | Callable[[ConstrainedSystem, NumberLike], ConstrainedSystem]
+)
 
 
 @dataclass(frozen=True)
@@ -49,8 +60,46 @@ class Scaled:
         return mechanism.with_parameters({name: factor * jnp.asarray(value) for name, factor in self.factors.items()})
 
 
-def parameter_value(mechanism: Mechanism, name: str) -> Array:
+def parameter_value(mechanism: StudyModel, name: str) -> Array:
     """Return the value of an existing parameter, or of an entry (`joint.A.points[1][0]`)."""
     known = parameters_of(mechanism)
     owner, index = split_index(name, known)
     return jnp.asarray(known[owner].value)[index]
+
+
+def analysis_of(model: StudyModel) -> Analysis | None:
+    """Return the analysis of a mechanism; a user-defined system has none."""
+    return analyse(model) if isinstance(model, Mechanism) else None
+
+
+def state_shape(model: StudyModel, state: object = None) -> tuple[int, ...]:
+    """Return the shape of coordinates: (bodies, 3), or (n,) of a system, by its guess or a state."""
+    if isinstance(model, Mechanism):
+        return len(model.body_names), 3
+    q = model.q0 if state is None else getattr(getattr(state, "state", state), "q", None)
+    return () if q is None else np.shape(q)
+
+
+def body_names(model: StudyModel) -> tuple[str, ...]:
+    """Return the names of the bodies of a mechanism; a user-defined system has none."""
+    return model.body_names if isinstance(model, Mechanism) else ()
+
+
+def with_guess(model: Any, q: NumericArray, v: NumericArray) -> Any:
+    """Return a mechanism, or a system with a guess, with another initial guess."""
+    if not isinstance(model, Mechanism):
+        return model.with_parameters({"q0": q, "v0": v})
+    values: dict[str, NumericArray] = {}
+    for k, body in enumerate(model.body_names):
+        values |= {f"body.{body}.position": q[k, :2], f"body.{body}.angle": q[k, 2]}
+        values |= {f"body.{body}.velocity": v[k, :2], f"body.{body}.angular_velocity": v[k, 2]}
+    return model.with_parameters(values)
+
+
+@deferred
+def jacobians_of_system(system: Any, t: Any, q: Any, v: Any) -> Any:
+    """Return Psi_q, and the rows (Psi_q; phi_v), of a system of traced functions at a state."""
+    equations: Any = equations_of(system, SVD())
+    t, q, v = (jnp.asarray(x, float) for x in (t, q, v))
+    rows = equations.jacobian(t, q, v)
+    return rows[: len(equations.violation(t, q, v)[0])], rows

@@ -8,9 +8,10 @@ from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
 from udkjax.study.identify import prediction
 from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.identification import identify
+from udkjax.study.identify.initial_states import state_unknowns
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.search import horizons
-from udkjax.study.identify.unknowns import sample_guesses, state_unknowns
+from udkjax.study.identify.unknowns import sample_guesses
 from udkjax.study.noise import whiteness_of
 
 TRUE = {"body.rod.inertia": 0.375, "force.spring.damping": 0.2}

@@ -36,10 +36,10 @@ def test_only_what_needs_all_output_times_gets_them():
 
 
 def test_a_users_arrays_are_labelled_by_their_shapes():
-    assert guess_label("x", (6, 4, 3), 6, 4).dims == ("time", "body", "coordinate")
-    assert guess_label("x", (6, 2), 6, 4).dims == ("time", "x_1")
-    assert guess_label("x", (4, 3), 6, 4).dims == ("body", "coordinate")
-    assert guess_label("x", (), 6, 4).dims == ()
+    assert guess_label("x", (6, 4, 3), 6, (4, 3)).dims == ("time", "body", "coordinate")
+    assert guess_label("x", (6, 2), 6, (4, 3)).dims == ("time", "x_1")
+    assert guess_label("x", (4, 3), 6, (4, 3)).dims == ("body", "coordinate")
+    assert guess_label("x", (), 6, (4, 3)).dims == ()
 
 
 def test_arrays_of_a_function_without_a_name_go_by_their_own():

@@ -64,6 +64,10 @@ class Action(PrintsLine):
     def check(self, mechanism: Mechanism, where: str):
         """Raise an error, whose message begins with `where`, if its arguments do not fit a mechanism."""
 
+    def check_for_system(self, where: str):
+        """Raise an error, whose message begins with `where`, if the action cannot happen to a `ConstrainedSystem`."""
+        raise ValueError(f"{where}: {type(self).__name__} changes the joints of a mechanism, and this system has none")
+
     def has_usable_numbers(self) -> Bool[Array, ""]:
         """Return whether its numbers, which may be traced, are within their limits."""
         return jnp.array(True)
@@ -76,12 +80,18 @@ class Stop(Action):
     changes = False
     on_page = True
 
+    def check_for_system(self, where):
+        pass
+
 
 class Log(Action):
     """Record time and state, and go on."""
 
     changes = False
     on_page = True
+
+    def check_for_system(self, where):
+        pass
 
 
 class Impact(Action):
@@ -110,6 +120,12 @@ class Impact(Action):
     @property
     def rest(self):
         return self.at_rest
+
+    def check_for_system(self, where):
+        require_restitution(f"{where}: the restitution", self.restitution)
+        if self.at_rest != "stop":
+            cure = 'let the run end there, Impact(restitution, at_rest="stop"), or go on with a system that has the row'
+            raise ValueError(f"{where}: the constraints of a ConstrainedSystem do not change; {cure}")
 
     def check(self, mechanism, where):
         require_restitution(f"{where}: the restitution", self.restitution)

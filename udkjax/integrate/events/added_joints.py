@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.expressions import Graph, ScalarProgram, read_jaxpr
-from udkjax.integrate.events.condition_program import input_array
+from udkjax.integrate.events.condition_program import bodies_of, input_array
 from udkjax.integrate.events.conditions import frames_of
 from udkjax.integrate.events.phases import SCENE, Phases
 from udkjax.scene.mechanism import Mechanism
@@ -35,7 +35,7 @@ def joint_numbers(phases: Phases) -> list[Array]:
 
 def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
     """Return the joints that events add."""
-    names, joints = phases.mechanisms[SCENE].body_names, []
+    names, joints = bodies_of(phases.mechanisms[SCENE]) or (), []
     for (event, _), joint in zip(phases.added_by, phases.added, strict=True):
         arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten(arrays)

@@ -3,6 +3,7 @@
 from collections.abc import Hashable, Sequence
 from functools import lru_cache
 from types import FunctionType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,17 +26,17 @@ def condition_numbers(events: Sequence[Event]) -> list[Array]:
     return jax.tree.leaves(eqx.filter(tuple(events), eqx.is_inexact_array))
 
 
-def watched_conditions(events: Sequence[Event], mechanism: Mechanism) -> Conditions | None:
+def watched_conditions(events: Sequence[Event], mechanism: Any) -> Conditions | None:
     """Return the conditions of the events of a mechanism as programs; None if machine code lacks an instruction for one."""
     is_concrete = not any(isinstance(x, Tracer) for x in condition_numbers(events))
     return _concrete_conditions(mechanism, *events) if is_concrete and mechanism.is_concrete else _conditions(mechanism, *events)
 
 
-def _conditions(mechanism: Mechanism, *events: Event) -> Conditions | None:
-    names, by_velocity = mechanism.body_names, tuple(sees_velocity(e.condition, mechanism) for e in events)
+def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
+    names, by_velocity = bodies_of(mechanism), tuple(sees_velocity(e.condition, mechanism) for e in events)
     arrays, rest = eqx.partition(events, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
-    n, graph = 3 * len(names), Graph()
+    n, graph = coordinate_count(mechanism), Graph()
 
     def evaluate(t: Array, q: Array, v: Array, *numbers: Array) -> Array:
         return conditions_of(eqx.combine(jax.tree.unflatten(tree, numbers), rest), names, t, q, v)
@@ -121,7 +122,17 @@ def _text(program: ScalarProgram) -> str:
     return vector_function(program, "conditions", "in", "out").text()
 
 
-def conditions_of(events: Sequence[Event], names: Sequence[str], t: Array, q: Array, v: Array) -> Float[Array, "E"]:
-    """Return the conditions of all events at a state."""
-    frames = frames_of(names, q, v)
-    return jnp.stack([jnp.asarray(e.condition(t, frames), float) for e in events])
+def conditions_of(events: Sequence[Event], names: tuple[str, ...] | None, t: Array, q: Array, v: Array) -> Float[Array, "E"]:
+    """Return the conditions of all events at a state, with the names of the bodies; None for those of a system."""
+    arguments = (q, v) if names is None else (frames_of(names, q, v),)
+    return jnp.stack([jnp.asarray(e.condition(t, *arguments), float) for e in events])
+
+
+def bodies_of(model: Any) -> tuple[str, ...] | None:
+    """Return the names of the bodies, whose frames are the arguments of conditions; None for a system."""
+    return model.body_names if isinstance(model, Mechanism) else None
+
+
+def coordinate_count(model: Any) -> int:
+    """Return the number of coordinates."""
+    return 3 * len(model.body_names) if isinstance(model, Mechanism) else model.functions.n

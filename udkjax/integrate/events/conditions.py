@@ -112,10 +112,18 @@ def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoord
     raise ValueError(f"{where}: {quote(joint)} is a {type(found).__name__}, and must be {kinds}")
 
 
-def sees_velocity(condition: Callable[[Number, Frames], Any], mechanism: Mechanism) -> bool:
-    """Return whether a condition depends on velocities: it then fails with frames without velocities."""
+def probe_arguments(model: Any, moving: bool = True) -> tuple[Any, ...]:
+    """Return arguments with which conditions can be tried: of a mechanism the frames, of a system q and v; v may be None."""
+    if isinstance(model, Mechanism):
+        return (probe_frames(model.body_names, moving),)
+    probe = np.linspace(0.1, 0.9, model.functions.n)
+    return probe, probe if moving else None
+
+
+def sees_velocity(condition: Callable[..., Any], model: Any) -> bool:
+    """Return whether a condition depends on velocities: it then fails without them."""
     try:
-        return condition(0.0, probe_frames(mechanism.body_names, moving=False)) is None
+        return condition(0.0, *probe_arguments(model, moving=False)) is None
     except (TypeError, AttributeError, ValueError):  # errors of arithmetic with None, in Python, JAX or NumPy
         return True
 

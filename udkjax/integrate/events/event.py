@@ -12,7 +12,7 @@ is the condition, like the ready-made ones: numbers that a plain function closes
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import reduce
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.annotations import Number, NumberLike
+from udkjax.annotations import NumberLike
 from udkjax.arrays import is_traced, number
 from udkjax.integrate.events.actions import Action, Impact, Stop
 from udkjax.integrate.events.checks import (
@@ -32,11 +32,10 @@ from udkjax.integrate.events.checks import (
     require_vector,
 )
 from udkjax.integrate.events.conditions import (
-    Frames,
     Gap,
     WithinLimit,
     joint_coordinate,
-    probe_frames,
+    probe_arguments,
     require_name,
     sees_velocity,
 )
@@ -49,7 +48,7 @@ from udkjax.wording import quote, suggestion
 
 
 class Event(PrintsLine):
-    """An `action` that happens when `condition(t, frames)`, a scalar, crosses zero.
+    """An `action` that happens when `condition(t, frames)`, a scalar, crosses zero; of a system, `condition(t, q, v)`.
 
     `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
     `direction` is 1 for rising, -1 for falling, 0 for either; for an `Impact`, whose condition is positive before the
@@ -57,18 +56,18 @@ class Event(PrintsLine):
     cross it. But an `Impact` whose condition is zero at the start, and falling, happens at once.
 
     Args:
-        condition: (t, frames) -> a number.
+        condition: (t, frames) -> a number; for a `ConstrainedSystem`, (t, q, v) -> a number.
         action: consequence of the event: `Stop`, `Log`, `Impact`, `Release`, `Attach` or `Lock`.
         direction: 1: where it rises; -1: where it falls; 0: both.
         name: name in lists.
     """
 
-    condition: Callable[[Number, Frames], NumberLike]
+    condition: Callable[..., NumberLike]
     action: Action = Stop()
     direction: int = eqx.field(static=True, default=0)
     name: str = eqx.field(static=True, default="")
 
-    def expand(self, mechanism: Mechanism) -> list["Event"]:
+    def expand(self, mechanism: Any) -> list["Event"]:
         """Return this event as a list; ready-made events may expand to several."""
         return [self]
 
@@ -213,7 +212,7 @@ class ExpandsToEvents(Protocol):
         ...
 
 
-def expand_events(events: Sequence[ExpandsToEvents], mechanism: Mechanism) -> tuple[Event, ...]:
+def expand_events(events: Sequence[ExpandsToEvents], mechanism: Any) -> tuple[Event, ...]:
     """Return all events with unique names. Raises `ValueError` if one is invalid."""
     found: list[Event] = []
     for k, event in enumerate(events):
@@ -228,10 +227,13 @@ def expand_events(events: Sequence[ExpandsToEvents], mechanism: Mechanism) -> tu
     return tuple(found)
 
 
-def _expand(event: ExpandsToEvents, k: int, mechanism: Mechanism, found: list[Event]) -> None:
+def _expand(event: ExpandsToEvents, k: int, mechanism: Any, found: list[Event]) -> None:
     if not hasattr(event, "expand"):
         raise ValueError(f"must be an Event, a JointLimit or a Contact, not a {type(event).__name__}")
-    for one in event.expand(mechanism):
+    if not isinstance(mechanism, Mechanism) and not isinstance(event, Event):
+        raise ValueError(f"a {type(event).__name__} is for mechanisms; write udk.Event(lambda t, q, v: ...) for this system")
+    expanded: Any = event
+    for one in expanded.expand(mechanism):
         require_name_text("name", one.name, may_be_empty=True)
         name = one.name or f"event{k + 1}"
         if any(name == other.name for other in found):
@@ -263,19 +265,22 @@ def _with_name(event: Event, name: str) -> Event:
     return Event(event.condition, event.action, -1 if falls else event.direction, name)
 
 
-def _check(event: Event, mechanism: Mechanism) -> None:
+def _check(event: Event, mechanism: Any) -> None:
     where, action = f"event {quote(event.name)}", event.action
     if not isinstance(action, Action):
         raise ValueError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., not a {type(action).__name__}")
     if not isinstance(event.direction, int) or isinstance(event.direction, bool) or event.direction not in (-1, 0, 1):
         raise ValueError(f"{where}: the direction must be -1, 0 or 1, {describe(event.direction)}")
     if not callable(event.condition):
-        raise ValueError(f"{where}: the condition must be a function (t, frames), not a {type(event.condition).__name__}")
-    frames, has_traced = probe_frames(mechanism.body_names), is_traced(event)
+        arguments = "(t, frames)" if isinstance(mechanism, Mechanism) else "(t, q, v)"
+        raise ValueError(f"{where}: the condition must be a function {arguments}, not a {type(event.condition).__name__}")
+    has_traced = is_traced(event)
     try:
         with nullcontext() if has_traced else jax.ensure_compile_time_eval():
-            value = event.condition(0.0, frames)
+            value = event.condition(0.0, *probe_arguments(mechanism))
     except KeyError as error:
+        if not isinstance(mechanism, Mechanism):
+            raise
         name = error.args[0]
         raise ValueError(f"{where}: no body named {quote(str(name))}{suggestion(name, mechanism.body_names)}") from error
     if not has_traced and isinstance(value, Tracer):  # derivatives with respect to the traced numbers would be lost
@@ -289,4 +294,7 @@ def _check(event: Event, mechanism: Mechanism) -> None:
             raise ValueError(f"{where}: an Impact is where its condition falls to zero, and not where direction=1: {cure}")
         if sees_velocity(event.condition, mechanism):
             raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
-    action.check(mechanism, where)
+    if isinstance(mechanism, Mechanism):
+        action.check(mechanism, where)
+    else:
+        action.check_for_system(where)

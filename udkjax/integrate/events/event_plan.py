@@ -14,6 +14,7 @@ from udkjax.integrate.events.conditions import sees_velocity
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import MOST_KINKS
 from udkjax.integrate.events.phases import Phases, Switches
+from udkjax.scene.mechanism import Mechanism
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class EventPlan:
     max_events: int  # without kinks
     turns: tuple[tuple[int, float, float] | None, ...]  # the side that it turns, with factor and shift
     side_count: int  # the number S of sides
+    of_system: bool = False  # whether a user-defined system moves, whose coordinates have no bodies and masses
 
     @cached_property
     def kinks(self) -> Bool[np.ndarray, "E"]:
@@ -168,4 +170,5 @@ def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_even
         max_events=max_events,
         turns=tuple(e.action.turn for e in events),
         side_count=sum(held.smooth.count for held in phases.held),
+        of_system=not isinstance(phases.mechanisms[0], Mechanism),
     )

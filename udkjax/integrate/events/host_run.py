@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from udkjax.annotations import TreeDef
-from udkjax.equations.loads import mass_of
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import added_joints, joint_numbers
-from udkjax.integrate.events.condition_program import condition_numbers
+from udkjax.integrate.events.condition_program import condition_numbers, coordinate_count
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.event_plan import EventPlan, event_plan
-from udkjax.integrate.events.hybrid import Hybrid
+from udkjax.integrate.events.hybrid import Hybrid, inverse_mass_of
 from udkjax.integrate.events.kinks import FREE, places_of_kinks
 from udkjax.integrate.events.loop import run_loop
 from udkjax.integrate.events.machine_system import MachinePlan, MachineSystem, MemberUnits
@@ -190,7 +189,8 @@ def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
         xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in numbers), xp.zeros(0)])
         for numbers in (condition_numbers(events), joint_numbers(phases))
     )
-    inverse_mass = 1 / mass_of(phases.mechanisms[SCENE], xp)
+    model = phases.mechanisms[SCENE]
+    inverse_mass = inverse_mass_of(model, coordinate_count(model), xp)
     return [x[None] for x in (of_conditions, _stack([e.action.rebound for e in events], xp), inverse_mass, of_joints)]
 
 

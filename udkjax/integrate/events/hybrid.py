@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
+from types import ModuleType
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,14 +12,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations.formulations import Formulation
+from udkjax.equations.loads import mass_of
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.scales import Scales
-from udkjax.equations.textbook import TextbookEquations, prepare
+from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate import native_engine
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, RunPlan
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.events.condition_program import conditions_of
+from udkjax.integrate.events.condition_program import bodies_of, conditions_of
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import contact_rows
@@ -28,6 +30,7 @@ from udkjax.integrate.events.runs import RunState
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
 T = TypeVar("T")
@@ -65,9 +68,9 @@ class Hybrid(eqx.Module):
         return len(self.events)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the bodies."""
-        return self.phases.mechanisms[SCENE].body_names
+    def names(self) -> tuple[str, ...] | None:
+        """The names of the bodies; None for a system."""
+        return bodies_of(self.phases.mechanisms[SCENE])
 
     @property
     def projects(self) -> bool:
@@ -77,7 +80,8 @@ class Hybrid(eqx.Module):
     @property
     def scales(self) -> Scales:
         """The characteristic length, time and mass of the scene."""
-        return self.phases.analyses[SCENE].scales
+        analysis, model = self.phases.analyses[SCENE], self.phases.mechanisms[SCENE]
+        return equations_of(model).scales if analysis is None else analysis.scales  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def force(self) -> Float[Array, ""]:
@@ -140,9 +144,11 @@ class Hybrid(eqx.Module):
         branches = [lambda *x, which=which: function(which, *x) for which in (SWITCHED, SCENE)]
         return jax.lax.switch(self.plan.is_first(phase).astype(int), branches, *arguments)
 
-    def textbook(self, which: int, at: RunState) -> TextbookEquations:
+    def textbook(self, which: int, at: RunState) -> Any:
         """Return the equations of a phase, of the mechanism `which`, solved by SVD."""
         mechanism = self.phases.mechanism(which, at.phase, at.joints)
+        if self.plan.of_system:
+            return equations_of(mechanism, SVD(), self.baumgarte)
         return prepare(mechanism, SVD(), self.baumgarte, self.phases.analyses[which])
 
     # --- conditions
@@ -169,16 +175,20 @@ class Hybrid(eqx.Module):
         conditions = self.conditions(added)
         by_t, by_q, by_v = jax.jacfwd(conditions, (0, 1, 2))(t, q, v)
 
-        def of_mechanism(which: int, normals: Array, at: RunState) -> tuple[Array, Array]:
+        def of_mechanism(which: int, normals: Array, at: RunState) -> tuple[Array, Array, Array]:
             (t, q, v, *_), equations = at, self.textbook(which, at)
-            directions = contact_rows(equations, t, q, normals).directions if is_free else jnp.zeros_like(normals)
-            return equations.accelerations(t, q, v), directions
+            mobilities = directions = jnp.zeros_like(normals)
+            if is_free and self.plan.of_system:
+                mobilities, directions = jax.vmap(lambda normal: equations.impulse(t, q, v, normal))(normals)
+            elif is_free:
+                directions = contact_rows(equations, t, q, normals).directions
+            return equations.accelerations(t, q, v), mobilities, directions
 
-        a, directions = self.in_phase(at.phase, of_mechanism, by_q, at, is_free=is_free)
+        a, mobilities, directions = self.in_phase(at.phase, of_mechanism, by_q, at, is_free=is_free)
         g, rate = rate_along(conditions, t, q, v, a)
         rates = lambda t, q, v: self.conditions_and_rates(added)(t, q, v)[1]  # noqa: E731
         rate_2 = jnp.where(np.array(self.plan.by_velocity), 0.0, rate_along(rates, t, q, v, a)[1])
-        return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions)
+        return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions, mobilities)
 
     def second_rates(self, at: RunState) -> tuple[Float[Array, "n"], Float[Array, "E"]]:
         """Return the rate of the accelerations along the motion, and the second rates of all conditions, at a state."""
@@ -211,3 +221,8 @@ class Hybrid(eqx.Module):
 def rate_along(f: Condition, t: Array, q: Array, v: Array, a: Array) -> tuple[Float[Array, "k"], Float[Array, "k"]]:
     """Return f(t, q, v) and its rate along the motion."""
     return jax.jvp(f, (t, q, v), (jnp.ones(()), v, a))
+
+
+def inverse_mass_of(model: Any, n: int, xp: ModuleType) -> Float[Any, "n"]:
+    """Return one over the mass of each coordinate of a mechanism; ones for a system, whose M is a function."""
+    return 1 / mass_of(model, xp) if isinstance(model, Mechanism) else xp.ones(n)

@@ -46,6 +46,7 @@ from udkjax.transforms.gradients import stop_gradients
 # the metric of M. At a sine of 1e-8, half of the digits, u is merely the rounding error of a difference of two rows, and no
 # impulse follows from it.
 BLOCKED = 1e-16
+BLOCKED_IN_SYSTEM = 1e-13  # the same where u . u is a difference of products, with their rounding errors
 # CLOSED, relative to a condition's scale: contacts this close to zero are hit together with another one. This bound exceeds the
 # errors of a symmetric mechanism at usual tolerances, and advances a hit by 1e-9 T at most. STILL, relative to the fastest
 # approach in an impact, or to the strongest pull: smaller values of other contacts are zero, to the accuracy of their rows.
@@ -121,6 +122,15 @@ def rows_of_directions(
     mobility = inverse_mass[..., None, :]
     W, given = directions / mobility @ directions.swapaxes(-1, -2), (normals**2 * mobility).sum(-1)
     return ContactRows(W, directions, (directions**2 / mobility).sum(-1) > BLOCKED * given)
+
+
+def rows_of_system(
+    normals: Float[Any, "*m E n"], directions: Float[Any, "*m E n"], mobilities: Float[Any, "*m E n"]
+) -> ContactRows:
+    """Return the rows of contacts of a system, whose M need not be diagonal: W = n P M^(-1) n^T."""
+    W = normals @ directions.swapaxes(-1, -2)
+    size, given = (normals * directions).sum(-1), (normals * mobilities).sum(-1)
+    return ContactRows((W + W.swapaxes(-1, -2)) / 2, directions, size > BLOCKED_IN_SYSTEM * given)
 
 
 def impulses_of_impact(

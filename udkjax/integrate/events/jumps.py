@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from udkjax.integrate.events.crossings import ConditionValues
-from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions
+from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions, rows_of_system
 from udkjax.integrate.events.runs import MemberIndices, RunState, take
 from udkjax.integrate.events.system import StateValues, System
 from udkjax.transforms.gradients import stop_gradients
@@ -67,7 +67,10 @@ def apply_event(
     free, held = state._replace(phase=plan.free(after)), plan.held(phase, xp)
     is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
     state_values = state_values if is_evaluated else system.look(members, free, is_free=True)
-    rows = rows_of_directions(state_values.by_q, state_values.directions, take(system.inverse_mass, members))
+    if plan.of_system:
+        rows = rows_of_system(state_values.by_q, state_values.directions, state_values.mobilities)
+    else:
+        rows = rows_of_directions(state_values.by_q, state_values.directions, take(system.inverse_mass, members))
 
     def second_rates(v: Any) -> Any:
         after = free._replace(v=v)

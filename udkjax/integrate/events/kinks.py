@@ -167,6 +167,8 @@ def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, "SmoothLoads", b
 
 def with_held_forces(mechanism: Mechanism) -> tuple[Mechanism, tuple[HeldElement, ...], tuple[Event, ...]]:
     """Return a mechanism with held forces, what these are, and the events at which their sides turn; without kinks, itself."""
+    if not isinstance(mechanism, Mechanism):
+        return mechanism, (), ()
     elements, events, forces, first = [], [], list(mechanism._forces), 0
     for name, smooth, can_be_held in _smooth_forces(mechanism):
         if not smooth.count or not can_be_held:

@@ -81,7 +81,9 @@ class MachineSystem:
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
         (B, _), n = ts.shape, inverse_mass.shape[1]
         self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
-        self.coordinates = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
+        self.coordinates = np.ones((B, n))
+        if not self.plan.of_system:
+            self.coordinates = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
         E = self.plan.count
         contacts = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
         self._watched = [np.append(np.arange(E), E + contacts[: x.contact_count]) for x in plan.phases]

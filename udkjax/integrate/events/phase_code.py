@@ -23,6 +23,7 @@ from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.primitive import call_members
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
+from udkjax.scene.mechanism import Mechanism
 
 INPUTS = RunWatched.input_names
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # the inputs of a run that are times and initial state
@@ -79,13 +80,19 @@ def phase_plan(
     return PhasePlan(
         run=run.watching(replace(conditions, rows=rows)),
         states=run.accelerations.of_events(conditions, tuple(impacts)),
-        marking=marking(compiled.textbook.mechanism.at(0.0)) if run.code.marks_rows else None,
+        marking=_marking(compiled.textbook) if run.code.marks_rows else None,
         projected=compiled.plan.projected,
         project=run.accelerations.projection if added else None,
         joints=(*joints, places_of_sides(mechanism, phases.held) if phases.held else ()),
         active=active,
         sides_of_events=of_kinks,
     )
+
+
+def _marking(textbook: Any) -> MarkRows:
+    """Return the operation that marks independent rows among those that numbers mark as possible."""
+    model = textbook.mechanism
+    return marking(model.at(0.0)) if isinstance(model, Mechanism) else MarkRows(textbook.programs_of_marked_rows)
 
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
@@ -150,7 +157,7 @@ class PhaseCode:
         assert plan.states.conditions is not None  # this code has conditions
         n, E = inverse_mass.shape[1], plan.states.conditions.own_count
         self._places, start = [], 0
-        for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues`
+        for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues` before directions
             self._places.append((slice(start, start + math.prod(shape)), shape))
             start += math.prod(shape)
         self._switches = switches
@@ -191,10 +198,12 @@ class PhaseCode:
             self._put_sides(of_states, members)
         (results,) = call_members(*inputs, of_states, operation=operation, times=2)
         values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
-        directions = np.zeros((b, conditions.own_count, n))
+        directions, mobilities = np.zeros((2, b, conditions.own_count, n))
         if operation.impacts:
-            directions[:, list(operation.impacts)] = results[:, self._places[-1][0].stop :].reshape(b, -1, n)
-        return StateValues._make([*values, directions])
+            found = results[:, self._places[-1][0].stop :].reshape(b, -1, len(operation.impacts), n)
+            for array, x in zip((directions, mobilities), found.swapaxes(0, 1), strict=False):
+                array[:, list(operation.impacts)] = x
+        return StateValues._make([*values, directions, mobilities])
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of members, projected to the constraints of their phases."""

@@ -56,14 +56,14 @@ class Switches(NamedTuple):
 class Phases(eqx.Module):
     """The mechanism of the scene, and the one with all switches if there are any; their analyses, and the switches."""
 
-    mechanisms: tuple[Mechanism, ...]
-    analyses: tuple[Analysis, ...]
+    mechanisms: tuple[Any, ...]  # mechanisms, or one traced system
+    analyses: tuple[Analysis | None, ...]
     added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, without the numbers that depend on the state at the event
     added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # for each added joint its event and its switch
     switches: Switches = eqx.field(static=True)
     held: tuple[HeldElement, ...] = eqx.field(static=True, default=())  # the forces with held sides
 
-    def mechanism(self, which: int, phase: Bool[Array, "C"], added: Added) -> Mechanism:
+    def mechanism(self, which: int, phase: Bool[Array, "C"], added: Added) -> Any:
         """Return the mechanism of a phase, with the joints that events have added and the sides of its comparisons.
 
         Args:
@@ -110,12 +110,14 @@ class _Switch(NamedTuple):
     event: int  # the event that adds it, or whose contact it holds; -1: it is a constraint of the scene
 
 
-def phases_of(mechanism: Mechanism, events: Sequence[Event], analysis: Analysis) -> Phases:
-    """Return the phases of a mechanism with events."""
-    switches, E = _switches(mechanism, events), len(events)
+def phases_of(mechanism: Any, events: Sequence[Event], analysis: Analysis | None) -> Phases:
+    """Return the phases of a mechanism, or of a system, with events. A system has one phase."""
+    switches, E = _switches(mechanism, events) if isinstance(mechanism, Mechanism) else [], len(events)
     if not switches:
         none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E)
         return Phases((mechanism.without_origin,), (analysis,), (), (), none)
+    assert isinstance(mechanism, Mechanism)
+    assert analysis is not None  # a mechanism has one
     whole = _with(mechanism, switches)
     with_all = analysis.with_rows_of(whole)
     row_names, names = [name for name, _ in with_all.row_names], [x.name for x in switches]

@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.loads import mass_of
 from udkjax.integrate.events.crossings import NO_EVENT
 from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
-from udkjax.integrate.events.hybrid import Hybrid
+from udkjax.integrate.events.hybrid import Hybrid, inverse_mass_of
 from udkjax.integrate.events.impacts import Contacts
 from udkjax.integrate.events.loop import run_loop
 from udkjax.integrate.events.phases import SCENE, Added
@@ -76,7 +75,7 @@ class PlainSystem:
         self.hybrid, self.plan = hybrid, hybrid.plan
         self.end, self.rate = hybrid.ts[-1:], hybrid.rate[None]
         self.coordinates = hybrid.scales.coordinates(len(hybrid.q))[None]
-        self.inverse_mass = 1 / mass_of(hybrid.phases.mechanisms[SCENE], jnp)[None]
+        self.inverse_mass = inverse_mass_of(hybrid.phases.mechanisms[SCENE], len(hybrid.q), jnp)[None]
 
     def contacts(self, members: MemberIndices) -> Contacts:
         """Return the contacts."""

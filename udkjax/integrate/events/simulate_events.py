@@ -18,7 +18,12 @@ from udkjax.devices import computing_on_host, on_host
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
-from udkjax.integrate.events.condition_program import watched_conditions, with_cached_functions
+from udkjax.integrate.events.condition_program import (
+    bodies_of,
+    coordinate_count,
+    watched_conditions,
+    with_cached_functions,
+)
 from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
 from udkjax.integrate.events.event_plan import event_plan
 from udkjax.integrate.events.host_run import HostRun, concrete_plan, event_arrays
@@ -36,7 +41,6 @@ from udkjax.native.watching.conditions import Conditions
 from udkjax.positions.assembly import Closure, State
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
-from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.wording import quote
 
@@ -65,9 +69,9 @@ class Given(NamedTuple):
 
 
 def simulate_events(
-    mechanism: Mechanism,
+    mechanism: Any,
     events: ExpandsToEvents | Sequence[ExpandsToEvents] | None,
-    analysis: Analysis,
+    analysis: Analysis | None,
     ts: Any,
     state: State | None,
     closure: Closure | None,
@@ -77,9 +81,9 @@ def simulate_events(
     """Run a mechanism with events.
 
     Args:
-        mechanism: the scene.
+        mechanism: the scene, or a system of traced functions.
         events: one event or several, ready-made ones among them; None: only the kinks of forces.
-        analysis: its `Analysis`.
+        analysis: its `Analysis`; None for a system.
         ts: the output times (s).
         state: the initial state; None: the state of `closure`.
         closure: the assembled initial guess.
@@ -114,7 +118,7 @@ def simulate_events(
     return put_arrays(_solution(mechanism, names, given, found, kinks, reasons, int(found.count)))
 
 
-def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
+def _run_at_once(mechanism: Any, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
     """Return the result of `_run` for concrete numbers; None if machine code alone cannot compute it."""
     is_concrete = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
     if given.conditions is None or not is_concrete or jax.config.jax_disable_jit:
@@ -137,7 +141,7 @@ def _run_at_once(mechanism: Mechanism, given: Given) -> tuple[EventRun, tuple[st
 Prepared = tuple[tuple[Event, ...], Phases]
 
 
-def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToEvents] | None, analysis: Analysis) -> Prepared:
+def _prepare(mechanism: Any, events: ExpandsToEvents | Sequence[ExpandsToEvents] | None, analysis: Analysis | None) -> Prepared:
     """Return all events, with unique names, and the phases that they lead to; cached if all numbers are concrete."""
     listed = events if events is None else tuple(events) if isinstance(events, Sequence) else (events,)
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, listed, analysis))):
@@ -146,12 +150,12 @@ def _prepare(mechanism: Mechanism, events: ExpandsToEvents | Sequence[ExpandsToE
 
 
 @cached_by_identity
-def _expand_concrete(mechanism: Mechanism, analysis: Analysis, has_none: bool, *events: ExpandsToEvents) -> Prepared:
+def _expand_concrete(mechanism: Any, analysis: Analysis | None, has_none: bool, *events: ExpandsToEvents) -> Prepared:
     with jax.ensure_compile_time_eval(), computing_on_host():
         return _expand(mechanism, None if has_none else events, analysis)
 
 
-def _expand(mechanism: Mechanism, events: Sequence[ExpandsToEvents] | None, analysis: Analysis) -> Prepared:
+def _expand(mechanism: Any, events: Sequence[ExpandsToEvents] | None, analysis: Analysis | None) -> Prepared:
     found = () if events is None else expand_events(events, mechanism)
     phases, (smooth, held, kinks) = phases_of(mechanism, found, analysis), with_held_forces(mechanism)
     return ((*found, *kinks), phases.with_kinks(smooth, held, len(kinks))) if held else (found, phases)
@@ -216,7 +220,7 @@ _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
 
 
 def _solution(
-    mechanism: Mechanism,
+    mechanism: Any,
     names: tuple[str, ...],
     given: Given,
     found: EventRun,
@@ -226,7 +230,8 @@ def _solution(
 ) -> Solution:
     """Return the solution with `count` events, or, for a traced count (None), padded to `max_events`."""
     xp: Any = jnp if count is None else np
-    bodies, choices = (-1, len(mechanism.body_names), 3), given.choices
+    names_of_bodies, choices = bodies_of(mechanism), given.choices
+    bodies = (-1, coordinate_count(mechanism)) if names_of_bodies is None else (-1, len(names_of_bodies), 3)
 
     def trim(x: Array, padding: float = np.inf) -> Array:
         if count is not None:
@@ -271,7 +276,7 @@ def _solution(
         stats=stats,
         rtol=choices.rtol,
         atol=choices.atol,
-        bodies=mechanism.body_names,
+        bodies=names_of_bodies or (),
         choices=tuple(settings.items()),
         events=listing if names else None,
         unlocated=None if kinks is None else kinks.unlocated,

@@ -22,6 +22,7 @@ class StateValues(NamedTuple):
     by_q: Float[Any, "*m E n"]
     by_v: Float[Any, "*m E n"]
     directions: Float[Any, "*m E n"]  # directions of impulses; arbitrary for events that are not impacts
+    mobilities: Float[Any, "*m E n"]  # of a system, M^(-1) g_q: the directions without constraints
 
 
 class System(Protocol):

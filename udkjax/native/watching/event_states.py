@@ -6,6 +6,7 @@ For a state (t, q, v) it returns, concatenated:
     g, g_dot, g_ddot         conditions with first and second rates along the motion (E,) each
     g_t, g_q, g_v            their derivatives (E,), (E, n), (E, n)
     d                        directions of impulses along g_q, only of impacts, (impacts, n)
+    M^(-1) g_q               the same without constraints, only where M is a function of the state, (impacts, n)
 
 A direction d = P M^(-1) g_q^T is the change of velocity by a unit impulse along g_q, with P the projector on the tangent space,
 so that W_ij = g_q,i d_j.
@@ -36,10 +37,12 @@ class EventStates(StateTangentPart, StateAccelerations):
         self.places.add("event values", len(conditions.at_state.outputs))
         self.places.add("inverse mass", self.n)
         self.places.add("directions", len(impacts) * self.n)
+        self.places.add("mobilities", len(impacts) * self.n if code.has_mobility else 0)
 
     @property
     def solving(self) -> list[str]:
-        return ["accelerations", *(["tangent_part"] if self.impacts else [])]
+        of_impacts = ["tangent_part", *(["mobility"] if self.plan.code.has_mobility else [])]
+        return ["accelerations", *(of_impacts if self.impacts else [])]
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         given = self.member_address(f, "event_numbers", member)
@@ -67,17 +70,23 @@ class EventStates(StateTangentPart, StateAccelerations):
         for k, event in enumerate(self.impacts):
             with f.each(self.n) as i:
                 normal = self.entry(f, "event values", i + (4 * count + event * self.n))
-                self.put_entry(f, "state dq", i, normal * self.entry(f, "inverse mass", i))
-                self.put_entry(f, "state dv", i, 0.0)
+                self.put_entry(f, "state dv", i, normal * self.entry(f, "inverse mass", i))
+                self.put_entry(f, "state dq", i, 0.0)
+            if self.plan.code.has_mobility:
+                self.invoke(f, "mobility")
+                with f.each(self.n) as i:
+                    self.put_entry(f, "state dv", i, self.entry(f, "result dv", i))
+                    self.put_entry(f, "mobilities", i + k * self.n, self.entry(f, "result dv", i))
             StateTangentPart._evaluate(self, f, s)
             with f.each(self.n) as i:
-                self.put_entry(f, "directions", i + k * self.n, self.entry(f, "result dq", i))
+                self.put_entry(f, "directions", i + k * self.n, self.entry(f, "result dv", i))
 
     def write_found(self, f: Function, s: Lane):
         counts = {
             "result a": self.n,
             "event values": len(self.conditions.at_state.outputs),
             "directions": len(self.impacts) * self.n,
+            "mobilities": len(self.impacts) * self.n if self.plan.code.has_mobility else 0,
         }
         with self.each_lane(f, s.active) as k:
             to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))

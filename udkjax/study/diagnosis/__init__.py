@@ -2,3 +2,4 @@
 
 from udkjax.study.diagnosis.diagnose import diagnose as diagnose
 from udkjax.study.diagnosis.diagnosis import Diagnosis as Diagnosis
+from udkjax.study.diagnosis.system_diagnosis import SystemDiagnosis as SystemDiagnosis

@@ -11,7 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.equations import determinacy
+from udkjax.equations.position_rows import PositionRows
 from udkjax.pinv.row_spaces import null_space
+from udkjax.study.diagnosis.configuration import Configuration
 
 DEPENDS = 1e-6  # norm above which a row of N, whose columns are orthonormal, is nonzero; well above rounding errors
 
@@ -50,6 +53,23 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
             remaining = remaining @ np.linalg.svd(remaining[row : row + 1])[2][1:].T
             unexcluded = unexcluded @ np.linalg.svd(unexcluded[row : row + 1])[2][1:].T
     return sorted(collected, key=lambda dependency: len(dependency.constraints))
+
+
+def dependencies_at(
+    attached: dict[str, tuple[str, ...]], here: Configuration, generic: Sequence[Configuration], owners: Sequence[str]
+) -> tuple[list[Dependency], list[Dependency]]:
+    """Return the sets of constraints that are dependent in all generic configurations, and those dependent in `here` only."""
+    best = max(generic, key=lambda c: c.smallest)
+    permanent = dependencies(best.left, owners, attached)
+    if here.rank == best.rank:
+        return permanent, []
+    # Combinations of rows that vanish here, without those that vanish everywhere: one row is excluded for each of the latter.
+    spared = PositionRows.dispensable([best.left])
+    N = here.left
+    for row in spared:
+        if np.linalg.norm(N[row]) > determinacy.UNIQUE_TOL:
+            N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
+    return permanent, dependencies(N, owners, attached)
 
 
 def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> int:

@@ -1,10 +1,12 @@
 """`diagnose`: mobility, redundancy, singularities and unique forces of a mechanism, and its rank along a trajectory."""
 
+from typing import Any, overload
+
 import numpy as np
 
 from udkjax.equations import determinacy
 from udkjax.equations.analysis import hold_pins
-from udkjax.equations.position_rows import PositionRows
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.positions.assembly import State, close, require_closed
 from udkjax.positions.channels import StateHistory
 from udkjax.scene.arguments import checked
@@ -12,18 +14,27 @@ from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import clearance
 from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions
-from udkjax.study.diagnosis.dependence import Dependency, dependencies
+from udkjax.study.diagnosis.dependence import Dependency, dependencies_at
 from udkjax.study.diagnosis.diagnosis import Diagnosis
 from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fix_of_held_pin, fixes_of
 from udkjax.study.diagnosis.second_order import branches
+from udkjax.study.diagnosis.system_diagnosis import SystemDiagnosis, diagnose_system
 from udkjax.study.diagnosis.timeline import timeline
 
 MOST_FIXES = 64  # largest number of fixes of a cure, which are applied in sequence
 
 
+@overload
+def diagnose(mechanism: Mechanism, state: State | None = None, *arguments: Any, **settings: Any) -> Diagnosis: ...
+
+
+@overload
+def diagnose(mechanism: ConstrainedSystem, state: State | None = None, *arguments: Any, **settings: Any) -> SystemDiagnosis: ...
+
+
 @checked
 def diagnose(
-    mechanism: Mechanism,
+    mechanism: Mechanism | ConstrainedSystem,
     state: State | None = None,
     solution: StateHistory | None = None,
     t: float = 0.0,
@@ -31,14 +42,14 @@ def diagnose(
     time_tol: float | None = None,
     fixes: bool = True,
     walk: bool = True,
-) -> Diagnosis:
+) -> Diagnosis | SystemDiagnosis:
     """Find dependent constraints, changes that make them independent, and configurations where the rank changes.
 
     The rank is that of the scaled Jacobian J of Psi: lengths are divided by the characteristic length, angles are in radians, and
     rows are scaled; a mechanism of a micrometre therefore gets the same diagnosis as one of a kilometre.
 
     Args:
-        mechanism: mechanism with concrete numbers.
+        mechanism: mechanism with concrete numbers, or a `ConstrainedSystem`, whose rows are Psi_q and phi_v, not scaled.
         state: the configuration, closed first; by default the initial guess, or the start of `solution`.
         solution: a trajectory, for the `timeline`.
         t: time (s) of the configuration, for drivers.
@@ -48,16 +59,18 @@ def diagnose(
         walk: whether to follow a mechanism with one degree of freedom, or a driven one, along its path to the next rank change.
 
     Returns:
-        The `Diagnosis`, which prints as text.
+        The `Diagnosis`, which prints as text; of a `ConstrainedSystem` a `SystemDiagnosis`, without fixes and paths.
 
     Raises:
         AssemblyError: the configuration cannot be closed.
         ValueError: numbers of the mechanism are traced.
     """
-    if not mechanism.is_concrete:
-        raise ValueError("diagnose needs concrete numbers: under jit and vmap use uniqueness and singular_values, which are pure")
     if state is None and solution is not None:
         state, t = State(solution.q[0], solution.v[0]), float(solution.ts[0])
+    if isinstance(mechanism, ConstrainedSystem):
+        return diagnose_system(mechanism, state, float(t), rank_tol, solution, time_tol)
+    if not mechanism.is_concrete:
+        raise ValueError("diagnose needs concrete numbers: under jit and vmap use uniqueness and singular_values, which are pure")
     closure = close(mechanism, t, state)
     require_closed(mechanism, closure._replace(psi_dot=0.0 * closure.psi_dot))  # the diagnosis does not depend on velocities
     q = np.asarray(closure.state.q, float)
@@ -71,7 +84,7 @@ def diagnose(
     generic_rank = max([current.rank, *(c.rank for c in neighbours)])
     generic = [c for c in [current, *neighbours] if c.rank == generic_rank]
     owners = [name for name, _ in rows.names]
-    permanent, momentary = _dependencies(mechanism, current, generic, owners)
+    permanent, momentary = dependencies_at(attached_bodies(mechanism), current, generic, owners)
     if not neighbours and current.freedom:  # moves to first order only: rows are dependent here
         permanent, momentary = [], [*permanent, *momentary]
     redundancies = _with_fixes(mechanism, positions, generic if fixes and not held else [], permanent)
@@ -104,22 +117,9 @@ def diagnose(
     )
 
 
-def _dependencies(
-    mechanism: Mechanism, here: Configuration, generic: list[Configuration], owners: list[str]
-) -> tuple[list[Dependency], list[Dependency]]:
-    """Return the sets of constraints that are dependent in all generic configurations, and those dependent in `here` only."""
-    attached = {name: mechanism.frames_of(element) for name, element in mechanism.constraints.items()}
-    best = max(generic, key=lambda c: c.smallest)
-    permanent = dependencies(best.left, owners, attached)
-    if here.rank == best.rank:
-        return permanent, []
-    # Combinations of rows that vanish here, without those that vanish everywhere: one row is excluded for each of the latter.
-    spared = PositionRows.dispensable([best.left])
-    N = here.left
-    for row in spared:
-        if np.linalg.norm(N[row]) > determinacy.UNIQUE_TOL:
-            N = N @ np.linalg.svd(N[row : row + 1])[2][1:].T
-    return permanent, dependencies(N, owners, attached)
+def attached_bodies(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
+    """Return the bodies of each constraint of a mechanism."""
+    return {name: mechanism.frames_of(element) for name, element in mechanism.constraints.items()}
 
 
 def _with_fixes(
@@ -147,7 +147,7 @@ def _cure(
         done.append(best)
         ranked = RankedPositions(best.mechanism, positions.rank_tol)
         configurations, owners = [ranked.at(c.t, c.q) for c in configurations], [name for name, _ in ranked.rows.names]
-        left = _dependencies(best.mechanism, configurations[0], configurations, owners)[0]
+        left = dependencies_at(attached_bodies(best.mechanism), configurations[0], configurations, owners)[0]
         if not left or len(done) == MOST_FIXES:
             return tuple(done)
         order = sorted(configurations, key=lambda c: -c.smallest)  # the first position determines the stress of a set

@@ -6,7 +6,7 @@ a quintic through q, v and a.
 """
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.interpolate import BPoly
 
 from udkjax.equations import determinacy
-from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.analysis import Analysis
 from udkjax.equations.quantities import equations_of
 from udkjax.integrate import simulate
 from udkjax.integrate.solution import Solution
@@ -24,6 +24,7 @@ from udkjax.positions.assembly import State
 from udkjax.positions.channels import StateHistory
 from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.quantities import StudyModel, analysis_of
 
 SAMPLES_PER_OUTPUT = 4  # samples per output interval, to look for minima
 PARTS_OF_INTERVAL = 8  # number of parts of an interval that is integrated again
@@ -57,11 +58,11 @@ class Timeline(NamedTuple):
         return self.singular_values[:, max(int(self.rank.max()) - 1, 0)] / self.singular_values[:, 0]
 
 
-def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol: float | None = None) -> Timeline:
+def timeline(mechanism: StudyModel, solution: StateHistory, rank_tol: float, tol: float | None = None) -> Timeline:
     """Follow the rank along a trajectory.
 
     Args:
-        mechanism: the mechanism.
+        mechanism: the mechanism or the system.
         solution: ts (T,), q and v (T, bodies, 3); if it is a `Solution`, intervals with a rank change are integrated again.
         rank_tol: singular values up to this fraction of the largest count as zero.
         tol: half-width of the brackets around rank changes (s); by default 1e-9 of the scene's characteristic time.
@@ -69,7 +70,7 @@ def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol:
     Returns:
         The `Timeline`. The brackets of rank changes do not account for errors of the trajectory.
     """
-    analysis = analyse(mechanism)
+    analysis = analysis_of(mechanism)
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
     alive = np.isfinite(q).reshape(len(ts), -1).all(1)
     ts, q, v = ts[alive], q[alive].reshape(alive.sum(), -1), v[alive].reshape(alive.sum(), -1)
@@ -93,8 +94,8 @@ def timeline(mechanism: Mechanism, solution: StateHistory, rank_tol: float, tol:
     return Timeline(ts, sampled[output_indices], rank[output_indices], tuple(changes), (when, least))
 
 
-def _tolerance(analysis: Analysis, ts: np.ndarray) -> float:
-    time = float(analysis.time)
+def _tolerance(analysis: Analysis | None, ts: np.ndarray) -> float:
+    time = np.inf if analysis is None else float(analysis.time)
     return 1e-9 * (time if np.isfinite(time) else float(ts[-1] - ts[0]))
 
 
@@ -125,7 +126,7 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
 
 
 def _renew(
-    mechanism: Mechanism, analysis: Analysis, solution: StateHistory, ts: np.ndarray, low: float, high: float
+    mechanism: StudyModel, analysis: Analysis | None, solution: StateHistory, ts: np.ndarray, low: float, high: float
 ) -> "_Path | None":
     """Integrate the trajectory between two times again, starting from the output time before these."""
     if not isinstance(solution, Solution):
@@ -142,22 +143,31 @@ def _renew(
 class _Path:
     """Singular values at any time, by quintics through q, v and a of neighbouring states."""
 
-    def __init__(self, mechanism: Mechanism, analysis: Analysis, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
-        self.mechanism, self.analysis = mechanism.without_origin, analysis
+    def __init__(self, mechanism: StudyModel, analysis: Analysis | None, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
+        is_scene = isinstance(mechanism, Mechanism)
+        self.mechanism, self.analysis = mechanism.without_origin if is_scene else mechanism.traced(q.shape[1]), analysis
         a = np.asarray(_accelerations(self.mechanism, analysis, ts, q, v))
-        self.q = BPoly.from_derivatives(ts, np.stack([q, v, a], 1)) if len(ts) > 1 else lambda times: np.tile(q, (len(times), 1))
+        if len(ts) > 1:
+            self.q = BPoly.from_derivatives(ts, np.stack([q, v, a], 1))
+            self.v = self.q.derivative()
+        else:
+            self.q, self.v = (lambda times, x=x: np.tile(x, (len(times), 1)) for x in (q, v))
 
     def singular_values(self, times: np.ndarray) -> np.ndarray:
         """Return the singular values of the scaled Jacobian (times, k)."""
-        return np.asarray(_singular_values(self.mechanism, self.analysis, times, self.q(times)))
+        return np.asarray(_singular_values(self.mechanism, self.analysis, times, self.q(times), self.v(times)))
 
 
 @deferred
-def _singular_values(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike) -> Array:
+def _singular_values(mechanism: Any, analysis: Analysis | None, ts: ArrayLike, q: ArrayLike, v: ArrayLike) -> Array:
+    if not isinstance(mechanism, Mechanism):
+        equations: Any = equations_of(mechanism, SVD())
+        jacobian = jax.vmap(equations.jacobian)(jnp.asarray(ts), jnp.asarray(q), jnp.asarray(v))
+        return jnp.linalg.svd(jacobian, compute_uv=False)
     return jax.vmap(lambda t, q: determinacy.singular_values(mechanism, t, q, analysis))(jnp.asarray(ts), jnp.asarray(q))
 
 
 @deferred
-def _accelerations(mechanism: Mechanism, analysis: Analysis, ts: ArrayLike, q: ArrayLike, v: ArrayLike) -> Array:
+def _accelerations(mechanism: Any, analysis: Analysis | None, ts: ArrayLike, q: ArrayLike, v: ArrayLike) -> Array:
     equations = equations_of(mechanism, SVD(), analysis=analysis)
     return jax.vmap(equations.accelerations)(jnp.asarray(ts), jnp.asarray(q), jnp.asarray(v))

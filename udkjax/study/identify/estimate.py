@@ -25,6 +25,7 @@ from udkjax.study.identify.records import IdentificationError, dataset_of_fit, l
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import apply_values
 from udkjax.study.noise import Whiteness
+from udkjax.study.quantities import StudyModel, with_guess
 from udkjax.study.report import format_value, plain
 from udkjax.wording import join_names, plural, quote, suggestion
 
@@ -43,14 +44,6 @@ class Row(NamedTuple):
     units: str
     first_guess: float
     note: str
-
-
-def _starting_at(mechanism: Mechanism, state: State) -> Mechanism:
-    """Return the mechanism with another initial guess."""
-    q, v = np.asarray(state.q), np.asarray(state.v)
-    fields = {"position": q[:, :2], "angle": q[:, 2], "velocity": v[:, :2], "angular_velocity": v[:, 2]}
-    names = mechanism.body_names
-    return mechanism.with_parameters({f"body.{body}.{name}": x[k] for k, body in enumerate(names) for name, x in fields.items()})
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,16 +95,17 @@ class Estimate:
     loss: Loss
 
     @cached_property
-    def _with_values(self) -> Mechanism:
+    def _with_values(self) -> StudyModel:
         return apply_values(self.problem.mechanism, self.problem.unknowns.targets, jnp.asarray(self.values))
 
     @cached_property
-    def mechanism(self) -> Mechanism:
+    def mechanism(self) -> Any:
         """The mechanism with the identified values; its initial guess is the initial state of the first record."""
         start = self.problem.records[0].start
         if start.estimate == "nothing" and start.state is None:
             return self._with_values
-        return _starting_at(self._with_values, self.initial_states[0])
+        state = self.initial_states[0]
+        return with_guess(self._with_values, np.asarray(state.q), np.asarray(state.v))
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -270,7 +264,7 @@ class Estimate:
             "message": self.message,
             "tolerance": self.tol[0],
             **{f"version_{name}": value for name, value in versions().items()},
-            "scene": scene_text(self.mechanism),
+            **({"scene": scene_text(self.mechanism)} if isinstance(self.mechanism, Mechanism) else {}),
         }
         dataset = dataset.merge(xarray.Dataset(data, coords)).assign_attrs(attributes)
         return dataset.merge(profiles_dataset(profiles, self.parameters, uncertainty, level)) if profiles else dataset

@@ -16,18 +16,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udkjax.equations.analysis import analyse
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
 from udkjax.positions.assembly import AssemblyError, State, assemble
 from udkjax.positions.channels import Quantity, channel_of
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.initial_states import initial_state_unknowns
 from udkjax.study.identify.loop_consistency import nearest_closable, require_consistent_loops
 from udkjax.study.identify.parameters import ParametersLike, unknowns_of
 from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Prediction, Predictor, Runs, TolerancePair
 from udkjax.study.identify.record_reader import Data, records_of
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
-from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, initial_state_unknowns, with_conditions
+from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, with_conditions
+from udkjax.study.quantities import StudyModel, analysis_of
 from udkjax.wording import suggestion
 
 STILL_DEVIATION = 1e-12  # standard deviation below which a channel is constant, relative to its largest number
@@ -71,7 +74,7 @@ class FitProblem:
     constrained: int = 0  # number of unknowns that are determined by extra rows, not by measurements
 
     def __init__(
-        self, mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any] | None = None
+        self, mechanism: StudyModel, unknowns: Unknowns, records: Sequence[Record], settings: Mapping[str, Any] | None = None
     ):
         self.mechanism, self.unknowns, self.records = mechanism, unknowns, tuple(records)
         keys = list(dict.fromkeys(key for record in self.records for key in record.values))
@@ -92,7 +95,7 @@ class FitProblem:
         self.beginnings = np.arange(len(self.records))
         self.priors = np.flatnonzero(np.isfinite(unknowns.sigma))
         self.extra_rows = len(self.priors)
-        self.settings = {"analysis": analyse(mechanism), **(settings or {})}
+        self.settings = {"analysis": analysis_of(mechanism), **(settings or {})}
         self.predictor = Predictor(mechanism, unknowns.targets, self.channels, self.settings)
 
     @property
@@ -161,7 +164,7 @@ class FitProblem:
             r, J = np.concatenate([r, more_r], axis=1), np.concatenate([J, more_J], axis=1)
         return Residuals(r, J, prediction.code.max(1))
 
-    def first_states(self, mechanism: Mechanism, z: Float[np.ndarray, "K"]) -> tuple[State, ...]:
+    def first_states(self, mechanism: StudyModel, z: Float[np.ndarray, "K"]) -> tuple[State, ...]:
         """Return the closed initial states of the records for a mechanism with the parameters of z."""
         members, states = self.members(z[None]), []
         for record, run in zip(self.records, self.beginnings, strict=True):
@@ -207,7 +210,7 @@ def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
 
 
 def build_problem(
-    mechanism: Mechanism,
+    mechanism: StudyModel,
     data: Data,
     parameters: ParametersLike,
     settings: Mapping[str, Any],
@@ -224,11 +227,16 @@ def build_problem(
         IdentificationError: lists every mistake in the arguments.
         AssemblyError: the mechanism cannot be closed with the first guess or any guess near it.
     """
+    if isinstance(mechanism, ConstrainedSystem) and mechanism.q0 is None:
+        cure = "the initial guess is a number of the fit, too"
+        raise IdentificationError([f"a ConstrainedSystem needs q0 and v0, ConstrainedSystem(..., q0=..., v0=...): {cure}"])
     unknowns, records = _collect(
         lambda: _check_settings(mechanism, settings),
         lambda: unknowns_of(mechanism, parameters),
         lambda: _with_initial_state(records_of(mechanism, data, noise, ignore), initial_state),
     )[1:]
+    if isinstance(mechanism, ConstrainedSystem):
+        return FitProblem(mechanism, unknowns, records, settings)
     return _closable_problem(mechanism, unknowns, records, settings, seed, tol)
 
 
@@ -252,7 +260,7 @@ def _with_initial_state(records: Sequence[Record], given: Start | Estimated | No
     return [record.changed(initial_state=start) for record in records]
 
 
-def _check_settings(mechanism: Mechanism, settings: Mapping[str, Any]) -> None:
+def _check_settings(mechanism: StudyModel, settings: Mapping[str, Any]) -> None:
     allowed = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
     problems = [
         f"{name}: not an argument of simulate that can be given here{suggestion(name, allowed)}"

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.scene.arguments import checked
-from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fit_problem import FitProblem, Residuals, Strategy, build_problem
 from udkjax.study.identify.least_squares import CostHistory, Fit
@@ -25,6 +24,7 @@ from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
 from udkjax.study.identify.unknowns import INVISIBLE_RATIO
 from udkjax.study.noise import Whiteness, whiteness_of
+from udkjax.study.quantities import StudyModel
 
 MOST_REWEIGHTINGS = 2  # number of further fits, each weighted by the residuals of the previous one
 SAME_WEIGHT_RATIO = 1.05  # change of relative weights that shifts an estimate by a negligible fraction of its standard error
@@ -33,7 +33,7 @@ INTEGRATION_ERROR = 1e-8  # residuals below this, relative to a channel's scale,
 
 @checked
 def identify(
-    mechanism: Mechanism,
+    mechanism: StudyModel,
     data: Data,
     parameters: ParametersLike,
     *,
@@ -59,9 +59,10 @@ def identify(
     as with chaotic motion, the records are cut into pieces (multiple shooting).
 
     Args:
-        mechanism: the scene, with first guesses.
-        data: a `Record`, a mapping of times ("time") and channels, a pandas table, an xarray dataset, the path of a CSV or NetCDF
-            file, or a sequence of these. Each record has its own initial state.
+        mechanism: the scene, with first guesses; or a `ConstrainedSystem` with q0, whose parameters are fields of its modules.
+        data: a `Record`, a mapping of times ("time") and channels, such as "body.crank.angle" or "q[0]" of a system, a pandas
+            table, an xarray dataset, the path of a CSV or NetCDF file, or a sequence of these. Each record has its own initial
+            state.
         parameters: names of numbers of the scene, `length`s, ties as strings (`body.a.mass = body.b.mass`), or `Parameter`s with
             bounds and priors.
         noise: standard deviation, in SI units, of all channels or of each by channel; by default estimated from the residuals of

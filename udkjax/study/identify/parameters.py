@@ -15,7 +15,7 @@ from udkjax.scene.reshaping import length_of
 from udkjax.scene.units import units_of
 from udkjax.study.identify.records import IdentificationError
 from udkjax.study.identify.unknowns import Target, Transform, Unknown, Unknowns
-from udkjax.study.quantities import Length, Setter, parameter_value
+from udkjax.study.quantities import Length, Setter, StudyModel, body_names, parameter_value
 from udkjax.wording import quote, suggestion
 
 
@@ -72,7 +72,7 @@ class _Part(NamedTuple):
     same: bool  # True if all tied numbers have this value
 
 
-def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
+def unknowns_of(mechanism: StudyModel, given: ParametersLike) -> Unknowns:
     """Read parameters: strings, lengths, functions and `Parameter`s.
 
     Raises:
@@ -96,7 +96,7 @@ def unknowns_of(mechanism: Mechanism, given: ParametersLike) -> Unknowns:
     return Unknowns.of(unknowns)
 
 
-def _entries(mechanism: Mechanism, item: ParameterLike, problems: list[str]) -> list[Unknown]:
+def _entries(mechanism: StudyModel, item: ParameterLike, problems: list[str]) -> list[Unknown]:
     """Return the unknowns of a parameter, one for each entry of an array."""
     p = item if isinstance(item, Parameter) else Parameter(item)
     try:
@@ -122,7 +122,7 @@ def _name(target: Target) -> str:
     return f"scale({', '.join(target.names)})" if target.scaled else " = ".join(target.names)
 
 
-def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unknown:
+def _unknown(mechanism: StudyModel, p: Parameter, name: str, part: _Part) -> Unknown:
     """Return the unknown of a number.
 
     Raises:
@@ -157,13 +157,13 @@ def _unknown(mechanism: Mechanism, p: Parameter, name: str, part: _Part) -> Unkn
     return Unknown(name, _units(mechanism, target), target, kind, at_scene_value, guess, low, high, scale, mean, sigma)
 
 
-def _units(mechanism: Mechanism, target: Target) -> str:
+def _units(mechanism: StudyModel, target: Target) -> str:
     if isinstance(target.function, Length):
         return "m"
     return "1" if target.scaled else units_of(mechanism, target.names[0]) if target.names else ""
 
 
-def _is_positive(mechanism: Mechanism, target: Target, guess: float) -> bool:
+def _is_positive(mechanism: StudyModel, target: Target, guess: float) -> bool:
     """Return True if a value must stay positive."""
     if target.function is not None:
         return isinstance(target.function, Length)
@@ -173,7 +173,7 @@ def _is_positive(mechanism: Mechanism, target: Target, guess: float) -> bool:
 # --- numbers that a parameter refers to
 
 
-def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
+def _parts(mechanism: StudyModel, p: Parameter) -> list[_Part]:
     """Return the numbers that a parameter refers to; an array has one for each entry."""
     of, scaled = p.of, p.share == "scale"
     if p.share not in ("value", "scale"):
@@ -181,6 +181,8 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
     if isinstance(of, str):
         of, scaled = _read(mechanism, of, scaled)
     if isinstance(of, Length):
+        if not isinstance(mechanism, Mechanism):
+            raise ValueError("a length is that of a body, and a ConstrainedSystem has none: name a number of the system")
         lengths = [float(length_of(mechanism, body)) for body in of.bodies or ("",)]
         return [_Part(Target(function=of), lengths[0], len(set(lengths)) == 1)]
     if callable(of):
@@ -211,7 +213,7 @@ def _parts(mechanism: Mechanism, p: Parameter) -> list[_Part]:
     ]
 
 
-def _read(mechanism: Mechanism, text: str, scaled: bool) -> tuple[Length | tuple[str, ...], bool]:
+def _read(mechanism: StudyModel, text: str, scaled: bool) -> tuple[Length | tuple[str, ...], bool]:
     """Parse the text of a parameter: names or lengths separated by equals signs, or names with a common scale."""
     text = text.strip()
     if text.startswith("scale(") and text.endswith(")"):
@@ -225,9 +227,9 @@ def _read(mechanism: Mechanism, text: str, scaled: bool) -> tuple[Length | tuple
     return tuple(parts), scaled
 
 
-def _length(mechanism: Mechanism, text: str) -> tuple[str, ...]:
+def _length(mechanism: StudyModel, text: str) -> tuple[str, ...]:
     """Return the bodies of `length(a, b)` or `a.length`; empty if the text is not a length."""
     if text.startswith("length(") and text.endswith(")"):
         return tuple(body.strip().strip("\"'") for body in text[7:-1].split(","))
     owner, dot, field = text.rpartition(".")
-    return (owner,) if dot and field == "length" and owner in mechanism.body_names else ()
+    return (owner,) if dot and field == "length" and owner in body_names(mechanism) else ()

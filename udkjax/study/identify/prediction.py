@@ -22,10 +22,10 @@ from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembly import State, close
 from udkjax.positions.channels import Channel, Quantity
 from udkjax.scene.held import Held
-from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure
 from udkjax.study.identify.unknowns import Target, apply_values
 from udkjax.study.members import MOST_PROGRAMS, PIECE_MEMBERS, Program
+from udkjax.study.quantities import StudyModel, with_guess
 
 # Relative and absolute tolerances of the integration: for final estimates (the accuracy of parameters without noise); for
 # singular values and the continuity of pieces; and for the search for a fit.
@@ -69,7 +69,7 @@ class Predictor:
 
     def __init__(
         self,
-        mechanism: Mechanism,
+        mechanism: StudyModel,
         targets: tuple[Target, ...],
         channels: tuple[Channel | Quantity, ...],
         settings: Mapping[str, Any],
@@ -122,7 +122,7 @@ class _MemberRun:
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, _MemberRun) and self._key == other._key)
 
-    def place(self, arrays: PyTree, member: Members) -> tuple[Mechanism, State, dict[str, Any]]:
+    def place(self, arrays: PyTree, member: Members) -> tuple[StudyModel, State, dict[str, Any]]:
         """Return the mechanism of a member, the guess from which its initial state is closed, and the settings."""
         run = member.runs
         mechanism, settings = eqx.combine(arrays, self._static)
@@ -130,9 +130,10 @@ class _MemberRun:
         assigned = guess = apply_values(base, self.targets, member.x)
         if run.q is not None and run.v is not None:
             # Length parameters also move the record's guess; constants are computed from the scene's guess.
-            guess = apply_values(_with_state(base, run.q, run.v), self.targets, member.x)
-        q, v = (part.reshape(-1, 3) for part in jnp.einsum("iks,s->ik", run.bases, member.shift))
-        return assigned, State(guess.q0 + q, guess.v0 + v), settings
+            guess = apply_values(with_guess(base, run.q, run.v), self.targets, member.x)
+        q, v = jnp.einsum("iks,s->ik", run.bases, member.shift)
+        q0, v0 = jnp.asarray(guess.q0), jnp.asarray(guess.v0)
+        return assigned, State(q0 + q.reshape(q0.shape), v0 + v.reshape(q0.shape)), settings
 
     def __call__(self, shared: tuple[PyTree, Array], member: Members, shift: Array) -> dict[str, Array]:
         P = member.x.shape[0]
@@ -158,11 +159,3 @@ def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Prog
 @partial(jax.jit, static_argnums=0)
 def _guess(run: _MemberRun, arrays: PyTree, member: Members) -> State:
     return run.place(arrays, member)[1]
-
-
-def _with_state(mechanism: Mechanism, q: NumericArray, v: NumericArray) -> Mechanism:
-    values: dict[str, NumericArray] = {}
-    for k, body in enumerate(mechanism.body_names):
-        values |= {f"body.{body}.position": q[k, :2], f"body.{body}.angle": q[k, 2]}
-        values |= {f"body.{body}.velocity": v[k, :2], f"body.{body}.angular_velocity": v[k, 2]}
-    return mechanism.with_parameters(values)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from udkjax.positions.channels import Channel, Quantity, channel_of
-from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import conversion_factor
 from udkjax.study.identify.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
 from udkjax.study.identify.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
+from udkjax.study.quantities import StudyModel, body_names
 from udkjax.wording import abbreviate, quote, suggestion
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def records_of(
-    mechanism: Mechanism, data: Data, noise: Noise = None, ignore: Sequence[str] = (), quantities: Sequence[Quantity] = ()
+    mechanism: StudyModel, data: Data, noise: Noise = None, ignore: Sequence[str] = (), quantities: Sequence[Quantity] = ()
 ) -> tuple[Record, ...]:
     """Read data into records in SI units, with the canonical names of channels.
 
@@ -205,7 +205,7 @@ def _quantities_by_name(given: Iterable[Hashable]) -> dict[str, Quantity]:
 class _DataReader:
     """Reads data for a mechanism, and collects every mistake in `problems`."""
 
-    def __init__(self, mechanism: Mechanism, ignore: tuple[str, ...], quantities: dict[str, Quantity]):
+    def __init__(self, mechanism: StudyModel, ignore: tuple[str, ...], quantities: dict[str, Quantity]):
         self.mechanism, self.ignore, self.quantities = mechanism, ignore, quantities
         self.problems: list[str] = []
 
@@ -219,7 +219,7 @@ class _DataReader:
         else:
             if not isinstance(data, str | os.PathLike) and isinstance(data, Iterable):  # may name quantities
                 self.quantities |= _quantities_by_name(cast("Iterable[Hashable]", data))
-            for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems):
+            for table in read_tables(cast(TableData, data), body_names(self.mechanism), source, self.problems):
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
     def channel(self, given: ChannelKey) -> Channel | Quantity:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from udkjax.positions.assembly import State
 from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
+from udkjax.study.identify.initial_states import InitialStateUnknowns, state_unknowns
 from udkjax.study.identify.least_squares import (
     COARSE_STEP,
     FEW_STEPS,
@@ -33,7 +34,8 @@ from udkjax.study.identify.least_squares import (
 )
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import Prediction, Predictor, Runs, TolerancePair
-from udkjax.study.identify.unknowns import InitialStateUnknowns, apply_values, state_unknowns, with_conditions
+from udkjax.study.identify.unknowns import apply_values, with_conditions
+from udkjax.study.quantities import state_shape
 
 MOST_PIECES = 60  # largest number of pieces of all records, since the linear algebra is dense
 # Singular values below this, relative to the largest, belong to components of a piece's initial state that stay close to the end
@@ -89,7 +91,7 @@ class MultipleShooting(FitProblem):
         self.columns[self.following] = whole.K + np.arange(self.constrained).reshape(-1, self.S)
         q, v, conditions = jax.tree.map(lambda leaf: leaf[records], (whole.runs.q, whole.runs.v, whole.runs.conditions))
         if q is None:
-            q, v = (np.tile(np.asarray(state), (N, 1, 1)) for state in (self.mechanism.q0, self.mechanism.v0))
+            q, v = (np.repeat(np.asarray(x)[None], N, axis=0) for x in (self.mechanism.q0, self.mechanism.v0))
         self.runs = Runs(times, q, v, bases, conditions)
         self.inverse = np.zeros((N, self.S, 2 * n))
         self.guess, self.scale = self._guess_along(z, tol)
@@ -101,7 +103,7 @@ class MultipleShooting(FitProblem):
 
     def _begin_at(self, p: int, state: np.ndarray, x: np.ndarray) -> None:
         """Set the guess of a piece's initial state to a closed state (2, n)."""
-        q, v = state.reshape(2, -1, 3)
+        q, v = state.reshape(2, *state_shape(self.mechanism))
         basis = self._unknowns_at(self.pieces[p].record, x, float(self.runs.ts[p, 0]), State(q, v)).basis
         self.runs.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
         assert self.runs.q is not None and self.runs.v is not None

@@ -147,7 +147,8 @@ def _table_of_columns(
 
 def _heading(text: str) -> tuple[str, str | None]:
     """Split `body.link1.angle [deg]` into a name and units."""
-    match = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text.strip())
+    is_plain = re.fullmatch(r"[qv]\[\d+\]", text.strip())  # a coordinate of a system
+    match = None if is_plain else re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text.strip())
     return (match[1].strip(), match[2].strip() or None) if match else (text.strip(), None)
 
 

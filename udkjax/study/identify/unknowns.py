@@ -5,27 +5,20 @@ bounded, with u0 = (x0 - low) / (high - low); and x0 + scale z otherwise. An ini
 some coordinates and rates, one coordinate and one rate per degree of freedom.
 """
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
-from scipy.linalg import qr
+from jaxtyping import Array, Bool, Float
 from scipy.special import expit, logit
 
 from udkjax.arrays import make_module
-from udkjax.equations.analysis import analyse
-from udkjax.equations.dense_rows import KinematicRows
-from udkjax.positions.assembly import State, assemble
-from udkjax.positions.channels import RATES, UNITS
-from udkjax.scene.bodies import COORDINATES
-from udkjax.scene.checks import SceneError
+from udkjax.positions.assembly import State
 from udkjax.scene.held import Held
-from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
-from udkjax.study.identify.records import Estimated, IdentificationError, Record, Start
-from udkjax.study.quantities import Setter, parameter_value
+from udkjax.study.identify.records import IdentificationError, Record
+from udkjax.study.quantities import Setter, StudyModel, parameter_value
 from udkjax.wording import quote
 
 Transform = Literal["positive", "bounded", "free"]
@@ -41,7 +34,6 @@ FARTHEST_UNKNOWN = 20.0  # largest |z|; for a positive parameter, about the firs
 # Distance of other guesses from the first: a factor for positive parameters, a fraction of the scale for others.
 GUESS_FACTOR, GUESS_RADIUS = 2.5, 0.5
 BOUND_MARGIN = 0.02  # least distance of a guess from a bound, relative to the range, since z is infinite at a bound
-SMALLEST_READABLE_PART = 1e-3  # least pivot, relative to the largest, of coordinates that are chosen as unknowns
 STATE_RADIUS = 0.05  # distance of guesses of initial states from the first, relative to the scene's length and time, and rad
 
 
@@ -145,7 +137,7 @@ class Unknowns:
         return tuple(name for name, at, kind in zip(self.names, near, self.kinds, strict=True) if at and kind == "bounded")
 
 
-def apply_values(mechanism: Mechanism, targets: Sequence[Target], x: Float[Array, "P"] | np.ndarray) -> Mechanism:
+def apply_values(mechanism: Any, targets: Sequence[Target], x: Float[Array, "P"] | np.ndarray) -> Any:
     """Return the mechanism with values x (P,), which may be traced, assigned in the order of the parameters; pure."""
     base, values = mechanism, {}
     for k, target in enumerate(targets):
@@ -181,124 +173,26 @@ def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray
     return (parts + random.random((count, dimensions))) / count
 
 
-# --- initial states
+# --- differences between records
 
 
-class InitialStateUnknowns(NamedTuple):
-    """The S dimensionless unknowns of one initial state, which tied records share.
-
-    `sizes` (S,) are the changes of the named coordinates and rates per unit of each unknown, in `units`; `basis` has the
-    changes of all q and v (n,).
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    sizes: Float[np.ndarray, "S"]
-    basis: Float[np.ndarray, "2 n S"]
-
-
-def initial_state_unknowns(
-    mechanism: Mechanism, unknowns: Unknowns, records: Sequence[Record]
-) -> tuple[tuple[InitialStateUnknowns, ...], Int[np.ndarray, "records S"], Float[np.ndarray, "records 2 n S"]]:
-    """Return the unknowns of all initial states, their indices in z for each record (-1: unused), and the changes of q and v."""
-    by_start: dict[Hashable, tuple[Start, int, InitialStateUnknowns]] = {}  # key: the name of a start, or the index of its record
-    index, problems = len(unknowns.names), []
-    for k, record in enumerate(records):
-        start, key = record.start, record.start.name or k
-        if start.estimate == "nothing":
-            continue
-        if key in by_start:
-            if not _same(by_start[key][0], start):
-                problems.append(
-                    f"{record.place}start {quote(start.name)} differs from that of an earlier record: give the same Start to both"
-                )
-        else:
-            label = start.name or record.name or (f"record {k + 1}" if len(records) > 1 else "start")
-            try:
-                mech = apply_values(with_conditions(mechanism, record), unknowns.targets, unknowns.guess)
-                by_start[key] = start, index, state_unknowns(mech, record.t0, start.state, start.estimate, label)
-            except SceneError as problem:
-                raise IdentificationError([f"{record.place}{problem}"]) from None
-            index += len(by_start[key][2].names)
-    if problems:
-        raise IdentificationError(problems)
-    states = tuple(state for _, _, state in by_start.values())
-    S = max((len(state.names) for state in states), default=0)
-    columns, bases = np.full((len(records), S), -1), np.zeros((len(records), 2, 3 * len(mechanism.body_names), S))
-    for k, record in enumerate(records):
-        if record.start.estimate != "nothing":
-            _, first, state = by_start[record.start.name or k]
-            count = len(state.names)
-            columns[k, :count], bases[k, ..., :count] = first + np.arange(count), state.basis
-    return states, columns, bases
-
-
-def _same(first: Start, second: Start) -> bool:
-    a, b = first.state, second.state
-    equal = a is b or (a is not None and b is not None and np.array_equal(a.q, b.q) and np.array_equal(a.v, b.v))
-    return equal and first.estimate == second.estimate
-
-
-def with_conditions(mechanism: Mechanism, record: Record) -> Mechanism:
+def with_conditions(mechanism: Any, record: Record) -> Any:
     """Return the mechanism with the conditions of a record."""
     return mechanism.with_parameters(record.conditions) if record.conditions else mechanism
 
 
-def state_unknowns(mech: Mechanism, t0: float, guess: State | None, estimate: Estimated, label: str) -> InitialStateUnknowns:
-    """Choose coordinates that parametrize the closed states near a guess (None: the scene's guess), only angles if possible.
-
-    The names of the unknowns begin with `label`.
-    """
-    rows, q = KinematicRows(mech), np.asarray(assemble(mech, t0, guess).q, float).ravel()
-    free = np.eye(len(q))
-    if rows.count:
-        position = rows.close(t0, q)
-        assert position is not None, "an assembled state is closed"
-        free = rows.metric[:, None] * position.vt[position.rank :].T
-    chosen, scales = _independent_rows(free), analyse(mech).scales
-    size = np.where(np.array(chosen) % 3 == 2, 1.0, float(scales.length))  # angles in rad
-    rate = float(scales.rate) or 1.0  # 1/s for a scene without motion and loads
-    basis = free @ np.linalg.inv(free[chosen]) * size
-    names: list[str] = []
-    units: list[str] = []
-    sizes, parts, nothing = [], [], np.zeros_like(basis)
-    kinds = ("position", COORDINATES, 1.0, (basis, nothing)), ("velocity", RATES, rate, (nothing, rate * basis))
-    for kind, fields, factor, part in kinds:
-        if estimate in (kind, "both"):
-            sizes.append(factor * size)
-            names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
-            units += [UNITS[fields[k % 3]] for k in chosen]
-            parts.append(np.stack(part))
-    return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(sizes), np.concatenate(parts, axis=2))
-
-
-def _independent_rows(free: np.ndarray) -> list[int]:
-    """Choose as many well-conditioned rows as there are columns, only rows of angles if possible."""
-    count, all_rows = free.shape[1], np.arange(len(free))
-    chosen = all_rows[:0]
-    for rows in (all_rows[2::3], all_rows):
-        factors: Any = qr(free[rows].T / np.linalg.norm(free, 2), mode="r", pivoting=True)
-        R, order = factors
-        chosen, sizes = rows[order[:count]], np.abs(np.diag(R))
-        if len(sizes) == count and sizes.min(initial=1.0) >= SMALLEST_READABLE_PART:
-            break
-    return sorted(chosen.tolist())
-
-
-# --- other differences between records
-
-
-def guessed_states(mechanism: Mechanism, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+def guessed_states(mechanism: StudyModel, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
     """Return guesses q and v (records, bodies, 3) of initial states; None if all are the scene's guess."""
     states = [record.start.state for record in records]
     if all(state is None for state in states):
         return None, None
-    default = State(mechanism.q0, mechanism.v0)
+    model: Any = mechanism
+    default = State(model.q0, model.v0)
     q, v = (np.stack([np.asarray(getattr(state or default, field)) for state in states]) for field in "qv")
     return q, v
 
 
-def conditions_of(mechanism: Mechanism, records: Sequence[Record]) -> dict[str, np.ndarray | Held]:
+def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str, np.ndarray | Held]:
     """Return the values in all records of each parameter that differs between records, stacked; samples as one `Held`."""
     numbers, problems = parameters_of(mechanism), []
     conditions: dict[str, np.ndarray | Held] = {}

@@ -19,12 +19,13 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from udkjax.annotations import Numbers
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.pinv import Auto, Dense, Elimination, OneOf
 from udkjax.positions.assembly import State
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.choices import Choice
-from udkjax.study.quantities import Setter
+from udkjax.study.quantities import Setter, StudyModel
 
 # Settings of a run that are choices, with the label of None for each.
 CHOICES = {
@@ -44,7 +45,7 @@ class Distribution(Protocol):
     def ppf(self, q: np.ndarray) -> np.ndarray: ...
 
 
-AxisChoice: TypeAlias = "Mechanism | State | int | Choice"
+AxisChoice: TypeAlias = "StudyModel | State | int | Choice"
 # Numbers (n, ...) or choices; a range or a distribution if there is a design.
 Values: TypeAlias = "Distribution | State | Numbers | Sequence[AxisChoice]"
 
@@ -153,11 +154,15 @@ def labels_of(setting: str, choices: Sequence[AxisChoice], replaced: Collection[
 def _short_label(setting: str, choice: AxisChoice) -> str:
     if choice is None:
         return CHOICES[setting]
-    return choice.name if isinstance(choice, Mechanism) else str(choice) if isinstance(choice, int) else type(choice).__name__
+    if isinstance(choice, Mechanism | ConstrainedSystem):
+        return choice.name
+    return str(choice) if isinstance(choice, int) else type(choice).__name__
 
 
 def _label_with_numbers(name: str, choice: AxisChoice, replaced: Collection[str]) -> str:
     """Return the name of a choice with its scalar fields, except those that other axes replace."""
+    if isinstance(choice, ConstrainedSystem):
+        return name
     fields = {key: value for key, value in getattr(choice, "__dict__", {}).items() if key not in replaced}
     numbers = {key: value for key, value in fields.items() if eqx.is_array(value) and value.ndim == 0}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name

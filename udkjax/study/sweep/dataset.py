@@ -11,7 +11,9 @@ from jaxtyping import Int, PyTree
 
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import units_of
+from udkjax.study.quantities import body_names
 from udkjax.study.sweep.axes import AxisColumn, Dimension
 from udkjax.study.sweep.dimensions import NUMBERS_OF, RENAMED, SweepError
 from udkjax.study.sweep.groups import END, RESULT, STEPS, group_run
@@ -35,7 +37,7 @@ NOT_COMPUTED = -1  # the result of an unfinished member
 
 def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
     """Return the variables that are stored for each member of a group."""
-    bodies, variables = len(plan.mechanism_of(group).body_names), {}
+    shape, variables = plan.state_shape_of(group), {}
     labels = {name: label for measure in plan.measures for name, label in measure.labels.items()} | LABELS
     outputs = group_run(plan, group.index).outputs
     slopes = {f"d_{variable}_d_{by}": (variable, by) for variable in outputs for by in plan.derivatives}
@@ -48,7 +50,7 @@ def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
                 f"derivative of {variable} by {by}",
             )
         else:
-            label = labels.get(name) or guess_label(name, info.shape, len(plan.ts), bodies, plan.units.get(name, ""))
+            label = labels.get(name) or guess_label(name, info.shape, len(plan.ts), shape, plan.units.get(name, ""))
         variables[name] = StoredVariable(label.dims, info.shape, np.dtype(info.dtype), label.units, label.long_name)
     return variables
 
@@ -139,7 +141,7 @@ def _write_members(
 def _body_places(plan: SweepPlan) -> dict[int, list[int]]:
     """Return the indices of each group's bodies among all bodies, for groups that do not have all bodies."""
     everyone = list(plan.bodies)
-    names_by_group = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
+    names_by_group = {group.index: list(body_names(plan.mechanism_of(group))) for group in plan.groups}
     return {index: [everyone.index(name) for name in names] for index, names in names_by_group.items() if names != everyone}
 
 
@@ -158,8 +160,13 @@ def _coordinates(plan: SweepPlan) -> dict[str, Labelled]:
     if "body" in used:
         coordinates["body"] = list(plan.bodies)
     if "coordinate" in used:
-        coordinates["coordinate"] = list(COORDINATES)
+        coordinates["coordinate"] = list(COORDINATES) if plan.bodies else _coordinate_labels(plan)
     return coordinates
+
+
+def _coordinate_labels(plan: SweepPlan) -> list[str]:
+    """Return labels of the coordinates of user-defined systems."""
+    return [f"q[{k}]" for k in range(max(plan.state_shape_of(group)[0] for group in plan.groups))]
 
 
 def _coordinate(dimension: Dimension, column: AxisColumn) -> dict[str, Labelled]:
@@ -187,7 +194,7 @@ def _attributes(plan: SweepPlan) -> dict[str, str | int | float]:
         **{f"version_{name}": value for name, value in versions().items()},
         "start_time": float(plan.ts[0]),
         "parameters": json.dumps({k: np.asarray(v).tolist() for k, v in plan.mechanism.parameters().items()}),
-        "scene": scene_text(plan.mechanism),
+        **({"scene": scene_text(plan.mechanism)} if isinstance(plan.mechanism, Mechanism) else {}),
     }
 
 

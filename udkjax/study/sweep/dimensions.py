@@ -9,6 +9,7 @@ from typing import Any, TypeAlias, cast
 import jax
 import numpy as np
 
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.simulate import simulate
 from udkjax.pinv import Auto
 from udkjax.positions.assembly import State
@@ -17,6 +18,7 @@ from udkjax.scene.checks import Mistakes, SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.units import NUMBERS, units_of
+from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import (
     CHOICES,
     Axis,
@@ -69,7 +71,7 @@ def refuse_untraceable(subject: str) -> Iterator[None]:
         raise SweepError([f"{subject}: {cure}"]) from None
 
 
-def lay_out(mechanism: Mechanism, axes: Mapping[str, AxisValues], design: SweepDesign | None = None) -> tuple[Dimension, ...]:
+def lay_out(mechanism: StudyModel, axes: Mapping[str, AxisValues], design: SweepDesign | None = None) -> tuple[Dimension, ...]:
     """Return the dimensions of a sweep over `axes`.
 
     Raises:
@@ -128,7 +130,7 @@ def _is_range(given: "Axis | Values") -> bool:
 
 
 def _column(
-    mechanism: Mechanism, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]
+    mechanism: StudyModel, name: str, given: AxisValues, unit: np.ndarray | None, problems: list[str]
 ) -> AxisColumn | None:
     """Return the values of an axis; if they are invalid, add the mistake to `problems` and return None."""
     assert not isinstance(given, Zipped), "zipped axes are passed one by one"
@@ -169,8 +171,8 @@ def _choices(name: str, of: tuple[str, ...], values: Values, problems: list[str]
         choices = tuple(cast("Iterable[AxisChoice]", values))
     if of == ("state",) and not all(isinstance(choice, State) for choice in choices):
         problems.append(f"axis {quote(name)}: must be States, as `assemble` returns them")
-    if of == ("mechanism",) and not all(isinstance(choice, Mechanism) for choice in choices):
-        problems.append(f"axis {quote(name)}: must be Mechanisms")
+    if of == ("mechanism",) and len({type(choice) for choice in choices} & {Mechanism, ConstrainedSystem}) != 1:
+        problems.append(f"axis {quote(name)}: must be Mechanisms, or all of them ConstrainedSystems")
     return AxisColumn(name, choices, of, "", labels_of(of[0], choices))
 
 
@@ -186,7 +188,7 @@ def _numbers(values: Values) -> np.ndarray | None:
     return array.astype(float) if array.dtype.kind in "iuf" and array.ndim else None
 
 
-def _unknown_targets(mechanism: Mechanism, name: str, of: Sequence[str]) -> Iterator[str]:
+def _unknown_targets(mechanism: StudyModel, name: str, of: Sequence[str]) -> Iterator[str]:
     parameters = parameters_of(mechanism)
     for target in of:
         if target not in NUMBERS and target not in CHOICES and split_index(target, parameters)[0] not in parameters:
@@ -201,7 +203,7 @@ def _suggest_ending(target: str, parameters: Iterable[str]) -> str:
     return f"; did you mean {quote(last[close[0]])}?" if close else ""
 
 
-def _misfits(mechanism: Mechanism, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
+def _misfits(mechanism: StudyModel, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
     """Iterate over mistakes of values that violate the shape or a requirement of a parameter or setting."""
     parameters = [target for target in of if target not in NUMBERS]
     if parameters:
@@ -232,7 +234,7 @@ def _clashes(dimensions: Sequence[Dimension]) -> Iterator[str]:
                 owner[target] = column.name
 
 
-def check_settings(mechanism: Mechanism, dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
+def check_settings(mechanism: StudyModel, dimensions: Sequence[Dimension], settings: Settings) -> list[str]:
     """Return the mistakes in axes of settings: invalid values, settings given twice, and numbers that no member uses."""
     columns = [column for dimension in dimensions for column in dimension.columns]
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
@@ -263,7 +265,7 @@ def uses_number(setting: str, choice: AxisChoice, name: str) -> bool:
     return hasattr(Auto() if setting == "method" and choice is None else choice, name)
 
 
-def check_tangents(mechanism: Mechanism, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
+def check_tangents(mechanism: StudyModel, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
     """Return the mistakes in the names of derivatives."""
     columns = {column.name: column for dimension in dimensions for column in dimension.columns}
     parameters, problems = parameters_of(mechanism), []

@@ -3,6 +3,7 @@
 import difflib
 import hashlib
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TypeAlias
@@ -12,9 +13,11 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution, scene_text, versions
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.sweep.axes import AxisColumn
+from udkjax.study.quantities import StudyModel, body_names
+from udkjax.study.sweep.axes import AxisChoice, AxisColumn
 from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import SweepPlan
 from udkjax.wording import abbreviate
@@ -28,7 +31,7 @@ STATS = ("steps", "accepted", "rejected", "implicit", "right_hand_sides", "proje
 def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
     """Return all inputs that determine the results; plans with equal fingerprints have the same results."""
     return {
-        **_mechanism(plan.mechanism),
+        **_mechanism(plan.mechanism, math.prod(plan.state_shape_of(plan.groups[0]))),
         "axes": {dimension.name: {c.name: _axis(plan, c) for c in dimension.columns} for dimension in plan.dimensions},
         "design": repr(plan.design) if plan.design else None,
         "ts": _value(plan.ts),
@@ -43,7 +46,12 @@ def _axis(plan: SweepPlan, column: AxisColumn) -> dict[str, JsonValue]:
     of: JsonValue = None if callable(column.of) else column.of
     if callable(column.of):
         of = _function(column.of, plan.mechanism, np.zeros(column.numbers.shape[1:]))
-    return {"of": of, "values": [_value(value) for value in column.values] if column.is_choice else _value(column.values)}
+    n = math.prod(plan.state_shape_of(plan.groups[0]))
+
+    def described(x: AxisChoice) -> JsonValue:
+        return _mechanism(x, n) if isinstance(x, ConstrainedSystem) else _value(x)
+
+    return {"of": of, "values": [described(value) for value in column.values] if column.is_choice else _value(column.values)}
 
 
 def _measure(plan: SweepPlan, measure: Measure) -> dict[str, JsonValue]:
@@ -59,10 +67,10 @@ def _measure(plan: SweepPlan, measure: Measure) -> dict[str, JsonValue]:
 
 def _solution(plan: SweepPlan) -> Solution:
     """Return a solution with the right shapes, for tracing."""
-    number, states = np.zeros(()), np.zeros((len(plan.ts), len(plan.mechanism.body_names), 3))
-    count = np.zeros((), int)
+    number, states = np.zeros(()), np.zeros((len(plan.ts), *plan.state_shape_of(plan.groups[0])))
+    count, model = np.zeros((), int), plan.mechanism
     stats = dict.fromkeys(STATS, count)
-    return Solution(plan.ts, states, states, count, number, stats, number, number, plan.mechanism.body_names, ())  # pyright: ignore[reportArgumentType]
+    return Solution(plan.ts, states, states, count, number, stats, number, number, body_names(model), ())  # pyright: ignore[reportArgumentType]
 
 
 def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
@@ -74,7 +82,12 @@ def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
     return {"name": name, "operations": digest(text.encode()), "constants": digest(constants)}
 
 
-def _mechanism(mechanism: Mechanism) -> dict[str, JsonValue]:
+def _mechanism(mechanism: StudyModel, n: int = 0) -> dict[str, JsonValue]:
+    if isinstance(mechanism, ConstrainedSystem):
+        traced = mechanism.traced(n)
+        text = traced.functions.text if hasattr(traced, "functions") else repr(mechanism)
+        numbers = [_value(x) for x in getattr(traced, "numbers", jax.tree.leaves(eqx.filter(mechanism, eqx.is_array)))]
+        return {"functions": digest(text.encode()), "numbers": numbers, "guess": [_value(mechanism.q0), _value(mechanism.v0)]}
     numbers = {name: _value(x) for name, x in mechanism.parameters().items()}
     return {"scene": scene_text(mechanism), "parameters": numbers}
 

@@ -4,9 +4,10 @@ Members of a group differ only in numbers, which are arguments of its program: n
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ from jaxtyping import Array, Int, PyTree
 from udkjax.arrays import number
 from udkjax.devices import default_devices
 from udkjax.equations.analysis import analyse
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import has_method
@@ -25,7 +27,7 @@ from udkjax.positions.assembly import Closure, State, close
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import NUMBERS
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Outputs, Program
-from udkjax.study.quantities import parameter_value
+from udkjax.study.quantities import StudyModel, analysis_of, parameter_value
 from udkjax.study.sweep.dimensions import NUMBERS_OF, refuse_untraceable, uses_number
 from udkjax.study.sweep.measures import SECONDS
 from udkjax.study.sweep.plan import SweepPlan, stack_choices
@@ -84,10 +86,10 @@ class GroupRun:
                 if len(places) > 1 and jax.tree.leaves(eqx.filter(fixed[setting], eqx.is_array)):
                     arrays, static = stack_choices([column.computed[k] for k in places])
                     self._own[setting] = GroupChoices(column.name, arrays, static, np.array(places))
-        analysis = analyse(fixed["mechanism"])
-        self.redundant = analysis.redundant_rows if redundant is None else redundant
-        fixed["analysis"] = dataclasses.replace(analysis, redundant_rows=self.redundant)
-        if "mechanism" in self._own:  # each mechanism has different scales
+        analysis = analysis_of(fixed["mechanism"])
+        self.redundant = redundant if redundant is not None or analysis is None else analysis.redundant_rows
+        fixed["analysis"] = analysis and dataclasses.replace(analysis, redundant_rows=self.redundant)
+        if "mechanism" in self._own and analysis is not None:  # each mechanism has different scales
             batched = self._own["mechanism"]
             column = next(column for column in plan.columns if column.name == batched.axis)
             analyses = [analyse(cast(Mechanism, column.choices[k])) for k in batched.places]
@@ -106,11 +108,11 @@ class GroupRun:
         in_lanes = (
             has_method(fixed.get("solver"))
             and (is_straight or not reason_for_plain(method or Auto(), formulation))
-            and self.redundant is not None
+            and (self.redundant is not None or analysis is None)
         )
         self._placed: Shared | None = None
         devices = default_devices()
-        states = 16 * len(plan.ts) * fixed["mechanism"].q0.size * (1 + len(self.names))  # bytes of a member
+        states = 16 * len(plan.ts) * math.prod(plan.state_shape_of(group)) * (1 + len(self.names))  # bytes of a member
         first = plan.first_alike[index]
         self.program = (
             Program(self, len(self.names), _piece(len(self.members), in_lanes, devices[0].platform, states), devices)
@@ -127,19 +129,20 @@ class GroupRun:
             choices[setting] = jax.tree.map(lambda x, rows=rows: x[rows], choice.numbers)
         return Own(choices, {column.name: column.numbers[places[column.name]] for column in self.numbers}, members)
 
-    def mechanism(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> Mechanism:
+    def mechanism(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> StudyModel:
         """Return the mechanism of one member, with `shift` added to the variables of differentiation."""
-        mechanism = self._setting("mechanism", shared, own)
+        mechanism: Any = self._setting("mechanism", shared, own)
         values: dict[str, np.ndarray | Array] = {}
+        kind = Mechanism if isinstance(mechanism, Mechanism) else ConstrainedSystem
         for column in self.numbers:
             x = own.axes[column.name] + shift.get(column.name, 0.0)
             if callable(column.of):
                 with refuse_untraceable(f"axis {quote(column.name)}"):
-                    mechanism, values = column.of(mechanism.with_parameters(values), x), {}
-                if not isinstance(mechanism, Mechanism):
-                    raise TypeError(
-                        f"axis {column.name!r}: its function must return a Mechanism, not a {type(mechanism).__name__}"
-                    )
+                    setter: Any = column.of
+                    mechanism, values = setter(mechanism.with_parameters(values), x), {}
+                if not isinstance(mechanism, kind):
+                    found = type(mechanism).__name__
+                    raise TypeError(f"axis {column.name!r}: its function must return a {kind.__name__}, not a {found}")
             else:
                 values |= {target: x for target in column.of if target not in NUMBERS}
         mechanism = mechanism.with_parameters(values) if values else mechanism
@@ -201,7 +204,7 @@ class GroupRun:
         """Return, for each derivative, its variable and the index of its variable of differentiation."""
         return {f"d_{of}_d_{by}": (of, k) for of in slopes if of not in (END, *self.seconds) for k, by in enumerate(self.names)}
 
-    def _closure(self, shared: Shared, own: Own, mechanism: Mechanism) -> Closure | None:
+    def _closure(self, shared: Shared, own: Own, mechanism: StudyModel) -> Closure | None:
         if shared.closure is not None or not self.assembled:
             return shared.closure
         return close(mechanism, self.plan.ts[0], analysis=self._setting("analysis", shared, own))

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,21 +12,27 @@ from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.equations.quantities import energy, violation
+from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.quantities import energy, equations_of, violation
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.positions.channels import Channel, channel_of
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure as evaluate_channels
+from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.dimensions import refuse_untraceable
 from udkjax.wording import quote, suggestion
 
-UserMeasure = TypeAliasType("UserMeasure", Callable[[Mechanism, Solution], Numbers | Mapping[str, NumberLike]])
+UserMeasure = TypeAliasType(
+    "UserMeasure",
+    Callable[[Mechanism, Solution], Numbers | Mapping[str, NumberLike]]
+    | Callable[[ConstrainedSystem, Solution], Numbers | Mapping[str, NumberLike]],
+)
 OneMeasure = TypeAliasType("OneMeasure", str | UserMeasure)
 MeasureChoice = TypeAliasType("MeasureChoice", OneMeasure | Sequence[OneMeasure] | Mapping[str, OneMeasure])
 # Coordinates (T, bodies, 3) to compare runs with, or a function of (mechanism, ts) that returns them.
-Reference = TypeAliasType("Reference", Solution | Numbers | Callable[[Mechanism, Array], Numbers] | None)
+Reference = TypeAliasType("Reference", Solution | Numbers | Callable[[Any, Array], Numbers] | None)
 
 SECONDS = "seconds"  # name of the measure whose values are written after a chunk has been computed
 RANK_NOT_REACHED = -1  # rank at output times that a run did not reach
@@ -35,7 +41,7 @@ RANK_NOT_REACHED = -1  # rank at output times that a run did not reach
 class MeasuredRun(NamedTuple):
     """The input of a measure: a completed run and its method."""
 
-    mechanism: Mechanism
+    mechanism: Any  # a mechanism or a system
     solution: Solution
     method: Pseudoinverse | None
     reference: Reference
@@ -66,7 +72,7 @@ class Measure:
     reference: Reference = None
     function: UserMeasure | None = None
 
-    def of(self, mechanism: Mechanism, solution: Solution, method: Pseudoinverse | None) -> dict[str, Array]:
+    def of(self, mechanism: StudyModel, solution: Solution, method: Pseudoinverse | None) -> dict[str, Array]:
         """Return the stored arrays by name in the dataset."""
         outputs = self.compute(MeasuredRun(mechanism, solution, method, self.reference))
         return {name: jnp.asarray(x) for name, x in zip(self.labels or outputs, outputs.values(), strict=True)}
@@ -82,17 +88,18 @@ class Measure:
 NAMELESS = "lambda"  # name of an anonymous function
 
 
-def guess_label(name: str, shape: tuple[int, ...], outputs: int, bodies: int, units: str = "") -> Label:
+def guess_label(name: str, shape: tuple[int, ...], outputs: int, state_shape: tuple[int, ...], units: str = "") -> Label:
     """Label the result of a user-defined function by its shape."""
     dims = [f"{name}_{k}" for k in range(len(shape))]
-    if shape[-2:] == (bodies, 3):
-        dims[-2:] = "body", "coordinate"
-    if shape and shape[0] == outputs and dims[0] != "body":
+    of_state = ("body", "coordinate")[-len(state_shape) :]
+    if shape[-len(state_shape) :] == state_shape and shape != (outputs,):
+        dims[-len(of_state) :] = of_state
+    if shape and shape[0] == outputs and dims[0] not in of_state:
         dims[0] = "time"
     return Label(tuple(dims), units, "")
 
 
-def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mechanism: Mechanism) -> tuple[Measure, ...]:
+def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mechanism: StudyModel) -> tuple[Measure, ...]:
     """Return the measures for an argument: a name, a function of (mechanism, solution), or a sequence or dict of these.
 
     Names are those of `MEASURES`, or of channels of the mechanism, such as `pin.C.x` and `driver.motor.load`.
@@ -110,15 +117,15 @@ def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mech
         if reference is not None:
             raise ValueError('reference: is used by the measure "error" only, which is not among the measures')
         return measures
-    reference = _reference(reference, ts)
+    reference = _reference(reference, ts, mechanism)
     return tuple(replace(measure, reference=reference) if measure.name == "error" else measure for measure in measures)
 
 
-def _measure(key: str, given: OneMeasure, mechanism: Mechanism) -> Measure:
+def _measure(key: str, given: OneMeasure, mechanism: StudyModel) -> Measure:
     if isinstance(given, str):
         if given in MEASURES:
-            return MEASURES[given]
-        if "." not in given:
+            return MEASURES[given] if isinstance(mechanism, Mechanism) else measure_of_system(MEASURES[given])
+        if "." not in given and isinstance(mechanism, Mechanism):
             near = suggestion(given, MEASURES) or f"; use {', '.join(MEASURES)}, or a channel such as pin.A.x"
             raise ValueError(f"measure {quote(given)} does not exist{near}")
         try:
@@ -147,7 +154,7 @@ def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array
     return {name: jnp.asarray(outputs)}
 
 
-def _reference(given: Reference, ts: np.ndarray) -> Reference:
+def _reference(given: Reference, ts: np.ndarray, mechanism: StudyModel) -> Reference:
     if given is None:
         raise ValueError(
             'measure "error" needs reference=: a Solution, coordinates (T, bodies, 3), or a function (mechanism, ts)'
@@ -155,10 +162,10 @@ def _reference(given: Reference, ts: np.ndarray) -> Reference:
     if callable(given) and not hasattr(given, "shape"):
         return given
     q = np.asarray(getattr(given, "q", given), float)
-    if q.ndim != 3 or q.shape[0] != len(ts) or q.shape[2] != 3:
-        raise ValueError(
-            f"reference: must be coordinates at the {len(ts)} output times, (T, bodies, 3), but is of shape {q.shape}"
-        )
+    is_state = q.ndim == 3 and q.shape[2] == 3 if isinstance(mechanism, Mechanism) else q.ndim == 2
+    if not is_state or q.shape[0] != len(ts):
+        shape = "(T, bodies, 3)" if isinstance(mechanism, Mechanism) else "(T, n)"
+        raise ValueError(f"reference: must be coordinates at the {len(ts)} output times, {shape}, but is of shape {q.shape}")
     return q
 
 
@@ -224,6 +231,8 @@ def _error(run: MeasuredRun) -> dict[str, Array]:
     with refuse_untraceable("reference"):
         reference = run.reference(run.mechanism, run.solution.ts) if callable(run.reference) else run.reference
     error = run.solution.q - jnp.asarray(getattr(reference, "q", reference))
+    if not isinstance(run.mechanism, Mechanism):
+        return {"error": _largest(error)}
     return {"position_error": _largest(error[..., :2]), "angle_error": _largest(error[..., 2])}
 
 
@@ -249,9 +258,41 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     """Compute ranks by the method's rule; for `Auto`, by that of its rank-revealing fallback."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
+    if isinstance(run.mechanism, ConstrainedSystem):
+        return {"rank": _ranks_of_system(run, method)}
     equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
     if method.rank_tol is None:
         method = replace(method, rank_tol=equations.scales.rank_tol)
     reached = jnp.all(jnp.isfinite(q), axis=1)
     ranks = jax.vmap(lambda t, q: method.rank(equations.weighted_rows(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
     return {"rank": jnp.where(reached, ranks, RANK_NOT_REACHED)}
+
+
+# --- measures of user-defined systems, whose states are vectors
+
+_LABELS_OF_SYSTEM = {
+    "final": {
+        "q_end": Label(("coordinate",), "", "coordinates at the end"),
+        "v_end": Label(("coordinate",), "", "velocities at the end"),
+    },
+    "states": {
+        "q": Label(("time", "coordinate"), "", "coordinates"),
+        "v": Label(("time", "coordinate"), "", "velocities"),
+    },
+    "violation": {"violation": Label((), "", "largest residual of Psi or phi at an output time")},
+    "error": {"error": Label((), "", "largest error of a coordinate")},
+    "energy_drift": {"energy_drift": Label((), "J", "largest change of the total energy, including the work of loads")},
+}
+
+
+def measure_of_system(measure: Measure) -> Measure:
+    """Return a measure with the labels that it has for user-defined systems."""
+    return replace(measure, labels=_LABELS_OF_SYSTEM.get(measure.name, measure.labels))
+
+
+def _ranks_of_system(run: MeasuredRun, method: Pseudoinverse) -> Array:
+    solution, reached = run.solution, jnp.all(jnp.isfinite(run.solution.q), axis=1)
+    equations: Any = equations_of(run.mechanism.traced(solution.q.shape[1]), method)
+    q, v = (jnp.where(reached[:, None], x, x[0]) for x in (solution.q, solution.v))
+    ranks = jax.vmap(lambda t, q, v: equations.rank(q, equations.jacobian(t, q, v)))(solution.ts, q, v)
+    return jnp.where(reached, ranks, RANK_NOT_REACHED)

@@ -14,11 +14,13 @@ from jaxtyping import Int, PyTree
 from numpy.typing import ArrayLike
 
 from udkjax.equations.analysis import analyse
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.simulate import simulate
 from udkjax.requirements import require_output_times
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.quantities import StudyModel, body_names, state_shape
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign, structure_of
 from udkjax.study.sweep.dimensions import Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
@@ -61,7 +63,7 @@ class Chunk:
 class SweepPlan:
     """The plan of a sweep, made by `make_plan`. Immutable and picklable, so that other processes can compute parts of it."""
 
-    mechanism: Mechanism
+    mechanism: StudyModel
     dimensions: tuple[Dimension, ...]
     ts: np.ndarray  # (T,) s
     settings: Settings  # arguments of `simulate` that are not axes
@@ -143,20 +145,24 @@ class SweepPlan:
                 return column.choices[group.choices[column.name][0]]
         return self.mechanism if setting == "mechanism" else self.settings.get(setting)
 
-    def mechanism_of(self, group: Group) -> Mechanism:
+    def mechanism_of(self, group: Group) -> StudyModel:
         """Return the mechanism of a group; the first one if mechanisms differ in numbers."""
         mechanism = self.choice(group, "mechanism")
-        assert isinstance(mechanism, Mechanism)
+        assert isinstance(mechanism, Mechanism | ConstrainedSystem)
         return mechanism
+
+    def state_shape_of(self, group: Group) -> tuple[int, ...]:
+        """Return the shape of the coordinates of a group: (bodies, 3), or (n,) of a user-defined system."""
+        return state_shape(self.mechanism_of(group), self.choice(group, "state"))
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
         """The bodies of all mechanisms, in order of appearance."""
-        return tuple(dict.fromkeys(name for group in self.groups for name in self.mechanism_of(group).body_names))
+        return tuple(dict.fromkeys(name for group in self.groups for name in body_names(self.mechanism_of(group))))
 
 
 def make_plan(
-    mechanism: Mechanism,
+    mechanism: StudyModel,
     axes: Mapping[str, AxisValues],
     ts: ArrayLike,
     measure: MeasureChoice = "final",
@@ -192,6 +198,8 @@ def make_plan(
     if targets & {"alpha", "beta"} and "stabilization" not in targets:
         settings.setdefault("stabilization", Baumgarte())  # an axis of gains needs a stabilization
     problems += check_settings(mechanism, dimensions, settings)
+    if isinstance(mechanism, ConstrainedSystem) and mechanism.q0 is None and not {"state"} & {*targets, *settings}:
+        problems.append("state: a ConstrainedSystem without q0 has no initial guess: give state=State(q, v)")
     problems += check_tangents(mechanism, dimensions, derivatives)
     measures: tuple[Measure, ...] = ()
     try:

@@ -15,7 +15,7 @@ from udkjax.extras import require
 from udkjax.integrate.solution import Result
 from udkjax.progress import Progress, ProgressOption, report_progress
 from udkjax.scene.arguments import checked
-from udkjax.scene.mechanism import Mechanism
+from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import AxisValues, SweepDesign
 from udkjax.study.sweep.chunks import MEMORY, compute_members
 from udkjax.study.sweep.dataset import assemble, variables_of
@@ -35,7 +35,7 @@ Engine = Literal["auto", "devices", "dask"]
 
 @checked
 def sweep(
-    mechanism: Mechanism,
+    mechanism: StudyModel,
     axes: Mapping[str, AxisValues],
     ts: ArrayLike,
     measure: MeasureChoice = "final",
@@ -56,7 +56,7 @@ def sweep(
     Members (the single runs) are computed concurrently, in chunks of a few seconds, on all devices or cores of the machine.
 
     Args:
-        mechanism: the scene.
+        mechanism: the scene, or a `ConstrainedSystem`, whose numbers have the names of its `parameters`.
         axes: values by name. A name is that of a parameter (`body.link1.mass`), of a setting of `simulate` (`rtol`, `atol`,
             `drift_tol`, `dt0`, `method`, `solver`, `stabilization`, `formulation`, `max_steps`, `state`), of an attribute of
             settings (`alpha` and `beta` of Baumgarte's stabilization, `rank_tol` and `branch_tol` of the method), `t1`, to which
@@ -68,9 +68,10 @@ def sweep(
         measure: measures to store for each member; nothing else is stored. A measure is a name: "final" (q and v at the end),
             "states" (at all `ts`), "violation" (the largest, m or rad), "energy_drift" (J), "error" (the largest error of a
             position and of an angle, against `reference`), "counts", "seconds" (computing time), "rank" (of D at all `ts`), or a
-            channel, such as "pin.C.x" (at all `ts`). Members are computed together: "seconds" is the time of a chunk, shared
-            among its members in proportion to their steps. A measure may also be a function of (mechanism, solution), in
-            jax.numpy, that returns an array or a dict of arrays. Several measures are given in a list, or a dict by name.
+            channel, such as "pin.C.x" (at all `ts`), or "q[0]" of a `ConstrainedSystem`. Members are computed together: "seconds"
+            is the time of a chunk, shared among its members in proportion to their steps. A measure may also be a function of
+            (mechanism, solution), in jax.numpy, that returns an array or a dict of arrays. Several measures are given in a list,
+            or a dict by name.
         design: `Sobol`, `LatinHypercube` or `Random`: the values of numeric axes are then ranges (low, high) or frozen
             distributions of scipy.stats, and all of them lie along the dimension "member".
         reference: for the measure "error": a Solution, coordinates (T, bodies, 3), or a function of (mechanism, ts).
