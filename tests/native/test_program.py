@@ -13,6 +13,12 @@ from udkjax.native.base.program import UnsupportedError, write
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, 1e-9, -1e-9, 1e-300, 700.0, -700.0, 1e200, np.inf, -np.inf, np.nan])
 RNG = np.random.default_rng(0)
 ORDINARY = np.concatenate([RNG.uniform(-4.0, 4.0, 60), 10.0 ** RNG.uniform(-12, 2, 30), -(10.0 ** RNG.uniform(-12, 2, 30))])
+
+
+def _whole(k):
+    return -k + 2 * jnp.abs(k) - 3 * jnp.sign(k) * jnp.clip(k, -2, 5) - jnp.maximum(k, 3)
+
+
 ONE = {
     "abs": jnp.abs,
     "neg": lambda x: -x,
@@ -60,6 +66,7 @@ ONE = {
     "switch": lambda x: lax.switch(jnp.int32(x), [lambda x: x, lambda x: -x, lambda x: x * x], jnp.clip(x, -2.0, 2.0)),
     "sorted": lambda x: jnp.sort(jnp.stack([x, 0.5 * jnp.ones(()), -2.0 * x]))[1],
     "table": lambda x: jnp.interp(x, jnp.array([-1.0, 0.0, 0.7]), jnp.array([2.0, -1.0, 5.0])),
+    "whole": lambda x: _whole(jnp.int32(jnp.clip(2.0 * x, -50.0, 50.0))) * x,
     "truncated": lambda x: 0.5 * (jnp.int32(jnp.clip(x, -50.0, 50.0)) + 1) * x,
     "greatest": lambda x: jnp.max(jnp.stack([x, 0.1 * jnp.ones(()), x * x])),
     "softplus": jax.nn.softplus,

@@ -143,6 +143,16 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             return f.arithmetic(name, *a)
         case "div" | "rem" if a[0].base == INT:
             return _divide_whole(f, name, *a)
+        case "abs" if a[0].base == INT:
+            return f.select(f.compare("lt", a[0], f.const(0, INT, f.width)), -a[0], a[0])
+        case "sign" if a[0].base == INT:
+            signs = (
+                f.select(f.compare(order, a[0], f.const(0, INT, f.width)), f.const(1, INT, f.width), 0) for order in ("gt", "lt")
+            )
+            return f.arithmetic("sub", *signs)
+        case "clamp" if a[0].base == INT:
+            low = f.select(f.compare("lt", a[1], a[0]), a[0], a[1])
+            return f.select(f.compare("gt", low, a[2]), a[2], low)
         case "max" | "min" if a[0].base == INT:
             return f.select(f.compare("gt" if name == "max" else "lt", a[0], a[1]), a[0], a[1])
         case "shift_right_arithmetic" | "shift_right_logical" | "shift_left" if a[0].base == INT:

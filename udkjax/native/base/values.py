@@ -60,6 +60,8 @@ class Value:
         return self.f.arithmetic("div", other, self)
 
     def __neg__(self):
+        if self.base == INT:
+            return self.f.arithmetic("sub", self.f.const(0, INT, self.width), self)
         negative = self.f.op(f"fneg {self.type} {self.name}", self.base, self.width)
         if self.product:
             negative.product = self.product._replace(is_negative=not self.product.is_negative)
