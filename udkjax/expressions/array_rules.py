@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 
 from udkjax.expressions.graph import Graph, Scalar
+from udkjax.expressions.matrix_rules import decompose, solve_triangular
 from udkjax.expressions.selection import apply, both, either, where
 
 ScalarArrays = list[Any]  # arrays of Scalars, which type checkers know as arrays of arrays
@@ -177,6 +178,58 @@ def _polynomial(graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.nd
     return [result]
 
 
+def _host_platform(graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray]:
+    """Return the index of the branch for the CPU, or of the one for all platforms."""
+    platforms = equation.params["platforms"]
+    index = next(k for k, names in enumerate(platforms) if names is None or "cpu" in names)
+    return [np.array(graph.constant(index, np.int32), object)]
+
+
+def select_rows(
+    select: Callable[[ScalarArrays], np.ndarray], array: np.ndarray, indices: np.ndarray, offset: Sequence[int]
+) -> np.ndarray | None:
+    """Return the elements that a `gather` takes from an array by rows of indices, of which some are unknown.
+
+    Each element depends on one row of indices only, and so the choices do not multiply with the rows.
+
+    Args:
+        select: Function from indices, an array of constants, to the elements.
+        array: The array.
+        indices: The rows of indices (..., k), as Scalars.
+        offset: The axes of the result that are no axes of the rows.
+
+    Returns:
+        The elements; None if there are too many places to choose from.
+    """
+    dtype, graph = indices.flat[0].node.dtype, indices.flat[0].graph
+    first = 0 if dtype.kind == "u" else -1
+    places = range(first, max(array.shape, default=0) + 1)  # with one beyond either end: indices may be out of bounds
+    columns = indices.shape[-1]
+    if len(places) ** columns > MOST_PLACES:
+        return None
+    numbers = [graph.constant(k, dtype) for k in places]
+    cases = np.empty([len(places)] * columns, object)
+    for chosen in np.ndindex(*cases.shape):
+        row = np.array([numbers[k] for k in chosen], object)
+        cases[chosen] = select([np.broadcast_to(row, indices.shape)])
+    some = cases.flat[0]
+    kept = [axis for axis in range(some.ndim) if axis not in offset]
+    result = np.empty(some.shape, object)
+    for spot in np.ndindex(*result.shape):
+        row = indices[tuple(spot[axis] for axis in kept)]
+
+        def choose_from(known: tuple[int, ...], row: Any = row, spot: tuple[int, ...] = spot) -> Scalar:
+            if len(known) == columns:
+                return cases[known][spot]
+            index = row[len(known)]
+            options = [choose_from((*known, k)) for k in range(len(places))]
+            number = index if first == 0 else apply(lax.add_p, dtype, index, graph.constant(1, dtype))
+            return choose(number, options)
+
+        result[spot] = choose_from(())
+    return result
+
+
 def select_unknown(select: Callable[[ScalarArrays], np.ndarray], array: np.ndarray, indices: ScalarArrays) -> np.ndarray | None:
     """Return the elements of an array at indices of which some are unknown, by `select` of known ones.
 
@@ -218,4 +271,7 @@ RULES: dict[str, ArrayRule] = {
     "lt_to": partial(_compare_totally, True),
     "le_to": partial(_compare_totally, False),
     "polynomial": _polynomial,
+    "platform_index": _host_platform,
+    "lu": decompose,
+    "triangular_solve": solve_triangular,
 }

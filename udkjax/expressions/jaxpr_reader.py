@@ -15,8 +15,10 @@ from jax.extend import core
 from jax.extend.core.primitives import closed_call_p
 from jax.typing import ArrayLike
 
-from udkjax.expressions.array_rules import RULES, choose, choose_branch, select_unknown
+from udkjax.expressions.array_rules import RULES, choose, choose_branch, select_rows, select_unknown
 from udkjax.expressions.graph import BoundPrimitive, Graph, Scalar
+from udkjax.expressions.loop_reader import unroll
+from udkjax.expressions.matrix_rules import is_small
 from udkjax.expressions.selection import fold
 
 ClosedJaxpr: TypeAlias = Any  # JAX exports the class, but not to type checkers
@@ -38,7 +40,6 @@ _INLINED = (
     "checkpoint",
 )
 POWERS = 20  # powers of two whose sum is exact, also in single precision
-UNROLLED_OPERATIONS = 20_000  # maximum for an unrolled loop, over all its iterations: more take too long to compile
 # Positions of the updates and of the indices among the inputs of primitives that put elements into an array.
 _REPLACING: dict[str, Callable[[list[np.ndarray]], tuple[np.ndarray, list[np.ndarray]]]] = {
     "scatter": lambda inputs: (inputs[2], [inputs[1]]),
@@ -133,11 +134,10 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
         return _read_inner(graph, inner, inputs)
     if name in _SHAPES:
         return [np.asarray(_SHAPES[name](*inputs, **parameters), object)]
-    if (
-        name == "scan"
-        and parameters["length"] * len(getattr(parameters["jaxpr"], "jaxpr", parameters["jaxpr"]).eqns) <= UNROLLED_OPERATIONS
-    ):
-        return _unroll(graph, equation, inputs)
+    if name in ("scan", "while"):
+        unrolled = unroll(partial(_read_inner, graph), equation, inputs)
+        if unrolled is not None:
+            return unrolled
     shape, dtype = equation.outvars[0].aval.shape, np.dtype(equation.outvars[0].aval.dtype)
     if name in _ARITHMETIC and np.issubdtype(dtype, np.floating):
         return [_elementwise(partial(_ARITHMETIC[name], **parameters), shape, inputs)]
@@ -182,6 +182,10 @@ def _write_out(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> li
     if name == "cond":
         branches = [partial(_read_inner, graph, branch, inputs[1:]) for branch in equation.params["branches"]]
         return choose_branch(graph, inputs[0].item(), branches)
+    if name == "custom_linear_solve" and is_small(*inputs):
+        counts, programs = equation.params["const_lengths"], equation.params["jaxprs"]
+        first, right = counts.matvec + counts.vecmat, counts.matvec + counts.vecmat + counts.solve + counts.transpose_solve
+        return _read_inner(graph, programs.solve, [*inputs[first : first + counts.solve], *inputs[right:]])
     if name == "call_hi_primitive":  # such as `searchsorted`: JAX has an expansion of it
         expanded = jax.make_jaxpr(equation.params["_prim"].expand)(*(v.aval for v in equation.invars))
         return read_jaxpr(graph, expanded, inputs)
@@ -190,22 +194,6 @@ def _write_out(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> li
 
 def _read_inner(graph: Graph, jaxpr: core.Jaxpr | ClosedJaxpr, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     return read_jaxpr(graph, jaxpr, inputs) if hasattr(jaxpr, "consts") else _read(graph, jaxpr, [], inputs)
-
-
-def _unroll(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    body, order = equation.params["jaxpr"], range(equation.params["length"])
-    inner = getattr(body, "jaxpr", body)
-    # Constants and carry come first; the scanned inputs have a leading dimension, one entry per iteration.
-    rows = sum(a.aval.shape != b.aval.shape for a, b in zip(equation.invars, inner.invars, strict=True))
-    carries = sum(a.aval.shape == b.aval.shape for a, b in zip(equation.outvars, inner.outvars, strict=True))
-    ends = np.cumsum([len(inputs) - carries - rows, carries])
-    fixed, state, scanned = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
-    rows_of_outputs: dict[int, list[np.ndarray]] = {}
-    for k in reversed(order) if equation.params["reverse"] else order:
-        outputs = _read_inner(graph, body, [*fixed, *state, *(np.asarray(x[k], object) for x in scanned)])
-        state, rows_of_outputs[k] = outputs[:carries], outputs[carries:]
-    columns = zip(*(rows_of_outputs[k] for k in order), strict=True)
-    return [*state, *(np.stack([np.asarray(x, object) for x in column]) for column in columns)]
 
 
 def _elementwise(operation: Callable[..., Scalar], shape: tuple[int, ...], inputs: list[np.ndarray]) -> np.ndarray:
@@ -266,6 +254,9 @@ def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates:
 def _select(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray | None:
     """Select elements by indices, by letting JAX select from an array of their positions; None if too much is unknown."""
     array, *indices = inputs
+    if equation.primitive.name == "gather" and any(s.constant is None for s in indices[0].flat):
+        offset = equation.params["dimension_numbers"].offset_dims
+        return select_rows(lambda known: _select_known(equation, array, known), array, indices[0], offset)
     return select_unknown(lambda known: _select_known(equation, array, known), array, indices)
 
 
