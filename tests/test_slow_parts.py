@@ -39,7 +39,7 @@ def project(slow, tmp_path, monkeypatch):
     (tmp_path / ".gitignore").write_text("*.fails\n*.stops\n.pytest_cache/\n__pycache__/\n")
     for words in (["init", "-q"], ["add", "."], ["-c", "user.name=x", "-c", "user.email=x@x", "commit", "-qm", "All"]):
         subprocess.run(["git", *words], cwd=tmp_path, check=True)
-    for name, value in {"ROOT": tmp_path, "PARTS": {"a": ("tests/a",)}, "ONLY_SLOW": {}}.items():
+    for name, value in {"ROOT": tmp_path, "PARTS": {"a": ("tests/a",)}, "ONLY_SLOW": {}, "LOWEST_TESTS": ()}.items():
         monkeypatch.setattr(slow, name, value)
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # they import JAX
     return tmp_path
@@ -95,3 +95,10 @@ def test_each_slow_test_is_in_one_part_and_what_is_named_exists(slow):
     assert slow.part_of("tests/native/test_ir.py") == "native"
     assert slow.part_of("tests/native/wasm/test_engine.py") == "webassembly"
     assert slow.part_of("tests/test_cli.py") == "rest"
+
+
+def test_the_lowest_versions_are_those_of_the_project(slow):
+    versions = slow.lowest_versions()
+    assert "numpy==2.2" in versions and any(x.startswith("xarray==") for x in versions)
+    assert all(x.count("==") == 1 and not set("<>,;") & set(x) for x in versions)
+    assert all((ROOT / path).exists() for path in slow.LOWEST_TESTS)

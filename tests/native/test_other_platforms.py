@@ -3,7 +3,9 @@
 No such device is needed: the programs are only written.
 """
 
+import ctypes
 import re
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ from jax.interpreters import mlir
 
 import udkjax as udk
 from udkjax.native import primitive
-from udkjax.native.base import host_function, host_program
+from udkjax.native.base import host_function, host_program, machine
 from udkjax.native.base.host_function import call_seldom
 from udkjax.programs.deferred import deferred, deferred_p
 
@@ -171,3 +173,17 @@ def test_other_devices_call_the_host_by_jax():
 
 
 LOWERED = ((primitive.native_p, primitive), (host_function.host_p, host_function))
+
+
+def test_code_on_windows_finds_the_function_that_probes_the_stack(monkeypatch):
+    """On Windows, LLVM has functions with long frames call `__chkstk`, which is part of the system."""
+    calls = []
+    probe = ctypes.CFUNCTYPE(None)(lambda: calls.append(1))
+    monkeypatch.setattr(ctypes, "WinDLL", lambda name: SimpleNamespace(__chkstk=probe), raising=False)
+    text = "declare void @__chkstk()\ndefine void @f() {\n  call void @__chkstk()\n  ret void\n}\n"
+    code = machine.compile_module(text)
+    machine._linker()  # as on this system
+    monkeypatch.setattr(machine.sys, "platform", "win32")
+    found = machine.Library([code], ["f"])
+    machine.function(found["f"])()
+    assert calls == [1]

@@ -26,6 +26,9 @@ PART_LINES = 1_000  # a function of at least this many lines is compiled separat
 GROUP_LINES = 2_000  # maximum lines of a group of smaller functions, compiled in 50 ms; each part has an overhead of 2 ms
 
 
+STACK_PROBE = "__chkstk"  # its name on Windows; a C compiler would link it
+
+
 @cache
 def _llvm() -> Any:
     import llvmlite.binding as llvm
@@ -79,6 +82,14 @@ def _linker() -> Any:
     return llvm.create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
 
 
+def _address_of_stack_probe() -> int:
+    """Return the address of the function that Windows has functions call whose frame is longer than a page."""
+    probe = getattr(ctypes.WinDLL("ntdll"), STACK_PROBE)  # pyright: ignore[reportAttributeAccessIssue]
+    address = ctypes.cast(probe, ctypes.c_void_p).value
+    assert address is not None
+    return address
+
+
 class Library:
     """The machine code of one module, loaded while this object exists; indexing by name returns a function's address."""
 
@@ -87,6 +98,8 @@ class Library:
     def __init__(self, parts: Sequence[bytes], names: Sequence[str], is_optimized: bool = True):
         self.is_optimized = is_optimized
         builder = _llvm().JITLibraryBuilder().add_current_process()
+        if sys.platform == "win32":
+            builder.import_symbol(STACK_PROBE, _address_of_stack_probe())
         for code in parts:
             builder.add_object_img(code)
         for name in names:
