@@ -25,7 +25,7 @@ def test_a_spring_by_way_of_matrices():
     """The rows of A are exchanged, as its first pivot is the smaller one."""
     rod, pin = udk.Body(1.0, 0.1, [0.5, 0.0]), udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])
     ts, found = np.linspace(0.0, 1.0, 6), []
-    for spring in (SolvedSpring(["ground", "rod"], 7.0), udk.TorsionSpring(["ground", "rod"], stiffness=7.0)):
+    for spring in (SolvedSpring(["ground", "rod"], jnp.asarray(7.0)), udk.TorsionSpring(["ground", "rod"], stiffness=7.0)):
         mechanism = udk.Mechanism({"rod": rod}, {"pin": pin}, forces={"spring": spring})
         solution = udk.simulate(mechanism, ts, engine="native", rtol=1e-11, atol=1e-11)
         angle = lambda k, m=mechanism: udk.simulate(m.with_parameters({"force.spring.stiffness": k}), ts).q[-1, 0, 2]  # noqa: E731
