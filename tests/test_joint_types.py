@@ -24,8 +24,8 @@ from udkjax.show.player.marks import marks
 from udkjax.show.player.symbol_updates import symbol_updates
 from udkjax.show.player.symbols import symbols_of
 from udkjax.statics.reaction_peaks import cam_forces
+from udkjax.studio.drawn_fixes import drawn_fix
 from udkjax.studio.drawn_scenes import drawing_text_of
-from udkjax.studio.findings import drawn_change
 from udkjax.study.diagnosis.configuration import RankedPositions
 from udkjax.study.diagnosis.fixes import Fix, changes_of
 from udkjax.study.report import row_label
@@ -223,7 +223,12 @@ def dead(joint: udk.Joint) -> bool:
 
 
 def fix(joint: udk.Joint) -> bool:
-    return drawn_change(Fix("J", "", 1, 1.0, udk.Mechanism(BODIES, {"J": joint}))) is not None
+    """Return whether a pin J that becomes this joint becomes something that is drawn."""
+    links = "".join(f'[[link]]\nname = "{name}"\npins = ["J", "{name[0]}"]\nmass = 1\n' for name in BODIES)
+    ends = "".join(f"{name[0]} = [1, {k}]\n" for k, name in enumerate(BODIES))
+    text = f"format = 2\nground = []\n[pins]\nJ = [0, 0]\n{ends}{links}"
+    changed = Fix("J", "as before", 1, 1.0, udk.Mechanism(BODIES, {"J": joint}))
+    return drawn_fix(text, udk.loads(text), changed)["change"] != "as before"
 
 
 CHECKS: dict[str, Callable[[udk.Joint], object]] = {

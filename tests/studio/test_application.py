@@ -9,7 +9,7 @@ import udkjax as udk
 from udkjax.studio.findings import pins_in_line
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import duration_of
-from udkjax.studio.tasks import TEMPLATES
+from udkjax.studio.tasks import DRAWN, TEMPLATES
 from udkjax.studio.worker import Worker
 
 SIX_BAR = """format = 2
@@ -74,7 +74,7 @@ def test_files_and_templates_are_listed(client):
     (client.folder / "a.toml").write_text(SIX_BAR)
     found = client.ask("list").json()
     assert found["files"] == ["a.toml"]
-    assert [t["name"] for t in found["templates"]] == list(TEMPLATES)
+    assert [t["name"] for t in found["templates"]] == [*DRAWN, *TEMPLATES]
 
 
 def test_a_file_is_opened_changed_and_saved(client):
@@ -235,9 +235,9 @@ def test_fixes_are_changes_of_the_drawing(client):
     text = client.ask("open", template="parallelogram").json()["text"]
     fixes = client.ask("diagnose", text=text).json()["sets"][0]["fixes"]
     for fix in fixes:
-        drawn = fix["drawn"]
-        assert drawn["kind"] == "slot" and {drawn["on"], drawn["link"]} < {"ground", "link1", "link2", "link3", "coupler"}
-        np.testing.assert_allclose(drawn["direction"], [np.sqrt(0.5), -np.sqrt(0.5)], atol=1e-12)  # along the crank, as drawn
+        (slot,) = fix["document"]["slot"]
+        assert slot.get("on", "the ground") in fix["change"]
+        np.testing.assert_allclose(slot["direction"], [np.sqrt(0.5), -np.sqrt(0.5)], atol=1e-12)  # along the crank, as drawn
 
 
 def test_the_engine_takes_places_of_pins_and_the_one_for_pulling_has_no_motors(client):
@@ -247,7 +247,8 @@ def test_the_engine_takes_places_of_pins_and_the_one_for_pulling_has_no_motors(c
     assert set(answer["engine"]["modules"]) == {"run", "close", "evaluate"}
     assert set(answer["hand"]["modules"]) == {"close", "evaluate"}  # it closes positions, and runs no motion
     assert len(answer["hand"]["rows"]) == len(answer["engine"]["rows"]) - 1
-    assert answer["scene"]["drivers"] == [{"name": "motor1", "effort": "motor1: driving torque", "unit": "N m"}]
+    motor = {"name": "motor1", "effort": "motor1: driving torque", "unit": "N m", "pair": [-1, 0], "offset": 0.0}
+    assert answer["scene"]["drivers"] == [motor]
 
 
 def test_pins_of_any_form_have_an_engine_that_takes_their_places(client):
@@ -323,3 +324,24 @@ def test_a_name_is_not_a_formula_in_a_table(client):
     assert client.ask("save", text=text, path="x.csv", export=True).status_code == 200
     header = (client.folder / "x.csv").read_text().splitlines()[0].split(",")
     assert header[1] == f"'{name} x (m)" and not any(cell.startswith(("=", "+", "-", "@")) for cell in header)
+
+
+def test_motors_that_contradict_each_other_are_named(client):
+    text = ARMS.replace('{pin = "O", speed = 1}', '{pin = "O", speed = 1}, {pin = "C", speed = -3}')
+    found = client.ask("diagnose", text=text).json()
+    assert found["conflict"] == 'motors "motor1" and "motor2" contradict each other: remove one, or change its motion.'
+    assert client.ask("diagnose", text=ARMS).json()["conflict"] == ""
+
+
+def test_the_end_of_a_run_is_refused_unless_it_is_a_state(client):
+    for end in ({}, {"t": 0, "end": 1, "q": [0] * 8, "v": [0] * 9}, {"t": 0, "end": 1, "q": ["x"] * 9, "v": [0] * 9}):
+        assert client.ask("diagnose", text=ARMS, about="end", end=end).status_code == 400
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_a_drawn_template_moves_in_millimetres(client, name):
+    opened = client.ask("open", template=name).json()
+    mechanism = udk.loads(opened["text"])
+    assert opened["document"]["units"]["length"] == "mm" and opened["problems"] == []
+    assert mechanism.drivers or name == "door_closer"
+    np.testing.assert_allclose(udk.assemble(mechanism).q, mechanism.q0, atol=1e-4)  # closed as drawn

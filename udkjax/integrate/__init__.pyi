@@ -1,5 +1,6 @@
 """The door of `integrate`: the names that floors above import, each from its own module."""
 
+from udkjax.integrate.causes.find import cause_of_standstill as cause_of_standstill
 from udkjax.integrate.compiled_mechanism import reason_for_plain as reason_for_plain
 from udkjax.integrate.events import Attach as Attach
 from udkjax.integrate.events import Contact as Contact

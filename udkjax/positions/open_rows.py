@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.redundancy import kinematic_rows
+from udkjax.equations.redundancy import holders_of_driver, kinematic_rows
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 
@@ -56,6 +56,8 @@ def explain_open(
     text = name_open_rows(names, residual, scales, CLOSURE.tol * float(min(sizes.max(), 1e300)))
     if not is_open:
         drivers = [name for name in dict.fromkeys(names) if name in mechanism.drivers and f'"{name}"' in text]
+        if len(drivers) > 1 and set(drivers) & (holders_of_driver(mechanism, drivers[0]) or set()) - {drivers[0]}:
+            return f"drivers {' and '.join(map(_quote, drivers))} contradict each other: remove one, or change its motion."
         who = f"driver{'s' * (len(drivers) > 1)} {' and '.join(map(_quote, drivers))} ask{'s' * (len(drivers) < 2)} for"
         return (
             f"no velocities satisfy all constraints in this position; open (m/s, rad/s): {text}. "

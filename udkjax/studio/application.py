@@ -1,10 +1,11 @@
-"""The server of the studio: the files of the page, and five routes with JSON requests and answers.
+"""The server of the studio: the files of the page, and six routes with JSON requests and answers.
 
     POST /api/list        {}                                          -> {files, templates, folder}
     POST /api/open        {path} or {template}                        -> {text, document, path, revision, problems}
-    POST /api/save        {path, text, revision, export?}             -> {path, revision}, or 409 with the revision on disk
+    POST /api/save        {path, text, revision, export?, table?}     -> {path, revision}, or 409 with the revision on disk
     POST /api/compile     {text, document?, engine?}                  -> {text, document, problems, scene, engine}
-    POST /api/diagnose    {text, about?}                              -> findings about the drawing
+    POST /api/diagnose    {text, about?, end?}                        -> findings about the drawing
+    POST /api/design      {path, unit?, seed?}                        -> mechanisms with a point on a wanted path
 
 A refused request is answered by {problem} and an HTTP status.
 """
@@ -70,6 +71,9 @@ class Studio:
         if not request.get("export"):
             return {"path": path, "revision": self.folder.write(path, text.encode(), revision)}
         suffix = self.folder.locate(path, EXPORTS).suffix.lower()
+        if suffix == ".csv" and isinstance(request.get("table"), str):  # the curves of the page
+            data = request["table"].encode()
+            return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
         exported = self.examiner.call("export", {"text": text, "suffix": suffix}, EXPORT_SECONDS)
         data = bytes.fromhex(exported["data"])
         return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
@@ -86,7 +90,16 @@ class Studio:
     def diagnose(self, request: JsonObject) -> JsonObject:
         """Return findings about a drawing: degrees of freedom, redundant constraints and their fixes, travel, curves."""
         given = {"text": require_size(request.get("text")), "about": str(request.get("about", "structure"))}
+        if isinstance(request.get("end"), dict):
+            given["end"] = request["end"]
         return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
+
+    def design(self, request: JsonObject) -> JsonObject:
+        """Return mechanisms with a point that passes along a wanted path."""
+        path, unit, seed = request.get("path"), request.get("unit", "mm"), request.get("seed", 0)
+        if not isinstance(path, list) or unit not in Units.sizes("m") or type(seed) is not int or seed < 0:
+            raise RefusedError(400, "path: must be a list of places [x, y] in m; unit: a unit of lengths; seed: a natural number")
+        return self.examiner.call("find_path", {"path": path, "unit": unit, "seed": seed}, DIAGNOSE_SECONDS)
 
 
 def application(studio: Studio, port: int, token: str) -> ASGIApp:
@@ -97,7 +110,7 @@ def application(studio: Studio, port: int, token: str) -> ASGIApp:
         port: port at which it listens.
         token: token that each request to the interface must carry.
     """
-    actions = [studio.list, studio.open, studio.save, studio.compile, studio.diagnose]
+    actions = [studio.list, studio.open, studio.save, studio.compile, studio.diagnose, studio.design]
     routes = [Route(f"{INTERFACE}{action.__name__}", _answering(action), methods=["POST"]) for action in actions]
     return Gate(Starlette(routes=[*routes, Route("/{path:path}", _page_file)]), port, token)
 

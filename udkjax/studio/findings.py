@@ -1,39 +1,51 @@
 """Findings about a drawing, shown by the page: degrees of freedom, redundant constraints, unique reactions, travel of motors."""
 
 import math
+from functools import partial
 
 import numpy as np
 
 from udkjax.annotations import JsonObject
 from udkjax.integrate import SimulationError
-from udkjax.positions.assembly import AssemblyError
+from udkjax.integrate.causes.find import cause_of_standstill
+from udkjax.positions.assembly import AssemblyError, assemble
 from udkjax.positions.continuation import Reached
 from udkjax.positions.counting import count_of
 from udkjax.positions.kinematics import travel
-from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
-from udkjax.scene.joints import Revolute, Slot
+from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.equilibrium import equilibrium
+from udkjax.studio.drawn_fixes import drawn_fix
 from udkjax.studio.limits import RefusedError
-from udkjax.studio.shown_runs import force_curves, holding_curves
+from udkjax.studio.shown_runs import duration_of, force_curves, holding_curves
 from udkjax.study.diagnosis import Diagnosis, diagnose
-from udkjax.study.diagnosis.fixes import Fix
 from udkjax.wording import plural
 
 MOST_FIXES = 8  # fixes listed for one redundancy
 IN_LINE = 1e-4  # rad: the error of an angle at a dead point is the square root of the rounding error
 
 
-def examine(mechanism: Mechanism, about: str) -> JsonObject:
+def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None = None) -> JsonObject:
     """Return the findings about a subject.
 
     Args:
         mechanism: mechanism of the drawing.
+        text: text of the drawing.
         about: "structure" (degrees of freedom, redundant constraints, reactions), "travel" (of each motor), "dynamics" (curves
-            of forces), "rest" (an equilibrium), or "holding" (curves of holding torques and forces).
+            of forces), "rest" (an equilibrium), "holding" (curves of holding torques and forces), or "end" (the cause of the
+            early end of a run).
+        end: for "end", a state `t`, `q`, `v` of the run, as the page sends it, and the time `end` (s) at which it ended.
     """
-    subjects = {"structure": structure, "travel": motor_travel, "dynamics": force_curves, "rest": rest, "holding": holding_curves}
+    if about == "end":
+        return {"cause": _cause(mechanism, end or {}), "problems": []}
+    subjects = {
+        "structure": partial(structure, text=text),
+        "travel": motor_travel,
+        "dynamics": force_curves,
+        "rest": rest,
+        "holding": holding_curves,
+    }
     if about not in subjects:
         raise RefusedError(400, f"about: must be one of {', '.join(subjects)}")
     try:
@@ -42,7 +54,18 @@ def examine(mechanism: Mechanism, about: str) -> JsonObject:
         return {"problems": [str(error)]}
 
 
-def structure(mechanism: Mechanism) -> JsonObject:
+def _cause(mechanism: Mechanism, end: JsonObject) -> str:
+    """Return why motors stopped a run; empty if they did not."""
+    try:
+        t, until, q, v = float(end["t"]), float(end["end"]), *(np.asarray(end[key], float) for key in "qv")
+    except (KeyError, TypeError, ValueError):
+        raise RefusedError(400, "end: must have numbers t and end, and lists q and v") from None
+    if not (q.shape == v.shape == (3 * len(mechanism.bodies),) and all(np.isfinite(x).all() for x in (t, until, q, v))):
+        raise RefusedError(400, "end: q and v must have three finite numbers for each link")
+    return cause_of_standstill(mechanism, duration_of(mechanism), (t, q, v), until)
+
+
+def structure(mechanism: Mechanism, text: str) -> JsonObject:
     """Return degrees of freedom, sets of redundant constraints with their fixes, and reactions that are not unique."""
     diagnosis = diagnose(mechanism, walk=False)
     not_unique = {
@@ -57,14 +80,14 @@ def structure(mechanism: Mechanism) -> JsonObject:
         "redundant": diagnosis.rows - diagnosis.ordinary_rank,
         "singular": bool(diagnosis.is_singular),
         "motion": _why(diagnosis, mechanism),
+        "conflict": _conflict(mechanism),
         "sets": [
             {
                 "constraints": list(redundancy.constraints),
                 "count": redundancy.count,
                 "permanent": redundancy.permanent,
                 "fixes": [
-                    {"constraint": fix.constraint, "change": fix.change, "drawn": drawn_change(fix)}
-                    for fix in redundancy.fixes[:MOST_FIXES]
+                    {"constraint": fix.constraint, **drawn_fix(text, mechanism, fix)} for fix in redundancy.fixes[:MOST_FIXES]
                 ],
             }
             for redundancy in diagnosis.redundancies
@@ -74,16 +97,13 @@ def structure(mechanism: Mechanism) -> JsonObject:
     }
 
 
-def drawn_change(fix: Fix) -> JsonObject | None:
-    """Return a fix as a change of the drawing: a removed constraint, or a slot instead of a pin; None for any other fix."""
-    joint = fix.mechanism.joints.get(fix.constraint)
-    if joint is None:
-        return {"kind": "remove"}
-    if not isinstance(joint, Slot):
-        return None
-    base, guided = joint.bodies
-    angle = float(joint.axis) + (0.0 if base == GROUND else float(fix.mechanism.bodies[base].angle))
-    return {"kind": "slot", "on": base, "link": guided, "direction": [math.cos(angle), math.sin(angle)]}
+def _conflict(mechanism: Mechanism) -> str:
+    """Return why no velocities satisfy all constraints as drawn, with the names of the motors; empty if there are some."""
+    try:
+        assemble(mechanism)
+    except AssemblyError as error:
+        return str(error).replace("driver", "motor")
+    return ""
 
 
 def _why(diagnosis: Diagnosis, mechanism: Mechanism) -> str:

@@ -8,7 +8,8 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.equations.analysis import analyse
 from udkjax.equations.quantities import efforts
-from udkjax.integrate import Solution, simulate
+from udkjax.integrate import Result, Solution, simulate
+from udkjax.integrate.causes.find import cause_of_standstill
 from udkjax.positions.assembly import close
 from udkjax.positions.channels import StateHistory
 from udkjax.positions.drive import constant_speed, with_halted_drivers
@@ -24,6 +25,7 @@ STILL = 1.0  # s: duration of a run in which nothing moves
 INSTANTS = 401  # output times of a run: two hundred per turn
 DIGITS = 2  # significant digits of a duration
 TOLERANCE = 1e-8  # rtol and atol of a run
+FIRST_STEPS = 2_000  # of the first attempt at a run; two turns of a linkage take some hundred
 
 
 def duration_of(mechanism: Mechanism) -> float:
@@ -38,9 +40,22 @@ def duration_of(mechanism: Mechanism) -> float:
 
 
 def shown_run(mechanism: Mechanism) -> Solution:
-    """Return the run that is shown; a failed run has NaN from its failure on."""
+    """Return the run that is shown; a failed run has NaN from its failure on.
+
+    Where a motor asks for more than the linkage can reach, a run takes its largest number of steps to no avail: first come a few.
+    """
     ts = np.linspace(0.0, duration_of(mechanism), INSTANTS)
+    run = simulate(mechanism, ts, rtol=TOLERANCE, atol=TOLERANCE, max_steps=FIRST_STEPS, throw=False)
+    if run.result != Result.step_limit or _is_stopped(mechanism, run):
+        return run
     return simulate(mechanism, ts, rtol=TOLERANCE, atol=TOLERANCE, throw=False)
+
+
+def _is_stopped(mechanism: Mechanism, run: Solution) -> bool:
+    """Return whether motors stopped a run that reached its limit of steps."""
+    ts, q, v = (np.asarray(x) for x in (run.ts, run.q, run.v))
+    last = int(np.flatnonzero(np.isfinite(q).all((1, 2)))[-1])
+    return bool(cause_of_standstill(mechanism, float(ts[-1]), (float(ts[last]), q[last], v[last]), float(run.time)))
 
 
 def recorded_motion(mechanism: Mechanism) -> JsonObject:
@@ -104,11 +119,13 @@ def _efforts(mechanism: Mechanism, run: StateHistory, kind: str) -> list[JsonObj
 def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[JsonObject]:
     """Return curves of the forces at pins; forces that are not unique are marked; these are minimum-norm values."""
     unique = unique_pin_forces(mechanism, run)
-    return [
-        _curve(f"{pin}: force on {body}", "N", np.hypot(*np.asarray(load)[:, :2].T), unique[pin][body])
-        for pin, bodies in pin_reactions(mechanism, run).items()
-        for body, load in bodies.items()
-    ]
+    curves = []
+    for pin, bodies in pin_reactions(mechanism, run).items():
+        for body, load in bodies.items():
+            x, y = np.asarray(load)[:, :2].T
+            for part, values in (("force", np.hypot(x, y)), ("force x", x), ("force y", y)):
+                curves.append(_curve(f"{pin}: {part} on {body}", "N", values, unique[pin][body]))
+    return curves
 
 
 def _rate(driver: Driver, ts: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Tasks of the studio's worker processes: read, compile, diagnose and export drawings. Arguments and results are plain data."""
 
 from collections.abc import Callable, Mapping
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from udkjax.annotations import JsonObject
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.base.program import UnsupportedError
+from udkjax.positions.counting import count_of
 from udkjax.scene import library
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
@@ -22,7 +24,17 @@ from udkjax.studio.shown_runs import duration_of, effort_name, recorded_motion
 from udkjax.studio.text_edits import merge_document, read_document
 
 Maker = Callable[[], Mechanism]
-# Templates for new drawings: mechanisms of the library, as drawings.
+# Templates for new drawings, files of the folder `drawings`: mechanisms that a motor or a spring moves.
+DRAWN: Mapping[str, str] = {
+    "crank_rocker": "Crank-rocker",
+    "quick_return": "Quick return of a shaping machine",
+    "toggle_press": "Toggle press",
+    "cam_follower": "Cam and follower",
+    "six_bar": "Six-bar",
+    "jansen_leg": "Jansen's walking leg",
+    "door_closer": "Door closer",
+}
+# Further templates: mechanisms of the library, as drawings.
 TEMPLATES: Mapping[str, tuple[str, Maker]] = {
     "four_bar": ("Four-bar linkage", library.four_bar),
     "slider_crank": ("Slider-crank", library.slider_crank),
@@ -44,12 +56,13 @@ TEMPLATES: Mapping[str, tuple[str, Maker]] = {
 
 def list_templates() -> JsonObject:
     """Return the names and titles of the templates."""
-    return {"templates": [{"name": name, "title": title} for name, (title, _) in TEMPLATES.items()]}
+    titles = {**DRAWN, **{name: title for name, (title, _) in TEMPLATES.items()}}
+    return {"templates": [{"name": name, "title": title} for name, title in titles.items()]}
 
 
 def open_template(name: str) -> JsonObject:
     """Return the text and tables of a template."""
-    if not isinstance(name, str) or name not in TEMPLATES:
+    if not isinstance(name, str) or name not in {**DRAWN, **TEMPLATES}:
         raise RefusedError(404, f"there is no template {name!r}")
     return open_text(template_text(name))
 
@@ -147,17 +160,32 @@ def scene_of(mechanism: Mechanism) -> JsonObject:
         "length": float(analysis.length),
         "duration": duration_of(mechanism),
         "drivers": [
-            {"name": name, "effort": effort_name(name, driver, "driving"), "unit": driver.effort_unit}
+            {
+                "name": name,
+                "effort": effort_name(name, driver, "driving"),
+                "unit": driver.effort_unit,
+                **turning_of(mechanism, name),
+            }
             for name, driver in mechanism.drivers.items()
         ],
     }
 
 
-def diagnose_drawing(text: str, about: str = "structure") -> JsonObject:
-    """Return the findings about a drawing; `about` is a subject of findings.py."""
+def turning_of(mechanism: Mechanism, name: str) -> JsonObject:
+    """Return the bodies of a driver of an angle (`pair`, -1 for the ground) and the `offset` (rad) of its count; else nothing."""
+    driver = mechanism.drivers[name]
+    if driver.coordinate != "angle":
+        return {}
+    names = list(mechanism.bodies)
+    pair = [names.index(body) if body in names else -1 for body in driver.bodies]
+    return {"pair": pair, "offset": float(count_of(mechanism, name).offset)}
+
+
+def diagnose_drawing(text: str, about: str = "structure", end: JsonObject | None = None) -> JsonObject:
+    """Return the findings about a drawing; `about` is a subject of findings.py, and `end` that of a run."""
     try:
         require_few(read_document(text))
-        return examine(loads(text), about)
+        return examine(loads(text), text, about, end)
     except SceneError as error:
         return {"problems": list(error.problems)}
 
@@ -175,6 +203,15 @@ def export(text: str, suffix: str) -> JsonObject:
         raise RefusedError(422, str(error)) from None
 
 
+def find_path(path: object, unit: str = "mm", seed: int = 0) -> JsonObject:
+    """Return mechanisms with a point that passes along a wanted path."""
+    from udkjax.studio.path_search import find_mechanisms  # imports the synthesis, which other tasks need not
+
+    return find_mechanisms(path, unit, seed)
+
+
 def template_text(name: str) -> str:
     """Return a template as the text of a drawing."""
+    if name in DRAWN:
+        return files("udkjax.studio").joinpath(f"drawings/{name}.toml").read_text(encoding="utf-8")
     return drawing_text_of(TEMPLATES[name][1]())

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.analysis import Analysis
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.causes.element_loads import ElementLoads, TimedState, element_loads
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.integrate.causes.reach import explain_reach
@@ -91,6 +91,38 @@ def find_cause(run: FailedRun) -> str | None:
         case Result.step_limit:
             return _explain_many_steps(run)
     return None
+
+
+def cause_of_standstill(mechanism: Mechanism, span: float, state: tuple[float, Any, Any], time: float) -> str:
+    """Return the demands of drivers that stopped a run elsewhere, as on a page; empty if drivers did not stop it.
+
+    Args:
+        mechanism: mechanism of concrete numbers.
+        span: duration of the run (s).
+        state: a state (t, q, v) of the run before its end.
+        time: when it ended (s).
+    """
+    t, q, v = state[0], *(np.ravel(np.asarray(x, float)) for x in state[1:])
+    run = FailedRun(
+        mechanism=mechanism,
+        analysis=analyse(mechanism),
+        result=Result.step_limit,
+        time=time,
+        ts=np.array([t, t + span]),
+        q=np.stack([q, np.full_like(q, np.nan)]),
+        v=np.stack([v, np.full_like(v, np.nan)]),
+        end=None,
+        steps=0,
+        rtol=0.0,
+        atol=0.0,
+        drift_tol=0.0,
+        stabilization="Projection",
+        is_explicit=True,
+        drops_rows=False,
+        formulation="",
+    )
+    with np.errstate(all="ignore"):
+        return explain_reach(run, time + NEAR_REACH * span)
 
 
 def _explain_open_guess(run: FailedRun) -> str | None:

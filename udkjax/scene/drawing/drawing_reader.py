@@ -89,7 +89,7 @@ def read_drawing(
     problems += layout_mistakes(layout, groups, fixed_pins, all_read)
     if not is_traced((groups["pin"], groups["link"])):
         drawn = concrete_elements(groups)
-        problems += shape_mistakes(places_of(drawn["pin"]), drawn["link"])
+        problems += shape_mistakes(places_of(drawn["pin"]), drawn["link"], {slot.pin for slot in drawn["slot"].values()})
         if not problems:
             problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
     return DrawingElements(groups, gravity, problems)

@@ -1,6 +1,6 @@
 """Mistakes in a drawing as a whole: names used twice, unconnected pins and links, degenerate shapes."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -49,6 +49,7 @@ def layout_mistakes(layout: PinLayout, groups: DrawnGroups, ground: Sequence[str
     elements = {s: g for s, g in groups.items() if g and isinstance(next(iter(g.values())), DrawnElement)}
     yield from _taken_names(layout, groups)
     anchors = {pin for group in elements.values() for element in group.values() for pin in element.anchors}
+    anchors |= {slot.pin for slot in elements.get("slot", {}).values()}
     used = {pin for link in layout.links.values() for pin in link.pins}
     for k, pin in enumerate(ground):
         if pin not in used | anchors:
@@ -143,11 +144,14 @@ def pin_mistakes(pins: Mapping[str, AbstractPin], units: Units) -> Iterator[str]
             return
 
 
-def shape_mistakes(places: Mapping[str, PointArray], links: Mapping[str, Link]) -> Iterator[str]:
-    """Iterate over implausible pins and shapes; all numbers are concrete and finite."""
+def shape_mistakes(places: Mapping[str, PointArray], links: Mapping[str, Link], guided: Collection[str] = ()) -> Iterator[str]:
+    """Iterate over implausible pins and shapes; all numbers are concrete and finite.
+
+    Pins that are `guided` by slots may be at the places of other pins.
+    """
     size = extent(list(places.values()))
     for pin1, pin2 in combinations(places, 2):
-        if np.linalg.norm(places[pin2] - places[pin1]) <= SAME_PLACE * size:
+        if pin1 not in guided and pin2 not in guided and np.linalg.norm(places[pin2] - places[pin1]) <= SAME_PLACE * size:
             yield f"pins.{pin2}: is at the same place as pin {quote(pin1)}: give all links there one pin, or move it"
     yield from _far_pins(places)
     for k, (name, link) in enumerate(links.items()):

@@ -7,7 +7,8 @@ import numpy as np
 from udkjax.equations import determinacy
 from udkjax.equations.analysis import hold_pins
 from udkjax.equations.general import ConstrainedSystem
-from udkjax.positions.assembly import State, close, require_closed
+from udkjax.equations.position_closure import is_closed
+from udkjax.positions.assembly import Closure, State, close, require_closed
 from udkjax.positions.channels import StateHistory
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
@@ -72,7 +73,7 @@ def diagnose(
     if not mechanism.is_concrete:
         raise ValueError("diagnose needs concrete numbers: under jit and vmap use uniqueness and singular_values, which are pure")
     closure = close(mechanism, t, state)
-    require_closed(mechanism, closure._replace(psi_dot=0.0 * closure.psi_dot))  # the diagnosis does not depend on velocities
+    require_closed(mechanism, _at_rest(closure))  # the diagnosis does not depend on velocities
     q = np.asarray(closure.state.q, float)
     positions = RankedPositions(mechanism, rank_tol)
     rows = positions.rows
@@ -167,3 +168,10 @@ def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dic
             direction = determinacy.unique_direction(N[:2])
         forces[name] = JointForces(tuple((share <= determinacy.UNIQUE_TOL).tolist()), tuple(share.tolist()), direction)
     return forces
+
+
+def _at_rest(closure: Closure) -> Closure:
+    """Return a closure that is closed if its positions are."""
+    psi, q, v = np.asarray(closure.psi), np.ravel(closure.state.q), np.ravel(closure.state.v)
+    shut = is_closed(closure.scales, q, v, psi, np.zeros_like(psi), np)
+    return closure._replace(psi_dot=0.0 * closure.psi_dot, is_closed=shut)
