@@ -987,8 +987,8 @@ class Engine {
   /** One over the mass, or the inertia, of each coordinate. */
   inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
   /** Energies (J) at the states of a run and, if requested, the force or torque of each driver (N or N m) and the forces x, y (N)
-   *  of the joints of `data.forces`, for all joints time by time; these are empty if rows are redundant: forces are not unique. */
-  measure(parameters, run, efforts = false, forces = false) {
+   *  of the joints of `data.forces`, for all joints time by time, and accelerations `a`; these are empty if rows are redundant: forces are not unique. */
+  measure(parameters, run, efforts = false, forces = false, accelerations = false) {
     if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
     const {ts, q, v, count, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
@@ -1000,7 +1000,7 @@ class Engine {
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
       efforts: Object.fromEntries((efforts ? data.efforts : []).map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
-      forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
+      a: accelerations ? new Float64Array(count * size) : null, forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
     let next = -Infinity;  // time of the next sample, which changes the constants
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
@@ -1013,8 +1013,9 @@ class Engine {
       copy("v", v.subarray(i * size, (i + 1) * size));
       module.exports.energy(work, work);
       [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
-      if (!wanted.length && !found.forces.length) continue;
+      if (!wanted.length && !found.forces.length && !accelerations) continue;
       module.exports.accelerations(work, work);
+      found.a?.set(module.view(work + 8 * places.a, size), i * size);
       for (const {driver, place} of wanted) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
       if (found.forces.length) found.forces.set(this.forces(module.view(work, module.module.size), places), 2 * i * data.forces.length);
     }
@@ -1251,6 +1252,43 @@ class Address {
     }
   }
 }
+const HOPELESS = 1e3;  // times the largest number of steps: a run that would need more at the pace of a part has come to a standstill
+const STANDSTILL = "its steps become ever smaller, as where a motor asks for more than the linkage can reach";
+class PartRun {
+  /** The run of `engine` from a closed state over `times`, with the numbers `values`. */
+  constructor(engine, values, state, times) {
+    const T = times.length, n = engine.size;
+    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
+    Object.assign(this, {engine, values, state, run, steps: 0, tried: 0, t: times[0], goesOn: true, stands: false, done: false, stop: null, words: ""});
+  }
+  get most() { return this.engine.data.settings.max_steps; }
+  /** The part of the span that has been computed, from 0 to 1. */
+  get share() {
+    const {ts} = this.run;
+    return (this.t - ts[0]) / (ts[ts.length - 1] - ts[0]);
+  }
+  /** Integrate by at most `steps` steps; returns whether the run goes on. If not, `done` is false if it ended early, for the reason
+   *  `words`; `stop` is the reason if an event ended it. */
+  goOn(steps) {
+    const {engine, run, most} = this, n = engine.size, from = run.count, before = this.t;
+    const times = from ? Float64Array.of(this.state.t, ...run.ts.subarray(from)) : run.ts, skip = from ? 1 : 0;
+    const part = engine.run(this.values, this.state, times, null, Math.min(steps, most - this.tried)), count = Math.max(part.count - skip, 0);
+    run.ts.set(part.ts.subarray(skip, skip + count), from);
+    run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
+    run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
+    run.violation.set(part.violation.subarray(skip, skip + count), from);
+    if (part.held) run.held.set(part.held.subarray(skip, skip + count), from);
+    run.count = from + count;
+    run.events.push(...part.events);
+    this.steps += part.steps;
+    this.tried += part.tried;
+    Object.assign(this, {state: part.last, t: part.t, done: part.done, stop: part.stop ?? null, words: part.words});
+    this.stands = part.limited && part.tried * (run.ts[run.ts.length - 1] - part.t) > HOPELESS * most * (part.t - before);
+    if (this.stands) this.words = STANDSTILL;
+    this.goesOn = part.limited && !this.stands && this.tried < most;
+    return this.goesOn;
+  }
+}
 const SMALLEST_POSITIVE = 1e-17;  // m: drawn instead of a zero violation on a logarithmic axis
 const GHOST = 0.28;  // opacity of the first motion
 const REACH = {mouse: 6, touch: 16};  // px around a body within which it can be grasped
@@ -1296,38 +1334,26 @@ class LiveRun {
   /** Begin to simulate the motion with the current numbers; returns a message if its loops do not close. */
   begin() {
     this.drop();
-    const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
+    const {engine, times, values} = this, start = performance.now(), state = this.close(values);
     if (!state.closed) return `The loops do not close with these numbers: a gap of ${this.lengthOf(state.violation)} remains. The last valid motion is shown.`;
-    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
-    this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
+    const freedoms = this.freedoms(state, values);  // which marks the rows of the state
+    this.job = {parts: new PartRun(engine, values, state, times), freedoms, start};
     this.updater.update(engine.numbers(values));
     return "";
   }
   /** Simulate as many steps as fit into one frame; returns the message, with `bad` for a motion that ended too early. */
   goOn() {
-    const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
-    const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
-    const part = engine.run(values, job.state, times, null, Math.min(this.steps, most - job.tried));
-    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = this.times[this.times.length - 1] - run.ts[0];
-    run.ts.set(part.ts.subarray(skip, skip + count), from);
-    run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
-    run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
-    run.violation.set(part.violation.subarray(skip, skip + count), from);
-    if (part.held) run.held.set(part.held.subarray(skip, skip + count), from);
-    run.count = job.from = from + count;
-    run.events.push(...part.events);
-    job.steps += part.steps;
-    job.tried += part.tried;
-    job.state = part.last;
-    this.show(run);
-    if (part.limited && job.tried < most) return {words: `Simulating: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
+    const {job: {parts, freedoms, start}} = this, goesOn = parts.goOn(this.steps);
+    this.show(parts.run);
+    if (goesOn) return {words: `Simulating: ${Math.round(100 * parts.share)} %`, bad: false};
     this.job = null;
-    const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
-    const ended = part.done ? `${+span.toPrecision(3)} s simulated in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
-      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    const {run: {ts, events}, t, steps, done, words: reason} = parts, span = this.times[this.times.length - 1] - ts[0];
+    const happened = events.length ? `, ${events.length} event${events.length > 1 ? "s" : ""}` : "";
+    const ended = done ? `${+span.toPrecision(3)} s simulated in ${(performance.now() - start).toFixed(1)} ms, ${steps} steps${happened}.`
+      : `The motion ends at ${t.toPrecision(4)} s: ${reason}.`;
     const first = this.firstFreedoms === null ? "" : `, ${this.firstFreedoms} in the first motion`;
-    const words = job.freedoms === this.firstFreedoms || job.freedoms === null ? ended : `${ended} Degrees of freedom: ${job.freedoms}${first}.`;
-    return {words, bad: !part.done && !part.stop};
+    const words = freedoms === this.firstFreedoms || freedoms === null ? ended : `${ended} Degrees of freedom: ${freedoms}${first}.`;
+    return {words, bad: !done && !parts.stop};
   }
   drop() {
     this.job = null;

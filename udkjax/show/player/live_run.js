@@ -2,6 +2,7 @@
 
 import {Hand, bodyAt} from "./hand.js";
 import {Run, boundsOf, place} from "./motion.js";
+import {PartRun} from "./part_run.js";
 import {SymbolUpdater} from "./symbol_updates.js";
 
 const SMALLEST_POSITIVE = 1e-17;  // m: drawn instead of a zero violation on a logarithmic axis
@@ -62,39 +63,27 @@ export class LiveRun {
   /** Begin to simulate the motion with the current numbers; returns a message if its loops do not close. */
   begin() {
     this.drop();
-    const {engine, times, values} = this, start = performance.now(), state = this.close(values), T = times.length, n = engine.size;
+    const {engine, times, values} = this, start = performance.now(), state = this.close(values);
     if (!state.closed) return `The loops do not close with these numbers: a gap of ${this.lengthOf(state.violation)} remains. The last valid motion is shown.`;
-    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
-    this.job = {run, values, state, freedoms: this.freedoms(state, values), from: 0, steps: 0, tried: 0, start};
+    const freedoms = this.freedoms(state, values);  // which marks the rows of the state
+    this.job = {parts: new PartRun(engine, values, state, times), freedoms, start};
     this.updater.update(engine.numbers(values));
     return "";
   }
 
   /** Simulate as many steps as fit into one frame; returns the message, with `bad` for a motion that ended too early. */
   goOn() {
-    const {engine, job} = this, {run, from, values} = job, n = engine.size, most = engine.data.settings.max_steps;
-    const times = from ? Float64Array.of(job.state.t, ...run.ts.subarray(from)) : run.ts;
-    const part = engine.run(values, job.state, times, null, Math.min(this.steps, most - job.tried));
-    const skip = from ? 1 : 0, count = Math.max(part.count - skip, 0), span = this.times[this.times.length - 1] - run.ts[0];
-    run.ts.set(part.ts.subarray(skip, skip + count), from);
-    run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
-    run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
-    run.violation.set(part.violation.subarray(skip, skip + count), from);
-    if (part.held) run.held.set(part.held.subarray(skip, skip + count), from);
-    run.count = job.from = from + count;
-    run.events.push(...part.events);
-    job.steps += part.steps;
-    job.tried += part.tried;
-    job.state = part.last;
-    this.show(run);
-    if (part.limited && job.tried < most) return {words: `Simulating: ${Math.round(100 * (part.t - run.ts[0]) / span)} %`, bad: false};
+    const {job: {parts, freedoms, start}} = this, goesOn = parts.goOn(this.steps);
+    this.show(parts.run);
+    if (goesOn) return {words: `Simulating: ${Math.round(100 * parts.share)} %`, bad: false};
     this.job = null;
-    const happened = run.events.length ? `, ${run.events.length} event${run.events.length > 1 ? "s" : ""}` : "";
-    const ended = part.done ? `${+span.toPrecision(3)} s simulated in ${(performance.now() - job.start).toFixed(1)} ms, ${job.steps} steps${happened}.`
-      : `The motion ends at ${part.t.toPrecision(4)} s: ${part.words}.`;
+    const {run: {ts, events}, t, steps, done, words: reason} = parts, span = this.times[this.times.length - 1] - ts[0];
+    const happened = events.length ? `, ${events.length} event${events.length > 1 ? "s" : ""}` : "";
+    const ended = done ? `${+span.toPrecision(3)} s simulated in ${(performance.now() - start).toFixed(1)} ms, ${steps} steps${happened}.`
+      : `The motion ends at ${t.toPrecision(4)} s: ${reason}.`;
     const first = this.firstFreedoms === null ? "" : `, ${this.firstFreedoms} in the first motion`;
-    const words = job.freedoms === this.firstFreedoms || job.freedoms === null ? ended : `${ended} Degrees of freedom: ${job.freedoms}${first}.`;
-    return {words, bad: !part.done && !part.stop};
+    const words = freedoms === this.firstFreedoms || freedoms === null ? ended : `${ended} Degrees of freedom: ${freedoms}${first}.`;
+    return {words, bad: !done && !parts.stop};
   }
 
   drop() {
