@@ -30,17 +30,6 @@ def test_stiff_dampers(damping):
     assert (int(solution.stats["implicit"]) > 3) == (damping > 100)
 
 
-def test_a_run_with_events_goes_on_implicitly():
-    """Each stretch between two events decides anew; `implicit` counts the steps of all."""
-    mechanism, ts = damped(100.0), np.linspace(0.0, 5.0, 6)
-    plain = run(mechanism, ts=ts)
-    middle = float(plain.q[0, 0, 2] + plain.q[-1, 0, 2]) / 2
-    half = udk.Event(lambda t, at: at[mechanism.body_names[0]].angle - middle, udk.Log(), name="half")
-    solution = run(mechanism, ts=ts, events=half)
-    assert int(solution.stats["events"]) == 1 and int(solution.stats["implicit"]) > 3
-    assert_allclose(solution.q, plain.q, atol=3e-6)
-
-
 class Relaxing(udk.ForceElement):
     """A torque against the rotation of a body that is stiff for half a second and weak afterwards."""
 

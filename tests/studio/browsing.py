@@ -12,6 +12,21 @@ COMMAND = "from udkjax.cli import main; main()"
 PATIENCE = 120.0  # s: time for the server to compile and diagnose on a busy machine
 
 
+WATCH = """(() => {
+    const {canvas, parts} = studio, draw = canvas.draw.bind(canvas), watched = window.watched = {answers: [], longest: 0};
+    let waiting = null;
+    parts.canvas.addEventListener("pointermove", event => { waiting ??= event.timeStamp; }, true);
+    canvas.draw = shown => {
+        draw(shown);
+        if (waiting !== null) watched.answers.push(performance.now() - waiting);
+        waiting = null;
+    };
+    new PerformanceObserver(list => {
+        for (const task of list.getEntries()) watched.longest = Math.max(watched.longest, task.duration);
+    }).observe({entryTypes: ["longtask"]});
+})()"""
+
+
 class StudioPage:
     """The page of a studio, whose drawing is in millimetres."""
 
@@ -89,6 +104,20 @@ class StudioPage:
     def link(self, start, end):
         self.tool("l")
         self.drag(start, end)
+
+    def watch(self):
+        """Measure from now on how long events of the pointer wait until they are drawn, and the longest task of the page."""
+        self.page.evaluate(WATCH)
+
+    def watched(self):
+        """Return the times (s) from an event to its drawing, and the longest task of the page."""
+        answers, longest = self.page.evaluate("[watched.answers, watched.longest]")
+        return [x / 1e3 for x in answers], longest / 1e3
+
+    def open(self, name, text):
+        """Write a file, and open it without waiting for its motion."""
+        (self.folder / name).write_text(text)
+        self.page.evaluate(f"studio.files.openFile({json.dumps(name)})")
 
     def run(self):
         """Return the motion that the page computed: times and coordinates of all bodies."""

@@ -4,6 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from tests.studio.browsing import served, studio_page
+
 PORT, TOKEN = 8123, "a-token-of-a-test"
 BASE = f"http://127.0.0.1:{PORT}"
 
@@ -67,3 +69,18 @@ def client(tmp_path):
         return send("POST", f"/api/{route}", json.dumps(request).encode(), _headers, _without)
 
     return SimpleNamespace(send=send, ask=ask, folder=tmp_path)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """Serve a studio in a new folder; the fixture is its address and the folder."""
+    folder = tmp_path_factory.mktemp("drawings")
+    with served(folder) as address:
+        yield address, folder
+
+
+@pytest.fixture
+def studio(browser, server):
+    """Open the page of the module's studio."""
+    with studio_page(browser, *server) as page:
+        yield page

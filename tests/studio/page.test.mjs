@@ -6,9 +6,9 @@ import {test} from "node:test";
 const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
-const forms = await page("pin_forms");
-const {applyFix} = await page("fixes"), {shapeProblem} = await page("checks");
-const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("page_engine"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
+const forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
+const {shapeProblem} = await page("checks");
+const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("motions"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
 const at = (x, y, pin = null, link = null) => ({place: [x, y], pin, link, pixel: [1000 * x, -1000 * y]});
@@ -103,7 +103,7 @@ test("a senseless action is a problem in words", () => {
 });
 
 test("a pin on a bar lies on its line, between its ends", () => {
-  const [found, pin] = d.addPin(fourBar(), [1, 1]), [made, name] = actions.addPinToLink(fourBar(), 0, [0.015, 0.03]);
+  const [found, pin] = d.addPin(fourBar(), [1, 1]), [made, name] = joining.addPinToLink(fourBar(), 0, [0.015, 0.03]);
   assert.equal(pin, "E");
   assert.deepEqual(made.link[0].pins, ["A", name, "B"]);
   const [x, y] = made.pins[name];
@@ -113,7 +113,7 @@ test("a pin on a bar lies on its line, between its ends", () => {
 
 test("a pin on a plate's edge keeps the order of its corners", () => {
   const {document} = actions.drawPlate(d.EMPTY, [at(0, 0), at(0.1, 0), at(0.1, 0.1), at(0, 0.1)], context);
-  const [made, name] = actions.addPinToLink(document, 0, [0.1, 0.05]);
+  const [made, name] = joining.addPinToLink(document, 0, [0.1, 0.05]);
   assert.deepEqual(made.link[0].pins, ["A", "B", name, "C", "D"]);
 });
 
@@ -156,7 +156,7 @@ test("every tool that draws makes what its name says", () => {
   assert.deepEqual(actions.drawSpring(base, at(0, 0, "A"), {...at(0, 0, "A"), isClick: true}).document.spring[0], {pin: "A", stiffness: "10 N m/rad"});
   assert.deepEqual(actions.drawDamper(base, at(0.03, 0.04, "B"), at(0.1, 0, "D")).document.damper[0].between, ["B", "D"]);
   assert.deepEqual(actions.drawLoad(base, at(0.03, 0.04, "B"), at(0.03, -0.01), context).document.load[0], {pin: "B", force: ["0 N", "-10 N"]});
-  assert.equal(TOOLS.filter(tool => tool.make).length, 12);
+  assert.equal(TOOLS.filter(tool => tool.make).length, 13);
   assert.equal(new Set(TOOLS.map(tool => tool.key)).size, TOOLS.length);
 });
 
@@ -186,7 +186,7 @@ test("slots keep their pins on the line of two pins that move", () => {
 });
 
 test("pins between the ends of a bar stay on it", () => {
-  const [made, name] = actions.addPinToLink(fourBar(), 1, [0.075, 0.065]), moved = d.settle(d.movePin(made, "C", [0.13, 0.04]));
+  const [made, name] = joining.addPinToLink(fourBar(), 1, [0.075, 0.065]), moved = d.settle(d.movePin(made, "C", [0.13, 0.04]));
   const [x, y] = moved.pins[name], [[bx, by], [cx, cy]] = [moved.pins.B, moved.pins.C];
   assert.ok(Math.abs((cx - bx) * (y - by) - (cy - by) * (x - bx)) < 1e-8);
   assert.ok(x > bx && x < cx);
@@ -273,19 +273,6 @@ test("every element has symbols that name it, and strange ones have none", () =>
   for (const {points = [], frame} of symbolsOf(strange, 1e-3)) assert.ok([...points.flat(), ...frame.flat()].every(Number.isFinite));
 });
 
-test("a fix turns a pin into a slot, and the link that loses the pin keeps its mass", () => {
-  const document = fourBar(), scene = {bodies: ["link1", "link2", "link3"], frames: [[0.015, 0.02, 0], [0.075, 0.065, 0], [0.11, 0.045, 0]], masses: [1, 2, 3], inertias: [0.1, 0.2, 0.3]};
-  const drawn = {kind: "slot", on: "link2", link: "link1", direction: [1, 1e-17]}, found = applyFix(document, {constraint: "B", drawn}, scene);
-  assert.deepEqual(found.slot, [{pin: "B", direction: [1, 0], on: "link2"}]);
-  assert.deepEqual(found.link[1], {name: "link2", pins: ["C"], mass: "2 kg", inertia: "0.2 kg m2", centre: [75, 65]});
-  assert.deepEqual(d.members(found, "B"), ["link1"]);
-  const free = applyFix(document, {constraint: "A", drawn: {kind: "slot", on: "ground", link: "link1", direction: [0, 1]}}, scene);
-  assert.deepEqual([free.ground, free.slot], [["D"], [{pin: "A", direction: [0, 1]}]]);
-  assert.equal(applyFix(document, {constraint: "B", drawn: null}, scene), null);
-  assert.equal(applyFix(document, {constraint: "B", drawn: {...drawn, on: "link3"}}, scene), null);
-  assert.equal(applyFix({...document, gear: [{links: ["link1", "link3"], teeth: [1, 2]}]}, {constraint: "gear1", drawn: {kind: "remove"}}, scene).gear, undefined);
-});
-
 test("a view deep inside a drawing, or of extremely far places, costs nothing", () => {
   const document = {...fourBar(), slide: [{link: "link3", direction: 0}]};
   assert.ok(symbolsOf(document, 1e-12).length < 500);
@@ -362,4 +349,92 @@ test("a name never covers a sign: it moves, or is left out", async () => {
   names.put("elsewhere", "rod", [[80, 100, "left"], [80, 200, "left"]], "ink", 500);
   names.put("chosen", "bar", [[80, 100, "left"]], "ink", 700);
   assert.deepEqual(written, ["R", "rod", "bar"]);
+});
+
+/** An engine of one body that advances by `paces` of its steps in turn, the last of which repeats. */
+const pacedEngine = (paces, most = 1000) => ({size: 3, data: {settings: {max_steps: most}, why: ""}, run(values, state, times, pull, limit) {
+  const end = times[times.length - 1], pace = paces.length > 1 ? paces.shift() : paces[0], t = Math.min(end, (state.t ?? times[0]) + limit * pace);
+  const count = times.filter(x => x <= t).length, q = Float64Array.from({length: 3 * times.length}, (_, k) => times[Math.floor(k / 3)]);
+  return {ts: times, q, v: q, violation: new Float64Array(times.length), count, events: [], steps: limit, tried: limit, t, done: t === end,
+    limited: t < end, words: t < end ? "too many steps" : "", last: {t, q: [t, t, t], v: [1, 1, 1]}};
+}});
+const {PartRun} = await page("player/part_run");
+
+test("a run part by part is the whole run", () => {
+  const times = Float64Array.from({length: 11}, (_, k) => k / 10), parts = new PartRun(pacedEngine([0.0123]), null, {q: [0, 0, 0], v: [0, 0, 0]}, times);
+  while (parts.goOn(7));
+  assert.deepEqual([parts.done, parts.run.count, parts.share, parts.words], [true, 11, 1, ""]);
+  assert.deepEqual(parts.run.q, Float64Array.from({length: 33}, (_, k) => times[Math.floor(k / 3)]));
+});
+
+test("a run at a standstill ends, and a slow one goes on to its limit of steps", () => {
+  const times = Float64Array.of(0, 0.5, 1), run = paces => { const parts = new PartRun(pacedEngine(paces), null, {}, times); while (parts.goOn(10)); return parts; };
+  const stands = run([1e-3, 1e-3, 1e-9]), slow = run([1e-5]);
+  assert.deepEqual([stands.done, stands.tried, stands.words.startsWith("its steps become ever smaller")], [false, 30, true]);
+  assert.deepEqual([slow.done, slow.tried, slow.words], [false, 1000, "too many steps"]);
+});
+
+test("of runs asked for meanwhile only the last is computed", async () => {
+  const sent = [];
+  globalThis.Worker = class { postMessage(message) { sent.push(message); } terminate() {} };
+  const {Runner} = await page("runner"), runner = new Runner("data"), asked = ["a", "b", "c"].map(name => runner.run(name));
+  assert.deepEqual(sent, [{data: "data"}, {request: "a"}]);
+  runner.take({found: {name: "A"}});
+  runner.take({found: {name: "C"}});
+  assert.deepEqual([...await Promise.all(asked), sent.at(-1)], [{name: "A"}, null, {name: "C"}, {request: "c"}]);
+  const waits = [];
+  runner.onWait = x => waits.push(x);
+  const failing = runner.run("d");
+  runner.take({problem: "out of memory"});
+  await assert.rejects(failing, /out of memory/);
+  assert.deepEqual(waits, [true, false]);
+});
+
+test("fields take expressions, with units, in the units of the drawing", () => {
+  const mm = {unit: 1e-3, units: {mm: 1e-3, cm: 1e-2}, angleUnit: Math.PI / 180};
+  for (const [text, value] of [["40 + 50*cos(60)", 65], ["2*12 mm", 24], ["1 cm + 5", 15], ["-2^2", -4], ["2^-1", 0.5], ["sqrt(3)/2", Math.sqrt(3) / 2], ["atan2(1, 1)", 45],
+    ["hypot(3,4) * (1 + 1)", 10], ["1e2/.5", 200], ["acos(-1)", 180], ["7", 7]]) near([evaluate(text, mm)], [value]);
+  for (const text of ["", "40 +", "cos 60", "cos(60", "(1", "x", "1 2", "window", "constructor(1)", "1 kg", "2**3"]) assert.ok(Number.isNaN(evaluate(text, mm)), text);
+  const document = fourBar();
+  assert.deepEqual([units.expressed("20*3", "angle", document), units.expressed("5 cm * 2", "length", document), units.expressed("abc", "length", document)], [60, 100, undefined]);
+  near(units.placeFrom("50 @ 60", [0.01, 0], document), [0.035, 0.05 * Math.sin(Math.PI / 3)]);
+  near(units.placeFrom("hypot(3, 4), 2*3", [1, 1], document), [0.005, 0.006]);
+  assert.deepEqual(["12 mm", "5 N/mm", "2*12 mm", "-1e-3"].map(units.isMeasure), [true, false, false, true]);
+});
+
+test("bars are joined where they cross, at a pin under one, and at their middles", () => {
+  let found = d.EMPTY;
+  for (const [a, b] of [[at(0, 0), at(0.1, 0.1)], [at(0, 0.1), at(0.1, 0)]]) found = freeze(actions.drawLink(found, a, b, context).document);
+  const reach = {...context, reach: 0.002}, crossed = joining.drawPin(found, at(0.0505, 0.05, null, 0), reach);
+  const [{name}] = crossed.select;
+  near(d.placeOf(crossed.document, name), [0.05, 0.05]);
+  assert.deepEqual(d.members(crossed.document, name), ["link1", "link2"]);
+  near(joining.snapOnLink(found, 0, [0.0495, 0.05], 0.002), [0.05, 0.05]);
+  assert.equal(joining.snapOnLink(found, 0, [0.03, 0.03], 0.002), null);
+  const over = actions.drawLink(found, at(0, 0.05), at(0.1, 0.0500001), context).document, loose = joining.loosePins(actions.drawLink(over, at(0.05, 0.05), at(0.05, 0.2), context).document);
+  assert.deepEqual(loose, [{pin: "G", link: 0}, {pin: "G", link: 1}, {pin: "G", link: 2}]);
+  const bar = actions.drawLink(found, at(0.03, 0.03), at(0.03, 0.2), context).document, joined = joining.drawPin(bar, at(0.03, 0.03, "E"), reach).document;
+  assert.deepEqual(d.members(joined, "E"), ["link1", "link3"]);
+  assert.deepEqual(joining.loosePins(joined), []);
+  assert.equal(typeof joining.drawPin(found, at(0, 0, "A"), reach).problem, "string");
+  assert.equal(typeof joining.drawPin(found, at(0.5, 0.5), reach).problem, "string");
+});
+
+test("a mass and a density replace each other", () => {
+  const found = fourBar(), massive = d.withValue(found, "link", 0, "mass", "0.2 kg");
+  assert.deepEqual([massive.link[0].mass, massive.link[0].density], ["0.2 kg", undefined]);
+  const {thickness, ...rest} = massive.link[0], dense = d.withValue({...massive, link: [rest, ...massive.link.slice(1)]}, "link", 0, "density", 2700).link[0];
+  assert.deepEqual([dense.density, dense.mass, dense.thickness], [2700, undefined, 5]);
+});
+
+test("plates with pins almost in line are reported, and a gear has its own teeth", () => {
+  const plate = places => actions.drawPlate(d.EMPTY, places.map(([x, y]) => at(x, y)), context).document;
+  assert.equal(shapes.thinPlates(plate([[0, 0], [0.1, 0.001], [0.2, 0]])).length, 1);
+  assert.equal(shapes.thinPlates(plate([[0, 0], [0.1, 0.05], [0.2, 0]])).length, 0);
+  let found = d.EMPTY;
+  for (const x of [0, 0.1]) found = actions.drawDisc(found, at(x, 0), at(x + 0.05, 0), context).document;
+  for (const pin of ["A", "B"]) found = actions.drawGround(found, at(0, 0, pin)).document;
+  found = actions.drawGear(found, at(0, 0, null, 0), at(0, 0, null, 1)).document;
+  const rims = symbolsOf(found, 1e-4).filter(({of, points}) => of.kind === "gear" && points?.length > 50);
+  assert.deepEqual(rims.map(({points}) => points.length / 5), [20, 20]);
 });

@@ -2,8 +2,9 @@
 //
 // A target is the beginning or the end of a gesture: {place} in metres, with the `pin` or the `link` (its index) under it.
 
-import {addPin, freshName, groundOf, list, members, nameOf, placeOf, project, movePin, withElement, withEntry, withKey, toggleGround} from "./document.js";
-import {centrePin, corners, linkShape} from "./shapes.js";
+import {addPin, freshName, groundOf, list, members, nameOf, placeOf, project, movePin, withElement, withEntry, toggleGround} from "./document.js";
+import {addPinToLink} from "./joining.js";
+import {centrePin, corners} from "./shapes.js";
 import {angleUnit, lengthUnit, niceBelow, tidy, written} from "./units.js";
 
 const STEEL = {density: 7850};  // kg/m^3
@@ -18,28 +19,6 @@ function pinFor(document, {pin, link, place}) {
   if (pin !== undefined && pin !== null) return [document, pin];
   if (link !== undefined && link !== null) return addPinToLink(document, link, place);
   return addPin(document, place);
-}
-
-/** The document with one more pin on a link: on the line of a bar, or between the corners of a plate. */
-export function addPinToLink(document, index, place) {
-  const link = list(document, "link")[index], shape = linkShape(document, link), pins = [...link.pins];
-  let at = pins.length, foot = place;
-  if (shape?.kind === "line" && pins.length > 1) {
-    const ends = [placeOf(document, pins[0]), placeOf(document, pins.at(-1))];
-    foot = project(place, ...ends);
-    if (link.inertia === undefined) at = pins.length - 1;  // a bar ends at its last pin
-  } else if (shape?.kind === "plate" && link.inertia === undefined && !link.outline) {
-    const places = pins.map(pin => placeOf(document, pin));
-    let least = Infinity;
-    places.forEach((a, k) => {
-      const b = places[(k + 1) % places.length], f = project(place, a, b), away = Math.hypot(f[0] - place[0], f[1] - place[1])
-        + Math.max(0, Math.hypot(f[0] - (a[0] + b[0]) / 2, f[1] - (a[1] + b[1]) / 2) - Math.hypot(a[0] - b[0], a[1] - b[1]) / 2);
-      if (away < least) [least, at] = [away, k + 1];
-    });
-  }
-  const [found, name] = addPin(document, foot);
-  pins.splice(at, 0, name);
-  return [withKey(found, "link", index, "pins", pins), name];
 }
 
 /** Width and thickness of a new link: those of the last one, or sizes that suit the view. */

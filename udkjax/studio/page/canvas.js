@@ -2,7 +2,7 @@
 
 import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {middle, symbolsOf} from "./drawn_symbols.js";
-import {carry} from "./page_engine.js";
+import {carry} from "./motions.js";
 import {linkShape} from "./shapes.js";
 import {Labels, aroundPin, besideBar, within} from "./player/labels.js";
 import {THEMES, contextOf} from "./player/painter.js";
@@ -57,6 +57,7 @@ export class DrawingCanvas {
       this.drawn = now;
     }
     this.paths(studio, painter);
+    if (studio.wanted.points) painter.line(studio.wanted.points.map(p => toPixels(view, p)), 2.4, theme.accent, {dash: [7, 5]});
     this.outlines = this.symbols.map(symbol => this.outline(symbol, painter));
     this.halos(studio, painter, theme);
     painter.draw(this.symbols);

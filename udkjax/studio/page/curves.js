@@ -2,14 +2,14 @@
 // links, travel of motors. Dynamics: energies, driving torques and forces from the engine in the page, forces at pins from the
 // server. Statics: the equilibrium, and holding torques and forces of motors.
 
+import {alongOf, turningMotors} from "./along.js";
 import {ask} from "./api.js";
+import {drawChart, valueAt} from "./chart.js";
 import {list, members, nameOf, pinsOf, placeOf} from "./document.js";
-import {carry} from "./page_engine.js";
+import {carry} from "./motions.js";
 import {lengthName, lengthUnit} from "./units.js";
 import {button, make} from "./player/elements.js";
-import {interval} from "./player/motion.js";
 import {Painter, THEMES, contextOf} from "./player/painter.js";
-import {drawStrip, stripPart} from "./player/strip.js";
 
 const ROUNDING = 1e-10;  // relative to the scale of a quantity: values that vary less are constant
 const VIOLATION = "constraint violation";
@@ -29,11 +29,15 @@ export class CurvesPanel {
     Object.assign(this, {studio, panel: "kinematics", chosen: {}, served: {}, facts: {}, busy: ""});
     this.tabs = Object.entries(PANELS).map(([name, {title, words}]) => [name, make("button", {type: "button", role: "tab", title: words, onclick: () => this.open(name)}, title)]);
     this.actions = Object.entries(PANELS).flatMap(([panel, {actions}]) => actions.map(([name, words, title]) => ({panel, name, button: button(words, title, () => this.ask(name))})));
-    this.select = make("select", {"aria-label": "curve", onchange: () => { this.chosen[this.panel] = this.select.value; studio.redraw(); }});
+    this.select = make("select", {"aria-label": "curve", onchange: () => { this.chosen[this.panel] = this.select.value; this.isKept = true; studio.redraw(); }});
+    this.over = make("select", {"aria-label": "over", title: "the horizontal axis", onchange: () => studio.redraw()});
+    this.more = button("+", "keep this curve, and choose another one as well", () => this.keep());
+    this.less = button("−", "show one curve alone", () => { this.keptNames[this.panel] = []; studio.redraw(); });
+    this.keptNames = {};
     this.canvas = make("canvas", {"aria-hidden": "true"});
     this.fact = make("span", {class: "fact", role: "status"});
     element.append(make("div", {class: "strip-bar"}, make("div", {class: "tabs", role: "tablist", "aria-label": "curves of"}, ...this.tabs.map(([, tab]) => tab)),
-      this.select, ...this.actions.map(one => one.button), this.fact), this.canvas);
+      this.select, this.more, this.less, this.over, ...this.actions.map(one => one.button), this.fact), this.canvas);
     this.canvas.addEventListener("pointerdown", event => { this.canvas.setPointerCapture(event.pointerId); this.seek(event); });
     this.canvas.addEventListener("pointermove", event => { if (event.buttons) this.seek(event); });
     this.open(this.panel);
@@ -46,12 +50,23 @@ export class CurvesPanel {
     this.studio.redraw();
   }
 
+  /** The curves that are shown beside the chosen one. */
+  kept() { return this.keptNames[this.panel] ?? []; }
+
+  keep() {
+    this.keptNames[this.panel] = [...new Set([...this.kept(), this.name])];
+    this.isKept = true;
+    this.select.focus();
+    this.studio.redraw();
+  }
+
   get name() { return this.chosen[this.panel] ?? ""; }
 
   seek(event) {
     const box = this.canvas.getBoundingClientRect(), {motion} = this.studio;
     motion.pause();
-    motion.seek(motion.end * stripPart(event.clientX - box.left, box.width));
+    if (!motion.end || !this.along) return;
+    motion.seek(this.along.timeOf(valueAt(event.clientX - box.left, box.width, this.along.range)));
   }
 
   /** The names of the curves of the panel that is open. */
@@ -63,13 +78,13 @@ export class CurvesPanel {
   }
 
   kinematic() {
-    const {document, motion} = this.studio, found = [], driven = list(document, "motor").flatMap(({pin}) => (pin ? members(document, pin) : []));
+    const {document, motion} = this.studio, accelerations = Boolean(motion.energies?.a), found = [], driven = list(document, "motor").flatMap(({pin}) => (pin ? members(document, pin) : []));
     for (const pin of Object.keys(pinsOf(document))) {
-      if (this.studio.canvas.carrier(document, pin) >= 0) found.push(`${pin}: x`, `${pin}: y`, `${pin}: speed`);
+      if (this.studio.canvas.carrier(document, pin) >= 0) found.push(`${pin}: x`, `${pin}: y`, `${pin}: speed`, ...(accelerations ? [`${pin}: acceleration`] : []));
       const met = members(document, pin).filter(name => name !== "ground"), transmits = driven.length && !met.some(name => driven.includes(name));
       if (met.length === 2) found.push(`${pin}: angle between ${met[0]} and ${met[1]}${transmits ? " (transmission angle)" : ""}`);
     }
-    for (const link of list(document, "link")) found.push(`${link.name}: angle`, `${link.name}: angular velocity`);
+    for (const link of list(document, "link")) found.push(`${link.name}: angle`, `${link.name}: angular velocity`, ...(accelerations ? [`${link.name}: angular acceleration`] : []));
     return motion.run.violation.length ? [...found, VIOLATION] : found;
   }
 
@@ -88,8 +103,10 @@ export class CurvesPanel {
 
   servedCurves() { return this.servedFor()?.curves ?? []; }
 
-  /** Show a curve of the selected element, if it has one. */
+  /** Show a curve of the selected element, if it has one, unless a curve was chosen from the list. */
   follow() {
+    if (this.isKept && this.names().includes(this.name)) return;
+    this.isKept = false;
     const first = this.names().find(name => name.startsWith(this.selectedName()));
     if (first && !this.name.startsWith(this.selectedName())) this.chosen[this.panel] = first;
     this.select.value = this.name;
@@ -101,7 +118,11 @@ export class CurvesPanel {
     if (!names.includes(this.name)) this.chosen[this.panel] = groups[0] ?? names[0] ?? "";
     this.select.replaceChildren(...names.map(name => make("option", {value: name}, name)));
     this.select.value = this.name;
-    this.select.hidden = !names.length;
+    const motors = this.studio.motion.pageEngine && names.length ? turningMotors(this.studio.motion.pageEngine.scene).map(({name}) => name) : [], {value} = this.over;
+    this.over.replaceChildren(make("option", {value: ""}, "time"), ...motors.map(name => make("option", {value: name}, name)));
+    this.over.value = motors.includes(value) ? value : "";
+    this.over.hidden = !motors.length;
+    this.select.hidden = this.more.hidden = !names.length;
     this.listed = names.join();
   }
 
@@ -125,15 +146,36 @@ export class CurvesPanel {
     const still = (scale, values) => withoutRounding(values, scale);
     if (quantity === "angle" && link >= 0) return {unit: "°", values: still(180, each(i => run.q[i + 3 * pageEngine.order[link] + 2] * 180 / Math.PI))};
     if (quantity === "angular velocity") return {unit: "rad/s", values: each(i => run.v[i + 3 * pageEngine.order[link] + 2])};
+    if (quantity === "angular acceleration") return {unit: "rad/s²", values: each(i => energies.a[i + 3 * pageEngine.order[link] + 2])};
     const place = placeOf(document, owner), carrier = this.studio.canvas.carrier(document, owner);
     if (quantity.startsWith("angle between ")) return {unit: "°", values: this.angles(owner, each)};
-    if (quantity === "speed") return {unit: `${long}/s`, values: each((i, motions) => this.speed(i, motions, carrier, place) / unit)};
+    if (quantity === "speed") return {unit: `${long}/s`, values: each((i, motions) => Math.hypot(...this.rates(i, motions, carrier, place).v) / unit)};
+    if (quantity === "acceleration") return {unit: `${long}/s²`, values: each((i, motions) => Math.hypot(...this.rates(i, motions, carrier, place).a) / unit)};
     return {unit: long, values: still(pageEngine.scene.length / unit, each((_, motions) => carry(motions, carrier, place)[quantity === "x" ? 0 : 1] / unit))};
   }
 
-  speed(i, motions, link, place) {
-    const {run, pageEngine} = this.studio.motion, k = i + 3 * pageEngine.order[link], at = carry(motions, link, place), w = run.v[k + 2];
-    return Math.hypot(run.v[k] - w * (at[1] - run.q[k + 1]), run.v[k + 1] + w * (at[0] - run.q[k]));
+  /** Velocity and acceleration (m/s, m/s2) of a place of a link at an instant, whose numbers begin at i. */
+  rates(i, motions, link, place) {
+    const {run, energies, pageEngine} = this.studio.motion, k = i + 3 * pageEngine.order[link], at = carry(motions, link, place), w = run.v[k + 2];
+    const [x, y] = [at[0] - run.q[k], at[1] - run.q[k + 1]], a = energies?.a;
+    return {v: [run.v[k] - w * y, run.v[k + 1] + w * x], a: a && [a[k] - a[k + 2] * y - w * w * x, a[k + 1] + a[k + 2] * x - w * w * y]};
+  }
+
+  /** All curves of the motion as comma-separated values, in the units in which they are shown; empty without a motion. */
+  table() {
+    const {run} = this.studio.motion, {panel} = this;
+    if (!run || run.count < 2) return "";
+    const columns = [["time (s)", Array.from(run.ts).slice(0, run.count)]];
+    for (const one of ["kinematics", "dynamics"]) {
+      this.panel = one;
+      for (const name of this.names()) {
+        const {unit, values, ts} = this.values(name);
+        if (!ts) columns.push([`${name}${unit && ` (${unit})`}`, values]);
+      }
+    }
+    this.panel = panel;
+    const cell = words => (/^[=+\-@\t]/.test(words) ? `"'${words.replaceAll('"', '""')}"` : /[",\n]/.test(words) ? `"${words.replaceAll('"', '""')}"` : words);
+    return `${[columns.map(([name]) => cell(name)), ...columns[0][1].map((_, i) => columns.map(([, values]) => values[i]))].map(row => row.join(",")).join("\n")}\n`;
   }
 
   /** The angle (degrees, 0 to 180) at a pin between the lines to the farthest other pin of each of its two links. */
@@ -181,6 +223,7 @@ export class CurvesPanel {
       button.hidden = panel !== this.panel || !motion.run || (!moves && name !== "rest");
       button.disabled = Boolean(this.busy);
     }
+    this.less.hidden = !this.kept().length;
     const said = fact?.document === studio.document ? fact : null;
     const words = this.busy ? "computing …" : said?.words ?? (this.panel === "kinematics" && moves ? studio.findings.travelWords() : "");
     if (this.fact.textContent !== words) this.fact.textContent = this.fact.title = words;
@@ -194,11 +237,13 @@ export class CurvesPanel {
     this.showBar();
     const {context, width, height} = contextOf(canvas), theme = THEMES[studio.theme];
     if (!this.name || !motion.run || motion.run.count < 2) return this.drawNothing(context, theme, width, height);
-    const key = [this.name, this.panel, motion.run, this.served[this.panel]];
-    if (!this.cache || key.some((x, k) => x !== this.cache.key[k])) this.cache = {key, curve: this.values(this.name)};
-    const {curve} = this.cache, ts = curve.ts ?? motion.run.ts;
-    const run = {label: "", ts: Array.from(ts).slice(0, Math.min(motion.run.count, curve.values.length)), measures: [{name: this.name, ...curve}], find: t => interval(ts, t)};
-    return drawStrip(context, width, height, [run], this.name, 0, motion.end, motion.t, theme, width);
+    const names = [...new Set([...this.kept().filter(name => this.names().includes(name)), this.name])], key = [names.join("\n"), this.panel, motion.run, this.served[this.panel], this.over.value];
+    if (!this.cache || key.some((x, k) => x !== this.cache.key[k])) {
+      this.along = alongOf(motion.run, motion.pageEngine.scene, this.over.value);
+      this.cache = {key, curves: names.map(name => ({name, ...this.values(name)}))};
+    }
+    const {along} = this, {curves} = this.cache, now = values => along.between(values, motion.t);
+    return drawChart(context, width, height, curves.map(curve => ({...curve, now: now(curve.values)})), {...along, now: along.at(motion.t)}, theme, curves[0].log);
   }
 
   drawNothing(context, theme, width, height) {

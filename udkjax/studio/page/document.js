@@ -8,6 +8,7 @@ export const LISTS = ["link", "slide", "slot", "gear", "cam", "motor", "spring",
 // Keys of tables that name pins and links.
 const PIN_KEYS = ["pin", "pins", "along", "between"], LINK_KEYS = ["link", "on", "links", "of", "carrier", "bodies", "body"];
 const GROUND = "ground";
+const THICKNESS = 0.005;  // m, of a link that gets a density
 const OFF_LINE = 1e-9;  // fraction of a line's length: a pin closer to the line lies on it
 const INNER = 0.05;  // fraction of a bar's length that its inner pins keep from its ends
 
@@ -35,6 +36,14 @@ export function withKey(document, section, index, key, value) {
     const {[key]: _, ...rest} = entry;
     return value === undefined ? rest : key in entry ? {...entry, [key]: value} : {...rest, [key]: value};
   });
+}
+
+/** The document with a value of an element: of a link, a mass and a density replace each other. */
+export function withValue(document, section, index, key, value) {
+  const found = withKey(document, section, index, key, value), entry = list(found, section)[index], other = {mass: "density", density: "mass"}[key];
+  if (section !== "link" || value === undefined || !other) return found;
+  const changed = withKey(found, section, index, other, undefined), lacks = key === "density" && entry.thickness === undefined;
+  return lacks ? withKey(changed, section, index, "thickness", written(THICKNESS, found)) : changed;
 }
 
 export function withEntry(document, section, index, change) {

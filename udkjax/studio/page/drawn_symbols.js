@@ -5,6 +5,7 @@ import {groundOf, list, members, nameOf, pinsOf, placeOf} from "./document.js";
 import {camOutline, extent, gearWheels, lineAngle, linkShape} from "./shapes.js";
 import {length} from "./units.js";
 
+const MOST_TEETH = 200;  // of a wheel
 const ROUND = 48;  // vertices of a circle drawn as a polyline
 const MOST_STROKES = 200;  // hatching strokes of one line, which may extend far beyond the view
 const RAIL = 0.25;  // half of a rail's length, as a fraction of the drawing's extent
@@ -133,8 +134,9 @@ class Draft {
     if (!found) return;
     found.radii.forEach((radius, k) => {
       const body = this.body(entry.links[k]), internal = entry.internal && radius === Math.max(...found.radii);
-      const depth = Math.min(4 * this.unit, 0.12 * radius), frame = at(body, this.place(found.pins[k]));
-      const teeth = Math.min(Math.max(Math.round(2 * Math.PI * radius / (9 * this.unit) / 4) * 4, 12), 96), rim = [];
+      const own = Number.isInteger(entry.teeth?.[k]) && entry.teeth[k] > 3 ? entry.teeth[k] : Math.max(Math.round(2 * Math.PI * radius / (9 * this.unit) / 4) * 4, 12);
+      const teeth = Math.min(own, MOST_TEETH), rim = [];
+      const depth = Math.min(entry.teeth ? Math.PI * radius / teeth : 4 * this.unit, 0.12 * radius), frame = at(body, this.place(found.pins[k]));
       for (let i = 0; i < teeth; i++) for (const [turn, out] of [[0, -1], [0.25, -1], [0.35, 1], [0.65, 1], [0.75, -1]]) {
         const a = 2 * Math.PI / teeth * (i + turn), r = radius + out * depth / 2;
         rim.push([r * Math.cos(a), r * Math.sin(a)]);

@@ -173,7 +173,8 @@ export class FileActions {
   async export(path, revision) {
     this.studio.say(`exporting ${path} …`);
     try {
-      const {bytes} = await ask("save", {path, text: await this.text(), revision, export: true});
+      const text = await this.text(), table = path.endsWith(".csv") ? this.studio.curves.table() : "";
+      const {bytes} = await ask("save", {path, text, revision, export: true, ...(table && {table})});
       this.studio.say(`wrote ${path} (${Math.ceil(bytes / 1000)} kB)`);
       return true;
     } catch (error) {

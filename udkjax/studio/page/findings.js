@@ -2,11 +2,12 @@
 // mechanism, or why it cannot move; which reactions are unique; the travel of motors.
 
 import {list, nameOf, LISTS, pinsOf} from "./document.js";
-import {applyFix} from "./fixes.js";
+import {loosePins} from "./joining.js";
+import {thinPlates} from "./shapes.js";
 import {make} from "./player/elements.js";
 
 const COMPONENTS = ["x", "y", "torque"];
-const MOST_PROBLEMS = 30;
+const MOST_PROBLEMS = 30, MOST_LOOSE = 6;
 const HINTS = {
   freedom: "independent motions that the joints leave",
   redundant: "a constraint that the others imply already: removing it changes no motion, and makes reactions unique",
@@ -51,7 +52,7 @@ export class FindingsPanel {
     if (!problems.length) return;
     this.structure = this.travel = null;
     this.mark([]);
-    this.replace(make("p", {class: "lead"}, `${plural(problems.length, "problem")} to solve before it can move`), make("p", {}, "Click a line to go to the element."),
+    this.replace(make("p", {class: "lead"}, `${plural(problems.length, "problem")} to solve before it can move`), ...this.loose(), make("p", {}, "Click a line to go to the element."),
       make("ul", {class: "problems"}, ...problems.slice(0, MOST_PROBLEMS).map(problem => {
         const item = itemOf(this.studio.document, problem);
         return make("li", {}, item ? make("button", {type: "button", class: "link", onclick: () => this.studio.select([item])}, problem) : problem);
@@ -77,8 +78,9 @@ export class FindingsPanel {
     const driven = s.joint_mobility !== s.degrees_of_freedom ? `, ${s.degrees_of_freedom} with motors held` : "";
     const rows = [make("p", {class: "lead"}, make("b", {title: HINTS.freedom}, `${s.joint_mobility} ${s.joint_mobility === 1 ? "degree" : "degrees"} of freedom`), driven, " · ",
       make("b", {class: s.redundant ? "bad" : "", title: HINTS.redundant}, s.redundant ? plural(s.redundant, "redundant constraint") : "no redundant constraints")),
-    make("p", {}, s.motion, "."), ...(s.singular ? [make("p", {class: "warn"}, "The drawn position is singular: either branches of the motion meet here, or the mechanism moves only infinitesimally.")] : [])];
+    s.conflict ? make("p", {class: "warn"}, s.conflict) : make("p", {}, s.motion, "."), ...(s.singular ? [make("p", {class: "warn"}, "The drawn position is singular: either branches of the motion meet here, or the mechanism moves only infinitesimally.")] : [])];
     for (const one of this.travel ?? []) rows.push(make("p", {class: one.ends.length || one.lost.length ? "warn" : ""}, travelWords(one)));
+    rows.push(...this.loose(), ...thinPlates(this.studio.document).map(words => make("p", {class: "warn"}, words)));
     for (const set of s.sets) rows.push(this.set(set, pins));
     const shared = Object.entries(s.not_unique);
     rows.push(make("p", {}, make("b", {}, "Reactions: "), shared.length
@@ -91,6 +93,13 @@ export class FindingsPanel {
     this.mark(s.sets.flatMap(set => set.constraints.map(pinOf(pins)).filter(Boolean).map(pin => [pin, {sign: "R", strong: false}])));
   }
 
+  /** Pins that look joined to a bar and are not, each with a button that joins them. */
+  loose() {
+    const {studio} = this;
+    return loosePins(studio.document).slice(0, MOST_LOOSE).map(one => make("p", {class: "warn"}, `pin ${one.pin} lies on ${nameOf(studio.document, "link", one.link)} but does not belong to it `,
+      make("button", {type: "button", class: "small", "aria-label": `join ${one.pin} to ${nameOf(studio.document, "link", one.link)}`, onclick: () => studio.join(one)}, "Join")));
+  }
+
   /** The travel of motors, in words; empty until it is known for the current drawing. */
   travelWords() {
     if (!this.travel || this.element.classList.contains("stale")) return "";
@@ -98,11 +107,10 @@ export class FindingsPanel {
   }
 
   /** A button that applies a fix, if the drawing can express it. */
-  fixButton(fix) {
-    const {studio} = this, {pageEngine} = studio.motion, changed = () => applyFix(studio.document, fix, pageEngine.bodies());
-    const isStale = () => this.element.classList.contains("stale");
-    return pageEngine && changed() ? [make("button", {type: "button", class: "small", "aria-label": `apply the change at ${fix.constraint}`,
-      onclick: () => (isStale() ? studio.say("the drawing has changed: wait for its new findings") : studio.commit(changed(), []))}, "Apply")] : [];
+  fixButton({constraint, document}) {
+    const {studio} = this, isStale = () => this.element.classList.contains("stale");
+    return document ? [make("button", {type: "button", class: "small", "aria-label": `apply the change at ${constraint}`,
+      onclick: () => (isStale() ? studio.say("the drawing has changed: wait for its new findings") : studio.commit(document, []))}, "Apply")] : [];
   }
 
   set({constraints, count, permanent, fixes}, pins) {
@@ -113,18 +121,13 @@ export class FindingsPanel {
       make("ul", {}, ...fixes.map(fix => make("li", {}, make("button", {type: "button", class: "link",
         onclick: () => this.studio.select([itemNamed(this.studio.document, fix.constraint)].filter(Boolean)),
         onmouseenter: () => this.mark([...constraints.map(toPin).filter(Boolean).map(pin => [pin, {sign: "R", strong: pin === toPin(fix.constraint)}])]),
-      }, make("b", {}, fix.constraint), `: ${changeWords(fix)}`), ...this.fixButton(fix)))));
+      }, make("b", {}, fix.constraint), `: ${fix.change}`), ...this.fixButton(fix)))));
   }
 }
 
 const plural = (n, word) => `${n} ${word}${n === 1 ? "" : "s"}`;
 
 const pinOf = pins => name => (Object.hasOwn(pins, name) ? name : Object.keys(pins).find(pin => name.startsWith(`${pin}-`)));
-
-function changeWords({change, drawn}) {
-  const of = name => (name === "ground" ? "the ground" : name);
-  return drawn?.kind === "slot" ? `let the pin on ${of(drawn.link)} slide in a slot of ${of(drawn.on)}` : change;
-}
 
 function travelWords({motor, unit, words, ends, lost}) {
   const value = x => (unit === "rad" ? `${(x * 180 / Math.PI).toFixed(1)}°` : `${+(1e3 * x).toPrecision(4)} mm`).replace("-", "−");

@@ -2,11 +2,13 @@
 // (another finger, Esc, a lost pointer) leaves the drawing as it was.
 
 import {mergePins, movePin, placeOf, pinsOfItems, settle, shiftPins} from "./document.js";
+import {snapOnLink} from "./joining.js";
 import {itemAt, itemsWithin, pinAt, same} from "./picking.js";
 import {toolOf} from "./tools.js";
 import {toMetres, zoomAt, ZOOM_STEP} from "./view.js";
 
 const CLICK = 4;  // px: a gesture that moves less is a click
+const SNAP = 9;  // px: from middles and crossings of bars
 const WHEEL_LINE = 100;  // px of one notch
 
 export class Gestures {
@@ -34,8 +36,9 @@ export class Gestures {
     const {studio} = this, pixel = this.pixel(event), touch = event.pointerType === "touch";
     const pin = pinAt(studio.canvas.places, pixel, touch, except);
     const found = pin === null ? itemAt(studio.canvas.outlines, studio.canvas.places, pixel, touch, ["link"]) : null;
-    const place = pin === null ? studio.snap(toMetres(studio.view, pixel), event) : placeOf(studio.document, pin);
-    return {pixel, pin, link: found?.index ?? null, place, free: toMetres(studio.view, pixel)};
+    const free = toMetres(studio.view, pixel), mark = found && !event.altKey ? snapOnLink(studio.document, found.index, free, SNAP / studio.view.scale) : null;
+    const place = pin === null ? mark ?? studio.snap(free, event) : placeOf(studio.document, pin);
+    return {pixel, pin, link: found?.index ?? null, place, free};
   }
 
   down(event) {
@@ -59,6 +62,7 @@ export class Gestures {
   press(tool, event) {
     if (this.studio.isMoved) this.studio.rewind();
     const target = this.target(event);
+    if (tool.kind === "stroke") this.studio.wanted.begin(target.free);
     this.now = {kind: "draw", tool, target};
     if (tool.kind === "points" && !this.start) this.studio.preview = {from: target, to: target};
   }
@@ -127,6 +131,7 @@ export class Gestures {
 
   stretch(event, first) {
     const {studio, now} = this;
+    if (now.tool.kind === "stroke") studio.wanted.go(toMetres(studio.view, this.pixel(event)));
     if (now.tool.kind === "points") {
       if (first && !this.start) this.start = null;
       studio.preview = {from: this.start ?? now.target, to: this.target(event, null)};
@@ -165,9 +170,16 @@ export class Gestures {
     if (this.moved) this.studio.motion.endPull(); else if (goesOn) this.studio.motion.play();
   }
 
+  /** A place for the tool in hand that was typed: as a click there. */
+  give(target) {
+    this.moved = false;
+    this.release({tool: toolOf(this.studio.tool), target}, target);
+  }
+
   /** A release with a drawing tool: one click of several, or the end of the whole gesture. */
   release({tool, target}, end) {
-    const {studio} = this, context = {size: studio.usualSize(), scale: studio.view.scale};
+    const {studio} = this, context = studio.context;
+    if (tool.kind === "stroke") return studio.wanted.end();
     if (tool.kind === "click") return studio.apply(tool.make(studio.document, target, context));
     if (tool.kind === "corners") return this.corner(tool, target, context);
     if (this.moved && !this.start) return studio.apply(tool.make(studio.document, target, end, context));
@@ -194,13 +206,14 @@ export class Gestures {
     return undefined;
   }
 
-  /** Finish a plate by Enter or a double click, without a click on its first corner. */
+  /** Finish a plate by Enter or a double click, without a click on its first corner; returns whether there was one. */
   finish() {
     const tool = toolOf(this.studio.tool);
-    if (tool.kind !== "corners" || this.corners.length < 3) return;
+    if (tool.kind !== "corners" || this.corners.length < 3) return false;
     const corners = this.corners.filter((c, k, all) => !k || Math.hypot(c.pixel[0] - all[k - 1].pixel[0], c.pixel[1] - all[k - 1].pixel[1]) > CLICK);
     this.corners = [];
-    this.studio.apply(tool.make(this.studio.document, corners, {size: this.studio.usualSize(), scale: this.studio.view.scale}));
+    this.studio.apply(tool.make(this.studio.document, corners, this.studio.context));
+    return true;
   }
 
   pinch([a, b], [c, d]) {
@@ -225,6 +238,7 @@ export class Gestures {
     const {studio, now} = this, was = Boolean(now || this.start || this.corners.length);
     if (now?.kind === "drag") studio.propose(now.before);
     if (now?.kind === "pull") studio.motion.endPull();
+    if (now?.tool?.kind === "stroke") studio.wanted.remove();
     Object.assign(this, {now: null, start: null, corners: []});
     studio.preview = null;
     studio.redraw();

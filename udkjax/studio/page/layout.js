@@ -9,7 +9,7 @@ const ICONS = {
 };
 
 // Templates offered by an empty page.
-const FIRST = [["four_bar", "Four-bar"], ["slider_crank", "Slider-crank"], ["parallelogram", "Five-bar"]];
+const FIRST = [["crank_rocker", "Crank-rocker"], ["quick_return", "Quick return"], ["jansen_leg", "Walking leg"]];
 
 /** Build the page in an element; returns its parts by name. */
 export function buildPage(studio, root) {
@@ -46,7 +46,10 @@ export function buildPage(studio, root) {
     return found;
   });
   parts.picture = make("div", {class: "group"});
-  const options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, parts.picture));
+  parts.entry = make("div", {class: "wanted"});
+  parts.wanted = make("div", {class: "wanted", role: "group", "aria-label": "wanted path"});
+  const load = button("path", "read a wanted path from a table (CSV) of x and y", () => studio.wanted.input.click());
+  const options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, load, parts.picture));
   const narrow = matchMedia("(max-width: 760px)"), unfold = () => { options.open = !narrow.matches; };
   narrow.addEventListener("change", unfold);
   unfold();
@@ -58,7 +61,7 @@ export function buildPage(studio, root) {
     })), make("p", {}, "or start from an example"),
     make("div", {class: "group"}, ...FIRST.map(([name, words]) => button(words, `start from this example: ${words}`, () => studio.files.openTemplate(name))),
       button("More …", "open a file or a template (Ctrl+O)", () => studio.files.showOpen())));
-  const stage = make("main", {}, parts.canvas, parts.welcome, options, parts.status);
+  const stage = make("main", {}, parts.canvas, parts.welcome, options, parts.status, parts.entry, parts.wanted);
   parts.play = button(icon("play"), "play (space)", () => studio.motion.toggle(), "icon primary");
   parts.home = button(svgIcon(ICONS.home), "back to the drawn position (Home)", () => studio.rewind(), "icon");
   parts.scrub = make("input", {type: "range", min: 0, max: 10000, step: 1, "aria-label": "time", oninput: () => {
@@ -69,9 +72,13 @@ export function buildPage(studio, root) {
   parts.speed = make("select", {"aria-label": "speed", title: "speed", onchange: () => { studio.motion.speed = +parts.speed.value; }},
     ...[0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10].map(x => make("option", {value: x}, `${x} ×`)));
   parts.speed.value = 1;
+  parts.goto = make("input", {type: "text", "aria-label": "go to", title: "go to an angle of the motor, as 60 deg, or to a time, as 0.3 s", placeholder: "60 deg", spellcheck: "false", class: "goto"});
+  parts.goto.addEventListener("change", () => studio.motion.goTo(parts.goto.value));
   parts.loops = make("span", {class: "loops", role: "status"});
+  parts.stop = button("Stop", "stop computing the motion", () => studio.motion.stop());
+  parts.stop.hidden = true;
   parts.strip = make("section", {class: "strip", "aria-label": "curves"});
-  const transport = make("footer", {}, parts.home, parts.play, parts.time, parts.scrub, parts.speed, parts.loops);
+  const transport = make("footer", {}, parts.home, parts.play, parts.time, parts.goto, parts.scrub, parts.speed, parts.stop, parts.loops);
   const side = make("aside", {}, section("Findings", "findings"), section("Selection", "properties"), section("Text (TOML)", "source"));
   parts.help = make("dialog", {class: "help", "aria-label": "keyboard shortcuts"}, make("h2", {}, "Keyboard shortcuts"),
     make("dl", {}, ...KEYS.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])),

@@ -1,33 +1,17 @@
-// The engine of the page: the motion of the drawing, its closed positions, and pulling it. WebAssembly computes; this module
-// matches its bodies to the links of the document, whose frames coincide with the ground's in the drawn position.
+// The engine of the page: closed positions of the drawing, pulling it, and its runs, which another thread computes (runner.js).
+// WebAssembly computes; this module matches its bodies to the links of the document, whose frames coincide with the ground's in the
+// drawn position.
 
 import {list, placeOf} from "./document.js";
+import {carry, motionsOf} from "./motions.js";
+import {pathsOf} from "./page_run.js";
+import {Runner} from "./runner.js";
 import {stateAt} from "./player/motion.js";
 
-const INSTANTS = 401;
 const PULLS = 12;  // closures per frame, each nearer to the pointer
+const FRAME = 30;  // ms that the closures of one frame may take together
 const LONGEST_PULL = 0.08;  // characteristic lengths per closure, so that the pull cannot jump to another branch
-const STILL = 1e-9;  // characteristic lengths, or rad: a smaller motion is rounding
 const NEAR = 1e-4;  // characteristic lengths: at this distance the pointer counts as reached
-
-/** Motions p -> t + R p of the ground frame that bring bodies from the frames `drawn` (x, y, angle) to the frames `q`. */
-export function motionsOf(q, drawn, order) {
-  const found = new Float64Array(3 * order.length);
-  order.forEach((body, k) => {
-    if (body < 0) return;
-    const angle = q[3 * body + 2] - drawn[3 * body + 2], c = Math.cos(angle), s = Math.sin(angle);
-    const x = drawn[3 * body], y = drawn[3 * body + 1];
-    found.set([q[3 * body] - c * x + s * y, q[3 * body + 1] - s * x - c * y, angle], 3 * k);
-  });
-  return found;
-}
-
-/** The place to which a motion brings a place of the drawing. */
-export function carry(motions, k, [x, y]) {
-  if (k < 0) return [x, y];
-  const c = Math.cos(motions[3 * k + 2]), s = Math.sin(motions[3 * k + 2]);
-  return [motions[3 * k] + c * x - s * y, motions[3 * k + 1] + s * x + c * y];
-}
 
 export class PageEngine {
   /** Load the engine of `document` from `compiled`, the answer of the compile route. */
@@ -38,9 +22,10 @@ export class PageEngine {
     found.size = 3 * found.scene.bodies.length;
     found.order = list(document, "link").map(link => found.scene.bodies.indexOf(link.name));
     if (compiled.engine) {
-      found.engine = await loadEngine(compiled.engine);
-      found.hand = compiled.hand ? await loadEngine(compiled.hand) : found.engine;
+      found.engine = await loadEngine(positionsOf(compiled.engine));
+      found.hand = compiled.hand ? await loadEngine(positionsOf(compiled.hand)) : found.engine;
       found.pins = compiled.pins;
+      found.runner = new Runner(compiled.engine);
     }
     found.follow(document);
     return found;
@@ -65,27 +50,21 @@ export class PageEngine {
     return this.engine.close(this.parameters);
   }
 
-  /** The motion from the drawn position, or from a state. */
-  run(from = null) {
-    if (!this.engine) {
-      const {times, q, v, cause} = this.recorded;
-      return {ts: times, q, v, count: times.length, done: !cause, words: cause, violation: []};
-    }
-    const state = from ?? this.start(), still = {ts: [0], q: state.q, v: state.v, count: 1, done: false, violation: [state.violation]};
-    if (state.closed && this.engine.data.why) return {...still, words: this.engine.data.why};
-    if (!state.closed) return {...still, words: "the loops do not close as drawn"};
-    const times = Float64Array.from({length: INSTANTS}, (_, k) => this.duration * k / (INSTANTS - 1));
-    const found = this.engine.run(this.parameters, state, times);
-    if (!found.count) return {...still, words: found.words};
-    return this.moves(found) ? found : {...still, words: "nothing moves"};
+  /** The run from the drawn position, or from a state: see computeRun; null if a later one takes its place. `carried` are the pins
+   *  whose paths are wanted, {name, link, place}. */
+  async run(from, carried) {
+    const {parameters, drawn, order} = this;
+    if (this.engine) return this.runner.run({parameters, drawn, order, length: this.scene.length, duration: this.duration, from, carried});
+    const {times, cause} = this.recorded, [q, v] = [this.recorded.q, this.recorded.v].map(x => Float64Array.from(x));
+    const run = {ts: Float64Array.from(times), q, v, count: times.length, done: !cause, words: cause, violation: [], drawn, energies: null};
+    return {...run, paths: pathsOf(run, drawn, order, carried)};
   }
 
-  /** True if any body moves during a run. */
-  moves({q, count}) {
-    const {size} = this, least = STILL * this.scene.length;
-    for (let k = size; k < count * size; k++) if (Math.abs(q[k] - q[k % size]) > (k % 3 === 2 ? STILL : least)) return true;
-    return false;
-  }
+  /** Stop the run in hand. */
+  stop() { this.runner?.stop(); }
+
+  /** End the thread of the engine. */
+  close() { this.runner?.close(); }
 
   /** The state of a run at a time. It is closed again: interpolation between instants leaves loops slightly open. */
   at(run, t) {
@@ -95,14 +74,15 @@ export class PageEngine {
     return found.closed ? found : {...state, violation: found.violation};
   }
 
-  /** The closed state, with motors released, that brings a drawn place of a link (m) closest to the pointer at `hand`. */
+  /** The closed state, with motors released, that brings a drawn place of a link (m) closer to the pointer at `hand`; `goesOn` if
+   *  it can come closer still, for which there was no time. */
   pull(state, link, place, hand) {
     const body = this.order[link], {length} = this.scene;
     let best = state;
-    for (let i = 0; i < PULLS; i++) {
+    for (let i = 0, start = performance.now(); i < PULLS && performance.now() - start < FRAME; i++) {
       const motions = motionsOf(best.q, this.drawn, this.order), at = carry(motions, link, place);
       const way = [hand[0] - at[0], hand[1] - at[1]], away = Math.hypot(...way);
-      if (away <= NEAR * length) break;
+      if (away <= NEAR * length) return {...best, words: ""};
       const share = Math.min(1, LONGEST_PULL * length / away), q = Float64Array.from(best.q);
       q[3 * body] += share * way[0];
       q[3 * body + 1] += share * way[1];
@@ -112,21 +92,19 @@ export class PageEngine {
       if (Math.hypot(hand[0] - reached[0], hand[1] - reached[1]) >= away - 1e-9 * length) return {...best, words: "it cannot get closer to the pointer"};
       best = found;
     }
-    return {...best, words: ""};
+    return {...best, words: "", goesOn: true};
   }
 
-  /** Names, frames, masses (kg) and inertias (kg m2) of the bodies in the current drawing. */
-  bodies() {
-    const {scene, engine, drawn} = this, frames = scene.bodies.map((_, k) => Array.from(drawn.slice(3 * k, 3 * k + 3)));
-    if (!engine) return {...scene, frames};
-    const numbers = engine.numbers(this.parameters), [masses, inertias] = [0, 1].map(i => engine.data.masses.map(places => numbers[places[i]]));
-    return {bodies: scene.bodies, frames, masses, inertias};
+  /** The masses (kg) of the bodies by name, in the current drawing. */
+  masses() {
+    const {scene, engine} = this;
+    if (!engine) return new Map(scene.bodies.map((name, k) => [name, scene.masses[k]]));
+    const numbers = engine.numbers(this.parameters);
+    return new Map(scene.bodies.map((name, k) => [name, numbers[engine.data.masses[k][0]]]));
   }
 
   motions(q) { return motionsOf(q, this.drawn, this.order); }
-
-  /** Energies (J) over a run. */
-  energies(run) {
-    return this.engine && run.count > 1 ? this.engine.measure(this.parameters, run, true) : null;
-  }
 }
+
+/** The part of an engine's data that closes positions. */
+const positionsOf = data => ({...data, modules: {close: data.modules.close, evaluate: data.modules.evaluate}, held: {}});

@@ -1,19 +1,20 @@
 // The fields of the selected element: each value with its unit, as written in the file.
 
-import {groundOf, list, nameOf, pinsOf, placeOf, renameElement, renamePin, toggleGround, withKey} from "./document.js";
+import {groundOf, list, movePin, nameOf, pinsOf, placeOf, renameElement, renamePin, settle, toggleGround, withKey, withValue} from "./document.js";
 import {readValue, valueText} from "./values.js";
 import {shapeProblem} from "./checks.js";
 import {copy, remove} from "./keys.js";
 import {swapPair} from "./actions.js";
+import {carry} from "./motions.js";
 import {formsOf} from "./pin_forms.js";
-import {angle, length, lengthName, lengthUnit} from "./units.js";
+import {angle, angleUnit, angleWritten, direction, expressed, isMeasure, length, lengthName, lengthUnit, placeFrom, shown, tidy} from "./units.js";
 import {make} from "./player/elements.js";
 
 // The editable keys of each kind of element, and the kind of quantity of each.
 const KEYS = {
   link: [["pins", "names"], ["density", "density"], ["width", "length"], ["thickness", "length"], ["mass", "mass"], ["inertia", "inertia"], ["centre", "length"], ["outline", "length"]],
-  slide: [["link", "name"], ["along", "names"], ["direction", "angle"], ["on", "name"]],
-  slot: [["pin", "name"], ["along", "names"], ["direction", "angle"], ["on", "name"], ["link", "name"]],
+  slide: [["link", "name"], ["along", "names"], ["direction", "direction"], ["on", "name"]],
+  slot: [["pin", "name"], ["along", "names"], ["direction", "direction"], ["on", "name"], ["link", "name"]],
   gear: [["links", "names"], ["teeth", "count"], ["radii", "length"], ["internal", "yes"], ["carrier", "name"]],
   cam: [["pins", "names"], ["links", "names"], ["profile.angle", "angle"], ["profile.radius", "length"]],
   motor: [["pin", "name"], ["slide", "name"], ["between", "names"], ["of", "names"], ["speed", "speed"], ["torque", "torque"], ["motion", "motion"]],
@@ -21,13 +22,16 @@ const KEYS = {
   damper: [["between", "names"], ["pin", "name"], ["of", "names"], ["damping", "damping"]],
   load: [["pin", "name"], ["link", "name"], ["force", "force"], ["torque", "torque"], ["frame", "name"]],
 };
+// The keys that are always shown; others are shown if the element has them, and offered in a list if not.
+const USUAL = {link: ["pins"], slide: ["link"], slot: ["pin"], gear: ["links"], cam: ["pins"], motor: [], spring: ["stiffness", "length"], damper: ["damping"], load: []};
 const EXAMPLES = {density: "7850", mass: "0.2 kg", inertia: "1e-4 kg m2", speed: "60 rpm", torque: "1 N m", stiffness: "1 N/mm", damping: "10 N s/m",
-  force: "[0 N, -10 N]", angle: "30 deg"};
-const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", torque: "N m", stiffness: "N/m", damping: "N s/m", force: "N", angle: "rad", length: "m"};
+  force: "[0 N, -10 N]", angle: "30 deg", direction: "30 deg"};
+const NUMBERS = ["density", "length", "mass", "inertia", "angle", "count", "stiffness", "damping", "speed", "torque"];  // that expressions may give
+const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", torque: "N m", stiffness: "N/m", damping: "N s/m", force: "N", angle: "rad", direction: "rad", length: "m"};
 
 /** The unit of numbers of a quantity that are written without a unit. */
 function unitOf(document, quantity) {
-  const chosen = document.units?.[{speed: "angular_velocity"}[quantity] ?? quantity];
+  const chosen = document.units?.[{speed: "angular_velocity", direction: "angle"}[quantity] ?? quantity];
   if (quantity === "speed" && !chosen && (document.units?.angle ?? "rad") !== "rad") return "";  // the reader refuses a number without a unit here, as ambiguous
   return chosen ?? SI[quantity] ?? "";
 }
@@ -46,13 +50,14 @@ function lengthsText(document, {pins = [], width, outline}) {
 }
 
 export class PropertiesPanel {
-  constructor(studio, element) { Object.assign(this, {studio, element}); }
+  constructor(studio, element) { Object.assign(this, {studio, element, added: new Set()}); }
 
   show() {
     const {studio} = this, [item, ...more] = studio.selection;
-    const shown = JSON.stringify([studio.selection, studio.document]);
-    if (shown === this.last) return;
-    this.last = shown;
+    const key = JSON.stringify([studio.selection, studio.document, studio.motion.pageEngine !== null]);
+    if (key === this.last) return;
+    if (JSON.stringify(studio.selection) !== this.of) this.added.clear();
+    Object.assign(this, {last: key, of: JSON.stringify(studio.selection)});
     if (!item) return this.element.replaceChildren(...this.general());
     const parts = more.length ? [make("p", {}, `${1 + more.length} selected`)] : item.kind === "pin" ? this.pin(item.name) : this.entry(item);
     const buttons = [make("button", {type: "button", onclick: () => remove(studio)}, "Delete")];
@@ -113,13 +118,21 @@ export class PropertiesPanel {
     const {document} = this.studio, value = pinsOf(document)[name] ?? ["", ""];
     const put = next => this.set({...document, pins: {...pinsOf(document), [name]: next}});
     const take = (quantity, change) => text => {
-      const next = readValue(text), read = {length, angle}[quantity] ?? (x => (typeof x === "number" ? x : NaN));
+      const next = this.read(text, quantity), read = {length, angle}[quantity] ?? (x => (typeof x === "number" ? x : NaN));
       if (!Number.isFinite(read(next, document))) return this.refuse(`"${text}" is not ${{length: "a length: write 12 or 12 mm", angle: "an angle: write 30 or 30 deg"}[quantity] ?? "a number: write 0.5"}, for example`);
       return put(change(next));
     };
     const numbers = (key, quantity, values, names) => values.map((x, k) => this.field(names?.[k] ?? key, valueText(x), unitOf(document, quantity),
       take(quantity, next => (key === "" ? value.with(k, next) : {...value, [key]: Array.isArray(value[key]) ? value[key].with(k, next) : next}))));
-    if (Array.isArray(value)) return numbers("", "length", value, ["x", "y"]);
+    const polar = text => (text.includes("@") ? placeFrom(text, [0, 0], document) : null);
+    if (Array.isArray(value)) {
+      const fields = numbers("", "length", value, ["x", "y"]);
+      for (const field of fields) field.querySelector("input").addEventListener("change", event => {  // 50 @ 60 gives both
+        const to = polar(event.target.value);
+        if (to) { event.stopImmediatePropagation(); this.set(movePin(document, name, to)); }
+      }, true);
+      return fields;
+    }
     const from = [value.from].flat(), line = value.line ? ` from ${value.line.join("-")}` : "";
     return Object.entries(value).flatMap(([key, x]) => {
       if (key === "length") return numbers(key, "length", [x].flat(), from.map(other => `from ${other}`));
@@ -135,9 +148,49 @@ export class PropertiesPanel {
   form(name) {
     const {document} = this.studio, links = list(document, "link").filter(link => link.pins?.includes(name));
     const forms = formsOf(document, name, links.flatMap(link => link.pins).filter(other => other !== name));
-    const select = make("select", {"aria-label": "given by"}, make("option", {value: ""}, "given by …"), ...forms.map(([words], k) => make("option", {value: `${k}`}, words)));
-    select.addEventListener("change", () => select.value && this.set({...document, pins: {...pinsOf(document), [name]: forms[+select.value][1]}}));
-    return make("label", {class: "field"}, make("span", {}, "form"), select, make("span", {class: "unit"}));
+    return this.choice("form", "given by …", forms.map(([words], k) => [words, `${k}`]), k => this.set({...document, pins: {...pinsOf(document), [name]: forms[+k][1]}}), "given by");
+  }
+
+  /** A list [words, value] of which one is chosen. */
+  choice(label, prompt, options, take, title = label) {
+    const select = make("select", {"aria-label": title}, make("option", {value: ""}, prompt), ...options.map(([words, value]) => make("option", {value}, words)));
+    select.addEventListener("change", () => select.value && take(select.value));
+    return make("label", {class: "field"}, make("span", {}, label), select, make("span", {class: "unit"}));
+  }
+
+  /** The value of a text: a number of an expression, where numbers are wanted. */
+  read(text, quantity) {
+    const value = readValue(text, ["name", "names"].includes(quantity));
+    const number = typeof value === "string" && NUMBERS.concat("direction", "").includes(quantity) && !isMeasure(value) ? expressed(value, quantity === "direction" ? "angle" : quantity, this.studio.document) : undefined;
+    return number ?? value;
+  }
+
+  /** Length and angle of a bar of two pins as fields, or the lengths of another link; and its mass. */
+  shape(link) {
+    const {studio, studio: {document}} = this, masses = studio.motion.pageEngine?.masses(), mass = masses?.get(link.name);
+    const facts = [mass === undefined || link.mass !== undefined ? "" : `mass ${shown(mass, "kg")}`].filter(Boolean).map(words => make("p", {}, words));
+    const [a, b] = (link.pins ?? []).map(pin => placeOf(document, pin));
+    if (link.pins?.length !== 2 || !a || !b) return [make("p", {}, lengthsText(document, link)), ...facts];
+    const moves = groundOf(document).includes(link.pins[1]) && !groundOf(document).includes(link.pins[0]) ? 0 : 1;
+    const size = Math.hypot(b[0] - a[0], b[1] - a[1]), turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
+    const put = (long, way) => {
+      const s = moves ? 1 : -1, from = moves ? a : b, found = movePin(document, link.pins[moves], [from[0] + s * long * Math.cos(way), from[1] + s * long * Math.sin(way)]);
+      return found === document && (long !== size || way !== turn) ? this.refuse("other pins that are given by lengths would have no place") : this.set(settle(found));
+    };
+    const field = (label, quantity, value, unit, take) => this.field(label, value, unit, text => {
+      const next = {length, angle}[quantity](this.read(text, quantity), document);
+      return Number.isFinite(next) && (quantity !== "length" || next > 0) ? take(next) : this.refuse(`"${text}" is not ${quantity === "length" ? "a length" : "an angle"}`);
+    });
+    return [field("length", "length", tidy(+(size / lengthUnit(document)).toPrecision(9)), lengthName(document), next => put(next, turn)),
+      field("angle", "angle", tidy(+(turn / angleUnit(document)).toPrecision(9)), unitOf(document, "angle"), next => put(size, next)), ...facts];
+  }
+
+  /** Say where a selected pin is while the mechanism is away from its drawn position. */
+  showNow() {
+    const {studio} = this, [item] = studio.selection, place = item?.kind === "pin" && studio.isMoved ? placeOf(studio.document, item.name) : null;
+    if (!this.now) return;
+    const at = place && carry(studio.motions, studio.canvas.carrier(studio.document, item.name), place).map(x => shown(x / lengthUnit(studio.document), ""));
+    this.now.textContent = at ? `now at ${at.join(", ")} ${lengthName(studio.document)}` : "";
   }
 
   pin(name) {
@@ -152,17 +205,19 @@ export class PropertiesPanel {
     fixed.addEventListener("change", () => this.set(toggleGround(document, name)));
     return [make("h3", {}, `pin ${name}`),
       this.field("name", name, "", rename),
-      ...this.place(name), this.form(name),
+      ...this.place(name), this.form(name), this.now = make("p", {class: "now"}),
       make("label", {class: "field check"}, make("span", {}, "fixed"), fixed, make("span", {class: "unit"}))];
   }
 
   entry({kind, index}) {
     const {studio} = this, {document} = studio, entry = list(document, kind)[index] ?? {}, title = nameOf(document, kind, index);
-    const fields = (KEYS[kind] ?? []).map(([path, quantity]) => {
-      const [key, sub] = path.split("."), value = sub ? entry[key]?.[sub] : entry[key], plain = value === undefined || typeof [value].flat(2)[0] === "number";
+    const isShown = ([path]) => (USUAL[kind] ?? []).includes(path) || path.split(".")[0] in entry, more = (KEYS[kind] ?? []).filter(one => !isShown(one) && !this.added.has(one[0]));
+    const fields = (KEYS[kind] ?? []).filter(one => !more.includes(one)).map(([path, quantity]) => {
+      const [key, sub] = path.split("."), given = sub ? entry[key]?.[sub] : entry[key];
+      const value = quantity === "direction" && Array.isArray(given) ? angleWritten(direction(given, document), document) : given, plain = value === undefined || typeof [value].flat(2)[0] === "number";
       const take = text => {
-        const value = readValue(text, ["name", "names"].includes(quantity)), next = quantity === "names" && typeof value === "string" ? [value] : value;
-        this.set(withKey(document, kind, index, key, sub ? {...entry[key], [sub]: next} : next));
+        const value = this.read(text, quantity), next = quantity === "names" && typeof value === "string" ? [value] : value;
+        this.set(withValue(document, kind, index, key, sub ? {...entry[key], [sub]: next} : next));
       };
       const unit = plain ? unitOf(document, quantity) : "";
       return this.field(sub ?? key, valueText(value), unit, take, EXAMPLES[quantity] ? `e.g. ${EXAMPLES[quantity]}` : "");
@@ -173,7 +228,8 @@ export class PropertiesPanel {
       if (found === document && to !== title) return this.refuse(to ? `another ${kind} is called ${to}` : `a ${kind} needs a name`);
       return this.set(found);
     };
-    const lengths = kind === "link" ? [make("p", {}, lengthsText(document, entry))] : [];
+    const lengths = kind === "link" ? this.shape(entry) : [];
+    if (more.length) fields.push(this.choice("more", "more …", more.map(([path]) => [path, path]), path => { this.added.add(path); this.again(); }));
     const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", rename, title), ...lengths, ...fields,
       ...extra.map(key => this.field(key, valueText(entry[key]), "", text => this.set(withKey(document, kind, index, key, readValue(text)))))];
     if (Array.isArray(entry.of) && entry.of.length === 2) parts.push(make("button", {type: "button", onclick: () => this.set(swapPair(document, kind, index))}, "Swap the two links"));

@@ -3,6 +3,7 @@
 import {groundOf, list, members, placeOf, pinsOf} from "./document.js";
 import {angle, direction, length, point} from "./units.js";
 
+const THIN = 0.02;  // area of a plate over its length squared: a thinner one is meant as a bar
 const IN_LINE = 1e-9;  // fraction of the size squared: points whose hull has a smaller area are in line
 
 /** The corners of a link through points, and whether they enclose an area: the hull of a plate, or the ends of a bar. */
@@ -51,6 +52,16 @@ export function linkShape(document, link) {
   if (link.width !== undefined && link.inertia === undefined) return {kind: "line", points: alongLine(places)};
   const [points, closed] = corners(places);
   return {kind: closed ? "plate" : "line", points};
+}
+
+/** Findings about plates whose pins are almost in line: as plates they have hardly any mass. */
+export function thinPlates(document) {
+  return list(document, "link").flatMap(link => {
+    const places = (link.pins ?? []).map(pin => placeOf(document, pin)).filter(Boolean);
+    if (link.width !== undefined || link.outline || link.inertia !== undefined || places.length < 3) return [];
+    const [hull, closed] = corners(places), size = Math.max(...hull.map(p => Math.hypot(p[0] - hull[0][0], p[1] - hull[0][1])));
+    return closed && area(hull) > THIN * size * size ? [] : [`the pins of ${link.name} are almost in line: a plate through them has hardly any mass; give it a width, and it is a bar`];
+  });
 }
 
 function alongLine(places) {

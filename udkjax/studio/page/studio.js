@@ -3,11 +3,13 @@
 import {askedFile} from "./api.js";
 import {DrawingCanvas} from "./canvas.js";
 import {CurvesPanel} from "./curves.js";
-import {EMPTY, list, members, pinsOf} from "./document.js";
+import {EMPTY, list, members, nameOf, pinsOf} from "./document.js";
+import {PlaceEntry} from "./entry.js";
 import {FileActions} from "./files.js";
 import {FindingsPanel} from "./findings.js";
 import {Gestures} from "./gestures.js";
 import {History} from "./history.js";
+import {joinPin, loosePins} from "./joining.js";
 import {followKeys} from "./keys.js";
 import {buildPage} from "./layout.js";
 import {Motion} from "./motion.js";
@@ -19,11 +21,14 @@ import {toolOf} from "./tools.js";
 import {extentPoints} from "./shapes.js";
 import {lengthUnit, niceBelow, tidy} from "./units.js";
 import {fit} from "./view.js";
+import {WantedPath} from "./wanted.js";
+import {make} from "./player/elements.js";
 import {THEMES} from "./player/painter.js";
 
 const NEW_SIZE = 0.25;  // m: width of the view of a new drawing
 const SNAP_PIXELS = 8;  // least spacing of snapping points
 const LINK_PIXELS = 26;  // width of a new link
+const REACH = 9;  // px of a click on a link
 
 const text = state => JSON.stringify(state.document);
 
@@ -45,6 +50,8 @@ class Studio {
     this.source = new SourcePanel(this, this.parts.source);
     this.files = new FileActions(this);
     this.pictures = new Pictures(this, this.parts.picture);
+    this.wanted = new WantedPath(this, this.parts.wanted);
+    this.entry = new PlaceEntry(this, this.parts.entry);
     this.sync = new Sync(this);
     this.gestures = new Gestures(this, this.parts.canvas);
     followKeys(this);
@@ -98,7 +105,15 @@ class Studio {
     if (problem) return this.say(problem);
     this.say("");
     this.commit(document, select);
+    const loose = loosePins(document).find(({link}) => select?.some(item => item.kind === "link" && item.index === link));
+    if (loose) this.say(`${loose.pin} lies on ${nameOf(document, "link", loose.link)}, but does not belong to it. `, false, ["Join them", () => this.join(loose)]);
     return undefined;
+  }
+
+  /** Join a pin to the link on which it lies. */
+  join({pin, link}) {
+    this.say("");
+    this.commit(joinPin(this.document, pin, link), [{kind: "pin", name: pin}]);
   }
 
   undo() { this.travel(this.history.canUndo, () => this.history.undo()); }
@@ -127,13 +142,15 @@ class Studio {
 
   setTool(name) {
     this.gestures.cancel();
+    this.parts.entry.hidden = true;
     this.tool = name;
     this.say(name === "select" ? "" : toolOf(name).title);
     this.shown();
   }
 
-  say(words, isBad = false) {
-    this.parts.status.textContent = words;
+  /** Say something in the status line, with buttons [title, action]. */
+  say(words, isBad = false, ...buttons) {
+    this.parts.status.replaceChildren(words, ...buttons.map(([title, action]) => make("button", {type: "button", class: "small", onclick: action}, title)));
     this.parts.status.classList.toggle("bad", isBad);
   }
 
@@ -154,6 +171,7 @@ class Studio {
   fit() {
     const places = extentPoints(this.document);
     for (const {line} of this.paths) for (let k = 0; k < line.length; k += 2) places.push([line[k], line[k + 1]]);
+    places.push(...this.wanted?.points ?? []);
     const {width, height} = this.canvas;
     this.setView(fit(places, width || 800, height || 600, NEW_SIZE), true);
   }
@@ -171,8 +189,8 @@ class Studio {
     return place.map(x => tidy(Math.round(x / unit / step) * step) * unit);
   }
 
-  /** The width (m) that suits a new link in this view. */
-  usualSize() { return LINK_PIXELS / this.view.scale; }
+  /** Sizes that suit the view, for tools: the width of a new link (m), pixels per metre, and the reach of a click (m). */
+  get context() { return {size: LINK_PIXELS / this.view.scale, scale: this.view.scale, reach: REACH / this.view.scale}; }
 
   hover(item, preview) {
     const before = this.hovered;
@@ -206,7 +224,7 @@ class Studio {
   shown() {
     for (const button of this.parts.tools) button.setAttribute("aria-pressed", button.dataset.tool === this.tool);
     this.parts.canvas.dataset.tool = this.tool;
-    this.parts.welcome.hidden = this.tool !== "select" || Object.keys(pinsOf(this.document)).length > 0 || Boolean(this.picture);
+    this.parts.welcome.hidden = this.tool !== "select" || Object.keys(pinsOf(this.document)).length > 0 || Boolean(this.picture) || Boolean(this.wanted.points);
     this.parts.undo.disabled = !this.history.canUndo;
     this.parts.redo.disabled = !this.history.canRedo;
     this.properties.show();
@@ -226,6 +244,7 @@ class Studio {
     this.frame = null;
     this.canvas.draw(this);
     this.curves.draw();
+    this.properties.showNow();
     this.motion.showTime();
   }
 }

@@ -58,6 +58,7 @@ export class Sync {
     if (!moves) await this.compile(found.text, state.document, isLate);
     if (isLate()) return undefined;
     await new Promise(done => { setTimeout(done, DIAGNOSE_DELAY); });
+    if (!isLate()) await this.explainEnd(found.text, isLate);
     return isLate() ? undefined : this.diagnose(found.text, isLate);
   }
 
@@ -82,13 +83,24 @@ export class Sync {
     const pageEngine = await PageEngine.load(document, compiled, loadEngine);
     if (isLate()) return;
     this.structure = structureOf(document);
-    studio.motion.use(pageEngine, compiled.why ?? "");
+    await studio.motion.use(pageEngine, compiled.why ?? "");
+  }
+
+  /** Find out why the motion ends early. */
+  async explainEnd(text, isLate) {
+    const {motion} = this.studio;
+    await motion.settled();
+    const {unexplained: end, run} = motion;
+    if (isLate() || !end) return;
+    const {cause} = await ask("diagnose", {text, about: "end", end});
+    if (!isLate()) motion.explain(run, cause);
   }
 
   async diagnose(text, isLate) {
     const {studio} = this, found = await ask("diagnose", {text});
     if (isLate()) return;
     studio.findings.showStructure(found);
+    studio.motion.explain(studio.motion.run, found.conflict);
     if (found.problems.length || !studio.motion.pageEngine?.scene.drivers.length) return;
     const travel = await ask("diagnose", {text, about: "travel"});
     if (!isLate()) studio.findings.showTravel(travel);

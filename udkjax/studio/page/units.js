@@ -1,5 +1,6 @@
 // Lengths and angles of a drawing in metres and radians, and back in the units of the file.
 
+import {evaluate} from "./expressions.js";
 import {ANGLES, LENGTHS} from "./unit_sizes.js";
 
 const TEXT = /^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$/;
@@ -23,6 +24,33 @@ export const length = (value, document) => read(value, lengthUnit(document), LEN
 /** An angle in radians, from a number or a string such as "30 deg"; NaN if it is neither. */
 export const angle = (value, document) => read(value, angleUnit(document), ANGLES);
 
+/** The number of an expression such as 40 + 50*cos(60), in the document's unit of a quantity; undefined if the text is none. */
+export function expressed(text, quantity, document) {
+  const [unit, units] = {length: [lengthUnit(document), LENGTHS], angle: [angleUnit(document), ANGLES]}[quantity] ?? [1, {}];
+  const value = evaluate(text, {unit, units, angleUnit: angleUnit(document)});
+  return Number.isFinite(value) ? tidy(value) : undefined;
+}
+
+/** The place (m) that a text names: "x, y", or "length @ angle" from a place; null if it is neither. */
+export function placeFrom(text, from, document) {
+  const parts = text.includes("@") ? text.split("@") : splitPair(text);
+  if (parts.length !== 2) return null;
+  const isPolar = text.includes("@"), a = expressed(parts[0], "length", document), b = expressed(parts[1], isPolar ? "angle" : "length", document);
+  if (a === undefined || b === undefined) return null;
+  const size = a * lengthUnit(document), turn = b * angleUnit(document);
+  return isPolar ? [from[0] + size * Math.cos(turn), from[1] + size * Math.sin(turn)] : [size, b * lengthUnit(document)];
+}
+
+/** The two parts of a text at a comma outside of parentheses, or at the space between two plain numbers. */
+function splitPair(text) {
+  let deep = 0;
+  for (const [k, c] of [...text].entries()) {
+    deep += c === "(" ? 1 : c === ")" ? -1 : 0;
+    if (c === "," && deep === 0) return [text.slice(0, k), text.slice(k + 1)];
+  }
+  return text.trim().split(/\s+/);
+}
+
 /** A place in metres, or null if it is not a pair of lengths. */
 export function point(value, document) {
   if (!Array.isArray(value) || value.length !== 2) return null;
@@ -35,6 +63,9 @@ export function direction(value, document) {
   if (Array.isArray(value)) return value.length === 2 ? Math.atan2(+value[1], +value[0]) : NaN;
   return angle(value, document);
 }
+
+/** True for a number with a unit or without one. */
+export const isMeasure = text => TEXT.test(text) && !/[-+*/^@(]/.test(text.replace(TEXT, "$2"));
 
 export const tidy = x => +(+x).toPrecision(DIGITS) + 0;
 

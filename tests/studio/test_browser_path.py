@@ -1,0 +1,40 @@
+"""A wanted path is drawn in the studio's page, and becomes a mechanism."""
+
+import numpy as np
+import pytest
+
+
+@pytest.mark.slow
+def test_a_drawn_path_becomes_a_mechanism(studio):
+    studio.tool("t")
+    angles = np.linspace(0.0, 2 * np.pi, 40)
+    places = [studio.pixel(120 + 50 * np.cos(a) + 8 * np.cos(2 * a), 120 + 25 * np.sin(a)) for a in angles]
+    studio.page.mouse.move(*places[0])
+    studio.page.mouse.down()
+    for place in places[1:]:
+        studio.page.mouse.move(*place)
+    studio.page.mouse.up()
+    studio.page.get_by_role("button", name="find a mechanism with").click()
+    studio.until("studio.wanted.designs.length > 0")
+    assert " mm off, the crank turns, transmission angle at least " in studio.page.locator(".wanted").inner_text()
+    count, first = studio.js("studio.wanted.designs.length"), studio.document["pins"]
+    assert studio.js("studio.wanted.designs[0].deviation") < 0.004  # m; the path is 125 mm long
+    studio.page.get_by_role("button", name="the next mechanism").click()
+    assert studio.page.locator(".wanted").inner_text().startswith(f"2 of {count}") and studio.document["pins"] != first
+    studio.page.keyboard.press("Control+z")
+    assert studio.document["pins"] == first
+    studio.page.get_by_role("button", name="keep this mechanism").click()
+    assert not studio.page.locator(".wanted").is_visible()
+    studio.settle()
+    assert studio.js("studio.motion.end") == 2.0 and "motor1 turns all the way round" in studio.findings
+
+
+@pytest.mark.slow
+def test_a_wanted_path_is_read_from_a_table(studio):
+    file = studio.folder / "path.csv"
+    file.write_text("x,y,remark\n10,20,a\n30,40,b\n50,20,c\n")
+    studio.page.get_by_label("table of a wanted path").set_input_files(str(file))
+    studio.until("studio.wanted.points?.length === 3")
+    np.testing.assert_allclose(studio.js("studio.wanted.points"), [[0.01, 0.02], [0.03, 0.04], [0.05, 0.02]])
+    studio.page.get_by_role("button", name="remove the wanted path").click()
+    assert studio.js("studio.wanted.points") is None
