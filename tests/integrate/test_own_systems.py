@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.fresh_process import python
 from tests.integrate.own_systems import G, pendulum
 from udkjax.equations.general import prepare_general
 from udkjax.equations.traced_system import trace_system
@@ -270,3 +271,25 @@ def test_other_solvers_and_formulations(choice):
     one, other = (udk.simulate(pendulum(), TS, start, rtol=1e-9, atol=1e-9, **x) for x in (choice, {}))
     assert (one.settings["engine"] == "native") == isinstance(choice.get("solver"), diffrax.Kvaerno5)
     assert_allclose(one.q, other.q, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_single_precision():
+    """Runs, assembly and sweeps in float32, by diffrax; events and ranks say that they need float64."""
+    code = """
+import numpy as np, jax.numpy as jnp, udkjax as udk
+rate, ts = np.sqrt(9.81 / 0.6), np.linspace(0, 1, 3)
+system = udk.ConstrainedSystem(
+    lambda q: 2.0 * jnp.eye(3), constraint=lambda t, q: {"rod": q @ q - 1.0}, potential=lambda t, q: 2 * 9.81 * q[2],
+    q0=[0.8, 0.0, -0.6], v0=[0.0, 0.8 * rate, 0.0])
+run = udk.simulate(system, ts, rtol=1e-4, atol=1e-4)
+exact = np.stack([0.8 * np.cos(rate * ts), 0.8 * np.sin(rate * ts), 0 * ts - 0.6], 1)
+data = udk.sweep(system, {"rtol": [1e-3, 1e-4]}, ts, progress=False)
+print(run.q.dtype, bool(np.abs(run.q - exact).max() < 1e-4), bool(np.abs(data.q_end[1] - exact[-1]).max() < 1e-4))
+for function in (lambda: udk.diagnose(system), lambda: udk.simulate(system, ts, events=udk.Event(lambda t, q, v: q[0]))):
+    try:
+        function()
+    except ValueError as error:
+        print("leave JAX_ENABLE_X64 unset" in str(error))
+"""
+    assert python(code, JAX_ENABLE_X64="0").split() == ["float32", "True", "True", "True", "True"]

@@ -9,6 +9,7 @@ are closed by NumPy, without compilation; traced numbers take the same steps in 
 
 from typing import Any, NamedTuple, Protocol
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,9 +83,14 @@ def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -
     return step * CLOSURE.shortening(longest, xp)
 
 
+def _fixed(x: Any) -> Any:
+    """Return an array without derivatives; anything else, such as a function of a user-defined system, as it is."""
+    return jax.lax.stop_gradient(x) if eqx.is_array(x) else x
+
+
 def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
     """Take one step, halved until the residual falls; return whether it does. At rounding level no step is taken."""
-    fixed, current = (rows, q) if xp is np else jax.lax.stop_gradient((rows, q))
+    fixed, current = (rows, q) if xp is np else jax.tree.map(_fixed, (rows, q))
     size = xp.linalg.norm(fixed.residual(t, current))
     is_open = size > rounding(rows.scales, current, xp)
     if xp is np and not is_open:

@@ -210,7 +210,7 @@ def simulate(
             others = choices.only_by_diffrax or ("a diffrax adjoint" if choices.adjoint else "progress")
             raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {others}")
         if isinstance(system, ConstrainedSystem):
-            raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX")
+            raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
         solution = simulate_events(system, events, analysis, ts, state, closure, choices, max_events)

@@ -144,7 +144,8 @@ def close_system_guess(system: ConstrainedSystem, t: NumberLike, state: State | 
     traced = system.traced(np.size(q))
     found = close_system(traced, *(jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v)))
     sizes = jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in (found.psi, found.rates)])
-    closed = jnp.max(sizes) <= CLOSURE.tol * jnp.maximum(1.0, jnp.max(jnp.abs(found.v), initial=0.0))
+    tol = max(CLOSURE.tol, ROUNDING / np.finfo(float).eps * float(jnp.finfo(found.q.dtype).eps))
+    closed = jnp.max(sizes) <= tol * jnp.maximum(1.0, jnp.max(jnp.abs(found.v), initial=0.0))
     return Closure(State(found.q, found.v), found.psi, found.rates, found.rank, found.scales, closed)
 
 

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from udkjax.equations import determinacy
@@ -129,6 +130,8 @@ def diagnose_system(
     time_tol: float | None,
 ) -> SystemDiagnosis:
     """Diagnose a system in the closed state near a given one, or near its own guess."""
+    if not jax.config.jax_enable_x64:
+        raise ValueError("the rank of a ConstrainedSystem needs float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
     closure = close(system, t, state)
     require_closed(system, closure, t)
     q, v = (np.asarray(x, float) for x in (closure.state.q, closure.state.v))
