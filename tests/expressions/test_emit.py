@@ -133,3 +133,13 @@ def test_a_branch_that_is_not_taken_may_divide_by_zero(x, y):
     f = lambda x, y: jnp.hypot(x, y) + jnp.where(y > 0, x / jnp.maximum(y, 0.0), 0.0)  # noqa: E731
     (result,) = trace(f, 0.1, 0.2)(graph, *(np.asarray(s, object) for s in inputs))
     assert ScalarProgram(graph, inputs, [result.item()])([x, y])[0] == pytest.approx(float(f(x, y)), rel=1e-15)
+
+
+def test_a_program_on_floats_and_arrays_is_not_prepared_for_traces():
+    """Scenes have hundreds of programs, and JAX keeps some kilobytes for each function under jit."""
+    graph = Graph()
+    x = graph.input("x", "state")
+    program = ScalarProgram(graph, [x], [x * x + 1.0])
+    assert program([2.0]) == [5.0] and program.by_numpy([np.array([2.0, 3.0])])[0].tolist() == [5.0, 10.0]
+    assert "_traced" not in vars(program)
+    assert float(jax.jit(lambda x: program([x])[0])(2.0)) == 5.0 and "_traced" in vars(program)

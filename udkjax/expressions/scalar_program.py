@@ -75,7 +75,6 @@ class ScalarProgram:
                 n.arguments[0].index for n in nodes if n.kind == "apply" and n.detail.primitive.name in _SINE_AND_COSINE
             )
         )
-        self._traced = jax.jit(self._run)  # traced once for all calls and derivatives
 
     def uses(self, scalar: Scalar) -> bool:
         """Return True if the program uses an input."""
@@ -101,6 +100,11 @@ class ScalarProgram:
                 return [np.array(x, float).reshape(shape) for x in zip(*results, strict=True)]
             results = self._steps_on_arrays(values)
         return [x if np.shape(x) == shape else np.broadcast_to(x, shape) for x in results]
+
+    @cached_property
+    def _traced(self) -> Callable[[Sequence[Operand]], list[Operand]]:
+        """The program as a function that JAX traces once, for all calls and derivatives: 4 KB that most programs never need."""
+        return jax.jit(self._run)
 
     @cached_property
     def _calls_arrays(self) -> bool:
