@@ -23,7 +23,7 @@ def test_a_file_is_the_arguments_of_a_sweep():
     given = load_grid(EXAMPLE)
     np.testing.assert_array_equal(given["ts"], [0.0, 10.0])
     assert given["measure"] == ("final", "violation", "counts")
-    assert list(given["axes"]) == ["body.coupler.mass", "tolerance", "start", "stabilization"]
+    assert list(given["axes"]) == ["body.coupler.mass", "tol", "start", "stabilization"]
     mass, tolerance, start, stabilization = given["axes"].values()
     np.testing.assert_array_equal(mass.values, np.linspace(0.5, 4.5, 9))
     np.testing.assert_allclose(tolerance.values, 10.0 ** np.arange(-10, -2))
