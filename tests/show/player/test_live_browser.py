@@ -83,6 +83,7 @@ def test_the_motion_is_that_of_python(opened, name):
             assert_allclose(shown, values, rtol=0, atol=1e-6 * max(1.0, float(np.abs(values).max())))
 
 
+@pytest.mark.slow
 def test_samples_of_loads_and_motions_are_held_between_their_times(opened):
     """A motor with a spline motion, loaded by a torque that is held between samples: both determine its driving torque."""
     knots = np.linspace(0.0, 2.0, 6)
@@ -138,6 +139,7 @@ def with_events(slider_crank):
     return events, udk.animate(slider_crank, run, live=["motor.motor.speed", "pin.P[0]", "gravity"], events=events)
 
 
+@pytest.mark.slow
 def test_events_happen_at_new_times_while_a_slider_moves(opened, with_events, slider_crank):
     events, animation = with_events
     happened = f"{LIVE}.runs[0].run.events"
@@ -228,9 +230,7 @@ IMPACTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in ("lies", "feet", "rest", "velocity") else pytest.param(n, marks=pytest.mark.slow) for n in IMPACTS]
-)
+@pytest.mark.parametrize("name", [n if n == "rest" else pytest.param(n, marks=pytest.mark.slow) for n in IMPACTS])
 def test_impacts_are_those_of_the_new_motion(opened, name):
     mechanism, events = IMPACTS[name]
     ts, tight = np.linspace(0.0, 0.3 if name == "feet" else 3.0, 91), {"rtol": 1e-11, "atol": 1e-11, "max_events": 300}
@@ -251,6 +251,7 @@ def test_impacts_are_those_of_the_new_motion(opened, name):
             assert alive.all() and len(q) == len(ts)
 
 
+@pytest.mark.slow
 def test_contacts_that_a_page_cannot_compute_are_reported(opened):
     """Two contacts at rest, and two that are hit at once."""
     place = [0.5 * np.cos(0.1), 0.5 * np.sin(0.1) + 0.2]
@@ -268,6 +269,7 @@ def test_contacts_that_a_page_cannot_compute_are_reported(opened):
             assert words in note(page) and "a live page cannot" in note(page) and page.locator(".note.bad").count() == 1
 
 
+@pytest.mark.slow
 def test_a_body_pulled_against_a_stop_stays_there_until_it_is_pulled_back(opened):
     events = [udk.JointLimit("A", -2.4, 0.5, restitution=0.5)]
     run = udk.simulate(PENDULUM, TS, events=events, max_events=300)
@@ -347,6 +349,7 @@ def test_a_slider_by_mouse_and_keys(opened, live):
         assert page.evaluate(f"{LIVE}.values[0]") > speed
 
 
+@pytest.mark.slow
 def test_loops_that_cannot_be_closed_are_reported_and_the_last_motion_stays(opened):
     mechanism = udk.library.parallelogram()
     with opened(udk.animate(mechanism, udk.simulate(mechanism, TS), live=["joint.A3.points"], measures=())) as page:
@@ -375,6 +378,7 @@ def test_rows_that_other_numbers_make_redundant_are_found(opened, apart):
         assert_allclose(shown_q(page), np.asarray(udk.simulate(sound, TS).q).reshape(len(TS), -1), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_other_numbers_may_complete_a_failed_motion(opened):
     """A driven crank cannot make a full turn with a short rod, but can with a longer one."""
     drawing = udk.Drawing(
