@@ -154,9 +154,9 @@ def test_all_mistakes_at_once():
             'driver "A" (driver[0]).coordinate: must be one of "angle", "x", "y", "distance", not "angel"; did you mean "angle"?',
             'driver "A" (driver[0]).motion.times[2]: must be greater than the entry before, not 1.0',
             'driver "A" (driver[0]).motion.values: must have 3 entries, like the list before it, not [0.0, 1.0]',
-            'force "f" (force[0]).joint: "B" must be a revolute joint',
             'force "f" (force[0]).torque: must be >= 0, not -1.0',
-            'force "g" (force[1]).joint: no revolute joint named "Q"',
+            'force "f" (force[0]).torque: a slot does not turn: give a coefficient',
+            'force "g" (force[1]).joint: no joint named "Q"',
             'force "h" (force[2]).body: "ground" does not move; name a body',
         ]
     )
@@ -244,7 +244,7 @@ def test_traced_numbers_are_checked_as_concrete_ones_are(everything):
     """A number that must be positive is not; numbers that must increase do not."""
     hold = jax.jit(lambda element: traced_numbers_are_valid([element]))
     found = [one for element in everything.elements for one in _requiring(element)]
-    assert len({(type(owner), name) for owner, name in found}) == 9
+    assert len({(type(owner), name) for owner, name in found}) == 10
     for owner, name in {(type(owner), name): (owner, name) for owner, name in found}.values():
         assert hold(owner)
         assert not hold(eqx.tree_at(lambda x, name=name: getattr(x, name), owner, -getattr(owner, name)))

@@ -62,6 +62,7 @@ from udkjax.equations.reactions import unique_reactions as unique_reactions
 from udkjax.equations.redundancy import dependent_constraints as dependent_constraints
 from udkjax.equations.redundancy import holders_of_driver as holders_of_driver
 from udkjax.equations.redundancy import kinematic_rows as kinematic_rows
+from udkjax.equations.rubbing import settled_loads as settled_loads
 from udkjax.equations.run_programs import RunPrograms as RunPrograms
 from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales

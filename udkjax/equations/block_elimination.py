@@ -6,7 +6,7 @@ not exceed `drop_tol` times its diagonal entry is left out: the reciprocal of it
 
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -46,31 +46,30 @@ class BlockElimination:
     def __init__(self, terms: SceneTerms):
         self.terms, layout = terms, terms.layout
         # For each block: its group, and the index of its element within the group.
-        self._elements = [(group, i) for group in layout.eliminated for i in range(len(group.members))]
-        self._sizes = [len(group.rows) for group, _ in self._elements]
-        bodies = [set(group.bodies[:, i].tolist()) for group, i in self._elements]
-        self.order: list[Fronts] = order_blocks(self._sizes, bodies)
-        self._diagonals = [layout.reserve("gram", p + p * (p + 1) // 2) for p in self._sizes]
+        self.elements = [(group, i) for group in layout.eliminated for i in range(len(group.members))]
+        self.sizes = [len(group.rows) for group, _ in self.elements]
+        bodies = [set(group.bodies[:, i].tolist()) for group, i in self.elements]
+        self.order: list[Fronts] = order_blocks(self.sizes, bodies)
+        self.diagonals = [layout.reserve("gram", p + p * (p + 1) // 2) for p in self.sizes]
         self._position = {k: j for j, k in enumerate(k for fronts in self.order for k in fronts.blocks)}
-        self._off_diagonal_start, self._off_diagonal = layout.sizes["gram"], {}
+        self._off_diagonal_start, self.off_diagonals = layout.sizes["gram"], {}
         for fronts in self.order:
             for k, later in zip(fronts.blocks, fronts.later, strict=True):
                 for a in later:
-                    self._off_diagonal[a, k] = layout.reserve("gram", self._sizes[a] * self._sizes[k])
+                    self.off_diagonals[a, k] = layout.reserve("gram", self.sizes[a] * self.sizes[k])
         self._off_diagonal_size = layout.sizes["gram"] - self._off_diagonal_start
         layout.add_solves()
 
-    def _place(self, block: int, column: int) -> int:
-        group, i = self._elements[block]
+    def place(self, block: int, column: int) -> int:
+        """Return the entry of a block in a column of the table of its group."""
+        group, i = self.elements[block]
         return int(group.table[i, column])
 
     # --- programs
 
     def factorize(self, dropping: bool) -> ProgramParts:
         """Form Psi_q M^(-1) Psi_q^T from the entries in `psi_q` and factorize it, with or without dependent rows."""
-        if self._off_diagonal_size:
-            yield Reset("gram", self._off_diagonal_start, self._off_diagonal_size)
-        yield from self._gram
+        yield from self.form()
         yield Reset("nearness", 0, 1)
         yield Reset("trusted", 0, 1, 1.0)
         layout = self.terms.layout
@@ -83,14 +82,20 @@ class BlockElimination:
             key = ("eliminate", fronts.size, fronts.later_sizes, dropping, first_mark)
             yield KernelLoop(self.terms.kernel(key, write), self._front_table(fronts))
 
+    def form(self) -> ProgramParts:
+        """Form Psi_q M^(-1) Psi_q^T from the entries in `psi_q`."""
+        if self._off_diagonal_size:
+            yield Reset("gram", self._off_diagonal_start, self._off_diagonal_size)
+        yield from self._gram
+
     def solve(self, solve: int = 0) -> ProgramParts:
         """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right, and jt_x = Psi_q^T x."""
         yield from self.substitute(solve)
         yield from self.terms.jt(solve)
 
-    def substitute(self, solve: int) -> ProgramParts:
-        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right."""
-        names = arrays_of_solve(solve)
+    def substitute(self, solve: int, **names: str) -> ProgramParts:
+        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right; `names` are those of arrays that differ from the system's."""
+        names = arrays_of_solve(solve) | names
         yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
         for fronts in self.order:
 
@@ -126,7 +131,7 @@ class BlockElimination:
     def rank(self) -> ProgramParts:
         """Count the rows that the last factorization retained."""
         yield Reset("rank", 0, 1)
-        for p in sorted(set(self._sizes)):
+        for p in sorted(set(self.sizes)):
 
             def count(w: KernelWriter, p: int = p):
                 zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
@@ -134,14 +139,14 @@ class BlockElimination:
                     inverse = w.read("factors", 0, p + triangle(j, j))
                     w.write(where(greater(absolute(inverse), zero), one, zero), "rank", None, 0, ADD)
 
-            blocks = [start for start, size in zip(self._diagonals, self._sizes, strict=True) if size == p]
+            blocks = [start for start, size in zip(self.diagonals, self.sizes, strict=True) if size == p]
             yield KernelLoop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
 
     def independent(self) -> ProgramParts:
         """Write `independent`: one for each row that the last factorization retained, zero for the others."""
         starts: dict[int, list[list[int]]] = {}
-        for block, (start, size) in enumerate(zip(self._diagonals, self._sizes, strict=True)):
-            starts.setdefault(size, []).append([start, self._place(block, ROW)])
+        for block, (start, size) in enumerate(zip(self.diagonals, self.sizes, strict=True)):
+            starts.setdefault(size, []).append([start, self.place(block, ROW)])
         for p, table in sorted(starts.items()):
 
             def mark(w: KernelWriter, p: int = p):
@@ -158,7 +163,7 @@ class BlockElimination:
     def _gram(self) -> list[KernelLoop]:
         loops, start = [], 0
         for group in self.terms.layout.eliminated:
-            loops.append(self._diagonal_blocks(group, self._diagonals[start : start + len(group.members)]))
+            loops.append(self._diagonal_blocks(group, self.diagonals[start : start + len(group.members)]))
             start += len(group.members)
         return loops + self._off_diagonal_blocks()
 
@@ -180,21 +185,24 @@ class BlockElimination:
 
     def _off_diagonal_blocks(self) -> list[KernelLoop]:
         """Return the loops over shared bodies that fill the blocks of pairs of constraints, one loop for each kind of pair."""
+        tables: dict[tuple[ConstraintGroup, int, ConstraintGroup, int], list[list[int]]] = {}
+        for (late, late_slot), (early, early_slot), body in self.shared_bodies():
+            entries = self.place(late, ENTRIES), self.place(early, ENTRIES)
+            key = self.elements[late][0], late_slot, self.elements[early][0], early_slot
+            row = [*entries, self.off_diagonals[late, early], self.terms.layout.of_body(body)]
+            tables.setdefault(key, []).append(row)
+        return [KernelLoop(self._product(*key), np.array(table)) for key, table in tables.items()]
+
+    def shared_bodies(self) -> Iterator[tuple[tuple[int, int], tuple[int, int], int]]:
+        """Iterate over pairs of coupled blocks, the later one first, each with the slot of a shared body, and that body."""
         holders: dict[int, list[tuple[int, int]]] = {}  # for each body: its blocks, and its index among the bodies of each
-        for block, (group, i) in enumerate(self._elements):
+        for block, (group, i) in enumerate(self.elements):
             for slot, body in enumerate(group.bodies[:, i].tolist()):
                 holders.setdefault(body, []).append((block, slot))
-        tables: dict[tuple[ConstraintGroup, int, ConstraintGroup, int], list[list[int]]] = {}
         for body, blocks in holders.items():
             blocks.sort(key=lambda x: self._position[x[0]])
-            for j, (early, early_slot) in enumerate(blocks):
-                for late, late_slot in blocks[j + 1 :]:
-                    if early != late:
-                        entries = self._place(late, ENTRIES), self._place(early, ENTRIES)
-                        key = self._elements[late][0], late_slot, self._elements[early][0], early_slot
-                        row = [*entries, self._off_diagonal[late, early], self.terms.layout.of_body(body)]
-                        tables.setdefault(key, []).append(row)
-        return [KernelLoop(self._product(*key), np.array(table)) for key, table in tables.items()]
+            for j, early in enumerate(blocks):
+                yield from ((late, early, body) for late in blocks[j + 1 :] if early[0] != late[0])
 
     def _product(self, late: ConstraintGroup, late_slot: int, early: ConstraintGroup, early_slot: int):
         def write(w: KernelWriter):
@@ -218,11 +226,11 @@ class BlockElimination:
         """
         table = []
         for k, later in zip(fronts.blocks, fronts.later, strict=True):
-            row = [self._diagonals[k], self._place(k, RIGHT)]
+            row = [self.diagonals[k], self.place(k, RIGHT)]
             for a in later:
-                row += [self._off_diagonal[a, k], self._place(a, RIGHT)]
+                row += [self.off_diagonals[a, k], self.place(a, RIGHT)]
             for i, a in enumerate(later):
-                row += [self._off_diagonal[a, b] for b in later[:i]] + [self._diagonals[a]]
+                row += [self.off_diagonals[a, b] for b in later[:i]] + [self.diagonals[a]]
             table.append(row)
         return np.array(table)
 

@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
+from udkjax.equations.friction_elimination import FrictionElimination
 from udkjax.equations.scene_layout import RIGHT, ConstraintGroup
 from udkjax.equations.scene_solver import SceneSolver, program
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms, dot, read_bodies, rows, write_jt
@@ -13,6 +14,7 @@ from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, LoopP
 
 # Arrays that are held fixed in derivatives. Kernels that read sines and cosines differentiate them as functions of q.
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
+NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "unsettled", "rubbing", "drag")  # of friction
 
 # Arrays of the second correction of a solution; their first-order changes vanish after the first correction.
 SETTLED = ("right2", "sum2", "y2", "x2")
@@ -98,25 +100,41 @@ class DifferentiablePrograms:
 
     def _corrected(self, right: str, **names: str) -> ProgramParts:
         """Compute x0, with its current value and the derivatives of two corrections, and jt_x0."""
-        terms, implicit = self._solver.terms, self._implicit_terms
+        terms, implicit, friction = self._solver.terms, self._implicit_terms, self._friction(right)
+        substitute = self._solver.elimination.substitute if friction is None else friction.substitute
         yield Reset("x0", 0, terms.layout.sizes["x0"])
         for solve in (1, 2):
             yield from implicit.transposed(**names)
+            yield from self._rubbing(right)
             yield terms.add("z", solution=0)
             yield from implicit.difference(right, solve, **names)
-            yield from self._solver.elimination.substitute(solve)
+            yield from substitute(solve)
             yield from implicit.correct_solution(solve)
         yield from implicit.transposed(**names)
+        yield from self._rubbing(right)
+
+    def _friction(self, right: str) -> FrictionElimination | None:
+        """Return the friction in the equation with a right-hand side: corrections have none."""
+        return self._solver.friction if right == "b" else None
+
+    def _rubbing(self, right: str) -> ProgramParts:
+        """Add the loads of friction to jt_x0."""
+        friction = self._friction(right)
+        if friction is not None:
+            yield from friction.add_loads(0)
 
     def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, target: str, sign: int) -> DifferentiableProgram:
         """Compute x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
         solver, terms = self._solver, self._solver.terms
         z, result = terms.add("z", solution=0), terms.add(target, start=x, change="z", sign=sign)
         system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]
-        residuals = self._implicit_terms.residuals(right)
-        implicit = [*residuals, z, *terms.rates("z", 1, subtract=True), *solver.solve(1)]
+        rubs = self._friction(right) is not None
+        residuals = [*self._implicit_terms.residuals(right), *self._rubbing(right)]
+        respond = solver.responding_solve(1) if rubs else solver.solve(1)
+        implicit = [*residuals, z, *terms.rates("z", 1, subtract=True), *respond]
+        solve = solver.accelerating_solve(0) if rubs else solver.solve()
         return DifferentiableProgram(
-            program(system, solver.solve(), [z, result], [solver.safe] if target == "a" else []),
+            program(system, solve, [z, result], [solver.safe] if target == "a" else []),
             [*loads, *implicit, terms.add("z", solution=1, update=ADD, fixed=("constants",)), result],
             [*loads, *self._corrected(right), terms.add(target, start=x, solution=0, sign=sign)],
         )

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.elements import differentiate_constraint, has_pieces, trace_force, trace_piece
+from udkjax.equations.elements import differentiate_constraint, has_pieces, trace_force, trace_piece, trace_rubbing
 from udkjax.equations.structure import ElementStructure, element_kinds
 from udkjax.expressions import Graph, Scalar, frontier
 from udkjax.scene.mechanism import Mechanism
@@ -90,8 +90,27 @@ class ForcePrograms(ElementPrograms):
         self._find_constants()
 
 
+class RubbingPrograms(ElementPrograms):
+    """The friction of a joint that depends on its load, with x = -lambda of its eliminated rows among the inputs.
+
+    Outputs: `loads`, 3 for each body, and `slopes`, their derivatives by each x, row by row. The loads are homogeneous in x, of
+    degree one: they are the sum of x times the slopes.
+    """
+
+    def __init__(self, structure: ElementStructure, row_count: int, rows: tuple[int, ...]):
+        super().__init__(structure)
+        zero = self.graph.constant(0.0)
+        self.x = [self.graph.input(("x", row), "position") for row in rows]
+        x = dict(zip(rows, self.x, strict=True))
+        multipliers = [-x[row] if row in x else zero for row in range(row_count)]
+        loads, slopes = trace_rubbing(self.graph, structure, self.leaves, self.t, self.q, self.v, multipliers)
+        self.outputs = {"loads": loads, "slopes": [-s for row in rows for s in slopes[row]]}
+        self._find_constants()
+
+
 constraint_programs = lru_cache(maxsize=256)(ConstraintPrograms)
 force_programs = lru_cache(maxsize=256)(ForcePrograms)
+rubbing_programs = lru_cache(maxsize=256)(RubbingPrograms)
 
 
 def has_rheonomic_joints(mechanism: Mechanism) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.annotations import NumericArray, TreeDef
-from udkjax.equations.structure import Element, ElementStructure, LeafShapes, element_structure
+from udkjax.equations.structure import Element, ElementStructure, LeafShapes, RubbingJoint, element_structure
 from udkjax.expressions import Differential, Graph, Scalar, operations, trace
 from udkjax.expressions.differential import SparseRow
 from udkjax.scene.bodies import GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
@@ -104,6 +104,49 @@ def trace_force(
     return [as_scalar(s) for s in loads(graph, leaves, numbers)], as_scalar(stored)
 
 
+def trace_rubbing(
+    graph: Graph,
+    kind: ElementStructure,
+    leaves: list[np.ndarray],
+    t: Scalar,
+    q: list[Scalar],
+    v: list[Scalar],
+    multipliers: list[Scalar],
+) -> tuple[list[Scalar], list[list[Scalar]]]:
+    """Return the generalized loads of a `RubbingJoint` over the columns of q, and their derivative by each multiplier."""
+    program = _trace_rubbing(*kind, len(multipliers))
+    one, zero = graph.constant(1.0), graph.constant(0.0)
+
+    def derivative(seeds: list[Scalar]) -> list[list[Scalar]]:
+        numbers = [np.asarray(s, object) for s in (t, *q, *v, *multipliers, *seeds)]
+        return [list(array) for array in program(graph, leaves, numbers)]
+
+    count = len(multipliers)
+    slopes = [derivative([one if i == k else zero for i in range(count)])[1] for k in range(count)]
+    return derivative([zero] * count)[0], slopes
+
+
+@lru_cache(maxsize=256)
+def _trace_rubbing(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...], rows: int) -> TraceFunction:
+    """Trace the generalized loads of a `RubbingJoint`, and their derivative along a change of the multipliers."""
+    n = 3 * (len(ground) - sum(ground))
+    leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+    def loads(leaves, numbers):
+        element = jax.tree.unflatten(tree, leaves)
+        frames = _frames(ground, numbers[1 : 1 + n], numbers[1 + n : 1 + 2 * n])
+
+        def of(multipliers):
+            found = element.loads(multipliers, numbers[0], *frames)
+            return jnp.stack([jnp.asarray(c) for load, fixed in zip(found, ground, strict=True) if not fixed for c in load])
+
+        multipliers, changes = numbers[1 + 2 * n : 1 + 2 * n + rows], numbers[1 + 2 * n + rows :]
+        return jax.jvp(of, (multipliers,), (changes,))
+
+    return trace(loads, leaves, [number] * (1 + 2 * n + 2 * rows))
+
+
 class TracedLoads:
     """The loads of all force elements of one structure, as scalars of a graph; compared by identity.
 
@@ -139,6 +182,8 @@ def traced_loads(element: ForceElement, frames: Sequence[str]) -> TracedLoads:
 
 def has_pieces(element: Element) -> bool:
     """Return whether an element is piecewise smooth, that is, overrides the method `piece`."""
+    if isinstance(element, RubbingJoint):
+        return False
     return type(element).piece not in (Constraint.piece, ForceElement.piece)
 
 

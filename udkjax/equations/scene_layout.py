@@ -17,10 +17,19 @@ from udkjax.equations.element_programs import (
     ConstraintPrograms,
     ElementPrograms,
     ForcePrograms,
+    RubbingPrograms,
     constraint_programs,
     force_programs,
+    rubbing_programs,
 )
-from udkjax.equations.structure import ElementKind, LeafShapes, element_kinds
+from udkjax.equations.structure import (
+    ElementKind,
+    ElementStructure,
+    LeafShapes,
+    element_kinds,
+    element_structure,
+    rubbing_joints,
+)
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import KernelWriter
 from udkjax.scene.mechanism import Mechanism
@@ -30,6 +39,9 @@ BODY_COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
 # Columns of the table of a group: start indices of an element's constants, of its entries of Psi_q, of its eliminated rows, and
 # of all its rows; then the three columns above for each of its bodies.
 OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
+# Columns at the end of the table of a group whose friction depends on its load: start indices of the constants of the friction,
+# and of its slopes.
+RUBBING_CONSTANTS, SLOPES = -2, -1
 # Indices of constants of the scene. The constants of each body follow: its entries of M^(-1) for x and y, and for the angle.
 DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
 PER_BODY, MASS_OR_INERTIA = 2, (0, 0, 1)  # number of entries of a body; indices for x, y and the angle
@@ -68,6 +80,26 @@ class ConstraintGroup(ElementGroup):
     programs: ConstraintPrograms
     rows: tuple[int, ...] = ()  # the eliminated rows of each constraint
     entry_index: dict[int, int] = field(default_factory=dict)  # index in `psi_q` of each node of Psi_q that is not constant
+    rubbing: RubbingPrograms | None = None  # friction that depends on the load
+    slope_index: dict[int, int] = field(default_factory=dict)  # index in `slopes` of each node of its slopes
+
+    def column(self, from_end: int) -> int:
+        """Return the index of a column from its index from the end of the table."""
+        return self.table.shape[1] + from_end
+
+    def slope(self, w: KernelWriter, row: int, k: int, base: int = SLOPES) -> Scalar:
+        """Read the derivative of component k of the friction's loads by x of a row; `base` is the column of a table."""
+        s = w.graph.constant(0.0)
+        if self.rubbing is not None:
+            s = self.rubbing.outputs["slopes"][self.rows.index(row) * self.coordinates + k]
+        if s.is_zero:
+            return w.graph.constant(0.0)
+        value = w.read("slopes", self.column(base) if base < 0 else base, self.slope_index[s.index])
+        return value if s.sign > 0 else -value
+
+    def slopes(self, w: KernelWriter, row: int) -> list[Scalar]:
+        """Read the derivatives of all components by x of a row."""
+        return [self.slope(w, row, k) for k in range(self.coordinates)]
 
     def entry(self, w: KernelWriter, row: int, k: int, base: int = ENTRIES) -> Scalar:
         """Read an entry of Psi_q that the elements wrote; `base` is the column of a table."""
@@ -111,15 +143,20 @@ class SceneLayout:
             "trusted": 1,
             "psi_q": 0,
             "gram": 0,
+            "slopes": 0,
         }
         self._eliminated = 0  # number of eliminated rows so far
         self._mechanism, self._loaded = mechanism, bool(mechanism.forces)
         rows = self._find_rows(redundant_rows or ())
+        self._rubbing = [None if x is None else element_structure(x, x.bodies) for x in rubbing_joints(mechanism)]
         # Marks of independent rows, in the order of elimination, if numbers mark redundant rows.
         self.marks, self.first_mark = self.row_count if redundant_rows is None else 0, self.constant_count
         self.constant_count += self.marks
         self.leaves_out_marked = bool(self.marks) and not every_row
-        self.constraints = [self._constraint_group(kind, rows, every_row) for kind in self._kinds(rows)]
+        self.constraints = [
+            self._constraint_group(kind, rows, every_row) for kind in self._kinds(list(zip(rows, self._rubbing, strict=True)))
+        ]
+        self.rubbing = [group for group in self.constraints if group.rubbing is not None and group.rows]
         forces = element_kinds(mechanism, list(mechanism.forces.values()))
         self.forces = [self._force_group(kind) for kind in forces]
         self.one = self.reserve("psi_q", 1)
@@ -164,7 +201,30 @@ class SceneLayout:
         self._eliminated += len(eliminated) * size
         columns = [start + step * np.arange(size) for start, step in zip(starts, steps, strict=True)]
         table = self._table(kind, [*columns, self.row_starts[kind.members]])
-        return ConstraintGroup(programs, kind.members, kind.bodies, table, eliminated, index)
+        friction = self._rubbing[kind.members[0]]
+        if friction is None:
+            return ConstraintGroup(programs, kind.members, kind.bodies, table, eliminated, index)
+        return self._rubbing_group(programs, kind, table, eliminated, index, friction)
+
+    def _rubbing_group(
+        self,
+        programs: ConstraintPrograms,
+        kind: ElementKind,
+        table: np.ndarray,
+        eliminated: tuple[int, ...],
+        index: dict[int, int],
+        friction: ElementStructure,
+    ) -> ConstraintGroup:
+        rubbing, size = rubbing_programs(friction, programs.row_count, eliminated), len(kind.members)
+        slopes: dict[int, int] = {}
+        for s in rubbing.outputs["slopes"]:
+            if not s.is_zero:
+                slopes.setdefault(s.index, len(slopes))
+        starts = self._own_constants(rubbing, size), self.reserve("slopes", len(slopes) * size)
+        steps = len(rubbing.constants), len(slopes)
+        columns = [start + step * np.arange(size) for start, step in zip(starts, steps, strict=True)]
+        table = np.concatenate([table, np.stack(columns, 1)], 1)
+        return ConstraintGroup(programs, kind.members, kind.bodies, table, eliminated, index, rubbing, slopes)
 
     def _force_group(self, kind: ElementKind) -> ForceGroup:
         programs, size = force_programs(kind.structure), len(kind.members)
@@ -192,7 +252,11 @@ class SceneLayout:
         """Add the arrays of linear systems, after the number of eliminated rows is final."""
         self.sizes["factors"] = self.sizes["gram"]
         for k in range(SOLVES):
-            self.sizes |= {f"{name}{k}": self.coordinate_count if name == "jt_x" else self._eliminated for name in SOLVE_ARRAYS}
+            self.add_solve(k)
+
+    def add_solve(self, k: int) -> None:
+        """Add the arrays of one linear system."""
+        self.sizes |= {f"{name}{k}": self.coordinate_count if name == "jt_x" else self._eliminated for name in SOLVE_ARRAYS}
 
     @cached_property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

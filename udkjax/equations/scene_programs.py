@@ -74,8 +74,10 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def is_small(self) -> bool:
-        """True if the programs are unrolled because the accelerations take few operations."""
-        loops = [loop for loop in self.accelerations.parts if isinstance(loop, KernelLoop)]
+        """True if the programs are unrolled because the accelerations, apart from friction, take few operations."""
+        solver = self._solver
+        parts = [*solver.acceleration_system, *solver.factorize, *solver.solve(), self._terms.add("a", start="free", solution=0)]
+        loops = [loop for loop in parts if isinstance(loop, KernelLoop)]
         return sum(len(loop.table) * loop.kernel.operation_count for loop in loops) <= UNROLLED_SCENE_OPERATIONS
 
     @property
@@ -111,7 +113,7 @@ class ScenePrograms(RunPrograms):
     def accelerations(self) -> LoopProgram:
         """Compute a; set safe."""
         solver = self._solver
-        solve = [*solver.factorize, *solver.solve(), self._terms.add("a", start="free", solution=0), solver.safe]
+        solve = [*solver.factorize, *solver.accelerating_solve(0), self._terms.add("a", start="free", solution=0), solver.safe]
         return program(solver.acceleration_system, solve)
 
     @cached_property
@@ -146,7 +148,7 @@ class ScenePrograms(RunPrograms):
         """Compute q1 and v1, each after a Newton step, and a, all from one factorization."""
         terms, solver, right = self._terms, self._solver, ("b", "psi", "psi_dot")
         system = [terms.sincos(), *terms.free_accelerations("v"), *terms.element_terms(("psi_q", *right))]
-        solves = [loop for k in range(3) for loop in solver.refined_solve(k, 3)]
+        solves = [*solver.accelerating_solve(0, refined_by=3), *(loop for k in (1, 2) for loop in solver.refined_solve(k, 3))]
         corrected = [terms.add(f"{x}1", start=x, solution=k, sign=-1) for k, x in enumerate("qv", 1)]
         return program(system, solver.factorize_dropping, solves, [terms.add("a", start="free", solution=0), *corrected])
 
@@ -186,9 +188,12 @@ class ScenePrograms(RunPrograms):
     @cached_property
     def equation_terms(self) -> LoopProgram:
         """Compute terms: a_F, followed by b of all rows."""
-        terms = self._terms
-        free = [terms.sincos(), *terms.free_accelerations("v"), terms.add("terms", start="free")]
-        return program(free, terms.row_terms("b", "terms", self.coordinate_count))
+        return program([self._terms.sincos(), *self._terms.free_accelerations("v")], self._equation_terms)
+
+    @property
+    def _equation_terms(self) -> list[KernelLoop | Reset]:
+        """Compute terms from a_F."""
+        return [self._terms.add("terms", start="free"), *self._terms.row_terms("b", "terms", self.coordinate_count)]
 
     @cached_property
     def geometry(self) -> LoopProgram:
@@ -218,9 +223,12 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def rows_and_loads(self) -> LoopProgram:
-        """Compute the inputs of rank-revealing methods: psi_q, psi, psi_dot and terms of all rows, and root, M^(-1/2)."""
+        """Compute the inputs of rank-revealing methods: psi_q, psi, psi_dot and terms of all rows, and root, M^(-1/2).
+
+        Friction that depends on multipliers is in a_F, by those of elimination.
+        """
         psi_dot = self._terms.row_terms("psi_dot", "psi_dot")
-        return program(self.equation_terms.parts, self.rows("psi"), psi_dot)
+        return program(self._solver.free_with_friction, self._equation_terms, self.rows("psi"), psi_dot)
 
     @cached_property
     def dense_accelerations(self) -> LoopProgram:

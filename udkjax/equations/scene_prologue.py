@@ -5,19 +5,20 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from udkjax.equations.element_programs import ConstraintPrograms
+from udkjax.equations.element_programs import ConstraintPrograms, ElementPrograms
 from udkjax.equations.scene_layout import (
     DROP_TOL,
     GAINS,
     OWN_CONSTANTS,
     RIGHT,
     ROW,
+    RUBBING_CONSTANTS,
     SAFE_TOL,
     ConstraintGroup,
     ElementGroup,
     SceneLayout,
 )
-from udkjax.equations.structure import Element
+from udkjax.equations.structure import Element, rubbing_joints
 from udkjax.expressions.loop_program import KernelLoop, KernelWriter, LoopProgram
 from udkjax.scene.mechanism import Mechanism
 
@@ -45,7 +46,9 @@ def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) ->
     bodies = [[int(b.mass), int(b.inertia), layout.of_body(k)] for k, b in enumerate(places.bodies.values())]
     loops = [KernelLoop(scene.kernel(), np.zeros((1, 1), int)), KernelLoop(body.kernel(), np.array(bodies).reshape(-1, 3))]
     constraints, forces = list(places.constraints.values()), list(places.forces.values())
+    rubbing = rubbing_joints(places)
     loops += [_group_constants(layout, group, constraints) for group in layout.constraints]
+    loops += [_constants(layout, group, group.rubbing, rubbing, group.column(RUBBING_CONSTANTS)) for group in layout.rubbing]
     loops += [_group_constants(layout, group, forces) for group in layout.forces]
     if layout.marks:
         loops += [_marks(layout, group, number_count + layout.gains) for group in layout.constraints]
@@ -60,7 +63,15 @@ def _marks(layout: SceneLayout, group: ConstraintGroup, start: int) -> KernelLoo
 
 
 def _group_constants(layout: SceneLayout, group: ElementGroup, elements: Sequence[Element]) -> KernelLoop:
-    programs, table = group.programs, group.table
+    return _constants(layout, group, group.programs, elements, OWN_CONSTANTS)
+
+
+def _constants(
+    layout: SceneLayout, group: ElementGroup, programs: ElementPrograms | None, elements: Sequence[Element | None], to: int
+) -> KernelLoop:
+    """Return the loop over the elements of a group that computes the constants of programs, from a column of the table on."""
+    assert programs is not None
+    table = group.table
     members = [jax.tree.leaves(elements[i]) for i in group.members]
     starts = np.array([[np.ravel(x)[0] if np.size(x) else 0 for x in leaves] for leaves in members], int)
     w, columns = KernelWriter(programs.graph), table.shape[1]
@@ -71,5 +82,5 @@ def _group_constants(layout: SceneLayout, group: ElementGroup, elements: Sequenc
         for k, s in enumerate([*programs.gains, *programs.gravity]):
             w.bind(s, "constants", None, (GAINS if layout.gains else layout.gravity) + k)
     for k, s in enumerate(programs.constants):
-        w.write(s, "constants", OWN_CONSTANTS, k)
+        w.write(s, "constants", to, k)
     return KernelLoop(w.kernel(), np.concatenate([table, starts.reshape(len(members), -1)], 1))

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 from udkjax.equations.block_elimination import BlockElimination
+from udkjax.equations.friction_elimination import FrictionElimination
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms
 from udkjax.expressions.loop_program import ADD, KernelLoop, LoopProgram, Reset
 from udkjax.pinv.rank_policy import RankPolicy
@@ -21,12 +22,36 @@ class SceneSolver:
     def __init__(self, terms: SceneTerms, policy: RankPolicy):
         self.terms, self.policy = terms, policy
         self.elimination = BlockElimination(terms)
+        self.friction = FrictionElimination(terms, self.elimination) if terms.layout.rubbing else None
         self.solve = self.elimination.solve
 
     @property
     def factorize(self) -> ProgramParts:
         """The factorization for accelerations, under the policy."""
         return self.elimination.factorize(self.policy.drops)
+
+    def accelerating_solve(self, solve: int, v: str = "v", refined_by: int | None = None) -> ProgramParts:
+        """Solve the system `solve` with the right-hand side b: x, and jt_x = Psi_q^T x with the friction that depends on x.
+
+        `refined_by` is the number of a system for the corrections of a refined solution.
+        """
+        yield from self.solve(solve) if refined_by is None else self.refined_solve(solve, refined_by)
+        if self.friction is not None:
+            yield from self.friction.settle(solve, v)
+
+    @property
+    def free_with_friction(self) -> list[KernelLoop | Reset]:
+        """Compute sines and cosines, and a_F with the friction that depends on x, by elimination without dependent rows."""
+        terms = self.terms
+        if self.friction is None:
+            return [terms.sincos(), *terms.free_accelerations("v")]
+        solved = [*self.acceleration_system, *self.factorize_dropping, *self.accelerating_solve(0)]
+        friction = [Reset("jt_x0", 0, terms.layout.coordinate_count), *self.friction.add_loads(0)]
+        return [*solved, *friction, terms.add("free", solution=0, update=ADD)]
+
+    def responding_solve(self, solve: int) -> ProgramParts:
+        """Solve the system `solve` for a change of x at the solution of `accelerating_solve`."""
+        return self.solve(solve) if self.friction is None else self.friction.solve(solve)
 
     @property
     def factorize_dropping(self) -> ProgramParts:
@@ -77,7 +102,7 @@ class SceneSolver:
         """Compute v1 after a Newton step to Psi_dot = 0, and a at v1, from one factorization."""
         terms = self.terms
         system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
-        solve = [*self.solve(1), terms.add("a", start="free", solution=1), self.safe]
+        solve = [*self.accelerating_solve(1, "v1"), terms.add("a", start="free", solution=1), self.safe]
         return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
 
     def tangent_parts(self, solve: int) -> ProgramParts:

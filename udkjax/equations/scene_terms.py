@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.element_programs import FREE_INPUTS, POSITION_INPUTS, VELOCITY_INPUTS
+from udkjax.equations.element_programs import FREE_INPUTS, POSITION_INPUTS, VELOCITY_INPUTS, ElementPrograms
 from udkjax.equations.scene_layout import (
     BODIES,
     BODY_CONSTANTS,
@@ -15,6 +15,7 @@ from udkjax.equations.scene_layout import (
     OWN_CONSTANTS,
     RIGHT,
     ROW,
+    RUBBING_CONSTANTS,
     SINE,
     ConstraintGroup,
     ElementGroup,
@@ -61,7 +62,39 @@ class SceneTerms:
         self, key: Hashable, group: ElementGroup, write: Write, fixed: Collection[str] = (), **names: str
     ) -> KernelLoop:
         """Return a loop over the elements of a group, with the inputs of their programs bound to the arrays of the scene."""
-        programs = group.programs
+        return self.over_elements((key, group), group, group.programs, OWN_CONSTANTS, write, fixed, **names)
+
+    def over_rubbing(self, key: Hashable, group: ConstraintGroup, write: Write, **names: str) -> KernelLoop:
+        """Return a loop over the joints of a group with friction, with the inputs of its programs bound to arrays.
+
+        x of their rows is read from the array `x`.
+        """
+        rubbing = group.rubbing
+        assert rubbing is not None
+
+        def bind_solution(w: KernelWriter):
+            for i, s in enumerate(rubbing.x):
+                w.bind(s, "x", RIGHT, i)
+            write(w)
+
+        return self.over_elements(
+            (key, group, "rubbing"), group, rubbing, group.column(RUBBING_CONSTANTS), bind_solution, **names
+        )
+
+    def over_elements(
+        self,
+        key: Hashable,
+        group: ElementGroup,
+        programs: ElementPrograms,
+        constants: int,
+        write: Write,
+        fixed: Collection[str] = (),
+        **names: str,
+    ) -> KernelLoop:
+        """Return a loop over the elements of a group, with the inputs of `programs` bound to the arrays of the scene.
+
+        `constants` is the column of the start indices of their constants.
+        """
 
         def bind_inputs(w: KernelWriter):
             arrays = dict.fromkeys(POSITION_INPUTS, ("q", BODY_COORDINATES, 0)) | dict.fromkeys(
@@ -72,14 +105,14 @@ class SceneTerms:
             )
             order = [*POSITION_INPUTS, *VELOCITY_INPUTS, *FREE_INPUTS, "sin", "cos"]
             for k, s in enumerate(programs.constants):
-                w.bind(s, "constants", OWN_CONSTANTS, k)
+                w.bind(s, "constants", constants, k)
             w.bind(programs.t, "t", None, 0)
             for name, body, s in programs.state:
                 array, column, start = arrays[name]
                 w.bind(s, array, BODIES + 3 * body + column, start + order.index(name) % 3 if name != "cos" else start + 1)
             write(w)
 
-        return KernelLoop(self.kernel((key, group), bind_inputs, programs.graph), group.table, names, fixed)
+        return KernelLoop(self.kernel(key, bind_inputs, programs.graph), group.table, names, fixed)
 
     # --- terms of the equations
 

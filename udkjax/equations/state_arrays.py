@@ -18,6 +18,7 @@ from udkjax.equations.analysis import Analysis
 from udkjax.equations.loads import mass_of
 from udkjax.equations.rest_program import LOADS
 from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
+from udkjax.equations.structure import rubbing_joints
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.programs.identity_cache import cached_by_identity
@@ -30,7 +31,8 @@ DENSE_ARRAYS = 8  # of the size of Psi_q, which a state needs at once
 def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = None) -> bool:
     """Return whether `StateArrays` has the quantities of a mechanism: its numbers and the given ones are concrete.
 
-    `method` must be the SVD, or what stands for it; numbers of the mechanism must not be samples over time.
+    `method` must be the SVD, or what stands for it; numbers of the mechanism must not be samples over time, and its friction must
+    not depend on the loads of joints.
     """
     config = jax.config
     return (
@@ -40,6 +42,7 @@ def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = Non
         and not (is_traced(numbers) or is_within_jit() or mechanism.samples)
         and config.jax_enable_x64
         and not (config.jax_disable_jit or config.jax_debug_nans)
+        and not any(joint is not None for joint in rubbing_joints(mechanism))
     )
 
 

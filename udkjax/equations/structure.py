@@ -9,23 +9,45 @@ from collections.abc import Callable, Hashable, Sequence
 from itertools import groupby
 from typing import NamedTuple, TypeAlias, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.annotations import NumericArray, TreeDef
+from udkjax.annotations import Number, NumericArray, TreeDef
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.element_setup import attached_bodies
-from udkjax.scene.forces import ForceElement
-from udkjax.scene.joints import Constraint
+from udkjax.scene.forces import ForceElement, Friction, Wrench
+from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
 
 LeafShapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shape and dtype of each leaf of a tree
-Element: TypeAlias = Constraint | ForceElement
+
+
+class RubbingJoint(eqx.Module):
+    """A joint with the friction that depends on its load, both without names.
+
+    Args:
+        bodies: the names of the bodies of the joint.
+        friction: the friction.
+        joint: the joint.
+    """
+
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    friction: Friction
+    joint: Joint
+
+    def loads(self, multipliers: Sequence[Number], t: Number, *frames: Frame) -> Sequence[Wrench]:
+        """Return the loads of the friction on the frames of the joint, from the multipliers of its rows."""
+        return self.friction.rubbing_loads(self.joint, multipliers, t, *frames)
+
+
+Element: TypeAlias = Constraint | ForceElement | RubbingJoint
 Result = TypeVar("Result")
+AnyElement = TypeVar("AnyElement", bound=eqx.Module)
 
 
 @cached_by_identity  # also for traced numbers: the result contains no numbers
@@ -80,18 +102,34 @@ class ElementStructure(NamedTuple):
 
 def element_structure(element: Element, frames: Sequence[str]) -> ElementStructure:
     """Return the structure of a constraint or force element attached to `frames`, names of bodies or the ground."""
+    leaves, tree = jax.tree.flatten(nameless(element, frames))
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    return ElementStructure(tree, shapes, tuple(name == GROUND for name in frames))
+
+
+def nameless(element: AnyElement, frames: Sequence[str]) -> AnyElement:
+    """Return an element with the indices of its `frames` instead of names of bodies, and without names of joints."""
     numbers = {name: GROUND if name == GROUND else str(k) for k, name in enumerate(frames)}
-    nameless = object.__new__(type(element))
+    renamed = object.__new__(type(element))
     for name, value in vars(element).items():
-        object.__setattr__(nameless, name, value)
+        object.__setattr__(renamed, name, value)
     for field in dataclasses.fields(element):
         if field.name == "bodies" or "names" in field.metadata:
             value = getattr(element, field.name)
-            renamed = numbers.get(value, "") if isinstance(value, str) else tuple(numbers.get(name, "") for name in value)
-            object.__setattr__(nameless, field.name, renamed)
-    leaves, tree = jax.tree.flatten(nameless)
-    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    return ElementStructure(tree, shapes, tuple(name == GROUND for name in frames))
+            new = numbers.get(value, "") if isinstance(value, str) else tuple(numbers.get(name, "") for name in value)
+            object.__setattr__(renamed, field.name, new)
+    return renamed
+
+
+def rubbing_joints(mechanism: Mechanism) -> list[RubbingJoint | None]:
+    """Return the joints with friction that depends on their load, in the order of the constraints; None for all others."""
+    frictions = {f.joint: f for f in mechanism.forces.values() if isinstance(f, Friction) and f.rubs}
+    found: list[RubbingJoint | None] = [None] * len(mechanism.constraints)
+    for k, (name, joint) in enumerate(mechanism.joints.items()):
+        if name in frictions:
+            bodies = joint.frame_names
+            found[k] = RubbingJoint(bodies, nameless(frictions[name], ()), nameless(joint, bodies))
+    return found
 
 
 class ElementKind(NamedTuple):
@@ -109,7 +147,8 @@ def element_kinds(
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
     kinds: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):
-        frames = attached_bodies(element, joints)  # called once: a method call on a large module visits all of its leaves
+        # Called once: a method call on a large module visits all of its leaves.
+        frames = element.bodies if isinstance(element, RubbingJoint) else attached_bodies(element, joints)
         key = element_structure(element, frames), labels[i] if labels else None
         kinds.setdefault(key, []).append((i, [body_index[name] for name in frames if name in body_index]))
     result = []

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
-from udkjax.equations import constraints, loads
+from udkjax.equations import constraints, loads, rubbing
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart
 from udkjax.equations.analysis import Analysis, analyse
@@ -34,11 +34,49 @@ class TextbookEquations(MechanismSystem):
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """Return a = a_F + M^(-1/2) D^+ b."""
-        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights)
+        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights, self._friction(t, q, v))
 
     def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         """Return lambda = -(D^+)^T D^+ b."""
+        if self.rubs:
+            return rubbing.settled_multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
         return uk.multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
+
+    def _friction(self, t: Time, q: Vector, v: Vector) -> Vector | None:
+        """Return the loads of friction that depends on the loads of joints; None if there is none."""
+        if not self.rubs:
+            return None
+        return rubbing.rubbing_loads(self.mechanism, t, q, v, self.multipliers(t, q, v))
+
+    def rubbing_powers(self, t: Time, q: Vector, v: Vector, multipliers: Float[Array, "m"]) -> dict[str, Array]:
+        """Return the power (W) of the friction that depends on the loads of joints, by joint."""
+        drags = rubbing.single_rubbing_loads(self.mechanism, t, q, v, multipliers)
+        return {joint: v @ drag for joint, drag in drags.items()}
+
+    def loose_friction(self, t: Time, q: Vector, v: Vector, N: Float[Array, "m k"]) -> dict[str, Array]:
+        """Return the accelerations (n, k) that a change of the multipliers by each column of N causes by friction, by joint.
+
+        They are those of a small change, without the change of the multipliers that follows from it.
+        """
+        multipliers, root = self.multipliers(t, q, v), uk.inverse_sqrt_mass(self.mechanism)
+        plus = uk.pseudoinverse(self.method, D := uk.D(self.mechanism, t, q, self.scales.weights))
+        slopes = jax.jacfwd(lambda x: rubbing.single_rubbing_loads(self.mechanism, t, q, v, x))(multipliers)
+
+        def accelerate(load: Vector) -> Vector:
+            pull = root * load
+            return root * (pull - plus @ (D @ pull))
+
+        return {joint: jax.vmap(accelerate, 1, 1)(slope @ N) for joint, slope in slopes.items()}
+
+    @property
+    def rubbing_joints(self) -> list[str]:
+        """The joints whose friction depends on their load."""
+        return rubbing.rubbing_names(self.mechanism)
+
+    @property
+    def rubs(self) -> bool:
+        """True if friction depends on the loads of joints."""
+        return bool(self.rubbing_joints)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Project q and v onto Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
@@ -66,7 +104,8 @@ class TextbookEquations(MechanismSystem):
         """Return M, F, Psi_q and gamma - 2 alpha Psi_dot - beta^2 Psi, for all rows."""
         mechanism, A = self.mechanism, constraints.psi_q(self.mechanism, t, q)
         c = uk.b(mechanism, t, q, v, self.baumgarte) + A @ uk.a_F(mechanism, t, q, v)
-        return jnp.diag(loads.mass(mechanism)), loads.force(mechanism, t, q, v), A, c
+        F, friction = loads.force(mechanism, t, q, v), self._friction(t, q, v)
+        return jnp.diag(loads.mass(mechanism)), F if friction is None else F + friction, A, c
 
     def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
         """Return Psi_q of all rows."""

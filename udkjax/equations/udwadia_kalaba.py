@@ -16,7 +16,8 @@ diag(w) b, which has the same solutions if the rows are consistent, and lambda =
 zero is left out.
 
 Arguments and shapes are those of constraints.py: t (s), q and v of n coordinates, m rows. `baumgarte` contains the gains alpha
-and beta; None: no stabilization. `w` are the weights (m,); None: all weights are one.
+and beta; None: no stabilization. `w` are the weights (m,); None: all weights are one. `friction` are loads (n,) added to F, those
+of friction that depends on lambda (rubbing.py); None: no such friction.
 """
 
 import equinox as eqx
@@ -33,6 +34,7 @@ from udkjax.printing import PrintsLine
 from udkjax.scene.mechanism import Mechanism
 
 Weights = Float[ArrayLike, "m"] | None
+Loads = Float[Array, "n"] | None
 
 
 class Baumgarte(PrintsLine):
@@ -58,16 +60,23 @@ def D(mechanism: Mechanism, t: NumberLike, q: BodyArray, w: Weights = None) -> F
     return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
-def a_F(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
+def a_F(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, friction: Loads = None) -> Float[Array, "n"]:
     """Return a_F = M^(-1) F: the accelerations without constraints."""
-    return loads.force(mechanism, t, q, v) / loads.mass(mechanism)
+    F = loads.force(mechanism, t, q, v)
+    return (F if friction is None else F + friction) / loads.mass(mechanism)
 
 
 def b(
-    mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, baumgarte: Baumgarte | None = None, w: Weights = None
+    mechanism: Mechanism,
+    t: NumberLike,
+    q: BodyArray,
+    v: BodyArray,
+    baumgarte: Baumgarte | None = None,
+    w: Weights = None,
+    friction: Loads = None,
 ) -> Float[Array, "m"]:
     """Return b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy."""
-    b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v)
+    b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v, friction)
     if baumgarte is not None:
         b = b - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
         b = b - baumgarte.beta**2 * constraints.psi(mechanism, t, q)
@@ -82,10 +91,11 @@ def accelerations(
     method: Pseudoinverse,
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
+    friction: Loads = None,
 ) -> Float[Array, "n"]:
     """Return a = a_F + M^(-1/2) D^+ b."""
-    x = pseudoinverse(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w)
-    return a_F(mechanism, t, q, v) + inverse_sqrt_mass(mechanism) * x
+    x = pseudoinverse(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w, friction)
+    return a_F(mechanism, t, q, v, friction) + inverse_sqrt_mass(mechanism) * x
 
 
 def multipliers(

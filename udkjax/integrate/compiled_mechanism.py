@@ -182,6 +182,11 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
         return f"it does not know {type(plain).__name__}"
     if formulation is not None and not isinstance(plain, TextbookEquations):
         return f"it knows {type(formulation).__name__} of mechanisms only"
+    if isinstance(plain, TextbookEquations) and plain.rubs:
+        if formulation is not None or not eliminates(plain.method):
+            return "it computes friction that depends on the loads of joints by elimination only"
+        if plain.redundant is None or plain.redundant:
+            return "friction depends on the loads of joints, and redundant rows share these"
     return reason_for_plain(plain.method, formulation)
 
 

@@ -195,7 +195,8 @@ class _Expanded:
         if primitive in _EXPANSIONS:
             return _EXPANSIONS[primitive](**parameters)
         if "_prim" in parameters:  # a JAX primitive defined by other operations
-            return parameters["_prim"].expand
+            defined = parameters["_prim"]
+            return lambda *xs: defined.expand(*jax.tree.unflatten(defined.in_tree, xs))
         impl = primitive.impl
         if isinstance(impl, partial) or impl.__module__.startswith(("jax.", "jaxlib")):
             return None

@@ -17,8 +17,9 @@ from udkjax.annotations import TomlTable
 from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import FieldMetadata, StaticValue
+from udkjax.scene.forces import Friction
 from udkjax.scene.held import Held
-from udkjax.scene.joints import Revolute
+from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.profiles import AbstractProfile, profile_class
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
@@ -78,7 +79,7 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
         problems.append("body: a mechanism needs at least one body")
     known: dict[str, dict[str, type | None]] = {
         "body": {GROUND: None, **{e.name: e.cls for e in bodies if isinstance(e.name, str)}},
-        "revolute": {e.name: e.cls for e in entries if e.section == "joint" and isinstance(e.name, str)},
+        "rubbing": {e.name: e.cls for e in entries if e.section == "joint" and isinstance(e.name, str)},
     }
     owner: dict[tuple[str, str], SceneEntry] = {}
     for entry in entries:
@@ -94,7 +95,17 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
             problems.extend(_check_references(f"{entry.where}.bodies", "body", entry.table.get("bodies"), known))
         else:
             problems.extend(check_table(entry.where, entry.cls, entry.table, known))
-    return problems
+    return [*problems, *_repeated_coefficients(entries)]
+
+
+def _repeated_coefficients(entries: Sequence[SceneEntry]) -> Iterator[str]:
+    """Iterate over force elements that give a joint a second coefficient of friction."""
+    first: dict[object, SceneEntry] = {}
+    for entry in entries:
+        if entry.cls is not None and issubclass(entry.cls, Friction) and "coefficient" in entry.table:
+            joint = abbreviate(entry.table.get("joint"))
+            if first.setdefault(joint, entry) is not entry:
+                yield f"{entry.where}.joint: {joint} has a coefficient of friction already, by {first[joint].where}"
 
 
 def name_mistake(name: object) -> str:
@@ -151,6 +162,10 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
             yield f"{where}.{name}: missing"
     if "bodies" in expected:
         yield from _check_bodies(where, cls, table)
+    if issubclass(cls, Friction):
+        joint = table.get("joint")
+        joint_class = known.get("rubbing", {}).get(joint) if isinstance(joint, str) else None
+        yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table, joint_class))
 
 
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
@@ -284,10 +299,10 @@ def _check_references(path: str, kind: str | None, value: object, known: KnownNa
         if not isinstance(name, str):
             continue
         if name not in named:
-            noun = {"revolute": "revolute joint"}.get(kind, kind)
+            noun = {"rubbing": "joint"}.get(kind, kind)
             yield f"{entry_path}: no {noun} named {quote(name)}{suggestion(name, named)}"
-        elif kind == "revolute" and not issubclass(named[name] or Revolute, Revolute):
-            yield f"{entry_path}: {quote(name)} must be a revolute joint"
+        elif kind == "rubbing" and not issubclass(named[name] or Revolute, Revolute | Prismatic | Slot):
+            yield f"{entry_path}: {quote(name)} must be a revolute joint, a prismatic joint or a slot"
         elif single and name == GROUND and path.endswith(".body"):
             yield f'{entry_path}: "{GROUND}" does not move; name a body'
 

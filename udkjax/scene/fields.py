@@ -126,7 +126,7 @@ class FieldMetadata(TypedDict, total=False):
     require: tuple[Requirement, ...]
     at_least: int  # number of entries
     called: bool  # the field holds a function of time, used only by calling it
-    names: Literal["body", "revolute", "pin", "link", "slide"]  # kind of the names that the field holds
+    names: Literal["body", "rubbing", "pin", "link", "slide", "slot"]  # kind of the names that the field holds
 
 
 CLOSES = 1e-9  # relative to the sum of the sizes: numbers of a file have more digits
@@ -153,8 +153,9 @@ PROFILE_RADII: FieldMetadata = {"require": (_POSITIVE,), "at_least": 3}
 CALLED: FieldMetadata = {"called": True}
 NOT_EMPTY: FieldMetadata = {"at_least": 1}
 BODY: FieldMetadata = {"names": "body"}  # the field names one or several bodies
-REVOLUTE: FieldMetadata = {"names": "revolute"}  # the field names a revolute joint
+RUBBING: FieldMetadata = {"names": "rubbing"}  # the field names a joint whose surfaces rub
 PIN: FieldMetadata = {"names": "pin"}  # one or several pins of a drawing
 LINK: FieldMetadata = {"names": "link"}  # one or several links of a drawing, bodies or the ground
 SLIDE: FieldMetadata = {"names": "slide"}  # a slide of a drawing
+SLOT: FieldMetadata = {"names": "slot"}  # a slot of a drawing
 OUTLINE: FieldMetadata = {"at_least": 3}

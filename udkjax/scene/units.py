@@ -61,6 +61,8 @@ _OF_TYPE = {
     ("TorsionSpring", "stiffness"): "N m/rad",
     ("TorsionSpring", "damping"): "N m s/rad",
     ("Friction", "velocity"): "rad/s",
+    ("Friction", "speed"): "m/s",
+    ("Friction", "viscous"): "s/m",
     ("Profile", "angle"): "rad",
     ("LiftProfile", "base"): "m",
     ("LiftProfile", "lift"): "m",

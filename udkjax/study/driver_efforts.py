@@ -12,6 +12,7 @@ from udkjax.arrays import is_traced
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.effort_arrays import efforts_by_numpy
+from udkjax.equations.rubbing import settled_loads
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.positions.coordinates import Coordinate, choose_name, constant_motion, named_element, value_of
@@ -70,7 +71,7 @@ def _by_jax(
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
         J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
         free, determined = _free_part(J), jnp.asarray(True)
-        missing = units * (loads.mass(mechanism) * a - loads.force(mechanism, t, q, v))
+        given = loads.mass(mechanism) * a - loads.force(mechanism, t, q, v)
         if analysis.rank is not None:  # otherwise the number of degrees of freedom is unknown
             deficient = SVD(RANK_TOL).plus(J).rank < analysis.rank if len(J) else jnp.asarray(False)
             u = v / units
@@ -78,8 +79,17 @@ def _by_jax(
             u = u / jnp.where(speed > 0, speed, 1.0)
             everywhere, determined = free, ~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0))
             free = lambda x: jnp.where(deficient, jnp.tensordot(u, u @ x, 0), everywhere(x))  # noqa: E731
-        required, A = free(missing), free((C * units).T * share)
-        f = share * (SVD(RANK_TOL).plus(A) @ required)
+        drive, bearing = SVD(RANK_TOL).plus(free((C * units).T * share)), SVD(RANK_TOL).plus(J) if len(J) else None
+
+        def efforts(friction: Array) -> Array:
+            return share * (drive @ free(units * (given - friction)))
+
+        def multipliers(friction: Array) -> Array:
+            carried = units * (given - friction - C.T @ efforts(friction))
+            return jnp.zeros(0) if bearing is None else -scales.weights * (bearing.T @ carried)
+
+        friction = settled_loads(multipliers, mechanism, t, q, v)
+        required, f = free(units * (given - friction)), efforts(friction)
         # Relative to the single terms, since their sum may be a rounding error.
         parts = units * (loads.mass(mechanism) * jnp.abs(a) + load_sizes(mechanism, t, q, v))
         size = jnp.maximum(jnp.max(parts), scales.mass * (scales.length * scales.rate) ** 2)

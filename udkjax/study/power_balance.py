@@ -25,7 +25,7 @@ from udkjax.printing import PrintedTable, format_number, prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
-from udkjax.scene.forces import ForceElement
+from udkjax.scene.forces import ForceElement, Friction
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -122,13 +122,17 @@ def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
         kinetic = jax.jvp(lambda v: loads.kinetic_energy(mechanism, v), (v,), (a,))[1]
         potential = jax.jvp(lambda t, q: loads.potential_energy(mechanism, t, q, v), (t, q), (jnp.ones_like(t), v))[1]
         by_joint = -multipliers * (constraints.psi_q(mechanism, t, q) @ v)
-        return multipliers * psi_t, _force_powers(mechanism, t, q, v), by_joint, kinetic, potential
+        drags = equations.rubbing_powers(t, q, v, multipliers)
+        return multipliers * psi_t, _force_powers(mechanism, t, q, v, drags), by_joint, kinetic, potential
 
     return jax.vmap(one)(ts, q, v)
 
 
-def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[Array, "forces"]:
-    """Return the power of each force element: the power of its loads, and of the explicit time dependence of its potential."""
+def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array, drags: dict[str, Array]) -> Float[Array, "forces"]:
+    """Return the power of each force element: the power of its loads, and of the explicit time dependence of its potential.
+
+    `drags` are the powers of friction that depends on the loads of joints, by joint.
+    """
 
     def power(element: ForceElement, *frames: Frame) -> Array:
         stated = element.loads(t, *frames)
@@ -142,4 +146,7 @@ def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array) -> Float[A
     by_element = jnp.zeros(len(mechanism.forces))
     for kind, powers in loads.evaluate_forces(power, mechanism, q, v):
         by_element = by_element.at[kind.members].set(powers)
+    for k, force in enumerate(mechanism.forces.values()):
+        if isinstance(force, Friction) and force.rubs:
+            by_element = by_element.at[k].add(drags[force.joint])
     return by_element

@@ -9,6 +9,7 @@ import numpy as np
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.integrate.causes.element_loads import ElementLoads, TimedState, element_loads
 from udkjax.integrate.causes.failed_run import FailedRun
+from udkjax.integrate.causes.jamming import explain_jamming
 from udkjax.integrate.causes.reach import explain_reach
 from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import is_explicit
@@ -176,7 +177,7 @@ def _nothing_projects(run: FailedRun) -> str:
 
 
 def _explain_not_finite(run: FailedRun) -> str | None:
-    text = _not_finite_ahead(run)
+    text = _not_finite_ahead(run) or explain_jamming(run)
     if text:
         return text
     if run.formulation == "Augmented" and (run.analysis.redundant_rows or _rank(run) < run.rows.count):
@@ -188,7 +189,8 @@ def _explain_not_finite(run: FailedRun) -> str | None:
 
 
 def _explain_small_step(run: FailedRun) -> str | None:
-    return _not_finite_ahead(run) or _reach_at_end(run) or _violent_load(run) or _near_singular(run) or _stiff(run)
+    text = _not_finite_ahead(run) or explain_jamming(run) or _reach_at_end(run)
+    return text or _violent_load(run) or _near_singular(run) or _stiff(run)
 
 
 def _explain_many_steps(run: FailedRun) -> str | None:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.arrays import make_module, number
-from udkjax.scene.forces import Friction
+from udkjax.scene.forces import Friction, Wrench
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 
@@ -47,7 +47,15 @@ class SwitchedFriction(Friction):
     active: Float[Array, ""] = eqx.field(default=1.0)
 
     def loads(self, t, *frames):
-        return [tuple(self.active * x for x in load) for load in super().loads(t, *frames)]
+        loads = super().loads(t, *frames)
+        return None if loads is None else [self._switched(load) for load in loads]
+
+    def rubbing_loads(self, joint, multipliers, t, *frames):
+        return [self._switched(load) for load in super().rubbing_loads(joint, multipliers, t, *frames)]
+
+    def _switched(self, load: Wrench) -> Wrench:
+        x, y, torque = load
+        return self.active * x, self.active * y, self.active * torque
 
 
 def with_switched_friction(forces: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:

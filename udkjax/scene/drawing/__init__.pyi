@@ -5,6 +5,7 @@ from udkjax.scene.drawing.drawn_forces import Load as Load
 from udkjax.scene.drawing.drawn_forces import Motor as Motor
 from udkjax.scene.drawing.drawn_forces import PinDamper as PinDamper
 from udkjax.scene.drawing.drawn_forces import PinSpring as PinSpring
+from udkjax.scene.drawing.drawn_friction import PinFriction as PinFriction
 from udkjax.scene.drawing.drawn_joints import CamPair as CamPair
 from udkjax.scene.drawing.drawn_joints import GearPair as GearPair
 from udkjax.scene.drawing.drawn_joints import PinInSlot as PinInSlot

@@ -23,6 +23,7 @@ from udkjax.scene.drawing.drawing_reader import (
     read_drawing,
 )
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
+from udkjax.scene.drawing.drawn_friction import PinFriction
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, around
@@ -69,6 +70,7 @@ class Drawing(AbstractDrawing):
         name: The name of the mechanism.
         units: Units of plain numbers, such as `{"length": "mm"}`; by default SI units and radians. A number may be a string with
             its unit, such as "60 rpm".
+        friction: Friction at pins, in slides and in slots, as the elements above.
 
     Raises:
         SceneError: The drawing is wrong; the error lists all mistakes. Traced numbers are not checked.
@@ -102,9 +104,10 @@ class Drawing(AbstractDrawing):
         gravity: Numbers | None = None,
         name: str = "",
         units: Mapping[str, str] | None = None,
+        friction: "Mapping[str, PinFriction | TomlTable] | Sequence[PinFriction | TomlTable] | None" = None,
     ):
         given = {"link": links, "slide": slides, "slot": slots, "gear": gears, "cam": cams}
-        given |= {"motor": motors, "spring": springs, "damper": dampers, "load": loads}
+        given |= {"motor": motors, "spring": springs, "damper": dampers, "load": loads, "friction": friction}
         given |= {"body": bodies, "joint": joints, "driver": drivers, "force": forces}
         unknown = [
             f"velocities.{pin}: no pin named {quote(pin)}{suggestion(pin, pins)}" for pin in velocities or {} if pin not in pins

@@ -10,6 +10,7 @@ from udkjax.arrays import by_numpy, is_traced
 from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes, name_mistake
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
+from udkjax.scene.drawing.drawn_friction import PinFriction
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
 from udkjax.scene.drawing.link import Link, with_concrete_numbers
@@ -32,6 +33,7 @@ SECTIONS: Mapping[str, type[DrawnElement]] = {
     "spring": PinSpring,
     "damper": PinDamper,
     "load": Load,
+    "friction": PinFriction,
 }
 DRAWN = {"pin": AbstractPin, "link": Link, **SECTIONS}
 BY_HAND = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}  # as in a mechanism
@@ -60,7 +62,7 @@ def read_drawing(
     problems += [] if gravity is None else gravity_mistakes(gravity)
     named = {s: {str(e.name): e.cls for e in entries if e.section == s} for s in (*DRAWN, *BY_HAND)}
     bodies = {GROUND: None, **named["link"], **named["body"]}
-    known: dict[str, Any] = {"pin": named["pin"], "link": bodies, "body": bodies, "slide": named["slide"]}
+    known: dict[str, Any] = {"pin": named["pin"], "link": bodies, "body": bodies, "slide": named["slide"], "slot": named["slot"]}
     fixed_pins: Sequence[str] = ground if isinstance(ground, list | tuple) and all(isinstance(p, str) for p in ground) else ()
     if not named["link"] and not named["body"]:
         problems.append("link: a drawing needs at least one link")
@@ -75,8 +77,8 @@ def read_drawing(
     for section in groups:
         if section == "body":  # the pins and links, which determine the joints, have been read
             layout = PinLayout(groups["link"], fixed_pins, groups["slide"])
-            known["revolute"] = dict.fromkeys(joint_names(layout, list(groups["pin"])), Revolute)
-            known["revolute"] |= named["joint"]
+            known["rubbing"] = dict.fromkeys(joint_names(layout, list(groups["pin"])), Revolute)
+            known["rubbing"] |= named["joint"]
         for entry in entries:
             if entry.section == section:
                 _read_element(entry, known, units, groups[section], problems)
@@ -123,6 +125,8 @@ def units_of_element(cls: type, table: TomlTable) -> tuple[str, str]:
     """Return the class name under which the units of an element are listed, and the unit of its motion law."""
     if cls in (PinSpring, PinDamper):
         return ("TorsionSpring" if "pin" in table else "Spring"), ""
+    if cls is PinFriction:
+        return "Friction", ""
     if cls is Motor:
         return ("SlideMotor", "m") if "slide" in table or table.get("between") else ("Motor", "rad")
     return cls.__name__, "rad" if table.get("coordinate") == "angle" else "m"

@@ -24,6 +24,7 @@ SECTIONS = {
     "gravity": "Gravity",
     "force": "Forces",
     "load": "Loads",
+    "friction": "Friction",
     "spring": "Springs",
     "damper": "Dampers",
     "pin": "Pins",

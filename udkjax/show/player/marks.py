@@ -197,7 +197,9 @@ class _Drawing:
             case TorsionSpring():
                 self.elements.append({"kind": MarkKind.SPIRAL, **self._axle(force.bodies)})
             case Friction():
-                self.elements.append({"kind": MarkKind.FRICTION, **self._axle(self.mechanism.joints[force.joint].bodies)})
+                of = self.mechanism.joints[force.joint]
+                place = self._axle(of.bodies) if isinstance(of, Revolute) else self._at(of.bodies[1], of.points[1])
+                self.elements.append({"kind": MarkKind.FRICTION, **place})
             case Force():
                 place = self._at(force.body, force.point)
                 vector = np.asarray(_at_start(force.vector), float).tolist()

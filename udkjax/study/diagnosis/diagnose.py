@@ -2,19 +2,22 @@
 
 from typing import Any, overload
 
+import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations import determinacy
 from udkjax.equations.analysis import hold_pins
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.position_closure import is_closed
+from udkjax.equations.textbook import prepare
+from udkjax.pinv import SVD
 from udkjax.positions.assembly import Closure, State, close, require_closed
 from udkjax.positions.channels import StateHistory
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import clearance
-from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions
+from udkjax.study.diagnosis.configuration import Configuration, JointForces, JointFriction, RankedPositions
 from udkjax.study.diagnosis.dependence import Dependency, dependencies_at
 from udkjax.study.diagnosis.diagnosis import Diagnosis
 from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fix_of_held_pin, fixes_of
@@ -115,6 +118,7 @@ def diagnose(
         clearance=clearance(positions, current, generic_rank, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
         held=tuple(pin.name for pin in held),
+        friction=_friction(mechanism, current, owners),
     )
 
 
@@ -154,6 +158,28 @@ def _cure(
         order = sorted(configurations, key=lambda c: -c.smallest)  # the first position determines the stress of a set
         best = best_fix(best.mechanism, ranked, order, owners, left)
     return ()
+
+
+def _friction(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointFriction]:
+    """Return for friction that depends on loads whether these, and the accelerations that it causes, are unique, by joint.
+
+    Accelerations are those of a motion that slides in all joints that can.
+    """
+    equations = prepare(mechanism, SVD())
+    if not equations.rubbing_joints:
+        return {}
+    scales, q = equations.scales, jnp.asarray(here.q)
+    unit = np.asarray(scales.coordinates(q.size))
+    any_motion = jnp.asarray(np.random.default_rng(0).normal(size=q.size) * unit * float(scales.rate))
+    v = equations.tangent_part(here.t, q, q, q, any_motion).dv
+    loose = equations.loose_friction(here.t, q, v, jnp.asarray(here.left / np.asarray(scales.rows)[:, None]))
+    found = {}
+    for joint, a in loose.items():
+        share = np.linalg.norm(here.left[[k for k, owner in enumerate(owners) if owner == joint]])
+        size = np.abs(np.asarray(a) / unit[:, None]).max(initial=0.0) * float(scales.mass * scales.length)
+        load = bool(share <= determinacy.UNIQUE_TOL)
+        found[joint] = JointFriction(load, load or bool(size <= determinacy.UNIQUE_TOL))
+    return found
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:

@@ -7,7 +7,7 @@ import numpy as np
 from udkjax.printing import PrintedTable, html_table
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import Clearance, RankChange
-from udkjax.study.diagnosis.configuration import JointForces
+from udkjax.study.diagnosis.configuration import JointForces, JointFriction
 from udkjax.study.diagnosis.fixes import Fix, Redundancy
 from udkjax.study.diagnosis.second_order import Branch
 from udkjax.study.diagnosis.timeline import Timeline
@@ -51,6 +51,7 @@ class Diagnosis(NamedTuple):
     singular_values: np.ndarray  # singular values of the scaled Jacobian
     clearance: Clearance
     timeline: Timeline | None
+    friction: dict[str, JointFriction]  # by joint: whether the load of its friction, and its effect, are unique
     held: tuple[str, ...] = ()  # pins that constraints hold to second order only, along the whole motion
 
     @property
@@ -136,6 +137,7 @@ def _sections(result: Diagnosis) -> list[tuple[str, list[str]]]:
         ("singular", _singular(result)),
         ("branches", _branches(result)),
         ("forces", _forces(result)),
+        ("friction", _friction(result)),
         ("conditioning", _conditioning(result)),
         ("timeline", [] if result.timeline is None else _timeline(result.timeline)),
     ]
@@ -224,6 +226,21 @@ def _forces(result: Diagnosis) -> list[str]:
         groups.setdefault(remark, []).extend(loose)
     lines = [f"not unique: {', '.join(loose)}{remark}" for remark, loose in groups.items()]
     return lines or (["all unique"] if result.rows else [])
+
+
+def _friction(result: Diagnosis) -> list[str]:
+    """Name the joints whose friction depends on a load that is not unique."""
+    loose = {True: [], False: []}
+    for joint, friction in result.friction.items():
+        if not friction.load:
+            loose[friction.accelerations].append(joint)
+    lines = [f"the loads of {', '.join(loose[True])} are not unique, but the accelerations are"] if loose[True] else []
+    if loose[False]:
+        lines.append(
+            f"the loads of {', '.join(loose[False])} are not unique, nor are the accelerations: "
+            "they are those of the loads of least norm"
+        )
+    return lines or (["all loads are unique, and so are the accelerations"] if result.friction else [])
 
 
 def _conditioning(result: Diagnosis) -> list[str]:

@@ -1,0 +1,78 @@
+"""Friction that depends on the loads of joints: the programs by elimination agree with the textbook, and never add energy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.friction import cart, drawer, pendulum, rubbing
+from tests.run_programs import evaluate_programs
+from udkjax.equations.rubbing import rubbing_loads, settled_multipliers
+from udkjax.equations.textbook import prepare
+
+MECHANISMS = {
+    "pendulum": lambda: pendulum(coefficient=0.3, radius=0.1),
+    "cart": lambda: cart(0.3, 0.2, static_coefficient=0.4, viscous=0.1),
+    "four-bar": lambda: rubbing(udk.library.four_bar()),
+    "slider-crank": lambda: rubbing(udk.library.slider_crank()),
+    "trammel": lambda: rubbing(udk.library.elliptic_trammel()),
+    "chain": lambda: rubbing(udk.library.double_pendulum(), radius=0.2),
+}
+
+
+def states(mechanism: udk.Mechanism, count: int) -> list[tuple[jnp.ndarray, jnp.ndarray]]:
+    """Return positions of a mechanism with random velocities that its constraints allow."""
+    equations, rng = prepare(mechanism), np.random.default_rng(3)
+    q = jnp.ravel(jnp.asarray(udk.assemble(mechanism).q))
+    return [(q, equations.tangent_part(0.0, q, q, q, jnp.asarray(rng.normal(size=q.size))).dv) for _ in range(count)]
+
+
+@pytest.mark.parametrize("name", ["pendulum", *(pytest.param(x, marks=pytest.mark.slow) for x in MECHANISMS if x != "pendulum")])
+def test_elimination_agrees_with_the_textbook(name):
+    mechanism = MECHANISMS[name]()
+    equations, numbers = (
+        prepare(mechanism),
+        [*map(float, np.concatenate([np.ravel(x) for x in mechanism.without_origin.numbers]))],
+    )
+    for q, v in states(mechanism, 1):
+        found = evaluate_programs(equations.programs, ["accelerations"], [*numbers, 0.0, 0.0], 0.0, np.asarray(q), np.asarray(v))
+        expected = np.asarray(udk.accelerations(mechanism, 0.0, q.reshape(-1, 3), v.reshape(-1, 3))).ravel()
+        np.testing.assert_allclose(found["a"], expected, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_friction_takes_power(name):
+    mechanism = MECHANISMS[name]()
+    weights = udk.analyse(mechanism).scales.weights
+
+    @jax.jit
+    def power(q, v):
+        multipliers = settled_multipliers(mechanism.without_origin, 0.0, q, v, udk.pinv.SVD(1e-10), None, weights)
+        return v @ rubbing_loads(mechanism.without_origin, 0.0, q, v, multipliers)
+
+    for q, v in states(mechanism, 20):
+        assert float(power(q, v)) < 0
+
+
+def test_drawer_jams_at_its_angle():
+    """With the pull F at the reach e from a guide of length b, F (1 - 2 mu e / b) = m a."""
+    at = jnp.zeros((1, 3)), jnp.array([[0.5, 0.0, 0.0]])
+    for coefficient in (0.1, 0.2, 0.24):
+        _, (*_, minus_pull) = udk.accelerations(drawer(coefficient), 0.0, *at, multipliers=True)
+        assert -float(minus_pull) == pytest.approx(2.0 * 0.6 / (1 - 4 * coefficient), rel=1e-9)
+    assert not np.isfinite(udk.accelerations(drawer(0.26), 0.0, *at)).any()
+
+
+def test_static_coefficient_is_reached_at_its_speed():
+    """At s = speed, mu is the static coefficient up to 1 - tanh 4; far above it is the coefficient."""
+    at = jnp.zeros((1, 3))
+    mechanism = udk.Mechanism(
+        {"b": udk.Body(1.0, 0.1)},
+        {"S": udk.Prismatic(["ground", "b"], [[0.0, 0.0]] * 2, 0.0)},
+        forces={"rub": udk.Friction("S", coefficient=0.1, static_coefficient=0.15, speed=0.01)},
+    )
+    for speed, coefficient in ((0.01, 0.1 * np.tanh(4.0) + 0.05), (-0.01, -0.1 * np.tanh(4.0) - 0.05), (100.0, 0.1)):
+        a = udk.accelerations(mechanism, 0.0, at, jnp.array([[speed, 0.0, 0.0]]))
+        assert float(a[0, 0]) == pytest.approx(-9.81 * coefficient, rel=1e-9)

@@ -1,0 +1,180 @@
+"""Friction that depends on the loads of joints, on arrays: the loads and the multipliers that belong to each other.
+
+With friction G(q, v, lambda) on the right-hand side, M a + Psi_q^T lambda = F + G, the multipliers solve
+
+    lambda = L(G(lambda)),        L(g) = -w (D^+)^T D^+ (b - D M^(-1/2) g),
+
+with D, b, weights w and D^+ as in udwadia_kalaba.py: with redundant rows they are those of least norm, or with compliances those
+of least elastic energy. Newton's method solves this from lambda = L(0). The implicit function theorem gives derivatives of any
+order. Where friction admits no motion (the mechanism jams), Newton's method does not end, and the multipliers are NaN.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.annotations import Time, Vector
+from udkjax.equations import constraints
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.constraints import BodyArray, bodies
+from udkjax.equations.structure import rubbing_joints
+from udkjax.equations.udwadia_kalaba import Baumgarte, Weights
+from udkjax.pinv import Pseudoinverse
+from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
+from udkjax.scene.mechanism import Mechanism
+
+MOST_STEPS = 50  # of Newton's method, which needs three to five
+SETTLED = 1e-13  # change of the loads of friction by a step, relative to these loads
+
+
+def rubbing_names(mechanism: Mechanism) -> list[str]:
+    """Return the joints whose friction depends on their load.
+
+    Args:
+        mechanism: The scene.
+
+    Returns:
+        Their names, in the order of the constraints.
+    """
+    return [name for name, x in zip(mechanism.constraints, rubbing_joints(mechanism), strict=True) if x is not None]
+
+
+def rubbing_loads(
+    mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
+) -> Float[Array, "n"]:
+    """Return G, the loads of all friction that depends on the loads of joints.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+        multipliers: lambda (m,).
+
+    Returns:
+        Force x, force y (N) and torque (N m) on each body (n,).
+    """
+    return sum(single_rubbing_loads(mechanism, t, q, v, multipliers).values(), jnp.zeros(3 * len(mechanism.body_names)))
+
+
+def single_rubbing_loads(
+    mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
+) -> dict[str, Float[Array, "n"]]:
+    """Return the loads of each friction that depends on the load of a joint, by the name of the joint; see `rubbing_loads`."""
+    time, places, speeds = jnp.asarray(t, jnp.result_type(float)), bodies(q), bodies(v)
+    index = {name: k for k, name in enumerate(mechanism.body_names)}
+    rows: dict[str, list[int]] = {}
+    for k, (owner, _) in enumerate(constraints.row_names(mechanism)):
+        rows.setdefault(owner, []).append(k)
+    found: dict[str, Array] = {}
+    for name, joint in zip(mechanism.constraints, rubbing_joints(mechanism), strict=True):
+        if joint is None:
+            continue
+        frames = [GROUND_FRAME_AT_REST if b == GROUND else _frame(places[index[b]], speeds[index[b]]) for b in joint.bodies]
+        total = jnp.zeros((len(index), 3))
+        wrenches = joint.loads([multipliers[k] for k in rows[name]], time, *frames)
+        for body, wrench in zip(joint.bodies, wrenches, strict=True):
+            if body != GROUND:
+                total = total.at[index[body]].add(constraints.vector(list(wrench)))
+        found[name] = total.ravel()
+    return found
+
+
+def _frame(place: Array, speed: Array) -> Frame:
+    (x, y, angle), (vx, vy, omega) = place, speed
+    return Frame(x, y, angle, jnp.cos(angle), jnp.sin(angle), vx, vy, omega)
+
+
+def settled_multipliers(
+    mechanism: Mechanism,
+    t: Time,
+    q: Vector,
+    v: Vector,
+    method: Pseudoinverse,
+    baumgarte: Baumgarte | None = None,
+    w: Weights = None,
+) -> Float[Array, "m"]:
+    """Return lambda = L(G(lambda)); NaN if friction admits none.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,).
+        v: Velocities (m/s, rad/s), (n,).
+        method: The pseudoinverse.
+        baumgarte: Gains of Baumgarte stabilization; None: no stabilization.
+        w: Weights of the rows (m,); None: all are one.
+
+    Returns:
+        lambda (m,), in N and N m.
+    """
+    D, root = uk.D(mechanism, t, q, w), uk.inverse_sqrt_mass(mechanism)
+    plus, b = uk.pseudoinverse(method, D), uk.b(mechanism, t, q, v, baumgarte, w)
+
+    def multipliers(friction: Array) -> Array:
+        return uk.weigh(w, -(plus.T @ (plus @ (b - D @ (root * friction)))))
+
+    return settle(multipliers, mechanism, t, q, v)
+
+
+def settled_loads(
+    multipliers: Callable[[Vector], Float[Array, "m"]], mechanism: Mechanism, t: Time, q: Vector, v: Vector
+) -> Float[Array, "n"]:
+    """Return G(lambda) with lambda = L(G(lambda)); zeros if no friction depends on the loads of joints.
+
+    Args:
+        multipliers: L, from loads (n,) to multipliers (m,); affine.
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,).
+        v: Velocities (m/s, rad/s), (n,).
+
+    Returns:
+        Force x, force y (N) and torque (N m) on each body (n,).
+    """
+    if not rubbing_names(mechanism):
+        return jnp.zeros_like(q)
+    return rubbing_loads(mechanism, t, q, v, settle(multipliers, mechanism, t, q, v))
+
+
+def settle(
+    multipliers: Callable[[Vector], Float[Array, "m"]], mechanism: Mechanism, t: Time, q: Vector, v: Vector
+) -> Float[Array, "m"]:
+    """Return lambda = L(G(lambda)) by Newton's method; NaN if it does not end.
+
+    Args:
+        multipliers: L, from loads (n,) to multipliers (m,); affine.
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,).
+        v: Velocities (m/s, rad/s), (n,).
+
+    Returns:
+        lambda (m,), with derivatives of any order.
+    """
+    friction, root = partial(rubbing_loads, mechanism, t, q, v), jax.lax.stop_gradient(uk.inverse_sqrt_mass(mechanism))
+
+    def remainder(x: Array) -> Array:
+        return x - multipliers(friction(x))
+
+    def solve(remainder: Callable[[Array], Array], start: Array) -> Array:
+        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            x, _, count = state
+            new = x - jnp.linalg.solve(jax.jacfwd(remainder)(x), remainder(x))
+            before, after = root * friction(x), root * friction(new)
+            return new, jnp.linalg.norm(after - before) > SETTLED * jnp.linalg.norm(after), count + 1
+
+        def goes_on(state: tuple[Array, Array, Array]) -> Array:
+            return state[1] & (state[2] < MOST_STEPS)
+
+        x, open_, _ = jax.lax.while_loop(goes_on, step, (start, jnp.asarray(True), jnp.asarray(0)))
+        return jnp.where(open_, jnp.nan, x)
+
+    def solve_for_tangent(linear: Callable[[Array], Array], y: Array) -> Array:
+        return jnp.linalg.solve(jax.jacfwd(linear)(y), y)
+
+    start = jax.lax.stop_gradient(multipliers(jnp.zeros(q.size)))
+    return jax.lax.custom_root(remainder, start, solve, solve_for_tangent)
