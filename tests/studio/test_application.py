@@ -10,7 +10,7 @@ from udkjax.studio.findings import pins_in_line
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import duration_of
 from udkjax.studio.tasks import DRAWN, TEMPLATES
-from udkjax.studio.worker import Worker
+from udkjax.studio.worker import Worker, WorkerPool
 
 SIX_BAR = """format = 2
 name = "six-bar" # of the studio's test
@@ -345,3 +345,18 @@ def test_a_drawn_template_moves_in_millimetres(client, name):
     assert opened["document"]["units"]["length"] == "mm" and opened["problems"] == []
     assert mechanism.drivers or name == "door_closer"
     np.testing.assert_allclose(udk.assemble(mechanism).q, mechanism.q0, atol=1e-4)  # closed as drawn
+
+
+def test_a_task_is_given_to_a_free_worker():
+    class Stub:
+        def __init__(self, is_busy):
+            self.is_busy = is_busy
+
+        def call(self, *_):
+            return {"is_busy": self.is_busy, "worker": self}
+
+    pool = WorkerPool(2)
+    pool.workers = [Stub(True), Stub(False)]  # pyright: ignore[reportAttributeAccessIssue]
+    assert pool.call("compile_drawing", {}, 1.0)["worker"] is pool.workers[1]
+    pool.workers[1] = Stub(True)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    assert pool.call("compile_drawing", {}, 1.0)["worker"] is pool.workers[0]

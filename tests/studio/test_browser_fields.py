@@ -139,3 +139,21 @@ def test_the_crank_goes_to_an_angle_and_several_curves_are_shown_over_it(studio)
     assert studio.js("studio.motion.t") == pytest.approx(1.0, abs=0.01)
     studio.page.get_by_role("button", name="show one curve alone").click()
     studio.until("studio.curves.cache.curves.length === 1")
+
+
+@pytest.mark.slow
+def test_arrows_of_velocities_are_those_of_the_pins(studio):
+    studio.js("studio.files.openTemplate('crank_rocker')")
+    studio.settle()
+    studio.page.get_by_role("button", name="arrows of the velocities").click()
+    found = studio.js("studio.vectors.at('velocities', 0.3).map(({place, vector}) => [...place, ...vector])")
+    turn = np.radians(60) + 2 * np.pi * 0.3
+    crank = next(x for x in found if np.hypot(x[0], x[1]) == pytest.approx(0.04))
+    np.testing.assert_allclose(crank[:2], [0.04 * np.cos(turn), 0.04 * np.sin(turn)], atol=1e-6)
+    np.testing.assert_allclose(crank[2:], 2 * np.pi * np.array([-crank[1], crank[0]]), atol=1e-5)
+    still = studio.js("studio.vectors.at('accelerations', 0.3).length")
+    assert still == len(found) == 3 and studio.js("studio.vectors.largest('velocities')") >= np.hypot(*crank[2:])
+    assert studio.js("studio.vectors.at('forces', 0.3)") == []
+    studio.page.get_by_role("tab", name="Dynamics").click()
+    studio.page.get_by_role("button", name="compute forces").click()
+    studio.until("studio.vectors.at('forces', 0.3).length === 4")

@@ -28,7 +28,7 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.studio.folder import Folder
 from udkjax.studio.gate import INTERFACE, Gate
 from udkjax.studio.limits import COMPILE_SECONDS, DIAGNOSE_SECONDS, EXPORT_SECONDS, RefusedError, require_size
-from udkjax.studio.worker import Worker
+from udkjax.studio.worker import Worker, WorkerPool
 
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 FOLDERS = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}  # package and folder of each address prefix
@@ -42,11 +42,11 @@ class Studio:
     Args:
         folder: folder of the files to open and save.
         reader: process that reads and merges texts, which takes milliseconds.
-        compiler: process that compiles engines.
+        compiler: processes that compile engines.
         examiner: process that diagnoses and exports, which takes longest.
     """
 
-    def __init__(self, folder: Folder, reader: Worker, compiler: Worker, examiner: Worker):
+    def __init__(self, folder: Folder, reader: Worker, compiler: Worker | WorkerPool, examiner: Worker):
         self.folder, self.reader, self.compiler, self.examiner = folder, reader, compiler, examiner
 
     def list(self, request: JsonObject) -> JsonObject:

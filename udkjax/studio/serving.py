@@ -16,9 +16,10 @@ with OptionalImport():
     import uvicorn
 
     from udkjax.studio.application import Studio, application
-from udkjax.studio.worker import Worker
+from udkjax.studio.worker import Worker, WorkerPool
 
 LOOPBACK = "127.0.0.1"
+COMPILERS = 2  # an outdated drawing and the current one
 TOKEN_BYTES = 32  # random bytes: too many to guess
 
 
@@ -33,7 +34,7 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
         say: function that shows the address to the user.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES)
-    workers = Worker(), Worker(), Worker()
+    workers = Worker(), WorkerPool(COMPILERS), Worker()
     with closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((LOOPBACK, port))

@@ -49,6 +49,11 @@ class Worker:
             raise RefusedError(answer["status"], answer["problem"], **answer["details"])
         return answer["result"]
 
+    @property
+    def is_busy(self) -> bool:
+        """True while a task runs."""
+        return self._lock.locked()
+
     def close(self) -> None:
         with self._lock:
             self._stop()
@@ -70,6 +75,29 @@ class Worker:
         if self._connection is not None:
             self._connection.close()
         self._process = self._connection = None
+
+
+class WorkerPool:
+    """Workers of which a free one runs a task, so that a new drawing does not wait until an old one is compiled.
+
+    Args:
+        count: number of workers; only the first starts before it is needed.
+    """
+
+    def __init__(self, count: int):
+        self.workers = [Worker() for _ in range(count)]
+
+    def start(self) -> None:
+        """Start the first process."""
+        self.workers[0].start()
+
+    def call(self, name: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+        """Return the answer of a task, as `Worker.call`; if no worker is free, it waits for the first."""
+        return next((one for one in self.workers if not one.is_busy), self.workers[0]).call(name, arguments, seconds)
+
+    def close(self) -> None:
+        for worker in self.workers:
+            worker.close()
 
 
 def _serve(connection: Connection) -> None:

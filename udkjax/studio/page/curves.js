@@ -6,7 +6,7 @@ import {alongOf, turningMotors} from "./along.js";
 import {ask} from "./api.js";
 import {drawChart, valueAt} from "./chart.js";
 import {list, members, nameOf, pinsOf, placeOf} from "./document.js";
-import {carry} from "./motions.js";
+import {carry, ratesOf} from "./motions.js";
 import {lengthName, lengthUnit} from "./units.js";
 import {button, make} from "./player/elements.js";
 import {Painter, THEMES, contextOf} from "./player/painter.js";
@@ -156,9 +156,8 @@ export class CurvesPanel {
 
   /** Velocity and acceleration (m/s, m/s2) of a place of a link at an instant, whose numbers begin at i. */
   rates(i, motions, link, place) {
-    const {run, energies, pageEngine} = this.studio.motion, k = i + 3 * pageEngine.order[link], at = carry(motions, link, place), w = run.v[k + 2];
-    const [x, y] = [at[0] - run.q[k], at[1] - run.q[k + 1]], a = energies?.a;
-    return {v: [run.v[k] - w * y, run.v[k + 1] + w * x], a: a && [a[k] - a[k + 2] * y - w * w * x, a[k + 1] + a[k + 2] * x - w * w * y]};
+    const {run, energies, pageEngine} = this.studio.motion, part = x => x && x.subarray(i, i + pageEngine.size);
+    return ratesOf({q: part(run.q), v: part(run.v), a: part(energies?.a)}, pageEngine.order[link], carry(motions, link, place));
   }
 
   /** All curves of the motion as comma-separated values, in the units in which they are shown; empty without a motion. */

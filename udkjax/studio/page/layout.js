@@ -1,6 +1,7 @@
 // The page: its bars, the drawing, and the panels around it.
 
 import {KEYS, TOOLS} from "./tools.js";
+import {VECTORS} from "./vectors.js";
 import {button, icon, keepKeys, make, svgIcon} from "./player/elements.js";
 
 const ICONS = {
@@ -36,13 +37,13 @@ export function buildPage(studio, root) {
   });
   parts.canvas = make("canvas", {tabindex: 0, role: "application", "aria-label": "drawing"});
   parts.status = make("p", {class: "status", role: "status"});
-  const toggles = [["grid", "grid"], ["snap", "snap points to the grid (hold Alt to place them freely)"], ["names", "names"], ["paths", "paths of pins"]].map(([name, title]) => {
+  const toggles = [["grid", "grid"], ["snap", "snap points to the grid (hold Alt to place them freely)"], ["names", "names"], ["paths", "paths of pins"], ...Object.entries(VECTORS)].map(([name, title]) => {
     const found = button(name, title, () => {
       studio.show[name] = !studio.show[name];
       found.setAttribute("aria-pressed", studio.show[name]);
       studio.redraw();
     });
-    found.setAttribute("aria-pressed", studio.show[name]);
+    found.setAttribute("aria-pressed", Boolean(studio.show[name]));
     return found;
   });
   parts.picture = make("div", {class: "group"});
@@ -50,7 +51,7 @@ export function buildPage(studio, root) {
   parts.wanted = make("div", {class: "wanted", role: "group", "aria-label": "wanted path"});
   const load = button("path", "read a wanted path from a table (CSV) of x and y", () => studio.wanted.input.click());
   const options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, load, parts.picture));
-  const narrow = matchMedia("(max-width: 760px)"), unfold = () => { options.open = !narrow.matches; };
+  const narrow = matchMedia("(max-width: 1000px)"), unfold = () => { options.open = !narrow.matches; };
   narrow.addEventListener("change", unfold);
   unfold();
   parts.welcome = make("div", {class: "welcome"}, make("h2", {}, "Draw a mechanism"),

@@ -26,3 +26,9 @@ export function carryBack(motions, k, [x, y]) {
   const c = Math.cos(motions[3 * k + 2]), s = Math.sin(motions[3 * k + 2]), dx = x - motions[3 * k], dy = y - motions[3 * k + 1];
   return [c * dx + s * dy, c * dy - s * dx];
 }
+
+/** Velocity and acceleration (m/s, m/s2) of a place [x, y] of a body in a state {q, v, a}; `a` is null if it is not known. */
+export function ratesOf({q, v, a}, body, [x, y]) {
+  const k = 3 * body, [dx, dy, w] = [x - q[k], y - q[k + 1], v[k + 2]];
+  return {v: [v[k] - w * dy, v[k + 1] + w * dx], a: a && [a[k] - a[k + 2] * dy - w * w * dx, a[k + 1] + a[k + 2] * dx - w * w * dy]};
+}

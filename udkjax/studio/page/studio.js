@@ -21,6 +21,7 @@ import {toolOf} from "./tools.js";
 import {extentPoints} from "./shapes.js";
 import {lengthUnit, niceBelow, tidy} from "./units.js";
 import {fit} from "./view.js";
+import {Vectors} from "./vectors.js";
 import {WantedPath} from "./wanted.js";
 import {make} from "./player/elements.js";
 import {THEMES} from "./player/painter.js";
@@ -52,6 +53,7 @@ class Studio {
     this.pictures = new Pictures(this, this.parts.picture);
     this.wanted = new WantedPath(this, this.parts.wanted);
     this.entry = new PlaceEntry(this, this.parts.entry);
+    this.vectors = new Vectors(this);
     this.sync = new Sync(this);
     this.gestures = new Gestures(this, this.parts.canvas);
     followKeys(this);
