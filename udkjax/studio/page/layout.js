@@ -47,7 +47,7 @@ export function buildPage(studio, root) {
     return found;
   });
   parts.picture = make("div", {class: "group"});
-  parts.entry = make("div", {class: "wanted"});
+  parts.entry = make("div", {class: "entry"});
   parts.wanted = make("div", {class: "wanted", role: "group", "aria-label": "wanted path"});
   const load = button("path", "read a wanted path from a table (CSV) of x and y", () => studio.wanted.input.click());
   const options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, load, parts.picture));
