@@ -90,7 +90,8 @@ def _fixed(x: Any) -> Any:
 
 def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
     """Take one step, halved until the residual falls; return whether it does. At rounding level no step is taken."""
-    fixed, current = (rows, q) if xp is np else jax.tree.map(_fixed, (rows, q))
+    held: tuple[Rows[AnyArray], AnyArray] = (rows, q) if xp is np else jax.tree.map(_fixed, (rows, q))
+    fixed, current = held
     size = xp.linalg.norm(fixed.residual(t, current))
     is_open = size > rounding(rows.scales, current, xp)
     if xp is np and not is_open:
