@@ -30,6 +30,44 @@ def test_stiff_dampers(damping):
     assert (int(solution.stats["implicit"]) > 3) == (damping > 100)
 
 
+class Bushing(udk.ForceElement):
+    """A spring (N/m) and a damper (N s/m) between the coupler of a parallelogram and the end of a link."""
+
+    stiffness: jax.Array
+    damping: jax.Array
+
+    def loads(self, t, *frames):
+        ends = [frame.point(p) for frame, p in zip(frames, ((-1.0, 0.0), (0.5, 0.0)), strict=True)]
+        rates = [frame.velocity(p) for frame, p in zip(frames, ((-1.0, 0.0), (0.5, 0.0)), strict=True)]
+        arms = [frame.vector(p) for frame, p in zip(frames, ((-1.0, 0.0), (0.5, 0.0)), strict=True)]
+        x = self.stiffness * (ends[0].x - ends[1].x) + self.damping * (rates[0].x - rates[1].x)
+        y = self.stiffness * (ends[0].y - ends[1].y) + self.damping * (rates[0].y - rates[1].y)
+        return [(s * x, s * y, s * (arm.x * y - arm.y * x)) for s, arm in zip((-1, 1), arms, strict=True)]
+
+
+@pytest.mark.parametrize("damping", [0.0, pytest.param(10.0, marks=pytest.mark.slow), pytest.param(1e4, marks=pytest.mark.slow)])
+def test_a_stiff_spring_in_place_of_a_pin(damping):
+    """Its vibration, which an explicit method leaves at the size of the tolerance, does not keep the run from going on."""
+    scene, ts = udk.library.parallelogram(), np.linspace(0.0, 2.0, 3)
+    joints = {name: joint for name, joint in scene.joints.items() if name != "B1"}
+    spring = Bushing(["coupler", "link1"], jnp.array(1e9), jnp.array(damping))
+    mechanism = udk.Mechanism(scene.bodies, joints, forces={"spring": spring}, gravity=scene.gravity)
+    solution, pinned = run(mechanism, 1e-4, ts), run(scene, 1e-8, ts)
+    assert int(solution.stats["steps"]) < 300 and int(solution.stats["implicit"]) > 50
+    assert_allclose(solution.q, pinned.q, atol=3e-4)
+
+
+def test_a_run_with_events_goes_on_implicitly():
+    """Each stretch between two events decides anew; `implicit` counts the steps of all."""
+    mechanism, ts = damped(100.0), np.linspace(0.0, 5.0, 6)
+    plain = run(mechanism, ts=ts)
+    middle = float(plain.q[0, 0, 2] + plain.q[-1, 0, 2]) / 2
+    half = udk.Event(lambda t, at: at[mechanism.body_names[0]].angle - middle, udk.Log(), name="half")
+    solution = run(mechanism, ts=ts, events=half)
+    assert int(solution.stats["events"]) == 1 and int(solution.stats["implicit"]) > 3
+    assert_allclose(solution.q, plain.q, atol=3e-6)
+
+
 class Relaxing(udk.ForceElement):
     """A torque against the rotation of a body that is stiff for half a second and weak afterwards."""
 

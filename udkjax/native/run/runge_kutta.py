@@ -226,3 +226,11 @@ def _estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q
             new_q = zero if error_q is None else h * (h * error_q)
             for to, new in ((to_q, new_q), (to_v, zero if error_v is None else h * error_v)):
                 module.put(f, to, r, new if mask is None else f.select(mask, new, module.vector(f, to, r)))
+    if module.plan.stiff:
+        with f.if_(f.any_of((s.stepping > 0.5) & (s.trial > 0.0))):
+            f.call("smooth_error", f.given["work"])
+
+
+def error_of_velocities(module: Module) -> str:
+    """Return the name of the array of estimated errors of velocities, before their projection."""
+    return "state dv" if module.plan.projected else "result dv"

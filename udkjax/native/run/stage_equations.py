@@ -27,13 +27,14 @@ from udkjax.native.base.program_derivative import SLOPES, ProgramDerivative
 from udkjax.native.base.steps import DIVERGING, EAGER, FADING, RENEWALS, SLOW, STAGE_ITERATIONS, STAGE_TOL
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 from udkjax.native.pseudoinverses.lu import OrderedLUCode
-from udkjax.native.run.runge_kutta import check_pivots, stage_state
+from udkjax.native.run.runge_kutta import check_pivots, error_of_velocities, stage_state
 
 
 class StageEquations:
     """The functions of a module that solve stages, in lanes that are `stepping`.
 
         take_stages_from_point3(work)    the accelerations of all stages of the step `step` from point 3
+        smooth_error(work)               D^(-1) of the error of velocities, where an implicit step is tried
         factor_stage(work)               the LU factors of D, from the slopes at the state
         solve_stage(work)                `guess a` of a stage, and its state
 
@@ -76,6 +77,8 @@ class StageEquations:
         self._write_factor("factor_stage", self._layout, "kept")
         self._write_solve()
         self.write_stages("point3")
+        if self._in.plan.stiff:
+            self._write_smooth_error()
         if self._exact is None:
             return
         self._write_factor("factor_exact", self._exact, "D")
@@ -216,6 +219,25 @@ class StageEquations:
 
         d.over_registers(module.rowcount, residual)
         self._lu.solve(d)
+
+    def _write_smooth_error(self):
+        """Write `smooth_error(work)`: the error e of velocities becomes D^(-1) e in lanes that try an implicit step.
+
+        An explicit method at its limit of stability leaves fast motions of the size of the tolerance. An implicit step damps
+        them, and their part in its first error does not show how long the next ones can be (Hairer and Wanner, IV.8).
+        """
+        module = self._in
+        f, s = module.function("smooth_error")
+        d, name = DenseMatrices(self._layout, f), error_of_velocities(module)
+        tries = module.broadcast(f, f.select((s.stepping > 0.5) & (s.trial > 0.0), f.const(1.0, DOUBLE, f.width), 0.0)) > 0.5
+
+        def enter(r: Operand):
+            d.row("b")[r] = module.vector(f, name, f.like(r, INT, 1))
+
+        d.over_registers(module.rowcount, enter)
+        self._lu.solve(d)
+        with f.each(module.rowcount) as r:
+            module.put(f, name, r, f.select(tries, d.row("x")[r], module.vector(f, name, r)))
 
     def write_stages(self, start: str):
         """Write the accelerations of all stages after the first, of the step from a point."""
