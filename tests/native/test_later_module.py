@@ -83,7 +83,7 @@ def test_if_it_cannot_be_loaded_the_call_is_refused(motion, monkeypatch, capfd):
     def fail(*arguments):
         raise OSError("no module")
 
-    monkeypatch.setattr(primitive, "_later_code", fail)
+    monkeypatch.setattr(primitive, "_load_later", fail)
     jitted = jax.jit(motion)
     assert jitted(SOFT)[2] == 0
     with pytest.raises((ValueError, jax.errors.JaxRuntimeError), match="no memory for a computation by machine code"):

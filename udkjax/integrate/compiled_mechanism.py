@@ -24,9 +24,9 @@ from udkjax.integrate.stabilization import Stabilization
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
-from udkjax.native.primitive import unsupported
 from udkjax.native.run.formulations import MethodCode
 from udkjax.native.runs import RunStates
+from udkjax.native.unsupported import unsupported
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism

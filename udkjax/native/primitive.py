@@ -3,11 +3,11 @@
 import ctypes
 import math
 import time
+import weakref
 import zlib
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,27 +16,24 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scales import scales_p
 from udkjax.native import records
 from udkjax.native.base import host_program, machine
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.base.loading import Code, load
-from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory
-from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.steps import Status
 from udkjax.native.base.text import text_of_module
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
-from udkjax.native.prepared_call import PreparedCall
 from udkjax.native.runs import RunCotangents, goes_back
-from udkjax.programs.identity_cache import cached_by_identity, cached_by_size
+from udkjax.native.unsupported import unsupported
+from udkjax.programs.identity_cache import cached_by_size
 from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
-from udkjax.threads import thread_count
+from udkjax.threads import shared_threads, thread_count
 
 CODE_BYTES = 1  # memory of loaded code, with the programs of its scene, for each character of the text
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
@@ -58,19 +55,26 @@ def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
     return module
 
 
-@cached_by_identity
-def unsupported(code: RunPrograms) -> str:
-    """Return the unsupported operations of a scene; empty if there are none.
+class PreparedCall(NamedTuple):
+    """A call of machine code: its record, with the arrays that it points to."""
 
-    For this check each kernel is written once, in loops; the text that is compiled may be unrolled and much longer.
-    """
-    loops, at = LoopWriter(1), defaultdict(lambda: ("work", 0))
-    try:
-        for name in ("prologue", "accelerations", "newton_v_and_psi", *(["pieces"] if code.piece_count else [])):
-            loops.write(getattr(code, name), name, ("work",), at)
-    except UnsupportedError as error:
-        return str(error)
-    return ""
+    run: Callable[[int], Any]
+    record: ctypes.Array
+    shared: ctypes.Array  # the index of the next member, and whether memory was refused
+    threads: int
+    inputs: list[np.ndarray]  # float64, contiguous in memory
+    outputs: list[np.ndarray]
+
+    def __call__(self) -> list[np.ndarray]:
+        """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
+        self.shared[:], address = (0, 0), ctypes.addressof(self.record)
+        others = [shared_threads().submit(self.run, address) for _ in range(self.threads - 1)]
+        self.run(address)
+        for other in others:
+            other.result()
+        if self.shared[1]:
+            raise MemoryError("no memory for a computation by machine code")
+        return self.outputs
 
 
 class LoadedCode:
@@ -83,8 +87,8 @@ class LoadedCode:
 
     def __init__(self, operation: Operation, width: int, tangent_lanes: int):
         module = generate(operation, width, tangent_lanes)
-        self._operation, later = operation, operation.later
-        self._later = None if later is None else (later, width, tangent_lanes)
+        self._operation, self._lanes = operation, (width, tangent_lanes)
+        self._later: LoadedCode | None = None  # the code of the later operation, once a run has needed it
         self._packed_text, self._directions_in = zlib.compress((text := module.written_text).encode(), 1), module.directions_in
         self._field_count, self._share = len(module.call_fields), operation.share
         self._step_limit = {name: k for k, name in enumerate(operation.all_settings)}.get("max_steps")
@@ -94,20 +98,14 @@ class LoadedCode:
         self.size = CODE_BYTES * len(text)  # an estimate of its memory, with that of the scene's programs
 
     def _load(self, level: int) -> Code:
-        later = partial(_later_code, *self._later, level) if self._later else None
-        return load(zlib.decompress(self._packed_text).decode(), level, later)
-
-    @property
-    def _present(self) -> "LoadedCode":
-        """The code to call: that of the later operation once a run has needed it."""
-        loaded = [code for level in ("_optimized", "_quick") if (code := self.__dict__.get(level)) is not None]
-        is_later = self._later and any(code.later and code.later.code for code in loaded)
-        return machine_code(*self._later) if self._later and is_later else self
+        later = self._operation.later
+        load_later = None if later is None else partial(_load_later, weakref.ref(self), later, self._lanes, level)
+        return load(zlib.decompress(self._packed_text).decode(), level, load_later)
 
     @property
     def name(self) -> str:
         """The name of the FFI target in XLA, in programs of the CPU."""
-        return self._present.code(machine.LEVEL).name
+        return (self._later or self).code(machine.LEVEL).name
 
     @property
     def name_on_card(self) -> str:
@@ -115,8 +113,8 @@ class LoadedCode:
 
         The driver calls it from threads of its own, which should not wait for Python: all its code is loaded here.
         """
-        if self._later:
-            return machine_code(*self._later).name_on_card
+        if self._operation.later:
+            return LoadedCode(self._operation.later, *self._lanes).name_on_card
         return host_handler.register(self.name, self._optimized.library["call_frame"])
 
     def code(self, level: int) -> Code:
@@ -134,8 +132,8 @@ class LoadedCode:
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
-        if (present := self._present) is not self:
-            return present(inputs, shapes)
+        if self._later:
+            return self._later(inputs, shapes)
         if (
             self._seconds > 0.0
             and shapes[0][0] <= QUICK_MEMBERS
@@ -145,7 +143,7 @@ class LoadedCode:
             outputs = self._call_quickly(inputs, shapes)
             if outputs is not None:
                 return outputs
-        return self._present.prepare(inputs, shapes)()
+        return (self._later or self).prepare(inputs, shapes)()
 
     def _is_quick(self, inputs: Sequence[np.ndarray]) -> bool:
         """Return whether a limit of steps can be set and met: not if reverse mode integrates again, which has no such result."""
@@ -190,19 +188,23 @@ class LoadedCode:
         return PreparedCall(code.run, call, following, threads, inputs, outputs)
 
 
-def _later_code(operation: Operation, width: int, tangent_lanes: int, level: int) -> Code:
-    return machine_code(operation, width, tangent_lanes).code(level)
+def _load_later(owner: Callable[[], LoadedCode | None], operation: Operation, lanes: tuple[int, int], level: int) -> Code:
+    """Return the code of the later operation, which its owner calls from then on."""
+    later, loaded = LoadedCode(operation, *lanes), owner()
+    if loaded is not None:
+        loaded._later = later
+    return later.code(level)
 
 
 @cached_by_size(lambda code: code.size)
 def machine_code(operation: Operation, width: int, tangent_lanes: int) -> LoadedCode:
     """Return the machine code of an operation."""
-    return LoadedCode(operation, width, tangent_lanes)
+    return LoadedCode(operation.first, width, tangent_lanes)
 
 
 def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
     """Run an operation on concrete numbers of one member, without tracing."""
-    return machine_code(operation.first, 1, 1)(inputs, operation.shapes(inputs, times))
+    return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
 
 
 # --- as a JAX primitive
@@ -212,7 +214,7 @@ def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
     one_by_one = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
     directions = inputs[-1].shape[1] if operation.tangents and one_by_one and operation.code.is_small else 1
     tangent_lanes = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are faster
-    return machine_code(operation.first, 1 if one_by_one else machine.lanes(), tangent_lanes)
+    return machine_code(operation, 1 if one_by_one else machine.lanes(), tangent_lanes)
 
 
 def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:

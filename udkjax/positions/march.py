@@ -14,7 +14,8 @@ from udkjax.annotations import NumberLike, NumericArray
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.native.position_operations import March
-from udkjax.native.primitive import call_concrete, native_p, unsupported
+from udkjax.native.primitive import call_concrete, native_p
+from udkjax.native.unsupported import unsupported
 from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 

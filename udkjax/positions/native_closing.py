@@ -14,7 +14,8 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.native.packing import ActiveNumbers
 from udkjax.native.position_operations import Close
-from udkjax.native.primitive import call_concrete, native_p, unsupported
+from udkjax.native.primitive import call_concrete, native_p
+from udkjax.native.unsupported import unsupported
 from udkjax.scene.mechanism import Mechanism
 
 # Results of closing: q, v, the residuals Psi and Psi_dot, and the rank of D.

@@ -24,7 +24,7 @@ from udkjax.integrate.solution import Result
 from udkjax.native.base.steps import Status
 from udkjax.native.runs import RunStates
 
-STATUS, TIME, COUNTS, WRITTEN = 0, 1, slice(2, 5), 5  # of `RunStates.info_names`
+STATUS, TIME, COUNTS, WRITTEN, IMPLICIT = 0, 1, slice(2, 5), 5, 7  # of `RunStates.info_names`
 INFO = len(RunStates.info_names)
 
 
@@ -212,6 +212,7 @@ class MachineSystem:
             places = members[b], output[b, k]
             runs.qs[places], runs.vs[places] = stretch.q[b, k + 1], stretch.v[b, k + 1]
         runs.totals[members, :3] += counts
+        runs.totals[members, 4] += stretch.info[:, IMPLICIT].astype(int)
         if self._is_projected[which]:
             runs.totals[members, 3] += counts[:, 0] + 2 * (rows.sum(1) - 1)
         known, watched = ((status == Status.CROSSED) | (status == Status.DONE)) & ~drifts, self._watched[which]

@@ -203,7 +203,7 @@ class PlainSystem:
             running=~fails[None],
             code=jnp.where(fails, code, Result.successful)[None],
             undefined=undefined[None],
-            totals=runs.totals + jnp.stack([raw.tried, raw.accepted, raw.evaluations, projections]),
+            totals=runs.totals + jnp.stack([raw.tried, raw.accepted, raw.evaluations, projections, raw.implicit]),
             qs=runs.qs.at[0, rows].set(q[of_outputs], mode="drop"),
             vs=runs.vs.at[0, rows].set(v[of_outputs], mode="drop"),
             window=Window(

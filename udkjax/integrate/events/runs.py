@@ -53,7 +53,7 @@ class EventRun(NamedTuple):
     unresolved: Float[Any, "*m E"]
     undefined: Bool[Any, "*m E"]
     code: Int[Any, "*m"]
-    totals: Int[Any, "*m 4"]  # steps tried, accepted, right-hand sides, projections
+    totals: Int[Any, "*m 5"]  # steps tried, accepted, right-hand sides, projections, implicit steps
 
 
 EVENT_STATES = ("event_time", "event_q", "event_v")
@@ -70,7 +70,7 @@ RECORD = (
 def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
     """Return the shapes of the fields of a run of T output times and n coordinates, with room for `room` events."""
     E, K, C, S = plan.count, room, len(plan.first), plan.side_count
-    return EventRun((T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K, C), (K,), (K, E), (K, S), (), (E,), (E,), (), (4,))
+    return EventRun((T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K, C), (K,), (K, E), (K, S), (), (E,), (E,), (), (5,))
 
 
 class MemberRuns(NamedTuple):
@@ -88,7 +88,7 @@ class MemberRuns(NamedTuple):
     running: Bool[Any, "B"]
     code: Int[Any, "B"]
     undefined: Bool[Any, "B E"]  # the conditions whose NaN ended the run
-    totals: Int[Any, "B 4"]
+    totals: Int[Any, "B 5"]
     qs: Float[Any, "B T n"]
     vs: Float[Any, "B T n"]
     count: Int[Any, "B"]  # number of events
@@ -148,7 +148,7 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
         running=code == Result.successful,
         code=code,
         undefined=no.copy(),
-        totals=xp.zeros((B, 4), int),
+        totals=xp.zeros((B, 5), int),
         qs=xp.full((B, *shapes["q"]), np.inf),
         vs=xp.full((B, *shapes["v"]), np.inf),
         count=xp.zeros(B, int),

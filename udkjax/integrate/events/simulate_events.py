@@ -256,6 +256,7 @@ def _solution(
         "steps": found.totals[0],
         "accepted": found.totals[1],
         "rejected": found.totals[0] - found.totals[1],
+        "implicit": found.totals[4],
         "right_hand_sides": found.totals[2],
         "projections": found.totals[3],
         **({"events": found.count} if names else {}),
