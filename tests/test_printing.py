@@ -90,7 +90,9 @@ def objects() -> dict[str, object]:
 # In tests/study: they take a fit or a search, or are made within one.
 ELSEWHERE = {"Estimate", "GradientCheck", "Design", "Designs", "FoundDesign", "DesignSearch", "MotionPoint"}
 ELSEWHERE |= {"CompleteDesign", "CompleteDesigns"}
+ELSEWHERE |= {"SystemDiagnosis", "ConstraintState"}
 ABSTRACT = {"Constraint", "Joint", "Motion", "ForceElement"}
+ABSTRACT |= {"MatrixPseudoinverse", "PointwiseFormulation", "Stabilization"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"
 
 

@@ -55,6 +55,7 @@ def test_a_rod_drawn_inexactly():
     np.testing.assert_allclose(sol.q, right.q, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_held_rod():
     mechanism, other = rod_between_guides(), rod_between_guides(angle_to_first_order=True)
 
@@ -82,6 +83,7 @@ def test_two_rods_between_the_same_guides():
     )
 
 
+@pytest.mark.slow
 def test_a_square_of_guides():
     """Blocks on the four sides of a square, opposite ones joined by rods: both rods are held, and one falls."""
     bodies, joints, a = {}, {}, 3.0

@@ -218,6 +218,7 @@ def reacted():
     return lambda k, s=1e3, first=1e-3: solve(k, s, 1.0, first)
 
 
+@pytest.mark.slow
 def test_stiffness_costs_nothing(reacted):
     """z follows x + k x^2 / s, and its rate s does not limit the step."""
     for s in (1e3, 1e6):

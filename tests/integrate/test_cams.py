@@ -65,6 +65,7 @@ def test_gradients_of_runs_without_projection(run):
     assert_allclose(run(xs, 1e-8)[1], differences(lambda x: run(x, 1e-12)[0], xs, 1e-5), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_second_derivatives_without_projection(run):
     """Without the jumps at the knots they are off by 1.3."""
     found = jax.jit(along(along(lambda x: at_end(x, stabilization=None))))(X)

@@ -100,6 +100,7 @@ def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
     primitive.machine_code.cache_clear()
 
 
+@pytest.mark.slow
 def test_each_member_of_a_batch_has_its_own_end_and_derivatives_as_other_failed_runs():
     angles, ts = jnp.array([SWING, 0.9]), np.linspace(0.0, 3.0, 4)
 

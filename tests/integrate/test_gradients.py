@@ -203,6 +203,7 @@ def test_a_duplicate_that_holds_a_body_on_the_ground_changes_nothing():
     np.testing.assert_allclose(by_each(mech.q0, mech.v0), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_spring_between_pins_that_a_joint_holds_together_changes_no_gradient():
     """The distance of its ends is a rounding error, and so the derivative of its force's direction would be arbitrary."""
     pendulum, ts = udk.library.double_pendulum(), np.linspace(0.0, 1.0, 5)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import udkjax as udk
 
@@ -21,6 +22,7 @@ class SolvedSpring(udk.ForceElement):
         return (0.0, 0.0, -torque), (0.0, 0.0, torque)
 
 
+@pytest.mark.slow
 def test_a_spring_by_way_of_matrices():
     """The rows of A are exchanged, as its first pivot is the smaller one."""
     rod, pin = udk.Body(1.0, 0.1, [0.5, 0.0]), udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])

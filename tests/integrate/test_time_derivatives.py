@@ -48,6 +48,7 @@ def test_states_change_by_times_as_by_differences(name, transform):
     assert_allclose(transform(f)(X), wanted, rtol=1e-6, atol=1e-6 * np.abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_second_derivatives_by_times_and_numbers():
     def f(x):
         found = states(ARMS["driven"].with_parameters({"body.rod.mass": x[2]}), x)

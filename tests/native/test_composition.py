@@ -107,6 +107,7 @@ def record_length(monkeypatch):
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_a_member_whose_record_is_too_long_is_run_again(record_length):
     """It is run again in the reverse pass: alone, and next to members whose record is long enough."""
     rtols = jnp.array([1e-4, 1e-6, 1e-8, 1e-10])  # of 11 to 14 points

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.textbook import terms
 from udkjax.positions import assembly
-from udkjax.positions.assembly import check
+from udkjax.positions.scene_check import check
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,7 @@ def peak_of():
     return peak
 
 
+@pytest.mark.slow
 def test_a_peak_and_its_derivative_through_a_run_are_those_of_the_closed_form(peak_of):
     def force(mass):
         return peak_of(mass)["A1"]["link1"].force

@@ -47,7 +47,7 @@ def double_pendulum(*forces):
     return udk.Mechanism(bodies, joints, forces=list(forces))
 
 
-@pytest.mark.parametrize("name", LOADED)
+@pytest.mark.parametrize("name", [x if x == "linkage" else pytest.param(x, marks=pytest.mark.slow) for x in LOADED])
 def test_linearizations_by_numpy_are_those_of_jax(name):
     mech = LOADED[name]()
     analysis = udk.analyse(mech)
@@ -204,6 +204,7 @@ def test_a_scene_without_a_degree_of_freedom_rests_where_its_drivers_hold_it():
     )
 
 
+@pytest.mark.slow
 def test_equilibria_from_many_starts():
     """On one assembly branch the reduction finds them, too."""
     mech = spring_four_bar()

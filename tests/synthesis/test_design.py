@@ -95,6 +95,7 @@ def within_its_bounds(case, found):
     return max(lengths) <= r * (1 + 1e-6) and np.all(np.abs([*local, *ground]) <= others * (1 + 1e-6)), turns
 
 
+@pytest.mark.slow
 def test_a_classic_case_is_solved_better_than_published(classic):
     case, problem = classic
     found = problem(starts=150, seed=0, results=1)

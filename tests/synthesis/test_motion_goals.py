@@ -41,6 +41,7 @@ def motion_of(problem, term):
     return mechanism, ts, udk.kinematics(mechanism, None, ts)
 
 
+@pytest.mark.slow
 def test_measures_are_those_of_inverse_dynamics_and_reactions(problem):
     x = problem.free.vector[None]
     found = [term.measures(x) for term in problem.terms]

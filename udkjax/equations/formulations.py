@@ -19,6 +19,7 @@ from udkjax.annotations import Time, Vector
 from udkjax.arrays import number, number_called
 from udkjax.equations.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.scales import UnitScales
 from udkjax.pinv import Pseudoinverse
 from udkjax.pinv.householder import complete_qr
 from udkjax.pinv.rule import exceeds
@@ -205,7 +206,7 @@ def _accelerations(formulated: FormulatedSystem, t: Time, q: Vector, v: Vector) 
     """Solve in the scene's units, in which coordinates, rows and masses are of order one: rank tolerances are relative."""
     M, F, A, c = formulated.matrices(t, q, v)
     scales = getattr(formulated.equations, "scales", None)
-    if scales is None:
+    if scales is None or isinstance(scales, UnitScales):
         return formulated.formulation.solve(M, F, A, c)
     unit = scales.coordinates(len(F))
     inertia = scales.mass * scales.length**2

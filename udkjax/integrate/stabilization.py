@@ -27,6 +27,7 @@ class ConstraintState(eqx.Module):
         q: coordinates (n,).
         v: velocities (n,).
         h: the length of the step (s).
+        equations: the equations of motion, with their constraints.
     """
 
     t: Float[Array, ""]

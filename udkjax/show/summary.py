@@ -17,7 +17,7 @@ from udkjax.wording import join_names, plural
 
 
 def check_summary(mech: Mechanism, check: Check) -> str:
-    """Describe the findings of `udkjax.positions.assembly.check` about a mechanism."""
+    """Describe the findings of `udkjax.positions.scene_check.check` about a mechanism."""
     lines = check_lines(check)
     lines["constraint equations"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
     lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in check.redundant) or "none"

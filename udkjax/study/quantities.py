@@ -20,10 +20,7 @@ from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
 
 StudyModel: TypeAlias = Mechanism | ConstrainedSystem  # the models of studies
-# (mechanism, value) -> mechanism, or the same of systems
-Setter = TypeAliasType(
-    "Setter", Callable[[Mechanism, NumberLike], Mechanism] | Callable[[ConstrainedSystem, NumberLike], ConstrainedSystem]
-)
+Setter = TypeAliasType("Setter", Callable[[Any, NumberLike], StudyModel])  # (mechanism, value) -> mechanism, or of systems
 
 
 @dataclass(frozen=True)

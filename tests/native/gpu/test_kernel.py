@@ -215,7 +215,7 @@ def both(request, function, *given):
     return known, jax.tree.map(np.asarray, jax.jit(function)(*given)), card
 
 
-@pytest.mark.parametrize("name", ["redundant", "tangent"])
+@pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "tangent"])
 def test_programs_launch_batches(request, name):
     known, found, card = both(request, jax.vmap(RUNS[name]), MASSES)
     jax.tree.map(assert_array_equal, found, known)
@@ -224,6 +224,7 @@ def test_programs_launch_batches(request, name):
     assert pushed == ["cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"] * len(card.grids)
 
 
+@pytest.mark.slow
 def test_scans_and_gradients_launch_batches(request):
     """Batches this small store the records of their steps on the card."""
     run = jax.vmap(lambda x: RUNS["tangent"](x)[0].sum())
@@ -258,7 +259,10 @@ RECORD = 8 * (3 + 3 * PENDULUM.q0.size) * 8  # bytes: eight points
 @pytest.mark.usefixtures("without_records")
 @pytest.mark.parametrize(
     ("limit", "members", "chunks"),
-    [("none", 11, 1), ("buffer", 4, 3), ("card", 2, 6), ("steps", 11, 1)],
+    [
+        *[pytest.param(*x, marks=pytest.mark.slow) for x in (("none", 11, 1), ("card", 2, 6), ("steps", 11, 1))],
+        ("buffer", 4, 3),
+    ],
     ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_reverse_mode_runs_in_chunks_for_which_there_is_memory(request, monkeypatch, limit, members, chunks):

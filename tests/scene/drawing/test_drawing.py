@@ -127,6 +127,7 @@ def test_elements_act_where_they_are_drawn():
     assert_allclose(end["block"][2] - end["arm"][2], -angle, atol=1e-9)  # it slides on the arm without turning
 
 
+@pytest.mark.slow
 def test_a_cylinder_lifts_a_boom_as_levers_say():
     """The cylinder's lever arm is the distance from O to the line C A, the weight's that of the boom's centre."""
     pins = {"O": (0.0, 0.0), "C": (0.3, -0.2), "A": (0.5, 0.15), "T": (1.5, 0.45)}

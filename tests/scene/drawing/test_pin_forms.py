@@ -98,6 +98,7 @@ def test_a_coupler_point_by_every_length_and_angle():
             assert_allclose(slopes[name][k], (ends[1] - ends[0]) / 2e-6, atol=1e-7, err_msg=name)
 
 
+@pytest.mark.slow
 def test_circles_that_touch_have_a_pin_without_derivatives():
     def place(r, s=80.0):
         return four_bar(A=udk.polar("O", 40, 180), B=udk.circles(("A", "C"), (r, s), "left")).drawing.pins["B"]

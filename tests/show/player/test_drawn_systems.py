@@ -26,9 +26,3 @@ def test_a_drawing_places_bodies():
     assert (curve["name"], curve["unit"]) == ("energy", "J")
     with pytest.raises(ValueError, match="no bodies to draw: give a solution and a drawing"):
         udk.animate(system, run)
-
-
-@pytest.mark.parametrize("study", [lambda system: udk.sweep(system, {}, TS), lambda system: udk.diagnose(system)])
-def test_studies_of_mechanisms_name_an_alternative(study):
-    with pytest.raises(TypeError, match="which has no bodies and joints: map simulate over its numbers"):
-        study(pendulum())

@@ -147,6 +147,7 @@ def test_a_prior_counts_as_one_more_measurement(measured):
 # --- what cannot be known
 
 
+@pytest.mark.slow
 def test_a_common_factor_of_masses_is_not_known(measured):
     """The motion of a pendulum without a spring determines the ratio of mass and inertia, the force on its pin the mass."""
     mech = udk.library.compound_pendulum()

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 import jax
 import numpy as np
 
-from udkjax.equations.analysis import analyse
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result, versions
 from udkjax.study.members import concurrent_chunks
+from udkjax.study.quantities import analysis_of
 from udkjax.study.sweep.groups import RESULT, STEPS, GroupRun, group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 from udkjax.threads import thread_count
@@ -53,7 +53,8 @@ def other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarra
     by_rows: dict[tuple[int, ...], list[int]] = {}
     for k in np.flatnonzero(result == Result.drift).tolist():
         inputs = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))
-        rows = analyse(group.mechanism(group.shared, inputs, {})).redundant_rows
+        analysis = analysis_of(group.mechanism(group.shared, inputs, {}))
+        rows = None if analysis is None else analysis.redundant_rows
         if rows is not None and rows != group.redundant:
             by_rows.setdefault(rows, []).append(k)
     return {rows: np.array(which) for rows, which in by_rows.items()}
