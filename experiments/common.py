@@ -6,7 +6,7 @@ A study is one module. Its docstring gives the claim and its reasons. It has
     holds(data) -> {part: bool}        the claim in parts, each compared with the data, also of a small run
     headline(data) -> str              the claim in figures, in one line; the README quotes it
     figure(data) -> Figure             drawn from the data alone
-    page(data) -> str                  a page of its own, NAME.md, if the study has one
+    page(data), html(data) -> str      pages of its own, NAME.md and NAME.html, if the study has them
 """
 
 import inspect
@@ -64,8 +64,9 @@ def redraw(name: str, out: Path | None = None) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     module.figure(data).savefig(file, dpi=DPI)
     Image.open(file).convert("RGB").quantize(COLOURS).save(file, optimize=True)
-    if hasattr(module, "page"):
-        ((HERE if out is None else out) / f"{name}.md").write_text(module.page(data), encoding="utf-8")
+    for function, suffix in (("page", "md"), ("html", "html")):
+        if hasattr(module, function):
+            ((HERE if out is None else out) / f"{name}.{suffix}").write_text(getattr(module, function)(data), encoding="utf-8")
     failed = [part for part, true in module.holds(data).items() if not true]
     print(f"{name} ({data.attrs['seconds']} s): {module.headline(data)}")
     print(f"  {data_file(name, out)}, {file}", *(f"\n  DOES NOT HOLD: {part}" for part in failed))

@@ -182,18 +182,24 @@ def _residual(entry: Table, t: Series, frames: Callable[[str], _Frame], guess: C
 
 def evaluate(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> Terms:
     """Return all terms of the equations of motion of a table at t, q and v (bodies, 3)."""
-    q, v = np.reshape(q, (-1, 3)), np.reshape(v, (-1, 3))
-    n, index = q.size, {body["name"]: k for k, body in enumerate(table["body"])}
-    directions = np.vstack([np.eye(n), v.reshape(1, -1)])  # the last is the motion itself
-    time = Series(np.full(n + 1, float(t)), np.append(np.zeros(n), 1.0))
+    return evaluate_all(table, t, np.reshape(q, (1, -1, 3)), np.reshape(v, (1, -1, 3)))[0]
+
+
+def evaluate_all(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> list[Terms]:
+    """Return the terms at t in several states, q and v (states, bodies, 3): one pass over the joints serves all of them."""
+    states, bodies = q.shape[:2]
+    n, index = 3 * bodies, {body["name"]: k for k, body in enumerate(table["body"])}
+    # Directions of all states, one after another; the last of each is the motion itself.
+    directions = np.concatenate([np.vstack([np.eye(n), one.reshape(1, -1)]) for one in v])
+    placed = np.repeat(q.reshape(states, n), n + 1, axis=0)
+    time = Series(np.full(len(placed), float(t)), np.tile(np.append(np.zeros(n), 1.0), states))
 
     def frame(x: Any, y: Any, angle: Any) -> _Frame:
         return _Frame(x, y, angle, _cos(angle), _sin(angle))
 
     ground = frame(Series(0.0), Series(0.0), Series(0.0))
-    full = np.ones(n + 1)
-    along = lambda k: [Series(q[k, i] * full, directions[:, 3 * k + i]) for i in range(3)]  # noqa: E731
-    moving = [frame(*along(k)) for k in range(len(q))]
+    along = lambda k: [Series(placed[:, 3 * k + i], directions[:, 3 * k + i]) for i in range(3)]  # noqa: E731
+    moving = [frame(*along(k)) for k in range(bodies)]
     still = {"ground": _Frame(0.0, 0.0, 0.0, 1.0, 0.0)}
     for body in table["body"]:
         (x, y), a = body["position"], body["angle"]
@@ -203,21 +209,26 @@ def evaluate(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> Terms:
         for entry in (*table["joint"], *table["driver"])
         for r in _residual(entry, time, lambda b: ground if b == "ground" else moving[index[b]], still.__getitem__)
     ]
-    parts = [[np.broadcast_to(x, (n + 1,)) for x in (r.a, r.b, r.c)] for r in rows]
-    block = np.array(parts).reshape(len(rows), 3, n + 1)
+    parts = [[np.broadcast_to(x, (len(placed),)) for x in (r.a, r.b, r.c)] for r in rows]
+    blocks = np.array(parts).reshape(len(rows), 3, states, n + 1)
     mass = np.array([m for body in table["body"] for m in (body["mass"], body["mass"], body["inertia"])])
-    conservative, other, potential = _loads(table, q, v, index)
-    weight = mass * np.tile([*table["gravity"], 0.0], len(q))
-    return Terms(
-        psi=block[:, 0, -1],
-        psi_q=block[:, 1, :-1],
-        psi_dot=block[:, 1, -1],
-        gamma=-2 * block[:, 2, -1],
-        mass=mass,
-        force=conservative + other + weight,
-        potential=float(potential - weight @ q.ravel()),
-        conservative=conservative + weight,
-    )
+    weight = mass * np.tile([*table["gravity"], 0.0], bodies)
+    found = []
+    for k in range(states):
+        block, (conservative, other, potential) = blocks[:, :, k], _loads(table, q[k], v[k], index)
+        found.append(
+            Terms(
+                psi=block[:, 0, -1],
+                psi_q=block[:, 1, :-1],
+                psi_dot=block[:, 1, -1],
+                gamma=-2 * block[:, 2, -1],
+                mass=mass,
+                force=conservative + other + weight,
+                potential=float(potential - weight @ q[k].ravel()),
+                conservative=conservative + weight,
+            )
+        )
+    return found
 
 
 def _loads(table: Table, q: np.ndarray, v: np.ndarray, index: dict[str, int]) -> tuple[np.ndarray, np.ndarray, float]:

@@ -23,6 +23,7 @@ SLOW: set[str] = {
     "tune_gains",
     "nine_points",
     "spread",
+    "atlas",
     "properties",  # a slice of it: tests/properties
 }
 README = (HERE / "README.md").read_text(encoding="utf-8")

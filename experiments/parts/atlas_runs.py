@@ -1,0 +1,155 @@
+"""The runs of the atlas: for each mechanism five sweeps, each along one of the choices that somebody has to make.
+
+`methods`: the pseudoinverse and the stabilization. `integrators`: the solver. `formulations`: how the accelerations are found.
+`gains`: Baumgarte's. `thresholds`: of the rank. Every run is compared with its reference at the same instants.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import xarray
+
+import udkjax as udk
+from experiments.parts.atlas_problems import Problem
+from experiments.parts.atlas_reference import Reference
+
+TOLERANCES = tuple(10.0**-k for k in range(3, 13))
+COARSE = TOLERANCES[1:8:3]  # where the tolerance is not what is asked for
+MAX_STEPS = 4_000  # several times what a run takes that gets on
+METHODS: dict[str, Callable[[float | None], Any]] = {
+    "Auto": lambda x: udk.Auto(x),
+    "Elimination": lambda x: udk.Elimination(x),
+    "SVD": lambda x: udk.SVD(x),
+    "Varga": lambda x: udk.Varga(x),
+    "Householder": lambda x: udk.Householder(x),
+    "Gram-Schmidt": lambda x: udk.GramSchmidt(x),
+    "Greville": lambda x: udk.Greville(x),
+}
+DENSE = {
+    "SVD": udk.SVD,
+    "Varga": udk.Varga,
+    "Householder": udk.Householder,
+    "Gram-Schmidt": udk.GramSchmidt,
+    "Greville": udk.Greville,
+}
+STABILIZATIONS = {
+    "projection": udk.Projection(),
+    "gains of 5": udk.Baumgarte(5.0, 5.0),
+    "none": udk.Baumgarte(0.0, 0.0),
+}
+SOLVERS: dict[str, Any] = {
+    "Dopri5": diffrax.Dopri5(),
+    "Tsit5": diffrax.Tsit5(),
+    "Verner65": udk.Verner65(),
+    "Dopri8": diffrax.Dopri8(),
+    "Kvaerno5": diffrax.Kvaerno5(),
+}
+MULTISTEP: dict[str, Any] = {"Adams": udk.Adams(), "BDF": udk.BDF()}
+FORMULATIONS: dict[str, Any] = {
+    "augmented, LU": udk.Augmented(),
+    "null space, QR": udk.NullSpaceQR(),
+    "null space, SVD": udk.NullSpaceSVD(),
+}
+SLOW_FORMULATIONS: dict[str, Any] = {
+    "augmented, SVD": udk.Augmented(udk.SVD()),
+    "partitioning": udk.CoordinatePartitioning(),
+}
+GAINS = tuple(float(x) for x in np.geomspace(0.5, 1000.0, 16).round(2))
+THRESHOLDS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+
+
+class Part(NamedTuple):
+    """A sweep: the settings of its cells, its tolerances, and how many of the starts it runs."""
+
+    cells: list[dict[str, Any]]  # names for the data, and under `settings` what `udk.sweep` gets
+    tolerances: tuple[float, ...] = TOLERANCES
+    starts: int | None = None  # None: all
+    timed: bool = False  # whether each method runs by itself, since the time of a chunk is shared by steps, whatever they cost
+
+
+def cell(**chosen: Any) -> dict[str, Any]:
+    """Return a cell, by default the package's own choices."""
+    names = {"method": "Auto", "stabilization": "projection", "solver": "default", "formulation": "Udwadia-Kalaba"}
+    return names | {"gain": np.nan, "threshold": np.nan} | chosen
+
+
+def parts(problem: Problem) -> dict[str, Part]:
+    """Return the sweeps of a mechanism by name."""
+    found = {
+        "methods": Part([cell(method=m, stabilization=s) for m in METHODS for s in STABILIZATIONS], timed=True),
+        "integrators": Part([cell(solver=s) for s in SOLVERS]),
+        "formulations": Part([cell(formulation=f) for f in FORMULATIONS]),
+        "gains": Part([cell(method=m, stabilization="gains", gain=g) for m in ("Auto", "Greville") for g in GAINS]),
+    }
+    if problem.thorough:  # programs that XLA compiles for seconds, and rank thresholds where ranks are at stake
+        found["multistep"] = Part([cell(solver=s) for s in MULTISTEP], TOLERANCES[1:8:2], 2)
+        found["partitioning"] = Part([cell(formulation=f) for f in SLOW_FORMULATIONS], TOLERANCES[1:8:2], 2)
+    if problem.crosses or problem.redundant:
+        several = [(s, m, x) for s in ("projection", "none") for m in METHODS for x in THRESHOLDS]
+        found["thresholds"] = Part([cell(method=m, stabilization=s, threshold=x) for s, m, x in several], COARSE, 4)
+    return found
+
+
+def settings(chosen: Mapping[str, Any], alone: bool = False) -> dict[str, Any]:
+    """Return the arguments of `simulate` for a cell; those that it shares with all cells are left out."""
+    gain, threshold, name = chosen["gain"], chosen["threshold"], chosen["method"]
+    solver = (SOLVERS | MULTISTEP).get(chosen["solver"])
+    formulation = (FORMULATIONS | SLOW_FORMULATIONS).get(chosen["formulation"])
+    found: dict[str, Any] = {"stabilization": STABILIZATIONS.get(chosen["stabilization"]) or udk.Baumgarte(gain, gain)}
+    if formulation is not None:
+        found["formulation"] = formulation
+    elif alone and name in DENSE:  # all dense methods share a program
+        number = np.asarray(list(DENSE).index(name))
+        found["method"] = udk.OneOf(methods=tuple(one() for one in DENSE.values()), number=number)
+    else:
+        found["method"] = METHODS[name](None if np.isnan(threshold) else threshold)
+    if solver is not None:
+        found["solver"] = solver
+    return found
+
+
+def compare(problem: Problem, expected: Reference) -> Callable[[udk.Mechanism, udk.Solution], Any]:
+    """Return a measure of a run: its largest error, relative to the problem's lengths, against the reference of its start."""
+    states = problem.states(len(expected.q))
+    starts = jnp.asarray(np.stack([np.concatenate([s.q, s.v]) for s in states]))
+    q, lengths = jnp.asarray(expected.q), jnp.asarray(problem.lengths)
+
+    def error(mechanism: udk.Mechanism, run: udk.Solution):
+        begun = jnp.concatenate([run.q[0], run.v[0]])
+        start = jnp.argmin(jnp.square(starts - begun).sum((1, 2)))
+        return jnp.max(jnp.abs(run.q - q[start]) / lengths)
+
+    return error
+
+
+def run(problem: Problem, expected: Reference, part: Part, out: Path | None) -> list[xarray.Dataset]:
+    """Run a part of the atlas, in one sweep or several; an interrupted sweep goes on from the chunks in the folder `out`."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for one in part.cells:
+        groups.setdefault(one["method"] if part.timed else "", []).append(one)
+    return [_sweep(problem, expected, part, cells, out and out / name) for name, cells in groups.items()]
+
+
+def _sweep(problem: Problem, expected: Reference, part: Part, cells: list[dict[str, Any]], out: Path | None) -> xarray.Dataset:
+    chosen = [settings(one, part.timed) for one in cells]
+    tolerances = np.array(part.tolerances)
+    axes = {
+        "cell": udk.Zipped({name: [one[name] for one in chosen] for name in chosen[0]}),
+        "tol": udk.Zipped({"rtol": tolerances, "atol": tolerances * problem.lengths.min()}),
+        "start": udk.Axis(problem.states(len(expected.q))[: part.starts], of="state"),
+    }
+    measures = {"wrong": compare(problem, expected), "closure": "violation", "energy": "energy_drift"}
+    return udk.sweep(
+        problem.mechanism,
+        axes,
+        expected.ts,
+        measures | {"n": "counts", "seconds": "seconds"},
+        out=out,
+        progress=False,
+        max_steps=MAX_STEPS,
+        units={"wrong": "1"},
+    )

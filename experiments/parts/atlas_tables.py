@@ -1,0 +1,181 @@
+"""What the atlas says: costs at equal error, silent failures, recommendations."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pandas
+import xarray
+
+TARGETS = (1e-3, 1e-6, 1e-9)  # errors that somebody may want
+LOST = 0.01  # relative to the mechanism's length, or rad
+TIGHT = 1.001e-4  # the largest tolerance at which such an error is not what was asked for
+TIMES_DEFAULT = 100.0  # an error that exceeds the default's by this factor is not the tolerance's
+CELL = ["method", "stabilization", "solver", "formulation"]
+DEFAULT = {"method": "Auto", "stabilization": "projection", "solver": "default", "formulation": "Udwadia-Kalaba"}
+COMPARED = ("methods", "integrators", "formulations", "multistep", "partitioning")
+
+
+def frame(data: xarray.Dataset) -> pandas.DataFrame:
+    """Return a table of all runs, with names in place of their numbers."""
+    found = {}
+    for name, variable in data.data_vars.items():
+        if variable.dims == ("run",):
+            labels = variable.attrs.get("flag_meanings")
+            found[name] = np.array(json.loads(labels))[variable.values] if labels else variable.values.astype(float)
+    return pandas.DataFrame(found)
+
+
+def silent(runs: pandas.DataFrame) -> pandas.Series:
+    """Return which runs with a tolerance of 1e-4 or less ended as successful and are wrong by far more than it explains."""
+    default = runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)]
+    usual = default.set_index(["problem", "tol", "start"]).error
+    keys = pandas.MultiIndex.from_frame(runs[["problem", "tol", "start"]])
+    explained = TIMES_DEFAULT * usual.reindex(keys).to_numpy()
+    return (runs.result == 0) & (runs.tol <= TIGHT) & (runs.error > LOST) & ~(runs.error <= explained)
+
+
+def mean_error(errors: pandas.Series) -> float:
+    """Return the geometric mean of errors; NaN if a run failed."""
+    return float(np.exp(np.log(errors.clip(lower=1e-17)).mean(skipna=False)))
+
+
+def geometric(runs: pandas.DataFrame) -> pandas.DataFrame:
+    """Return error (the geometric mean), seconds and right-hand sides by tolerance, where every start succeeded."""
+    by = runs.groupby("tol")
+    found = pandas.DataFrame(
+        {
+            "error": by.error.agg(mean_error),
+            "seconds": by.seconds.mean(),
+            "right_hand_sides": by.right_hand_sides.mean(),
+        }
+    )
+    return found.dropna().sort_index(ascending=False)
+
+
+def price(runs: pandas.DataFrame, target: float, of: str = "right_hand_sides") -> tuple[float, float]:
+    """Return the least cost at which runs of a cell have at most an error, and the tolerance; infinite if none has."""
+    curve = geometric(runs)
+    enough = curve[curve.error <= target]
+    if enough.empty:
+        return np.inf, np.nan
+    least = enough[of].idxmin()
+    return float(enough[of][least]), float(least)
+
+
+def prices(
+    runs: pandas.DataFrame, target: float, of: str = "right_hand_sides"
+) -> dict[tuple[str, tuple[str, ...]], tuple[float, float]]:
+    """Return the `price` of every cell that varies one of the great choices, by mechanism and cell."""
+    compared = runs[runs.part.isin(COMPARED)]
+    wrong = silent(runs)[compared.index]
+    bad = set(compared[wrong][["problem", *CELL]].itertuples(index=False, name=None))
+    return {
+        (key[0], key[1:]): price(some, target, of)
+        for key, some in compared.groupby(["problem", *CELL], sort=False)
+        if key not in bad
+    }
+
+
+def default_against_best(runs: pandas.DataFrame) -> dict[tuple[str, float], float]:
+    """Return the right-hand sides of the default relative to the least of all, by mechanism and error."""
+    found = {}
+    for target in TARGETS:
+        of_cell = prices(runs, target)
+        for problem in runs.problem.unique():
+            own = of_cell[problem, tuple(DEFAULT.values())][0]
+            least = min(cost for (name, _), (cost, _) in of_cell.items() if name == problem and cost > 0)
+            if np.isfinite(own) and np.isfinite(least):
+                found[problem, target] = own / least
+    return found
+
+
+def gains(runs: pandas.DataFrame) -> dict[str, float]:
+    """Return how gains compare: the error of safe ones relative to projection's, and what large ones cost in right-hand sides."""
+    chosen = runs[(runs.part == "gains") & (runs.method == "Auto") & runs.problem.isin(["hanging", "four-bar", "scissors"])]
+    key = ["problem", "tol", "start"]
+    default = runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)].set_index(key)
+    beside = default.reindex(pandas.MultiIndex.from_frame(chosen[key]))
+    error = chosen.error.to_numpy() / np.maximum(beside.error.to_numpy(), 1e-12)
+    work = chosen.right_hand_sides.to_numpy() / beside.right_hand_sides.to_numpy()
+    safe, large = (chosen.gain > 2) & (chosen.gain < 30), chosen.gain > 200
+    return {"ordinary": float(np.nanmedian(error[safe])), "dear": float(np.nanmedian(work[large]))}
+
+
+def words(cell: tuple[str, ...]) -> str:
+    """Return the choices of a cell that are not the default's."""
+    return ", ".join(value for value, usual in zip(cell, DEFAULT.values(), strict=True) if value != usual) or "the defaults"
+
+
+def recommendations(runs: pandas.DataFrame) -> list[dict[str, Any]]:
+    """Return for each mechanism and error: the default's tolerance and cost, and the setting with the least time."""
+    found = []
+    for target in TARGETS:
+        work, time = prices(runs, target), prices(runs, target, "seconds")
+        for problem in runs.problem.unique():
+            rows = {cell: cost for (name, cell), cost in time.items() if name == problem}
+            best = min(rows, key=lambda cell: rows[cell][0])
+            default = tuple(DEFAULT.values())
+            found.append(
+                {
+                    "problem": problem,
+                    "error": target,
+                    "tol": rows[default][1],
+                    "seconds": rows[default][0],
+                    "right_hand_sides": work[problem, default][0],
+                    "best": words(best),
+                    "best_tol": rows[best][1],
+                    "best_seconds": rows[best][0],
+                }
+            )
+    return found
+
+
+def markdown(data: xarray.Dataset) -> str:
+    """Return the recommendations and the failures as a page."""
+    runs, titles = frame(data), json.loads(data.titles)
+    wrong = silent(runs)
+    heads = (
+        "Mechanism",
+        "Error",
+        "Tolerance of the default",
+        "Time (ms)",
+        "Right-hand sides",
+        "Least time by",
+        "Tolerance",
+        "Time (ms)",
+    )
+    lines = [
+        "# Atlas: work against error",
+        "",
+        f"Written by `python -m experiments atlas` ({data.attrs['seconds']:.0f} s, {len(runs):,} runs). [The plots](atlas.html), "
+        "[the data](data/atlas.nc) (CC0), [the claims](atlas.py).",
+        "",
+        "The tolerance (`rtol`, and `atol` relative to the mechanism's length) at which the default has an error, its time in a "
+        "batch on one core, and the setting that takes the least time. Times were measured once, and differ by a factor of up to "
+        "two between repeats; right-hand sides do not.",
+        "",
+        _row(heads),
+        "|---" * len(heads) + "|",
+    ]
+    for row in recommendations(runs):
+        own, best = (_number(row[name] * 1e3, ".2f") for name in ("seconds", "best_seconds"))
+        tolerances = [_number(row[name], ".0e") for name in ("tol", "best_tol")]
+        work = _number(row["right_hand_sides"], ".0f")
+        name = row["best"] if best else ""
+        lines.append(_row((titles[row["problem"]], f"{row['error']:.0e}", tolerances[0], own, work, name, tolerances[1], best)))
+    lines += ["", "Runs that ended as successful and are wrong, and those that ended with a reason:", ""]
+    heads = ("Mechanism", "Stabilization", "Runs", "Silently wrong", "Refused")
+    lines += [_row(heads), "|---" * len(heads) + "|"]
+    for (problem, stabilization), some in runs.groupby(["problem", "stabilization"], sort=False):
+        refused = int((some.result != 0).sum())
+        lines.append(_row((titles[problem], stabilization, f"{len(some):,}", int(wrong[some.index].sum()), f"{refused:,}")))
+    return "\n".join(lines) + "\n"
+
+
+def _row(cells: tuple[Any, ...]) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _number(value: float, form: str) -> str:
+    return format(value, form) if np.isfinite(value) else ""
