@@ -1,12 +1,13 @@
 """What the atlas says: costs at equal error, silent failures, recommendations."""
 
 import json
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas
 import xarray
 
+Runs: TypeAlias = Any  # a table or a column of pandas, which its types cannot tell apart
 TARGETS = (1e-3, 1e-6, 1e-9)  # errors that somebody may want
 LOST = 0.01  # relative to the mechanism's length, or rad
 TIGHT = 1.001e-4  # the largest tolerance at which such an error is not what was asked for
@@ -16,7 +17,7 @@ DEFAULT = {"method": "Auto", "stabilization": "projection", "solver": "default",
 COMPARED = ("methods", "integrators", "formulations", "multistep", "partitioning")
 
 
-def frame(data: xarray.Dataset) -> pandas.DataFrame:
+def frame(data: xarray.Dataset) -> Runs:
     """Return a table of all runs, with names in place of their numbers."""
     found = {}
     for name, variable in data.data_vars.items():
@@ -26,7 +27,7 @@ def frame(data: xarray.Dataset) -> pandas.DataFrame:
     return pandas.DataFrame(found)
 
 
-def silent(runs: pandas.DataFrame) -> pandas.Series:
+def silent(runs: Runs) -> Runs:
     """Return which runs with a tolerance of 1e-4 or less ended as successful and are wrong by far more than it explains."""
     default = runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)]
     usual = default.set_index(["problem", "tol", "start"]).error
@@ -35,12 +36,12 @@ def silent(runs: pandas.DataFrame) -> pandas.Series:
     return (runs.result == 0) & (runs.tol <= TIGHT) & (runs.error > LOST) & ~(runs.error <= explained)
 
 
-def mean_error(errors: pandas.Series) -> float:
+def mean_error(errors: Runs) -> float:
     """Return the geometric mean of errors; NaN if a run failed."""
     return float(np.exp(np.log(errors.clip(lower=1e-17)).mean(skipna=False)))
 
 
-def geometric(runs: pandas.DataFrame) -> pandas.DataFrame:
+def geometric(runs: Runs) -> Runs:
     """Return error (the geometric mean), seconds and right-hand sides by tolerance, where every start succeeded."""
     by = runs.groupby("tol")
     found = pandas.DataFrame(
@@ -53,7 +54,7 @@ def geometric(runs: pandas.DataFrame) -> pandas.DataFrame:
     return found.dropna().sort_index(ascending=False)
 
 
-def price(runs: pandas.DataFrame, target: float, of: str = "right_hand_sides") -> tuple[float, float]:
+def price(runs: Runs, target: float, of: str = "right_hand_sides") -> tuple[float, float]:
     """Return the least cost at which runs of a cell have at most an error, and the tolerance; infinite if none has."""
     curve = geometric(runs)
     enough = curve[curve.error <= target]
@@ -63,9 +64,7 @@ def price(runs: pandas.DataFrame, target: float, of: str = "right_hand_sides") -
     return float(enough[of][least]), float(least)
 
 
-def prices(
-    runs: pandas.DataFrame, target: float, of: str = "right_hand_sides"
-) -> dict[tuple[str, tuple[str, ...]], tuple[float, float]]:
+def prices(runs: Runs, target: float, of: str = "right_hand_sides") -> dict[tuple[str, tuple[str, ...]], tuple[float, float]]:
     """Return the `price` of every cell that varies one of the great choices, by mechanism and cell."""
     compared = runs[runs.part.isin(COMPARED)]
     wrong = silent(runs)[compared.index]
@@ -77,7 +76,7 @@ def prices(
     }
 
 
-def default_against_best(runs: pandas.DataFrame) -> dict[tuple[str, float], float]:
+def default_against_best(runs: Runs) -> dict[tuple[str, float], float]:
     """Return the right-hand sides of the default relative to the least of all, by mechanism and error."""
     found = {}
     for target in TARGETS:
@@ -90,7 +89,7 @@ def default_against_best(runs: pandas.DataFrame) -> dict[tuple[str, float], floa
     return found
 
 
-def gains(runs: pandas.DataFrame) -> dict[str, float]:
+def gains(runs: Runs) -> dict[str, float]:
     """Return how gains compare: the error of safe ones relative to projection's, and what large ones cost in right-hand sides."""
     chosen = runs[(runs.part == "gains") & (runs.method == "Auto") & runs.problem.isin(["hanging", "four-bar", "scissors"])]
     key = ["problem", "tol", "start"]
@@ -107,7 +106,7 @@ def words(cell: tuple[str, ...]) -> str:
     return ", ".join(value for value, usual in zip(cell, DEFAULT.values(), strict=True) if value != usual) or "the defaults"
 
 
-def recommendations(runs: pandas.DataFrame) -> list[dict[str, Any]]:
+def recommendations(runs: Runs) -> list[dict[str, Any]]:
     """Return for each mechanism and error: the default's tolerance and cost, and the setting with the least time."""
     found = []
     for target in TARGETS:

@@ -58,7 +58,7 @@ def test_equations_of_several_states_are_those_of_each():
     plain = udk.Mechanism(mechanism.bodies, mechanism.joints, mechanism.drivers, mechanism.forces, mechanism.gravity)
     table = {"driver": [], "force": [], **tomllib.loads(udk.dumps(plain))}
     random = np.random.default_rng(0)
-    q, v = mechanism.q0 + 0.1 * random.standard_normal((2, 4, *mechanism.q0.shape))
+    q, v = np.asarray(mechanism.q0) + 0.1 * random.standard_normal((2, 4, *mechanism.q0.shape))
     for k, together in enumerate(evaluate_all(table, 0.3, q, v)):
         for one, other in zip(together, evaluate(table, 0.3, q[k], v[k]), strict=True):
             assert_allclose(one, other, rtol=1e-14, atol=1e-14)
