@@ -36,7 +36,7 @@ from udkjax.show.style import COLOURS, MARKERS
 
 SMALL = ("hanging", "crossing", "scissors")  # of the small version
 LARGEST_THRESHOLD = 0.011  # of the rank; above it, directions are left out that the motion needs
-SLOW_PARTS = ("multistep", "partitioning", "formulations")  # not of the small version
+SLOW_PARTS = ("multistep", "partitioning", "formulations", "Braun and Goldfarb", "constant steps")  # not of the small version
 KEPT = HERE / "data" / ".atlas"  # finished chunks of an interrupted study
 CODES = ("problem", "part", "method", "stabilization", "solver", "formulation")
 NUMBERS = ("gain", "threshold")
@@ -68,7 +68,7 @@ def study(smoke: bool, keep: int = 1) -> xarray.Dataset:
                 part = part._replace(cells=part.cells[:: 6 if kind == "thresholds" else 1], tolerances=part.tolerances[::4])
             out = None if smoke else KEPT / name / kind
             found = run(problem, expected, part, out)
-            cells = iter(part.cells)
+            cells = itertools.cycle(part.cells)
             for data in found:
                 add(columns, names, data, list(itertools.islice(cells, data.sizes["cell"])), problem=name, part=kind)
                 if not problem.conserves:

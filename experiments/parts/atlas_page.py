@@ -19,7 +19,13 @@ def html(data: xarray.Dataset) -> str:
     compared = runs[runs.part.isin(COMPARED)].groupby(["problem", "part", *CELL], sort=False)
     for (problem, part, method, stabilization, solver, formulation), some in compared:
         curve = geometric(some)
-        label = {"methods": f"{method}, {stabilization}", "integrators": solver, "multistep": solver}.get(part, formulation)
+        label = {
+            "methods": f"{method}, {stabilization}",
+            "integrators": solver,
+            "multistep": solver,
+            "constant steps": solver,
+            "Braun and Goldfarb": stabilization,
+        }.get(part, formulation)
         points = [[_short(x) for x in row] for row in curve.reset_index().to_numpy()]
         curves.append({"problem": problem, "part": part, "label": label, "points": points, "wrong": int(wrong[some.index].sum())})
     for part, axis in (("gains", "gain"), ("thresholds", "threshold")):

@@ -14,6 +14,7 @@ import numpy as np
 import xarray
 
 import udkjax as udk
+from experiments.parts.atlas_own import BraunGoldfarb, HalfImplicit
 from experiments.parts.atlas_problems import Problem
 from experiments.parts.atlas_reference import Reference
 
@@ -41,6 +42,7 @@ STABILIZATIONS = {
     "gains of 5": udk.Baumgarte(5.0, 5.0),
     "none": udk.Baumgarte(0.0, 0.0),
 }
+OWN = {"Braun and Goldfarb": BraunGoldfarb()}
 SOLVERS: dict[str, Any] = {
     "Dopri5": diffrax.Dopri5(),
     "Tsit5": diffrax.Tsit5(),
@@ -48,6 +50,7 @@ SOLVERS: dict[str, Any] = {
     "Dopri8": diffrax.Dopri8(),
     "Kvaerno5": diffrax.Kvaerno5(),
 }
+CONSTANT: dict[str, Any] = {"half-implicit": HalfImplicit()}  # by steps of equal length
 MULTISTEP: dict[str, Any] = {"Adams": udk.Adams(), "BDF": udk.BDF()}
 FORMULATIONS: dict[str, Any] = {
     "augmented, LU": udk.Augmented(),
@@ -68,6 +71,7 @@ class Part(NamedTuple):
     cells: list[dict[str, Any]]  # names for the data, and under `settings` what `udk.sweep` gets
     tolerances: tuple[float, ...] = TOLERANCES
     starts: int | None = None  # None: all
+    steps: bool = False  # whether the tolerances are steps, relative to the duration
     timed: bool = False  # whether each method runs by itself, since the time of a chunk is shared by steps, whatever they cost
 
 
@@ -87,6 +91,8 @@ def parts(problem: Problem) -> dict[str, Part]:
     }
     if problem.thorough:  # programs that XLA compiles for seconds, and rank thresholds where ranks are at stake
         found["multistep"] = Part([cell(solver=s) for s in MULTISTEP], TOLERANCES[1:8:2], 2)
+        found["Braun and Goldfarb"] = Part([cell(stabilization="Braun and Goldfarb")], TOLERANCES[:3], 2)
+        found["constant steps"] = Part([cell(solver=s) for s in CONSTANT], (1e-2, 1e-3, 1e-4), 2, steps=True)
         found["partitioning"] = Part([cell(formulation=f) for f in SLOW_FORMULATIONS], TOLERANCES[1:8:2], 2)
     if problem.crosses or problem.redundant:
         several = [(s, m, x) for s in ("projection", "none") for m in METHODS for x in THRESHOLDS]
@@ -97,9 +103,9 @@ def parts(problem: Problem) -> dict[str, Part]:
 def settings(chosen: Mapping[str, Any], alone: bool = False) -> dict[str, Any]:
     """Return the arguments of `simulate` for a cell; those that it shares with all cells are left out."""
     gain, threshold, name = chosen["gain"], chosen["threshold"], chosen["method"]
-    solver = (SOLVERS | MULTISTEP).get(chosen["solver"])
+    solver = (SOLVERS | MULTISTEP | CONSTANT).get(chosen["solver"])
     formulation = (FORMULATIONS | SLOW_FORMULATIONS).get(chosen["formulation"])
-    found: dict[str, Any] = {"stabilization": STABILIZATIONS.get(chosen["stabilization"]) or udk.Baumgarte(gain, gain)}
+    found: dict[str, Any] = {"stabilization": (STABILIZATIONS | OWN).get(chosen["stabilization"]) or udk.Baumgarte(gain, gain)}
     if formulation is not None:
         found["formulation"] = formulation
     elif alone and name in DENSE:  # all dense methods share a program
@@ -131,25 +137,36 @@ def run(problem: Problem, expected: Reference, part: Part, out: Path | None) -> 
     groups: dict[str, list[dict[str, Any]]] = {}
     for one in part.cells:
         groups.setdefault(one["method"] if part.timed else "", []).append(one)
+    if part.steps:  # of which a sweep takes one
+        parts = [part._replace(tolerances=(step,)) for step in part.tolerances]
+        return [_sweep(problem, expected, one, one.cells, out and out / str(k)) for k, one in enumerate(parts)]
     return [_sweep(problem, expected, part, cells, out and out / name) for name, cells in groups.items()]
 
 
 def _sweep(problem: Problem, expected: Reference, part: Part, cells: list[dict[str, Any]], out: Path | None) -> xarray.Dataset:
     chosen = [settings(one, part.timed) for one in cells]
     tolerances = np.array(part.tolerances)
-    axes = {
-        "cell": udk.Zipped({name: [one[name] for one in chosen] for name in chosen[0]}),
+    if len(cells) > 1:
+        varied: dict[str, Any] = {"cell": udk.Zipped({name: [one[name] for one in chosen] for name in chosen[0]})}
+        shared: dict[str, Any] = {}
+    else:
+        varied, shared = {}, chosen[0]
+    if part.steps:
+        shared = shared | {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": tolerances[0] * problem.end}
+    axes = varied | {
         "tol": udk.Zipped({"rtol": tolerances, "atol": tolerances * problem.lengths.min()}),
         "start": udk.Axis(problem.states(len(expected.q))[: part.starts], of="state"),
     }
     measures = {"wrong": compare(problem, expected), "closure": "violation", "energy": "energy_drift"}
-    return udk.sweep(
+    data = udk.sweep(
         problem.mechanism,
         axes,
         expected.ts,
         measures | {"n": "counts", "seconds": "seconds"},
         out=out,
         progress=False,
-        max_steps=MAX_STEPS,
+        max_steps=3 * MAX_STEPS if part.steps else MAX_STEPS,
+        **shared,
         units={"wrong": "1"},
     )
+    return data if varied else data.expand_dims("cell")
