@@ -10,7 +10,7 @@ import xarray
 Runs: TypeAlias = Any  # a table or a column of pandas, which its types cannot tell apart
 TARGETS = (1e-3, 1e-6, 1e-9)  # errors that somebody may want
 LOST = 0.01  # relative to the mechanism's length, or rad
-TIGHT = 1.001e-4  # the largest tolerance at which such an error is not what was asked for
+TIGHT = 1.001e-6  # the largest tolerance at which such an error is not what was asked for
 TIMES_DEFAULT = 100.0  # an error that exceeds the default's by this factor is not the tolerance's
 CELL = ["method", "stabilization", "solver", "formulation"]
 DEFAULT = {"method": "Auto", "stabilization": "projection", "solver": "default", "formulation": "Udwadia-Kalaba"}
@@ -28,7 +28,7 @@ def frame(data: xarray.Dataset) -> Runs:
 
 
 def silent(runs: Runs) -> Runs:
-    """Return which runs with a tolerance of 1e-4 or less ended as successful and are wrong by far more than it explains."""
+    """Return which runs with a tolerance of 1e-6 or less ended as successful and are wrong by far more than it explains."""
     default = runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)]
     usual = default.set_index(["problem", "tol", "start"]).error
     keys = pandas.MultiIndex.from_frame(runs[["problem", "tol", "start"]])
