@@ -12,7 +12,6 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 from jax.extend import core
-from jax.extend.core.primitives import closed_call_p
 from jax.typing import ArrayLike
 
 from udkjax.expressions.array_rules import RULES, choose, choose_branch, select_rows, select_unknown
@@ -113,6 +112,18 @@ def _read(graph: Graph, jaxpr: core.Jaxpr, constants: Sequence[np.ndarray], argu
     return outputs
 
 
+class _Inline:
+    """Evaluates a closed jaxpr where a primitive is expected: JAX's own calls take other parameters in each of its releases."""
+
+    name, multiple_results = "closed_call", True
+
+    def bind(self, *arrays: ArrayLike, call_jaxpr: ClosedJaxpr) -> list[jax.Array]:
+        return core.jaxpr_as_fun(call_jaxpr)(*arrays)
+
+
+_INLINE: Any = _Inline()
+
+
 def _after(graph: Graph, equation: Equation, inputs: list[np.ndarray], output: np.ndarray) -> np.ndarray:
     """Return an output that is computed after an equation without outputs, whose effect takes place with it."""
 
@@ -123,7 +134,7 @@ def _after(graph: Graph, equation: Equation, inputs: list[np.ndarray], output: n
     arrays = [output, *inputs]
     dtypes = [np.result_type(float, *(s.node.dtype for s in output.flat)), *(v.aval.dtype for v in equation.invars)]
     closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(a.shape, d) for a, d in zip(arrays, dtypes, strict=True)))
-    details = BoundPrimitive(closed_call_p, {"call_jaxpr": closed}, tuple(a.shape for a in arrays), equation.primitive.name)
+    details = BoundPrimitive(_INLINE, {"call_jaxpr": closed}, tuple(a.shape for a in arrays), equation.primitive.name)
     return graph.call(details, tuple(s for a in arrays for s in a.flat), [(output.shape, dtypes[0])])[0]
 
 
