@@ -126,7 +126,7 @@ def add(
 
 
 def packed(values: np.ndarray) -> np.ndarray:
-    """Return numbers in as many digits as are read: three of what was measured."""
+    """Return numbers in as many digits as are read: three for measured ones."""
     if not np.issubdtype(values.dtype, np.floating):
         return values.astype(np.int32 if np.abs(values).max(initial=0) > 127 else np.int8)
     bits = (values.astype(np.float32).view(np.uint32) + 0x1000) & np.uint32(0xFFFFE000)

@@ -1,4 +1,4 @@
-"""What the atlas says: costs at equal error, silent failures, recommendations."""
+"""Results of the atlas: costs at equal error, silent failures, recommendations."""
 
 import json
 from typing import Any, TypeAlias
