@@ -112,8 +112,8 @@ def test_derivatives_and_batches_of_impacts():
 def test_other_solvers_with_events():
     stop = udk.Event(lambda t, q, v: q[0], udk.Stop(), name="stop")
     for solver in (diffrax.Kvaerno5(), udk.BDF()):
-        run = udk.simulate(pendulum(), [0.0, 1.0], CONICAL, 1e-9, 1e-9, events=stop, solver=solver)
-        assert_allclose(run.time, np.pi / 2 / RATE, atol=1e-5)
+        run = udk.simulate(pendulum(), [0.0, 1.0], CONICAL, 1e-10, 1e-10, events=stop, solver=solver)
+        assert_allclose(run.time, np.pi / 2 / RATE, atol=1e-6)
 
 
 def test_mistakes():
