@@ -152,8 +152,8 @@ def markdown(data: xarray.Dataset) -> str:
         "[the data](data/atlas.nc) (CC0), [the claims](atlas.py).",
         "",
         "The tolerance (`rtol`, and `atol` relative to the mechanism's length) at which the default has an error, its time in a "
-        "batch on one core, and the setting that takes the least time. Times were measured once, beside other programs; counts of "
-        "right-hand sides do not depend on that.",
+        "batch on one core, and the setting that takes the least time. Times were measured once, beside other programs; counts "
+        "of right-hand sides do not depend on that.",
         "",
         _row(heads),
         "|---" * len(heads) + "|",

@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from experiments.parts.atlas_own import BraunGoldfarb, HalfImplicit
 from tests.integrate.own_systems import G, pendulum
 
 RATE = np.sqrt(G / 0.6)  # of the conical pendulum 0.6 m below its pivot
@@ -50,13 +51,6 @@ class ThreeTimes(udk.PointwiseFormulation):
         return free + mobility @ jnp.linalg.solve(A @ mobility, c - A @ free)
 
 
-class BraunGoldfarb(udk.Stabilization):
-    """Residuals act on the rates of the same step, with gains of 1/h."""
-
-    def rates(self, at, v, a):
-        return v - at.change_of_positions(at.psi) / at.h, a - at.change_of_velocities(at.psi_dot) / at.h
-
-
 class Radial(udk.Stabilization):
     """Scales positions to the sphere, and removes the radial velocity: for the pendulum alone."""
 
@@ -65,27 +59,6 @@ class Radial(udk.Stabilization):
     def end_of_step(self, at):
         q = self.length * at.q / jnp.linalg.norm(at.q)
         return q, at.v - q * (q @ at.v) / self.length**2
-
-
-class HalfImplicit(diffrax.AbstractSolver):
-    """Euler's step with the new velocities for the new positions."""
-
-    term_structure = diffrax.AbstractTerm
-    interpolation_cls = diffrax.LocalLinearInterpolation
-
-    def order(self, terms):
-        return 1
-
-    def init(self, terms, t0, t1, y0, args):
-        return None
-
-    def func(self, terms, t0, y0, args):
-        return terms.vf(t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        h, (dq, dv) = t1 - t0, jnp.split(terms.vf(t0, y0, args), 2)
-        y1 = y0 + h * jnp.concatenate([dq + h * dv, dv])
-        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
 def run(**choices: Any) -> udk.Solution:
