@@ -86,6 +86,7 @@ def test_a_run_that_failed_is_shown_and_how_it_ended_is_said(tmp_path, capsys):
         udk.animate(mech, failed)
 
 
+@pytest.mark.slow
 def test_a_live_page_has_the_engine_and_the_sliders_that_are_named(run, tmp_path):
     out = tmp_path / "live.html"
     assert udkjax("animate", SCENE, "--t1", 1, "--out", out, "--live", "pin.B", "link.crank.mass") == 0

@@ -33,6 +33,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_designs_are_found_shown_and_written(folder, capsys):
     goal = folder / "goal.toml"
     goal.write_text(GOAL)

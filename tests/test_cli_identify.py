@@ -52,6 +52,7 @@ def test_what_the_data_cannot_tell_is_said_and_all_is_written(tmp_path, capsys, 
     assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
     out = tmp_path / "found"
     options = ["--prior", f"{MASS}=2.0,0.002", "--bounds", f"{INERTIA} = 0.2,0.9", "--noise", CHANNEL + f"={np.radians(NOISE)}"]

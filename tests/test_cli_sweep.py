@@ -97,6 +97,7 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, monkeypatch, capsys, grid):
     assert "run the same command to continue" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_the_example_takes(tmp_path, capsys):
     assert udkjax(*THE_EXAMPLE, "--dry-run") == 0
     shown = " ".join(capsys.readouterr().out.split())

@@ -55,7 +55,7 @@ CALLS = {
 CALLED = {"kinematics": motion, "travel": lambda m: udk.travel(m, "body.c.angle"), "stop": lambda m: fall(m, crosses(udk.Stop()))}
 
 
-@pytest.mark.parametrize("name", fast(["simulate", "energy and violation", "kinematics", "stop"], [*CALLS, *CALLED]))
+@pytest.mark.parametrize("name", fast(["energy and violation", "kinematics", "stop"], [*CALLS, *CALLED]))
 def test_ordinary_calls_pass_where_jax_looks_for_values_that_are_no_numbers(name):
     """Also the derivatives of `CALLS`; test_kinematics.py checks those of positions."""
     with jax.debug_nans(True):

@@ -42,39 +42,37 @@ def mean_error(errors: Runs) -> float:
     return float(np.exp(np.log(errors.clip(lower=1e-17)).mean(skipna=False)))
 
 
-def geometric(runs: Runs) -> Runs:
-    """Return error (the geometric mean), seconds and right-hand sides by tolerance, where every start succeeded."""
-    by = runs.groupby("tol")
-    found = pandas.DataFrame(
-        {
-            "error": by.error.agg(mean_error),
-            "seconds": by.seconds.mean(),
-            "right_hand_sides": by.right_hand_sides.mean(),
-        }
-    )
+def geometric(runs: Runs, *by: str) -> Runs:
+    """Return error (the geometric mean), seconds and right-hand sides by columns and tolerance, where every start succeeded."""
+    groups = runs.assign(error=np.log(runs.error.clip(lower=1e-17))).groupby([*by, "tol"], sort=False)
+    found = groups[["error", "seconds", "right_hand_sides"]].mean()
+    found["error"] = np.exp(found.error).where(groups.error.count() == groups.size())
     return found.dropna().sort_index(ascending=False)
 
 
 def price(runs: Runs, target: float, of: str = "right_hand_sides") -> tuple[float, float]:
     """Return the least cost at which runs of a cell have at most an error, and the tolerance; infinite if none has."""
-    curve = geometric(runs)
-    enough = curve[curve.error <= target]
-    if enough.empty:
-        return np.inf, np.nan
-    least = enough[of].idxmin()
-    return float(enough[of][least]), float(least)
+    return _least(geometric(runs).reset_index(), target, of).get((), (np.inf, np.nan))
+
+
+def _least(curves: Runs, target: float, of: str, *by: str) -> dict[tuple[str, ...], tuple[float, float]]:
+    """Return the least cost of each curve that has an error, and its tolerance."""
+    enough = curves[curves.error <= target].sort_values(of, kind="stable")
+    found: dict[tuple[str, ...], tuple[float, float]] = {}
+    for *key, cost, tol in enough[[*by, of, "tol"]].itertuples(index=False, name=None):
+        found.setdefault(tuple(key), (float(cost), float(tol)))
+    return found
 
 
 def prices(runs: Runs, target: float, of: str = "right_hand_sides") -> dict[tuple[str, tuple[str, ...]], tuple[float, float]]:
     """Return the `price` of every cell that varies one of the great choices, by mechanism and cell."""
     compared = runs[runs.part.isin(COMPARED)]
     wrong = silent(runs)[compared.index]
-    bad = set(compared[wrong][["problem", *CELL]].itertuples(index=False, name=None))
-    return {
-        (key[0], key[1:]): price(some, target, of)
-        for key, some in compared.groupby(["problem", *CELL], sort=False)
-        if key not in bad
-    }
+    keys = ["problem", *CELL]
+    bad = set(compared[wrong][keys].itertuples(index=False, name=None))
+    least = _least(geometric(compared, *keys).reset_index(), target, of, *keys)
+    cells = compared[keys].drop_duplicates().itertuples(index=False, name=None)
+    return {(key[0], key[1:]): least.get(key, (np.inf, np.nan)) for key in cells if key not in bad}
 
 
 def default_against_best(runs: Runs) -> dict[tuple[str, float], float]:

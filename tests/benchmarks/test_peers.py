@@ -28,6 +28,7 @@ def test_the_equations_by_hand_are_those_by_jax(state, monkeypatch):
         np.testing.assert_allclose(rhs(0.0, state), expected, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_tolerance():
     rows = DOP853.curve(-45.0, knobs=(1e-3, 1e-6, 1e-9), end=2.0)
     errors = [row["error"] for row in rows]

@@ -33,6 +33,7 @@ def test_it_is_one_program(name, compilations):
     jax.tree.map(lambda x, y: assert_allclose(x, y, rtol=1e-12, atol=1e-12), function(MECH, *given), plain)
 
 
+@pytest.mark.slow
 def test_it_is_transformed_as_the_plain_one_is():
     """Differentiated with respect to time, positions and numbers of the scene; mapped over positions given as lists."""
 

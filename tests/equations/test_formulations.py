@@ -89,6 +89,7 @@ def driven(forces):
 SPRING = {"spring": udk.Spring(["ground", "lower"], [[0.3, 0.5], [0.1, 0.0]], stiffness=40.0, length=0.2, damping=3.0)}
 
 
+@pytest.mark.slow
 def test_a_driver_and_force_elements(kkt, closed):
     """Compared with the KKT equations in plain form."""
     mech = driven(SPRING)

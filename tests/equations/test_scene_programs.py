@@ -216,6 +216,7 @@ def machine():
     )
 
 
+@pytest.mark.slow
 def test_energy_changes_by_the_power_of_loads_and_drivers(machine):
     """dE/dt = v F_nc + V_t + lambda Psi_t, where v satisfies the constraints; the reactions of joints do no work."""
     random, t = np.random.default_rng(2), jnp.array(0.4)

@@ -66,6 +66,7 @@ def test_derivatives_of_a_held_rod():
     assert abs(found - jax.grad(lambda k: height(other, k))(100.0)) < 1e-7
 
 
+@pytest.mark.slow
 def test_two_rods_between_the_same_guides():
     """A closed frame of two rods and two long blocks: one rod is held, then the other one is redundant in the usual sense."""
     pins = {"A": (0, 1), "B": (3, 1), "C": (0, 2), "D": (3, 2)}

@@ -226,6 +226,7 @@ class TestDerivatives:
         np.testing.assert_allclose(found, self.exact, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_batch_is_its_members(swing):
     """Each member has its own order and step."""
     y0 = jnp.array([[2.0, 0.0], [0.1, 0.0], [3.0, 1.0]])
@@ -257,6 +258,7 @@ def swing_down(a):
 QUARTER = ellipk(np.sin(1.0) ** 2) / np.sqrt(9.81)  # s, of its period
 
 
+@pytest.mark.slow
 def test_dense_output():
     """It is as accurate as the steps, and continuous. An event is found in it."""
     run = swing_down(9.81)

@@ -97,6 +97,7 @@ def test_one_direction_for_all_members(pendulum):
     assert_allclose(slopes, (ahead - behind) / 2e-4, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
     """A link's mass appears in few constants of a linkage. Only these are differentiated."""
     linkage, found, machine_code = udk.library.parallelogram(np.deg2rad(-45)), [], primitive.machine_code

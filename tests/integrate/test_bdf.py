@@ -228,6 +228,7 @@ def test_stiffness_costs_nothing(reacted):
         assert run.stats["num_steps"] < 300
 
 
+@pytest.mark.slow
 def test_step_without_a_solution_is_rejected(reacted):
     """A first step of 2 makes x negative. The run recovers."""
     run = reacted(3.0, first=2.0)
@@ -287,6 +288,7 @@ def test_event_backward_in_time():
     np.testing.assert_allclose(rates["x"], -np.sin(ts), rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_jump_begins_a_new_history():
     """y' = -k (y - u(t)), and u jumps from 0 to 1. A solver that knows of the jump does not search for it by rejected steps."""
     k = 50.0

@@ -114,6 +114,7 @@ def test_outputs_of_a_motion_that_names_its_times(single, switch):
     assert_within(found, reference(switch=switch), 1e-8)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_have_breakpoints_of_their_own(single):
     shifts = np.array([[0.0, 0.0, 0.1], [0.05, 0.02, -0.3], [0.0, 0.3, 0.6], [0.1, -0.1, 2.0]])
     knots = jnp.asarray(KNOTS + np.stack([np.zeros(4), shifts[:, 0], shifts[:, 1], np.zeros(4), np.zeros(4)], 1))

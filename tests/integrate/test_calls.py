@@ -104,6 +104,7 @@ def test_a_batch_at_once_is_its_members():
     assert_allclose(jax.vmap(run)(masses), [run(float(x)) for x in masses], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_first_event_and_its_derivative_take_few_programs(compilations):
     """The loop over windows is not compiled, which would take seconds."""
     lowest = udk.Event(lambda t, frames: frames["b0"].angle, udk.Stop())
@@ -170,6 +171,7 @@ class Told(udk.ForceElement):
         return [(0.0, 1.0, 0.0)]
 
 
+@pytest.mark.slow
 def test_a_force_that_calls_back_is_run_by_diffrax():
     """`jax.debug.print` shows what a force is evaluated at, as in any other JAX function."""
     rod, times = udk.library.compound_pendulum(), []

@@ -58,6 +58,7 @@ def run():
     return jax.jit(jax.vmap(by_tol, (0, None)))
 
 
+@pytest.mark.slow
 def test_gradients_of_runs_without_projection(run):
     """A stage of a step that ends at a knot is not beyond it, where derivatives are others: gradients were off by 0.2."""
     rng = np.random.default_rng(0)

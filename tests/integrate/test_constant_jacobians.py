@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.choices import fast
 
 PUSH = udk.Torque(["ground", "one"], 0.7)
 ONE, TWO = udk.Body(1.0, 0.1), udk.Body(2.0, 0.3, [1.0, 0.0])
@@ -14,7 +15,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", fast(["gears"], SCENES))
 def test_reverse_mode_under_jit(name):
     mechanism, parameter = SCENES[name], "body.one.inertia"
     value = float(mechanism.bodies["one"].inertia)

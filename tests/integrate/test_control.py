@@ -135,6 +135,7 @@ def test_the_code_does_not_depend_on_how_many_samples_there_are():
     assert code_of(10) == code_of(10_000)
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_samples():
     """Each takes the same time, one step. The gradient with respect to all of them takes as long as a few runs."""
     count, dt = 100_000, 1e-4

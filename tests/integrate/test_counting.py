@@ -108,6 +108,7 @@ def test_counting_changes_nothing():
     assert alone == counted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno3(), diffrax.HalfSolver(diffrax.Heun())], ids=["implicit", "halved"])
 def test_solvers_without_a_tableau_are_not_counted(solver):
     counted = count_evaluations(solver, controller())
@@ -142,6 +143,7 @@ class Oscillator(eqx.Module):
         return None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("projected", [True, False])
 def test_what_forgets_its_last_stage_takes_it_again(calls, projected):
     run = diffrax.diffeqsolve(

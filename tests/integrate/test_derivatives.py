@@ -119,6 +119,7 @@ def test_second_derivatives(f, second, slopes):
     assert_allclose(found, found.T, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_number_that_a_batch_shares():
     """The gradient of a sum over a batch, and over a batch of batches, is the sum of the gradients."""
     mechanism, rates = udk.library.compound_pendulum(), jnp.linspace(-1.0, 1.0, 4)

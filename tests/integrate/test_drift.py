@@ -71,6 +71,7 @@ def test_the_length_of_a_mechanism_does_not_matter(scale):
     assert 2 <= ended < 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
     """A factor of ten in the nearest distance or in the limit makes no difference."""

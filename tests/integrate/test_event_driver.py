@@ -92,6 +92,7 @@ def test_an_action_of_ones_own_is_a_class():
     assert np.abs(tip - np.array([0.0, -1.0])).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_run_as_they_do_alone():
     """Some balls come to rest after a few bounces, others do not, and one starts below the floor."""
     ts, given = np.linspace(0, 2.0, 9), np.array([[0.2, 1.0], [0.9, 1.0], [0.5, 0.3], [0.5, -1.0], [1.2, 1.0]])

@@ -47,7 +47,7 @@ ENGINES = {"native": by_simulate("native"), "jax": by_simulate("jax"), "page": b
 
 
 CASES = [
-    pytest.param(name, engine, marks=pytest.mark.slow if engine == "jax" and name != "thrown" else ())
+    pytest.param(name, engine, marks=() if engine == "native" or name == "thrown" else pytest.mark.slow)
     for name in EXACT
     for engine in ENGINES
 ]

@@ -34,6 +34,7 @@ def test_block_creeps_where_it_would_stick():
     assert float(np.linalg.norm(solution.v[-1, 0, :2])) == pytest.approx(creep, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_jam_is_named():
     solution = udk.simulate(drawer(0.26), [0.0, 1.0], throw=False)
     assert solution.result != udk.Result.successful

@@ -119,6 +119,7 @@ def test_derivatives_agree_with_differences():
     np.testing.assert_allclose(jacobian, differences, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", fast("Varga"))
 def test_projection_has_derivatives(method):
     """A closed state stays. A change along the manifold stays too, and one that opens the loop is taken back."""

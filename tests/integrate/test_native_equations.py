@@ -102,6 +102,7 @@ def test_redundant_rows(angle):
     agree(udk.library.parallelogram(angle=angle, angular_velocity=0.7), METHODS + FORMULATIONS, closed=True)
 
 
+@pytest.mark.slow
 def test_what_is_no_number_does_not_last():
     """A state with a NaN velocity, followed in the same lane by a valid one: with several lanes, or a single one."""
     mechanism, t = udk.library.four_bar(), jnp.zeros(())

@@ -109,6 +109,7 @@ def end_in_bowl(p, **choices):
     return udk.simulate(in_a_bowl(p), TS, start, **(TIGHT | choices)).q[-1]
 
 
+@pytest.mark.slow
 def test_derivatives_through_closures():
     """Forward and reverse, by numbers that the functions close over and by the state, against differences."""
     h, steps = 1e-5, np.eye(3)

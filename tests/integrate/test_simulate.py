@@ -120,6 +120,7 @@ def test_a_mechanism_made_within_a_traced_function():
     assert engines == ["native", "native"]
 
 
+@pytest.mark.slow
 def test_progress_is_printed(pendulum, capfd):
     udk.simulate(pendulum, np.array([0.0, 0.5, 1.0]), progress=True)
     jax.effects_barrier()

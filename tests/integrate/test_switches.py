@@ -25,6 +25,7 @@ def row_of_pendulums(count):
     return udk.Mechanism(bodies, joints), limits
 
 
+@pytest.mark.slow
 def test_six_joints_have_ranges():
     """All pendulums come to rest at their lower limits; each agrees with itself alone."""
     mechanism, limits = row_of_pendulums(COUNT)

@@ -60,6 +60,7 @@ def test_second_derivatives_by_times_and_numbers():
     assert_allclose(second(x), wanted, atol=1e-5 * np.abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_members_share_what_is_differentiated():
     """This includes batches in which only the changes of states are batched; eagerly and compiled."""
     arm, shares = ARMS["driven"], jnp.array([0.9, 1.1])
@@ -84,6 +85,7 @@ def test_times_may_be_a_list_of_which_some_are_traced():
 TIMES = lambda t: [0.0, t], lambda t: jnp.stack([0.0, t])
 
 
+@pytest.mark.slow
 def test_control_intervals_change_by_length_and_time():
     arm = ARMS["driven"]
 

@@ -99,6 +99,7 @@ def test_a_jitted_function_of_a_mechanism_is_machine_code():
     assert_allclose(filtered.q, udk.simulate(udk.library.parallelogram(), TIMES).q, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_traced_numbers_mean_scales_of_their_own():
     """A mechanism a thousand times as long and heavy takes the same steps as a known one, under jit and in a batch."""
     linkage = udk.library.parallelogram(angle=-0.3)
@@ -115,6 +116,7 @@ def test_traced_numbers_mean_scales_of_their_own():
         assert_allclose(found.q, other.q, rtol=0, atol=1e-11 * np.abs(other.q).max())
 
 
+@pytest.mark.slow
 def test_batches_of_mechanisms_stacked_or_made_of_traced_numbers():
     angles = np.linspace(-1.2, 1.3, 11)  # some pass singular configurations
     make = lambda angle: udk.library.parallelogram(angle=angle)  # noqa: E731

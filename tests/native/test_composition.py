@@ -15,6 +15,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.choices import fast
 from udkjax import threads
 from udkjax.native import primitive, records
 from udkjax.native.base import code_cache, machine
@@ -132,7 +133,7 @@ IN_A_BATCH = {
 }
 
 
-@pytest.mark.parametrize("way", IN_A_BATCH)
+@pytest.mark.parametrize("way", fast(["vmap of grad", "grad of vmap"], IN_A_BATCH))
 def test_a_large_batch_stores_no_records(way, monkeypatch):
     """Its members are integrated again: all bits are those of a batch with records."""
     slope, rtols = IN_A_BATCH[way], jnp.array([1e-4, 1e-6, 1e-8, 1e-10])
@@ -220,6 +221,7 @@ def test_threads_of_xla_share_a_large_batch():
             assert_array_equal(found, expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [None, 3])
 def test_a_limit_of_threads_holds_inside_and_outside_of_compiled_programs(monkeypatch, limit):
     monkeypatch.setattr(threads, "cores", lambda: 8)

@@ -29,6 +29,7 @@ def test_the_exact_motion_of_a_redundant_linkage(method, stabilization):
     assert (run.settings["engine"], run.settings["method"]) == ("native", type(method).__name__)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scene", "method"), [("slider_crank", METHODS[0]), ("planetary_gear", METHODS[3])])
 def test_other_mechanisms_move_as_by_elimination(scene, method):
     mechanism = getattr(udk.library, scene)()
@@ -38,6 +39,7 @@ def test_other_mechanisms_move_as_by_elimination(scene, method):
     assert_allclose(one.q, two.q, rtol=0, atol=1e-7 * float(udk.analyse(mechanism).length))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [METHODS[1], METHODS[4]], ids=["Varga", "Greville"])
 def test_members_of_a_batch_are_single_runs(method):
     linkage = udk.library.parallelogram()

@@ -60,6 +60,7 @@ def test_it_is_loaded_when_a_run_needs_it(motion):
     assert_equal(jitted(SOFT), motion(SOFT))
 
 
+@pytest.mark.slow
 def test_members_in_lanes_leave_together(motion):
     """Members before them are complete, and members after them have not begun: all are run once."""
     dampings = np.array([*[SOFT] * 11, STIFF, *[SOFT] * 5, 10 * STIFF, *[SOFT] * 3])

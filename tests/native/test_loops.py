@@ -125,7 +125,7 @@ class At:
         return found
 
 
-@pytest.fixture(scope="module", params=fast(["linkage", "gears", "loaded", "free"], SCENES))
+@pytest.fixture(scope="module", params=fast(["linkage", "gears", "free"], SCENES))
 def at(request):
     return At(SCENES[request.param]())
 
@@ -382,6 +382,7 @@ def linkages():
     return pair
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angle", "bound"), [(-50.0, 1e-9), (60.0, 2e-5)], ids=["ordinary", "through a singular configuration"])
 def test_a_large_scene_moves_as_its_parts_do(linkages, angle, bound):
     alone, many = linkages(angle)

@@ -184,6 +184,7 @@ def turned_by_a_cam(lift=0.2):
     )
 
 
+@pytest.mark.slow
 def test_cams():
     """This includes outputs between steps near the boundary of two cubics of the profile."""
     mechanism, ts = turned_by_a_cam(), np.linspace(0.0, 1.5, 61)

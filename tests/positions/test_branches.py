@@ -1,6 +1,7 @@
 """Assembly branches compared with closed forms and with counts."""
 
 import numpy as np
+import pytest
 
 import udkjax as udk
 from udkjax.scene.library.posed_bodies import bar_pose
@@ -51,6 +52,7 @@ def test_none_where_it_cannot_be_closed():
     assert udk.branches(mech, "body.crank.angle", 3.0, starts=50).shape == (0, 3, 3)
 
 
+@pytest.mark.slow
 def test_a_six_bar_of_stephenson_has_as_many_as_its_circle_meets_the_coupler_curve():
     """A rod joins a coupler point p of a four-bar A-b-c-D to the end g of a driven crank on H: up to six branches."""
     pins = {"A": (0, 0), "b": (0.45, 0.3), "c": (1.1, 1.2), "D": (1.0, 0.0), "p": (0.2, 1.3), "g": (0.35, 0.35), "H": (0.3, 0.3)}

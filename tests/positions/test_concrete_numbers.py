@@ -28,6 +28,7 @@ def test_positions_of_concrete_and_of_traced_numbers(name):
     assert_allclose(known.a, traced.a, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", fast(["to a toggle"], CASES))
 def test_limits_of_concrete_and_of_traced_numbers(name):
     make, driver, _ = CASES[name]

@@ -98,6 +98,7 @@ def test_profile_is_the_periodic_cubic_spline():
         assert_allclose(jax.jit(jax.vmap(_derivative(profile, order)))(x), exact(x, order), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_natural_spline_goes_on_straight():
     knots, values = np.array([0.0, 0.5, 2.0, 3.0]), np.array([0.0, 1.0, -1.0, 0.5])
     exact = CubicSpline(knots, values, bc_type="natural")
@@ -114,6 +115,7 @@ def test_natural_spline_goes_on_straight():
     assert_allclose(line, 1.5, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_cam_depends_smoothly_on_its_profile(everything, at):
     def row(radius):
         return evaluate(everything.with_parameters({"joint.cam.profile.radius": radius}), "cam", at, everything.q0)[0]

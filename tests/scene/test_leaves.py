@@ -226,6 +226,7 @@ def test_mechanisms_that_share_arrays_keep_their_leaves_apart():
     assert [float(changed.bodies[name].mass) for name in ("coupler", "rocker")] == [3.0, 2.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", fast(["geared pendulum"], ["four-bar", "changed four-bar", "geared pendulum"]))
 def test_derivatives_by_leaves(name):
     """Reverse mode over the whole mechanism, compared with differences of runs with one leaf changed, and by name."""

@@ -56,6 +56,7 @@ def test_it_computes_what_the_network_says(network):
     assert_allclose(a[0, 2] - free[0, 2], torque / (body.inertia + body.mass * arm**2), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_it_learns_a_damper(network):
     """A few steps of gradient descent on the weights of the network, towards the motion with a linear damper."""
     (rod,) = network.body_names

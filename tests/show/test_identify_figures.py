@@ -144,6 +144,7 @@ def test_profiles_are_drawn_with_their_approximation_by_the_standard_error():
     assert two.patches[0].get_width() == 3.0  # an unbounded interval is drawn as far as the profile goes
 
 
+@pytest.mark.slow
 def test_single_samples_and_exact_fits_can_be_drawn(tmp_path):
     data = made(records=("one",), channels=1).isel(sample=slice(1))
     assert shown(pictures(data)["fit"])[0].get_title(loc="left") == "body.link0.angle"

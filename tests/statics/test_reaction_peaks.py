@@ -135,6 +135,7 @@ def machine():
     return udk.Mechanism(plain.bodies, plain.joints, plain.drivers, forces, plain.gravity)
 
 
+@pytest.mark.slow
 def test_power_is_the_rate_of_energy_and_its_integral_the_energy(machine):
     """It holds to 1e-9 of the largest power at each instant, and integrates to the stored energy by Gauss' quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(COUNT - 2)

@@ -191,6 +191,7 @@ def test_rest_where_all_loads_vanish_is_indifferent(scene, stable):
     assert not bool(udk.equilibrium(pushed).balanced)
 
 
+@pytest.mark.slow
 def test_a_scene_without_a_degree_of_freedom_rests_where_its_drivers_hold_it():
     mech = udk.library.slider_crank()
     rest, found = udk.equilibrium(mech, t=0.1), udk.modes(mech, t=0.1)
@@ -258,6 +259,7 @@ def test_modes_of_a_double_pendulum():
 VIBRATING = {"rod": (spring_rod, "rod", 0.0), "four-bar": (spring_four_bar, "coupler", GROUND)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", fast(["rod"], VIBRATING))
 def test_frequencies_have_exact_derivatives(name):
     """Derivatives through the moving equilibrium agree with differences."""

@@ -240,6 +240,7 @@ def test_fixes_are_changes_of_the_drawing(client):
         np.testing.assert_allclose(slot["direction"], [np.sqrt(0.5), -np.sqrt(0.5)], atol=1e-12)  # along the crank, as drawn
 
 
+@pytest.mark.slow
 def test_the_engine_takes_places_of_pins_and_the_one_for_pulling_has_no_motors(client):
     answer = client.ask("compile", text=SIX_BAR, engine="wasm").json()
     names = [parameter["name"] for parameter in answer["engine"]["parameters"]]

@@ -67,6 +67,7 @@ def held(motion: udk.Motion, *forces: udk.ForceElement) -> udk.Mechanism:
     return udk.Mechanism(bodies, {"A": pin}, {"hold": udk.Driver(["ground", "a"], "angle", motion)}, list(forces))
 
 
+@pytest.mark.slow
 def test_efforts_are_what_inverse_dynamics_finds_by_another_way():
     mech, ts = udk.library.slider_crank(), np.linspace(0.0, 0.5, 6)
     sol, needed = udk.simulate(mech, ts, rtol=1e-11, atol=1e-11), udk.inverse_dynamics(mech, ts)

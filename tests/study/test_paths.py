@@ -86,6 +86,7 @@ def test_a_path_is_differentiated_and_batched(linkage):
     assert_allclose(several[1], udk.path(mech, sol, "coupler", 2 * point), rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_after_a_failure_a_path_is_not_a_number_and_its_gradient_is(linkage):
     mech, sol = linkage
     q = sol.q.at[20:].set(jnp.nan)

@@ -75,6 +75,7 @@ def test_no_effort_where_the_motion_ends():
     assert_allclose(np.isnan(np.asarray(found.efforts["body.rocker.angle"])), ended)
 
 
+@pytest.mark.slow
 def test_distant_values_are_followed_by_values_between_them():
     """A whole turn in five steps equals the same in a hundred, at the five."""
     four_bar = udk.library.four_bar()

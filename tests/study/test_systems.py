@@ -161,6 +161,7 @@ def test_mistakes_of_a_sweep():
     assert any('did you mean "length"' in text for text in error.value.problems)
 
 
+@pytest.mark.slow
 def test_diagnosis_of_overconstrained_chains():
     """Bennett's four-bar has 14 rows of rank 11, Bricard's six-bar 24 of 23: one freedom each."""
     for (system, state), rank in ((bennett(), 11), (bricard(), 23)):
@@ -205,6 +206,7 @@ def measured(length, ts=np.linspace(0.0, 2.0, 41)):
     return {"time": ts, **{f"q[{k}]": x for k, x in enumerate(conical(length, ts).T)}}
 
 
+@pytest.mark.slow
 def test_identification_from_coordinates():
     """The length of a pendulum from its exact motion; its mass has no effect, which the estimate says."""
     guess = PENDULUM.with_parameters({"length": 1.1, "q0": start(1.0)[0]})

@@ -165,6 +165,7 @@ def test_a_coupler_goes_through_three_poses():
     assert np.min(sine) > np.sin(np.deg2rad(20.0)) - 2e-3
 
 
+@pytest.mark.slow
 def test_the_same_seed_finds_the_same(classic):
     one, two = (classic[1](starts=30, seed=5, results=1, threads=k) for k in (1, 2))
     assert one[0].loss == two[0].loss
@@ -187,6 +188,7 @@ GOALS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", fast(["pins of a four-bar", "points of joints", "radii of a cam"], KINDS))
 def test_the_loss_moves_when_any_parameter_does(kind):
     mechanism, free, point = KINDS[kind]
@@ -298,6 +300,7 @@ def test_a_design_over_lengths_finds_the_lengths():
         np.testing.assert_allclose(found.mechanism.parameters()[name], value, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_places_that_are_one_do_not_shrink_the_mechanism_to_a_point():
     found = udk.design(FOUR_BAR, udk.PathGoal("P", [[1, 1], [1, 1]]), starts=20, results=1)
     assert found[0].loss < 1e-20

@@ -55,6 +55,7 @@ def test_measures_are_those_of_inverse_dynamics_and_reactions(problem):
         np.testing.assert_allclose(values[0], term.measure_motion(mechanism, x[0], 0.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_loss_moves_when_any_number_does_by_every_goal_about_the_motion(problem):
     x = problem.free.vector[None]
     h = 1e-6 * np.maximum(np.abs(x[0]), 1.0)

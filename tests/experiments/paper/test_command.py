@@ -15,6 +15,7 @@ from tests.command_line import udkjax
 ROOT = Path(page.__file__).parents[2]
 
 
+@pytest.mark.slow
 def test_a_report_is_drawn_from_its_data_alone(tmp_path, monkeypatch, capsys, study_data):
     monkeypatch.setattr(page, "figure", lambda data, name: f"<p>{name}</p>")  # tests/show draws them
 

@@ -50,6 +50,7 @@ def page(study_data, tmp_path_factory):
     return report.page(read(file))
 
 
+@pytest.mark.slow
 def test_the_page_stands_alone_and_says_what_its_pictures_show(page):
     outline = Outline(page)
     pictures = outline.all("img")

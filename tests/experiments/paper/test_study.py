@@ -76,6 +76,7 @@ def test_solvers_are_found_by_name():
             solver_named(name)
 
 
+@pytest.mark.slow
 def test_a_small_study_is_run_and_judged():
     """Two runs, of 20 s without and of 0.1 s with the paper's gains, by the integrator that compiles fastest."""
     told = []

@@ -146,6 +146,7 @@ def slopes(inertia):
     return jax.jvp(angles, (inertia,), (1.0,))[1], jax.jacrev(angles)(inertia)
 
 
+@pytest.mark.slow
 def test_runs_and_their_derivatives_are_those_of_the_cpu(request):
     expected = [np.asarray(x) for x in (jax.jit(angles)(0.3), *jax.jit(slopes)(0.3))]
     card = request.getfixturevalue("card")
@@ -158,6 +159,7 @@ def test_runs_and_their_derivatives_are_those_of_the_cpu(request):
     assert all(STREAM in call for call in card.calls if call[0].startswith(("cuMemcpy", "cuStream")))
 
 
+@pytest.mark.slow
 def test_batches_do_not_copy_their_records(request):
     inertias = jnp.linspace(0.3, 0.5, records.LARGEST_ON_CARD)
     slope = jax.vmap(jax.grad(lambda x: angles(x)[-1]))

@@ -15,6 +15,7 @@ from jax.interpreters import mlir
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
+from tests.choices import fast
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import primitive, records
@@ -75,7 +76,7 @@ RUNS = {
 }
 
 
-FAST = ("redundant", "gradient", "closed", "elementary functions", "tangent", "SVD")
+FAST = ("gradient", "SVD")
 
 
 @pytest.mark.parametrize("name", [x if x in FAST else pytest.param(x, marks=pytest.mark.slow) for x in RUNS])
@@ -88,6 +89,7 @@ def test_threads_compute_what_the_engine_computes(name):
             assert_array_equal(found, known)
 
 
+@pytest.mark.slow
 def test_constants_that_all_members_share_are_in_the_memory_of_the_block(tmp_path):
     """Members that differ only by their starts: with threads, and with LLVM's PTX if there is a C compiler."""
     run = gpu.ours(LINKAGE, np.linspace(0.0, 0.5, 4))
@@ -287,6 +289,7 @@ def test_reverse_mode_runs_in_chunks_for_which_there_is_memory(request, monkeypa
     assert card.grids == [*[whole] * 3, *[blocks] * chunks * len(card.lent), whole]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_records")
 def test_a_card_without_memory_for_a_single_record_is_an_error(card):
     card.most = RECORD // 2
@@ -319,7 +322,7 @@ def test_small_batches_stay_with_the_host(monkeypatch):
         target_of(7)
 
 
-@pytest.mark.parametrize("name", [pytest.param("redundant", marks=pytest.mark.slow), "tangent", "gradient"])
+@pytest.mark.parametrize("name", fast(["tangent"], ["redundant", "tangent", "gradient"]))
 def test_kernels_are_assembled(name):
     assembler = target.ptxas()
     if assembler is None:
@@ -334,9 +337,7 @@ def test_kernels_are_assembled(name):
 
 
 @pytest.mark.skipif(shutil.which("cc") is None or platform.machine() != "x86_64", reason="no C compiler for this processor")
-@pytest.mark.parametrize(
-    "name", [pytest.param("redundant", marks=pytest.mark.slow), "elementary functions", "tangent", "gradient"]
-)
+@pytest.mark.parametrize("name", fast(["elementary functions"], ["redundant", "elementary functions", "tangent", "gradient"]))
 def test_ptx_computes_what_the_engine_computes(name, tmp_path):
     """LLVM's PTX, transliterated to C, is bitwise right, and so are the address spaces of its pointers."""
     programs = {}

@@ -54,6 +54,7 @@ def test_a_run(monkeypatch, name):
     assert_allclose(wasm[0][0, 1:-1], np.asarray(found[0].q).reshape(len(TIMES), -1)[1:-1], rtol=0, atol=1e-6 * max(length, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", fast(["slider_crank"], udk.library.__all__))
 def test_a_run_up_to_where_a_condition_crosses_zero(monkeypatch, name):
     mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
@@ -93,6 +94,7 @@ def test_closing(name):
     assert np.all(np.abs(residuals[0, : residuals.shape[1] // 2]) <= 1e-9 * np.asarray(analysis.scales.rows))
 
 
+@pytest.mark.slow
 def test_a_scene_that_runs_by_loops(monkeypatch):
     mechanism, found = udk.library.n_four_bar(14), []
     times = np.linspace(0.0, 0.2, 5)

@@ -255,6 +255,7 @@ def test_mechanisms_with_the_same_numbers_given_directly_are_stacked():
     assert [float(x["joint.B.points"][0][0]) for x in wanted] == [0.6, 0.7]
 
 
+@pytest.mark.slow
 def test_pins_are_differentiated_and_batched():
     """A coupler point's error with respect to all pins agrees with differences. Under vmap each member equals its own run."""
     drawing = four_bar(motors=[{"pin": "O", "speed": 2.0}])

@@ -58,6 +58,7 @@ NUMBERS = ["pin.B.length", "pin.P.length", "pin.P.angle", "pin.O", "pin.A.length
 NUMBERS += ["pin.M.share", "pin.N.length", "pin.N.off"]
 
 
+@pytest.mark.slow
 def test_derivatives_of_places_by_every_number():
     mech = four_bar()
     given = {name: mech.parameters()[name] for name in NUMBERS}

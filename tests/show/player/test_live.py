@@ -27,6 +27,7 @@ def live(slider_crank, run):
     return udk.animate(slider_crank, run, live=["motor.motor.speed", "pin.P"])
 
 
+@pytest.mark.slow
 def test_sliders_are_of_the_numbers_that_are_named(live, slider_crank):
     sliders = live.data["live"]["sliders"]
     assert [s["name"] for s in sliders] == ["motor.motor.speed", "pin.P[0]", "pin.P[1]"]

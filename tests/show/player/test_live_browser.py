@@ -168,6 +168,7 @@ def test_events_happen_at_new_times_while_a_slider_moves(opened, with_events, sl
         assert page.evaluate(happened) == first
 
 
+@pytest.mark.slow
 def test_events_are_marked_on_the_timeline(opened, with_events):
     """Also in the player of a recorded run; the name of the event that has just happened is shown."""
     _, animation = with_events

@@ -131,6 +131,7 @@ def test_singular_values_and_rank_of_the_papers_linkage():
     np.testing.assert_allclose(smallest.values, [float(expected[10]), np.nan], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_rank_of_a_large_mechanism_is_found_without_dense_matrices():
     """A dense Jacobian has 72 kB here; of each position the curve needs two numbers."""
     mech = udk.library.chain(50)

@@ -45,6 +45,7 @@ def design(candidates):
     return design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, pick=2)
 
 
+@pytest.mark.slow
 def test_what_does_not_move_tells_nothing(design):
     assert design.scores[0] == -np.inf and np.all(np.isinf(design.standard_errors[0])) and design.order[-1] == 0
 

@@ -24,6 +24,7 @@ def exact():
     return problem.evaluate(np.zeros((1, 2)), (1e-13, 1e-13)).J[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-3, 1e-5, 1e-8, 1e-11, 1e-13])
 def test_right_derivatives_agree_at_any_tolerance(tol):
     check = udk.check_gradients(pendulum(*FIRST), DATA, NAMES, tol=tol)

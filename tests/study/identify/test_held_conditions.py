@@ -18,6 +18,7 @@ def record(value, **choices):
     return udk.Record(TS, {ANGLE: run.q[:, 0, 2]}, 0.01, conditions={SETPOINT: value}, **choices)
 
 
+@pytest.mark.slow
 def test_parameters_are_found_from_records_with_other_samples():
     """Also with fewer samples in one record, and a constant number in another."""
     records = [record(udk.Held(SAMPLES, 0.15)), record(udk.Held(-SAMPLES[:7], 0.15)), record(np.array(0.2))]

@@ -39,6 +39,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("optimizer", "step_tol", "within"), OTHERS.values(), ids=list(OTHERS))
 def test_optimizers_end_where_least_squares_do(noisy, optimizer, step_tol, within):
     problem = problem_of(noisy)

@@ -25,6 +25,7 @@ def data():
     return udk.sweep(linkage, axes, TS, ["final", "seconds", height], units={"height": "m"}, progress=False)
 
 
+@pytest.mark.slow
 def test_xarray_selects_methods_by_their_labels(data):
     assert data.sel(pseudoinverse="SVD").q_end.dims == data.sel({"method": "SVD"}).q_end.dims == ("how", "body", "coordinate")
     assert data.method.values.tolist() == ["SVD", "Varga"] and data.sizes["pseudoinverse"] == 2

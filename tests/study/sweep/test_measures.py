@@ -53,6 +53,7 @@ def test_a_measure_that_cannot_be_traced_is_refused_with_the_cure(wrong):
         udk.sweep(FOUR_BAR, {"body.crank.mass": [1.0, 2.0]}, TS[:2], wrong, progress=False)
 
 
+@pytest.mark.slow
 def test_channels_are_measures():
     ts = TS[:3] / 10
     axes = {"body.crank.mass": [1.0, 2.0]}

@@ -161,6 +161,7 @@ def test_members_that_are_not_done_are_computed_once(pendulum, pace, memory, few
     assert np.all(np.diff(later) <= 0) and later[0] == 1 and later[-1] == 0
 
 
+@pytest.mark.slow
 def test_what_a_sweep_will_take_is_measured_of_a_piece_of_some_groups(pendulum):
     plan = make_plan(pendulum, {"max_steps": [100, 1000, 10_000], "body.rod.mass": MASSES}, [0.0, 0.1])
     found = estimate_cost(plan)

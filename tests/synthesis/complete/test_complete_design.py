@@ -49,6 +49,7 @@ def test_the_published_problem_has_its_64_real_classes(published):
     assert str(published).startswith(f"{len(published)} four-bars") and "proven within" in str(published[0])
 
 
+@pytest.mark.slow
 def test_limits_leave_out_what_is_beyond_them(published):
     limits = {"lengths": {("O", "A"): (0.1, 2.0)}, "bounds": {"pin.O": (-3.0, 3.0)}, "areas": {"C": (0.5, 0.5, 4.0)}}
     found = udk.design_all(FOUR_BAR, udk.PathGoal("P", DATA["points"]), transmission=0.05, rotation=True, **limits)
@@ -74,6 +75,7 @@ def test_other_ends_are_listed():
     assert found.unproven == 0
 
 
+@pytest.mark.slow
 def test_places_whose_solutions_are_far_away_have_all_of_them():
     """One class of solutions for these places has a pivot 1e8 units away, and is not at infinity."""
     found = udk.design_all(FOUR_BAR, udk.PathGoal("P", np.random.default_rng(1028).normal(size=(9, 2))))
@@ -118,6 +120,7 @@ def test_circuits_are_those_that_motions_meet(published):
         assert (meets == (one.circuits == 0)).all()
 
 
+@pytest.mark.slow
 def test_a_known_mechanism_is_among_those_found():
     """Random four-bars, turned, moved and scaled. If the crank turns, the nine points are in order, without defects."""
     rng = np.random.default_rng(3)
