@@ -68,7 +68,8 @@ def slopes():
     return {f: jax.jit(jax.jacfwd(f)) for f in AT}
 
 
-@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 11])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 11])
 def test_directions_side_by_side(count):
     """Derivatives along many directions at once equal those along each alone: with outputs, and with empty lanes."""
     names = [n for n in LINKAGE.parameters() if n.endswith(("mass", "inertia", "gravity", "link1.points", "angular_velocity"))]
@@ -190,11 +191,8 @@ def test_second_derivatives_of_assembly_by_machine_code(opening):
     assert_allclose(found, differences(slope, x, 1e-3), rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    "stabilization",
-    [udk.Projection(), *(pytest.param(s, marks=pytest.mark.slow) for s in (udk.Baumgarte(5.0, 5.0), None))],
-    ids=lambda x: type(x).__name__,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("stabilization", [udk.Projection(), udk.Baumgarte(5.0, 5.0), None], ids=lambda x: type(x).__name__)
 def test_second_derivatives_of_outputs_in_a_batch(stabilization):
     """Outputs between steps, with and without projection. Members of a batch equal single runs."""
     mechanism = udk.library.four_bar()

@@ -166,9 +166,8 @@ def test_runs_of_other_solvers_take_the_steps_of_the_plain_form(solver):
     assert_allclose(one.q, two.q, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    "formulation", [udk.Augmented(), pytest.param(udk.NullSpaceSVD(), marks=pytest.mark.slow)], ids=["LU", "SVD"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("formulation", [udk.Augmented(), udk.NullSpaceSVD()], ids=["LU", "SVD"])
 def test_lanes_and_derivatives_of_runs_by_a_formulation(formulation):
     """Members of a batch equal single runs. Derivatives in both modes are those of the Udwadia-Kalaba equation."""
     mechanism = udk.library.four_bar()

@@ -205,6 +205,7 @@ np.testing.assert_allclose(found, jax.vmap(jax.grad(closed))(places), rtol=1e-9)
 """
 
 
+@pytest.mark.slow
 def test_devices_run_shards():
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     environment = {**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": os.path.dirname(__file__)}
@@ -261,7 +262,8 @@ EAGER = COMPILED if deferred_p is None else ""
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the size of the process is read from /proc")
-@pytest.mark.parametrize(("way", "name"), [pytest.param("eager", EAGER, marks=pytest.mark.slow), ("jit", COMPILED)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("way", "name"), [("eager", EAGER), ("jit", COMPILED)])
 def test_a_record_without_memory_is_an_error(way, name):
     """The record of a gradient grows with the number of steps. Later calls are unaffected."""
     done = subprocess.run([sys.executable, "-c", WITHOUT_MEMORY, way], capture_output=True, text=True, check=False)

@@ -134,6 +134,7 @@ def test_findings_count_what_the_tables_show(study_data):
     assert "the paper has 1.1·10<sup>−4</sup> to 9.7·10<sup>−4</sup> m² where it was correct up to" in psi2_note(study_data)
 
 
+@pytest.mark.slow
 def test_the_page_begins_with_a_picture_and_words(page, study_data):
     found, picture = page.index("What was found"), page.index("<figure")
     assert picture < found < page.index("<ul>")

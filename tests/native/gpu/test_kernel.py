@@ -76,7 +76,7 @@ RUNS = {
 }
 
 
-FAST = ("gradient", "SVD")
+FAST = ("SVD",)
 
 
 @pytest.mark.parametrize("name", [x if x in FAST else pytest.param(x, marks=pytest.mark.slow) for x in RUNS])
@@ -258,13 +258,11 @@ def without_records(monkeypatch):
 RECORD = 8 * (3 + 3 * PENDULUM.q0.size) * 8  # bytes: eight points
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_records")
 @pytest.mark.parametrize(
     ("limit", "members", "chunks"),
-    [
-        *[pytest.param(*x, marks=pytest.mark.slow) for x in (("none", 11, 1), ("card", 2, 6), ("steps", 11, 1))],
-        ("buffer", 4, 3),
-    ],
+    [("none", 11, 1), ("card", 2, 6), ("steps", 11, 1), ("buffer", 4, 3)],
     ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_reverse_mode_runs_in_chunks_for_which_there_is_memory(request, monkeypatch, limit, members, chunks):
