@@ -1,5 +1,7 @@
 """A wanted path is drawn in the studio's page, and becomes a mechanism."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -14,9 +16,16 @@ def test_a_drawn_path_becomes_a_mechanism(studio):
     for place in places[1:]:
         studio.page.mouse.move(*place)
     studio.page.mouse.up()
+    start = time.perf_counter()
     studio.page.get_by_role("button", name="find a mechanism with").click()
     studio.until("studio.wanted.designs.length > 0")
+    assert time.perf_counter() - start < 10.0  # about 1 s on a machine without other work
+    assert studio.page.get_by_label("progress of the search").is_visible()
     assert " mm off, the crank turns, transmission angle at least " in studio.page.locator(".wanted").inner_text()
+    studio.until("!studio.wanted.busy")
+    assert studio.js(
+        "studio.wanted.at === 0 && studio.wanted.designs.every((one, k, all) => !k || one.deviation >= all[k - 1].deviation)"
+    )
     count, first = studio.js("studio.wanted.designs.length"), studio.document["pins"]
     assert studio.js("studio.wanted.designs[0].deviation") < 0.004  # m; the path is 125 mm long
     studio.page.get_by_role("button", name="the next mechanism").click()

@@ -12,12 +12,11 @@ BEAN = np.stack([0.1 + 0.06 * np.cos(ANGLES) + 0.01 * np.cos(2 * ANGLES), 0.1 + 
 
 
 def test_places_are_spread_evenly_along_a_path():
-    targets, is_closed = _spread(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.5]]))
+    targets = _spread(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.5]]))
     steps = np.linalg.norm(np.diff(targets, axis=0), axis=1)
-    assert not is_closed and len(targets) == TARGETS + 1 and targets[-1].tolist() == [1.0, 0.5]
+    assert len(targets) == TARGETS + 1 and targets[-1].tolist() == [1.0, 0.5]
     np.testing.assert_allclose(steps[steps > 0.09], 1.5 / TARGETS, rtol=1e-12)  # but around the corner
-    targets, is_closed = _spread(BEAN[:-1])
-    assert is_closed and len(targets) == TARGETS
+    assert len(_spread(BEAN[:-1])) == TARGETS  # closed
 
 
 @pytest.mark.parametrize("path", [None, [], [[0, 0], [1, 1]], [[0, 0, 0]] * 5, [[0, "x"]] * 5, [[0, np.nan]] * 5, [[1, 1]] * 5])

@@ -110,6 +110,22 @@ def test_a_classic_case_is_solved_better_than_published(classic):
 
 
 @pytest.mark.slow
+def test_a_search_is_run_for_another_path_with_the_same_programs(classic):
+    first, limits = np.array([[0.0, 8.0], [2.0, 12.0], [9.0, 14.0], [12.0, 8.0]]), {("O", "A"): (2.0, 9.0)}
+    second = 1.5 * first[:, ::-1] + [4.0, -3.0]
+    search = udk.DesignSearch(FOUR_BAR, udk.PathGoal("P", first), lengths=limits)
+    other, fresh = search.with_path(second), udk.DesignSearch(FOUR_BAR, udk.PathGoal("P", second), lengths=limits)
+    assert other.problem._turn_code is search.problem._turn_code and other.problem._margin is search.problem._margin
+    assert [d.loss for d in other(starts=8)] == [d.loss for d in fresh(starts=8)]
+    _, with_values = classic
+    with pytest.raises(ValueError, match="give one value for each target"):
+        with_values.with_path(first)
+    pose = udk.DesignSearch(FOUR_BAR, udk.PoseGoal("coupler", [[0, 8, 0], [9, 14, 0.5]]))
+    with pytest.raises(ValueError, match="only goal is a PathGoal"):
+        pose.with_path(first)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(5))
 def test_all_classic_cases_are_solved_at_least_as_well_as_published_from_any_seed(number):
     case, problem = search(number)

@@ -1,13 +1,13 @@
 """A mechanism for a wanted path: four-bars with a point that passes along a curve, each a drawing with a motor."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from udkjax.annotations import JsonObject
 from udkjax.positions.pin_motion import pin_motion
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import loads
 from udkjax.studio.limits import RefusedError
@@ -28,6 +28,9 @@ TRANSMISSION = np.deg2rad(20)  # least transmission angle (rad)
 DIGITS = 6  # of the written numbers
 DENSITY = 7850  # kg/m^3, of steel
 CURVE = 721  # values of the driver at which a found path is compared
+THREADS = 1  # batches are small: threads would take more time to start than they save
+# Pins of a four-bar about a path of extent 1, from which the search departs.
+DRAFT = {"O": (-1.0, -1.0), "A": (-0.8, -0.7), "B": (0.2, 0.1), "C": (0.4, -1.0), "P": (0.0, 0.3)}
 LINKS: Sequence[Mapping[str, Any]] = (
     {"name": "crank", "pins": ["O", "A"]},
     {"name": "coupler", "pins": ["A", "B", "P"]},
@@ -48,26 +51,31 @@ def find_mechanisms(path: object, unit: str = "mm", seed: int = 0) -> JsonObject
         `turns`, and its smallest transmission angle (rad); `extent` of the wanted path (m), and `reason` if nothing was found.
     """
     points = _points(path)
-    targets, is_closed = _spread(points)
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    size, middle = float(np.linalg.norm(np.ptp(points, axis=0))), points.mean(0)
     if not size > 0:
         raise RefusedError(400, "path: its points are all in the same place")
-    middle = points.mean(0)
-    area = (*map(float, middle), REACH * size)
-    try:
-        search = DesignSearch(
-            loads(merge_document("", _draft(middle, size, unit))),
-            PathGoal("P", targets),
-            areas={"O": area, "C": area},
-            lengths=dict.fromkeys((("O", "A"), ("A", "B"), ("C", "B"), ("A", "P")), (SHORTEST * size, LONGEST * size)),
-            transmission=TRANSMISSION,
-            rotation=True if is_closed else None,
-        )
-    except SceneError as error:
-        return {"designs": [], "extent": size, "reason": "; ".join(error.problems)}
-    found = search(starts=STARTS, seed=seed, results=RESULTS)
-    designs = [_drawn(design, points, size, unit) for design in found]
+    points = (points - middle) / size
+    found = prepared_search().with_path(_spread(points))(starts=STARTS, seed=seed, results=RESULTS, threads=THREADS)
+    designs = [_drawn(design, points, middle, size, unit) for design in found]
     return {"designs": sorted(designs, key=lambda one: one["deviation"]), "extent": size, "reason": found.reason}
+
+
+@cache
+def prepared_search() -> DesignSearch:
+    """Return the search for paths of extent 1 about the origin, compiled by a first search for an ellipse."""
+    area, ends = (0.0, 0.0, REACH), (SHORTEST, LONGEST)
+    angles = np.linspace(0.0, 2 * np.pi, TARGETS, endpoint=False)
+    ellipse = np.stack([0.45 * np.cos(angles), 0.2 * np.sin(angles)], 1)
+    search = DesignSearch(
+        loads(merge_document("", _document(DRAFT, 1.0, "m"))),
+        PathGoal("P", ellipse),
+        areas={"O": area, "C": area},
+        lengths=dict.fromkeys((("O", "A"), ("A", "B"), ("C", "B"), ("A", "P")), ends),
+        transmission=TRANSMISSION,
+        rotation=True,
+    )
+    search.with_path(ellipse)(starts=1, results=1, threads=THREADS)
+    return search
 
 
 def _points(path: object) -> np.ndarray:
@@ -80,24 +88,18 @@ def _points(path: object) -> np.ndarray:
     return points
 
 
-def _spread(points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return places at equal distances along a path, and whether it is closed."""
+def _spread(points: np.ndarray) -> np.ndarray:
+    """Return places at equal distances along a path: `TARGETS` if it is closed, and one more if it has two ends."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     gap = float(np.linalg.norm(points[-1] - points[0]))
     is_closed = gap <= CLOSED * way[-1]
     if is_closed:
         points, way = np.concatenate([points, points[:1]]), np.append(way, way[-1] + gap)
     at = np.linspace(0.0, way[-1], TARGETS + 1)[: TARGETS if is_closed else None]
-    return np.stack([np.interp(at, way, x) for x in points.T], 1), is_closed
+    return np.stack([np.interp(at, way, x) for x in points.T], 1)
 
 
-def _draft(middle: np.ndarray, size: float, unit: str) -> JsonObject:
-    """Return the document of a four-bar of the size of a path, from which the search departs."""
-    places = {"O": (-1.0, -1.0), "A": (-0.8, -0.7), "B": (0.2, 0.1), "C": (0.4, -1.0), "P": (0.0, 0.3)}
-    return _document({name: middle + size * np.array(place) for name, place in places.items()}, size, unit)
-
-
-def _document(places: Mapping[str, np.ndarray], size: float, unit: str) -> JsonObject:
+def _document(places: Mapping[str, Sequence[float] | np.ndarray], size: float, unit: str) -> JsonObject:
     """Return the document of a four-bar with pins at places (m), with links that suit its size (m)."""
 
     def written(metres: float) -> float:
@@ -115,16 +117,16 @@ def _document(places: Mapping[str, np.ndarray], size: float, unit: str) -> JsonO
     }
 
 
-def _drawn(design: FoundDesign, points: np.ndarray, size: float, unit: str) -> JsonObject:
-    """Return a design as a drawing, with the largest distance of the wanted points from its path."""
-    document = _document({name: design.parameters[f"pin.{name}"] for name in ("O", "A", "B", "C", "P")}, size, unit)
-    text = merge_document("", document)
+def _drawn(design: FoundDesign, points: np.ndarray, middle: np.ndarray, size: float, unit: str) -> JsonObject:
+    """Return a design of extent 1 as a drawing of a size (m) about a middle, with its largest distance from `points`."""
+    places = {name: middle + size * np.asarray(design.parameters[f"pin.{name}"]) for name in DRAFT}
+    text = merge_document("", _document(places, size, unit))
     curve = pin_motion(design.mechanism, design.motion(CURVE)).pins["P"][:, 0]
     off = np.linalg.norm(points[:, None] - np.asarray(curve)[None], axis=2).min(1)
     return {
         "document": read_document(text),
         "text": text,
-        "deviation": float(off.max()),
+        "deviation": size * float(off.max()),
         "turns": bool(design.turns),
         "transmission": float(np.arcsin(design.transmission)),
     }

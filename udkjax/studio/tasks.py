@@ -210,6 +210,14 @@ def find_path(path: object, unit: str = "mm", seed: int = 0) -> JsonObject:
     return find_mechanisms(path, unit, seed)
 
 
+def prepare_path_search() -> JsonObject:
+    """Compile the search for mechanisms for a path, so that the first path does not wait for it."""
+    from udkjax.studio.path_search import prepared_search
+
+    prepared_search()
+    return {}
+
+
 def template_text(name: str) -> str:
     """Return a template as the text of a drawing."""
     if name in DRAWN:

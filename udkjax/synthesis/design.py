@@ -1,10 +1,13 @@
 """Design by gradient: mechanisms with a point, link or output that moves as required."""
 
 from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from udkjax.annotations import Numbers
 from udkjax.positions.drive import Drive, only_driver
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.requirements import require_count, require_number
@@ -15,7 +18,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import Designs
-from udkjax.synthesis.goals import Goal
+from udkjax.synthesis.goals import Goal, PathGoal
 from udkjax.synthesis.limits import LengthLimits, Range, box_of, read_bounds
 from udkjax.synthesis.motion_goals import MotionTerm
 from udkjax.synthesis.polish import polish
@@ -71,11 +74,32 @@ class DesignSearch:
         goal.check_line(mechanism)
         limits = LengthLimits(numbers, lengths or {}, areas)
         boxes = {f"pin.{pin}": box_of(np.asarray(area, float)) for pin, area in (areas or {}).items()}
-        boxes = {name: box for name, box in boxes.items() if name in numbers.names}
-        ranges = read_bounds(numbers, {**boxes, **(bounds or {})}, _places(mechanism, goal), mechanism.name)
+        self._given = {**{name: box for name, box in boxes.items() if name in numbers.names}, **(bounds or {})}
+        ranges = read_bounds(numbers, self._given, _places(mechanism, goal), mechanism.name)
         self.problem = DesignProblem(
             mechanism, goal, numbers, driver, ranges, limits, float(np.sin(transmission)), rotation, terms
         )
+
+    def with_path(self, targets: Numbers) -> "DesignSearch":
+        """Return the same search for another path of the same point. Nothing is compiled again.
+
+        Args:
+            targets: positions (J, 2) in m, as those of a `PathGoal`; as many as its `values`, if it has any.
+
+        Returns:
+            A search with the same structure, free numbers and limits.
+
+        Raises:
+            ValueError: the goal of the search is not a single `PathGoal`, or the targets are invalid.
+        """
+        problem = self.problem
+        if not isinstance(problem.goal, PathGoal) or problem.terms:
+            raise ValueError("with_path needs a search whose only goal is a PathGoal")
+        goal = replace(problem.goal, targets=targets)
+        ranges = read_bounds(problem.free, self._given, _places(problem.mechanism, goal), problem.mechanism.name)
+        other = copy(self)
+        other.problem = problem.with_path(goal, ranges)
+        return other
 
     def __call__(self, starts: int = 300, seed: int = 0, results: int = 5, threads: int | None = None) -> Designs:
         """Search from random mechanisms; return the best different ones.

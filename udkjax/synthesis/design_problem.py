@@ -1,6 +1,7 @@
 """A design as a least-squares problem, evaluated for batches of trials by machine code."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cached_property
 
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from udkjax.positions.kinematics import FULL_TURN
 from udkjax.positions.position_batch import compile_programs, position_code
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
-from udkjax.synthesis.goals import Goal, goal_scale, place_of
+from udkjax.synthesis.goals import Goal, PathGoal, goal_scale, place_of
 from udkjax.synthesis.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
 from udkjax.synthesis.motion_goals import MotionTerm
 from udkjax.synthesis.motion_terms import CompiledTerm
@@ -48,7 +49,7 @@ class DesignProblem:
         rotation: bool | None,
         terms: Sequence[MotionTerm] = (),
     ):
-        self.mechanism, self.goal, self.free, self.driver, self.lengths = mechanism, goal, free, driver, lengths
+        self.mechanism, self.free, self.driver, self.lengths = mechanism, free, driver, lengths
         self.driven, self.least = drive(mechanism, driver), max(transmission, LEAST_TRANSMISSION)
         self.rotation = self.driven.is_angle if rotation is None else rotation
         if self.rotation and not self.driven.is_angle:
@@ -56,19 +57,30 @@ class DesignProblem:
         self.shifted = goal.start == "free" and goal.values is not None
         self.unknowns = free.count + self.shifted + goal.extras
         self.coordinates = 3 * len(mechanism.body_names)
-        self.scale = goal_scale(goal, mechanism)
-        self._unit = np.tile(
-            [self.scale if goal.has_place else float(self.driven.analysis.scales.length)] * 2 + [1.0], self.coordinates // 3
-        )
-        wide = np.full(self.unknowns - free.count, np.inf)
-        self.low, self.high = np.append(bounds.low, -wide), np.append(bounds.high, wide)
-        self.first, self.last = bounds.first, bounds.last
-        self.data, self.reach = goal.targets, float(np.max(bounds.last - bounds.first, initial=self.scale)) / 4
-        self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # scales of the free numbers
         self.local = goal.values is None  # the driver's values are unknowns
+        self._aim(goal, bounds)
         self.terms = self._compile_terms(terms)
         self._compile()
         self._require_effects()
+
+    def _aim(self, goal: Goal, bounds: Bounds):
+        """Set the targets, and the ranges and scales that go with them."""
+        self.goal, self.data, self.scale = goal, goal.targets, goal_scale(goal, self.mechanism)
+        length = self.scale if goal.has_place else float(self.driven.analysis.scales.length)
+        self._unit = np.tile([length, length, 1.0], self.coordinates // 3)
+        wide = np.full(self.unknowns - self.free.count, np.inf)
+        self.low, self.high = np.append(bounds.low, -wide), np.append(bounds.high, wide)
+        self.first, self.last = bounds.first, bounds.last
+        self.reach = float(np.max(bounds.last - bounds.first, initial=self.scale)) / 4
+        self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # scales of the free numbers
+
+    def with_path(self, goal: PathGoal, bounds: Bounds) -> "DesignProblem":
+        """Return the same problem for another path of the same point, with the programs of this one."""
+        programs = self._residual_code, self._margin, self._points  # compiled here, so that all copies share them
+        assert all(programs)
+        other = copy(self)
+        other._aim(goal, bounds)
+        return other
 
     def _compile_terms(self, terms: Sequence[MotionTerm]) -> list[CompiledTerm]:
         goal, span = self.goal, None
@@ -122,16 +134,20 @@ class DesignProblem:
             listed = ", ".join(map(quote, idle))
             raise SceneError([f"free: no measure of the goal depends on {listed}: leave it out"], self.mechanism.name)
 
+    @property
+    def _pins(self) -> list[str]:
+        return [] if self.mechanism.drawing is None else list(self.mechanism.drawing.groups["pin"])  # pyright: ignore
+
     @cached_property
     def _points(self) -> ScalarProgram:
         """The program of the measures and the places of all pins; without a drawing, of the measures, q and the free numbers."""
-        names = [] if self.mechanism.drawing is None else list(self.mechanism.drawing.groups["pin"])  # pyright: ignore
+        names = self._pins
 
         def points(x: Array, q: Array) -> Array:
             mechanism, bodies = self.free.moved(x[: self.free.count]), q.reshape(-1, 3)
             measured = self.goal.measure(mechanism, bodies)
             if not names:
-                return jnp.concatenate([measured, q, self.scale * x[: self.free.count] / self.sizes])
+                return jnp.concatenate([measured, q, x[: self.free.count]])
             return jnp.concatenate([measured, *(jnp.stack(place_of(mechanism, f"pin.{name}", None, bodies)) for name in names)])
 
         graph = Graph()
@@ -157,7 +173,10 @@ class DesignProblem:
 
     def signature(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return the points of links in a position; they are equal for trials of the same mechanism, however drawn."""
-        return self._at(x, q[None])[0, self._measured :]
+        points = self._at(x, q[None])[0, self._measured :]
+        if not self._pins:  # free numbers, in the unit of lengths
+            points[len(points) - self.free.count :] *= self.scale / self.sizes
+        return points
 
     def residuals(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return the residuals (J, G) of positions (J, n) of a motion."""

@@ -3,13 +3,12 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from scipy.spatial import ConvexHull, QhullError
 
-from udkjax.expressions import Graph, ScalarProgram, trace
+from udkjax.expressions import Differential, Graph, ScalarProgram, trace
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
@@ -145,17 +144,21 @@ def _with_slopes(
         pins = free.moved(x).drawing.pins  # pyright: ignore[reportOptionalMemberAccess]
         return jnp.stack([jnp.asarray(pins[b] if a is None else pins[b] - pins[a]) for a, b in pairs])
 
-    def both(x: Array) -> Array:
-        return jnp.concatenate([jnp.ravel(between(x)), jnp.ravel(jax.jacfwd(between)(x))])
-
     graph = Graph()
     inputs = [graph.input(("x", k), "x") for k in range(free.count)]
-    program = ScalarProgram(graph, inputs, list(trace(both, jnp.asarray(free.vector))(graph, np.array(inputs, object))[0].flat))
-    count = 2 * len(pairs)
+    vectors = list(trace(between, jnp.asarray(free.vector))(graph, np.array(inputs, object))[0].flat)
+    differential, zero = Differential(graph, vectors, inputs), graph.constant(0.0)
+    slopes = [row.get(x.index, zero) for row in map(differential.row, vectors) for x in inputs]
+    count, total = len(vectors), len(vectors) + len(slopes)
+    columns = [k for k, y in enumerate([*vectors, *slopes]) if not y.is_zero]  # most slopes vanish
+    program = ScalarProgram(graph, inputs, [[*vectors, *slopes][k] for k in columns])
 
     def values(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = np.zeros((total, len(x)))
         with np.errstate(all="ignore"):  # where circles do not meet, limits are NaN
-            found = np.stack([np.broadcast_to(y, len(x)) for y in program.by_numpy(list(x.T))], 1)
+            for column, y in zip(columns, program.by_numpy(list(x.T)), strict=True):
+                found[column] = y
+        found = found.T
         return found[:, :count].reshape(-1, len(pairs), 2), found[:, count:].reshape(-1, len(pairs), 2, free.count)
 
     return values

@@ -14,7 +14,7 @@ export class RequestError extends Error {
   }
 }
 
-/** Send a request to one of the routes list, open, save, compile, diagnose. */
+/** Send a request to one of the routes list, open, save, compile, diagnose, design. */
 export async function ask(route, request = {}, signal = undefined) {
   let answer;
   try {
