@@ -811,8 +811,9 @@ function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, lim
   }
 }
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes: more than any stack needs, the unit in which memory grows, alignment
-const UNFINISHED = {2: "too many steps", 3: "the step became too small", 4: "a number is not finite", 5: "the loops do not stay closed",
-  7: "the condition of an event varies too quickly"};
+const STATUSES = ["running", "done", "step_limit", "step_too_small", "not_finite", "lost", "singular", "spurious_rank", "crossed", "unresolved"];
+const UNFINISHED = {step_limit: "too many steps", step_too_small: "the step became too small", not_finite: "a number is not finite",
+  lost: "the loops do not stay closed", unresolved: "the condition of an event varies too quickly"};
 const EPS = 2 ** -52;
 const numbersOf = text => new Float64Array(bytesOf(text).buffer);
 const largest = (x, unit) => x.reduce((most, value, k) => Math.max(most, Math.abs(value) / unit(k)), 0);
@@ -963,10 +964,11 @@ class Engine {
     if (data.events) results.crossing = data.events.head + data.events.names.length + data.forces_watched + 2 * size;
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
-    let done = ended.code === 1, count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[ended.code] ?? "";
-    if (ended.lost < count) { done = false; count = ended.lost; words = UNFINISHED[5]; }
-    const limited = ended.code === 2, last = {t: ended.t, marks, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
-    return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t, code: ended.code,
+    const status = STATUSES[ended.code], limited = status === "step_limit";
+    let done = status === "done", count = done ? T : Math.min(ended.written + 1, T - 1), words = UNFINISHED[status] ?? "";
+    if (ended.lost < count) { done = false; count = ended.lost; words = UNFINISHED.lost; }
+    const last = {t: ended.t, marks, q: found.info.slice(info, info + size), v: found.info.slice(info + size)};
+    return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
   /** The conditions of events at a state: g, its first and second rates, derivatives with respect to t, q and v, and for each

@@ -12,6 +12,7 @@ from udkjax.native.run import controller
 
 TS = np.linspace(0.0, 5.0, 26)
 TIGHT = {"rtol": 1e-8, "atol": 1e-8, "throw": False}
+TOLERANCES = jnp.array([1e-6, 1e-7])
 SWING = np.deg2rad(45.0)  # the parallelogram is flat at zero, four times in these five seconds
 
 
@@ -51,6 +52,29 @@ def test_a_drifting_run_ends_at_a_singular_configuration(stabilization, method, 
     assert "near a singular configuration of" in solution.cause and "Projection()" in solution.cause
     gains = "larger gains" in solution.cause
     assert gains == (stabilization is not None)
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", [udk.SVD(1e-10), *(pytest.param(m(1e-10), marks=pytest.mark.slow) for m in (udk.Varga, udk.GramSchmidt))]
+)
+def test_redundant_rows_that_count_as_independent_end_a_run(method, engine):
+    """They are violated by more than the threshold of the rank, and take the energy, with Psi below 1e-7."""
+    run = {"stabilization": None, "engine": engine, "rtol": 1e-6, "atol": 1e-6, "throw": False}
+    codes = jax.vmap(lambda tol: udk.simulate(swing(-0.6), 2 * TS, method=method, **run | {"rtol": tol}).code)(TOLERANCES)
+    assert codes.tolist() == [Result.spurious_rank] * 2
+    alone = udk.simulate(swing(-0.6), 2 * TS, method=method, **run)
+    assert alone.result == Result.spurious_rank and "rank_tol" in alone.cause
+    if engine == "native":
+        assert udk.simulate(swing(-0.6), 2 * TS, method=udk.SVD(1e-4), **run).result == Result.successful
+
+
+@pytest.mark.parametrize("method", [udk.SVD(1e-10), pytest.param(udk.Varga(1e-12), marks=pytest.mark.slow)])
+def test_rounding_that_counts_as_rank_ends_a_projected_run(method):
+    """Near a singular configuration the last digits of redundant rows exceed the threshold."""
+    mech = swing(np.deg2rad(40.0))
+    codes = [udk.simulate(mech, 2 * TS, method=m, rtol=1e-10, atol=1e-10, throw=False).result for m in (method, udk.SVD(1e-6))]
+    assert codes == [Result.spurious_rank, Result.successful]
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])

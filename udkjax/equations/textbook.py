@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.annotations import Time, Vector
 from udkjax.equations import constraints, loads, rubbing
@@ -77,6 +77,10 @@ class TextbookEquations(MechanismSystem):
     def rubs(self) -> bool:
         """True if friction depends on the loads of joints."""
         return bool(self.rubbing_joints)
+
+    def rank(self, t: Time, q: Vector) -> Int[Array, ""]:
+        """Return the rank of D at q by the method's threshold."""
+        return uk.pseudoinverse(self.method, uk.D(self.mechanism, t, q, self.scales.weights)).rank
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Project q and v onto Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""

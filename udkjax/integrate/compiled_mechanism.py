@@ -87,6 +87,11 @@ class CompiledMechanism:
         """The equations, without the formulation that may contain them."""
         return textbook_of(self.equations)
 
+    @property
+    def most_rank(self) -> int:
+        """The number of rows that are not known to be redundant: a larger rank is due to rounding or violated rows."""
+        return len(self.textbook.scales.rows) - len(self.textbook.redundant or ())
+
 
 def compile_mechanism(
     system: Any,

@@ -11,6 +11,8 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.textbook import TextbookEquations
+from udkjax.integrate.compiled_mechanism import eliminates
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.drift import DriftController
 from udkjax.integrate.native_equations import equations_for_diffrax
@@ -61,6 +63,11 @@ def integrate_by_diffrax(
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, Status.STEP_LIMIT, Status.STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, Status.DONE, status)
     status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
+    equations = problem.equations
+    if isinstance(equations, TextbookEquations) and equations.redundant and not eliminates(equations.method):
+        # machine code looks after every step
+        is_held = equations.rank(t_end[0], jnp.split(end[0], 2)[0]) > problem.compiled.most_rank
+        status = jnp.where(is_held, Status.SPURIOUS_RANK, status)
     controller_state: Any = run.controller_state
     if measures_drift:
         controller_state, drifted = controller_state.inner, controller_state.status

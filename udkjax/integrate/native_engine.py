@@ -163,6 +163,7 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
         "omega": problem.rate,
         "max_steps": problem.max_steps,
         "drift_tol": problem.drift_tol,
+        "most_rank": float(compiled.most_rank),
     }
     numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]
     return operation.pack(numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)

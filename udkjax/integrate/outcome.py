@@ -47,6 +47,7 @@ def failure(status: Any, xp: ModuleType = jnp) -> Any:
         (Status.NOT_FINITE, Result.not_finite),
         (Status.LOST, Result.drift),
         (Status.SINGULAR, Result.singular),
+        (Status.SPURIOUS_RANK, Result.spurious_rank),
     ):
         code = xp.where(status == status_of, result, code)
     return code

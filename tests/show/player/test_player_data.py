@@ -4,6 +4,7 @@ import json
 import re
 import tracemalloc
 from html import unescape
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import udkjax as udk
 from tests.show.player.conftest import Motion
 from udkjax.integrate.events.conditions import Gap
+from udkjax.native.base.steps import Status
 from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.marks import body_points, corners_of, marks, to_ground
 from udkjax.show.player.measure_curves import measures_of, reaction_arrows
@@ -315,3 +317,10 @@ def test_nbconvert_keeps_the_player(animation):
     cell = nbformat.v4.new_code_cell("animation", outputs=[output])
     text, _ = nbconvert.HTMLExporter().from_notebook_node(nbformat.v4.new_notebook(cells=[cell]))
     assert embedded(unescape(text)) == embedded(unescape(data["text/html"]))
+
+
+def test_the_page_knows_the_ways_in_which_a_run_ends():
+    """The number of a status is that of machine code."""
+    source = (files("udkjax") / "show" / "player" / "engine.js").read_text()
+    found = re.search(r"const STATUSES = (\[.*?\]);", source)
+    assert found and json.loads(found[1]) == [name.lower() for name in vars(Status) if name.isupper()]

@@ -29,7 +29,19 @@ FORMULATION_SETTINGS = (
     "formulation_tol",
     "mass",
 )  # further settings of formulations: the rank tolerance, the characteristic mass (kg)
-SETTINGS = ("rtol", "atol", "smallest", "first", "length", "omega", "fallback_tol", "max_steps", "method", "drift_tol")
+SETTINGS = (
+    "rtol",
+    "atol",
+    "smallest",
+    "first",
+    "length",
+    "omega",
+    "fallback_tol",
+    "max_steps",
+    "method",
+    "drift_tol",
+    "most_rank",
+)
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
 SHARE = 32  # minimum number of members of a thread: waking a thread takes 50 us, the shortest runs take 1 or 2 us each

@@ -79,7 +79,7 @@ def write_decide(module: Module):
     code = where(stepping & failed & begin & ~accept, where(code.is_(float(Status.RUNNING)), Status.STEP_TOO_SMALL, code), code)
     code = where(accept & (s.last > 0.5), Status.DONE, code)
     lost = _accept_step(module, f, s, accept)
-    goes_on = code.is_(float(Status.RUNNING)) | (code.is_(float(Status.DONE)) & lost.is_(float(Status.SINGULAR)))
+    goes_on = code.is_(float(Status.RUNNING)) | (code.is_(float(Status.DONE)) & (lost >= float(Status.SINGULAR)))
     code = where((lost > 0.0) & goes_on, lost, code)
     s.where(accept & stepped, rate=rate)
     if module.plan.breaks:
@@ -211,6 +211,11 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
             lost.value = f.select(is_lost, f.const(Status.LOST, DOUBLE, f.width), 0.0)
         if module.measures_drift:
             lost.value = _judge_drift(module, f, s, accept)
+        if module.dense:
+            # Rows that depend on others along the whole motion are independent where these are violated, or by rounding, unless
+            # the threshold of the rank is larger: they then hold back what is free to move.
+            is_held = accept & (module.dense.rank(f) > s.most_rank) & lost.value.is_(0.0)
+            lost.value = f.select(is_held, f.const(Status.SPURIOUS_RANK, DOUBLE, f.width), lost.value)
         if module.m:
             s.where(accept, tolerance=velocity_tolerance(module, f, s, "point3 v"))
         module.record_step(f, s, accept)

@@ -10,7 +10,7 @@ programs by elimination. All systems at one state share a factorization.
 
 from collections.abc import Callable
 
-from udkjax.native.base.ir import DOUBLE, POINTER, Function
+from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.base.module import Module
 from udkjax.native.base.weighted_rows import WeightedRows
 from udkjax.native.pseudoinverses.dense import DenseMethod, MatrixRow
@@ -33,6 +33,10 @@ class DenseEquations:
                 f, s = module.function(name, [(POINTER, "work"), (POINTER, "out")])
                 s.safe = f.const(1.0, DOUBLE, f.width)
                 write(f)
+
+    def rank(self, f: Function) -> Value:
+        """Return the rank of the rows that were factorized last."""
+        return self._rows.matrices(f).row("rank").entry(0)
 
     @property
     def _functions(self) -> dict[str, Callable[[Function], None]]:
