@@ -71,6 +71,14 @@ def test_numbers_may_be_traced():
     assert_allclose(slope[3], [-np.sin(0.3), np.cos(0.3), 0.0], atol=1e-15)
 
 
+def test_a_parallelogram_has_any_size():
+    """Twice the lengths, four times the inertias and twice the gravity: twice the positions, and the same angles."""
+    small, large = library.parallelogram(0.3, 1.2), library.parallelogram(0.3, 1.2, 2.0, 1.0, 0.4, 2.0, 0.8, 19.62, spacing=2.0)
+    assert_allclose(large.q0, small.q0 * np.array([2.0, 2.0, 1.0]), atol=1e-15)
+    assert_allclose(large.v0, small.v0 * np.array([2.0, 2.0, 1.0]), atol=1e-15)
+    assert large.parameters()["joint.A3.points"][0].tolist() == [4.0, 0.0]
+
+
 def _positions_are_traced(name, key, default):
     """True if a mechanism of the library has traced positions when the number `key` is traced."""
     found = []

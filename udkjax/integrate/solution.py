@@ -80,8 +80,8 @@ CAUSES = {
     Result.singular: "the run, which is not projected, met a singular configuration with its constraints too far open: it may "
     "have lost its energy, or gone on along another branch; use `Projection()`",
     Result.spurious_rank: "rows that depend on others along the whole motion counted as independent, and hold back what is free "
-    "to move: the method's `rank_tol` is below rounding errors or, without `Projection()`, below the violation of the rows; raise "
-    "it or use `Auto()`",
+    "to move: the method's `rank_tol` is below rounding errors or, without `Projection()`, below the violation of the rows; "
+    "raise it or use `Auto()`",
     Result.undefined_condition: "the condition of an event is not a number: look at what it divides by, or takes the root of",
 }
 

@@ -19,7 +19,7 @@ from udkjax.scene.mechanism import Mechanism
 NEARBY = 1e-9  # fraction of the span: a load changes much within this time only if it jumps
 # Times after the end of the run at which non-finite numbers are looked for, as fractions of the span: the integrator may have
 # evaluated them in a rejected step up to ten times as long as the last.
-AHEAD = (0.0, *np.geomspace(1e-6, 0.1, 80))
+NOT_FINITE_TIMES = (0.0, *np.geomspace(1e-6, 0.1, 80))
 JUMP = 1e-3  # least relative change of a load over `NEARBY` at a jump; smooth loads change a million times less
 PARTS = 8  # of the way between two states; half of the change within one part is a jump, a smooth load has two eighths at most
 GROWN = 1e6  # ratio of a load to its earlier value above which it grows without bound
@@ -210,7 +210,7 @@ def _not_finite_ahead(run: FailedRun) -> str:
     """Name the elements with non-finite numbers at the end of the run or shortly after."""
     t, q, v = run.states[0]
     span = float(run.ts[-1] - run.ts[0])
-    states = [(t + share * span, q + share * span * v, v) for share in AHEAD]
+    states = [(t + share * span, q + share * span * v, v) for share in NOT_FINITE_TIMES]
     loads = _loads(run, states)
     for k, (time, position, _) in enumerate(states):
         psi, length, _ = run.rows.at(time, position) if run.rows.count else (np.zeros(0), np.zeros(0), None)

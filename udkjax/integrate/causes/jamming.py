@@ -13,7 +13,7 @@ from udkjax.scene.forces import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
-AHEAD = 0.0, 1e-9, 1e-6, 1e-4  # parts of the run after its end where friction may jam
+JAMMING_TIMES = 0.0, 1e-9, 1e-6, 1e-4  # times after the end of a run, as fractions of its span
 
 
 def explain_jamming(run: FailedRun) -> str:
@@ -24,7 +24,7 @@ def explain_jamming(run: FailedRun) -> str:
         return ""
     t, q, v = run.states[0]
     span = float(run.ts[-1] - run.ts[0])
-    for share in AHEAD:
+    for share in JAMMING_TIMES:
         state = t + share * span, q + share * span * v, v
         if not _jams(run, mechanism, state):
             continue

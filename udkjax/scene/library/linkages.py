@@ -25,26 +25,31 @@ def parallelogram(
     coupler_mass: ArrayLike = 2.0,
     coupler_inertia: ArrayLike = 0.2,
     gravity: ArrayLike = 9.81,
+    spacing: ArrayLike = 1.0,
 ) -> Mechanism:
     """Return the paper's five-bar parallelogram: three parallel links carry a coupler. 12 rows, rank 11, one degree of freedom.
 
-    Ground pivots at (0, 0), (1, 0), (2, 0); `angle` and `angular_velocity` are those of the links. Bodies link1, link2, link3,
-    coupler; rows A1, A2, A3 (link minus ground), then B1, B2, B3 (link minus coupler). The paper does not print the initial
-    state: release from rest at -45 degrees is inferred from its tables.
+    `length` (m) is that of the links alone, and `spacing` (m) the distance of neighbouring pivots, on the ground and on the
+    coupler: a parallelogram of another size needs both. Ground pivots are at (0, 0), (spacing, 0), (2 spacing, 0); `angle` and
+    `angular_velocity` are those of the links. Bodies link1, link2, link3, coupler; rows A1, A2, A3 (link minus ground), then B1,
+    B2, B3 (link minus coupler). The paper does not print the initial state: release from rest at -45 degrees is inferred from
+    its tables.
     """
+
+    across = spacing * np.array([1.0, 0.0])
 
     def pose(s):
         e = unit_vector(s)
-        links = [(np.array([x, 0.0]) + 0.5 * length * e, s) for x in (0.0, 1.0, 2.0)]
-        return [*links, (np.array([1.0, 0.0]) + length * e, 0.0 * s)]
+        links = [(k * across + 0.5 * length * e, s) for k in range(3)]
+        return [*links, (across + length * e, 0.0 * s)]
 
     links = ("link1", "link2", "link3")
     physics = [(mass, inertia)] * 3 + [(coupler_mass, coupler_inertia)]
     half = 0.5 * length
     return Mechanism(
         bodies_on_pose((*links, "coupler"), physics, pose, angle, angular_velocity),
-        {f"A{i + 1}": Revolute((GROUND, link), [(float(i), 0.0), (-half, 0.0)]) for i, link in enumerate(links)}
-        | {f"B{i + 1}": Revolute(("coupler", link), [(i - 1.0, 0.0), (half, 0.0)]) for i, link in enumerate(links)},
+        {f"A{i + 1}": Revolute((GROUND, link), [(i * spacing, 0.0), (-half, 0.0)]) for i, link in enumerate(links)}
+        | {f"B{i + 1}": Revolute(("coupler", link), [((i - 1) * spacing, 0.0), (half, 0.0)]) for i, link in enumerate(links)},
         gravity=gravity_vector(gravity),
         name="five-bar parallelogram",
     )
