@@ -37,6 +37,7 @@ def test_kinematics(tmp_path, capsys):
         assert data.attrs["scene"] == scene.read_text()
 
 
+@pytest.mark.slow
 def test_velocities_are_those_of_the_motor_s_own_speed(tmp_path, capsys):
     """Example 6-7 of Norton, "Design of machinery": links of 100, 40, 120 and 80 mm, the crank at 40 deg and 25 rad/s."""
     angle, place = math.radians(40.0), complex(0.1, 0.0)
@@ -178,6 +179,7 @@ def test_reactions_at_pins_carry_what_moves(tmp_path, capsys):
             assert peak["force"] == pytest.approx(max(force))
 
 
+@pytest.mark.slow
 def test_inverse_and_simulate_draw_what_they_find(tmp_path, capsys):
     plot = tmp_path / "i.png"
     results(capsys, "inverse", EXAMPLES / "slider_crank.toml", "--t1", 0.3, "--dt", 0.1, "--plot", plot)

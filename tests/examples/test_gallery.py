@@ -26,7 +26,6 @@ FACTS = {  # of each example, what must be true of the numbers that it prints
     "designed_paths": lambda line, letter, foot: line < 0.1 and letter < 2 and foot < 1,
     "six_bar_dwell": lambda swing, rest: 29 < swing < 36 and rest < 0.5,
 }
-FAST = ("four_bar",)
 
 
 def test_every_script_is_in_the_gallery_and_is_tested():
@@ -56,7 +55,8 @@ def test_the_picture_of_a_drawing(name, tmp_path, monkeypatch):
     assert lines <= 25 and violation < 1e-9 and (tmp_path / f"{name}.html").stat().st_size < 300_000
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in gallery.NAMES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", gallery.NAMES)
 def test_an_example_shows_what_it_says(name, tmp_path):
     example = gallery.make(name, tmp_path)
     assert FACTS[name](*example["facts"].values()), example["facts"]

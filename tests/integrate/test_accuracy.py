@@ -137,6 +137,7 @@ def test_outputs_in_singular_configurations(tol):
     assert np.abs(udk.violation(mech, sol)).max() < max(tol, 1e-9)  # rows that are dropped stay as they were interpolated
 
 
+@pytest.mark.slow
 def test_many_starts_cross_singular_configurations(linkage, placed):
     """A single start may be lucky: 64 starts within 5 degrees of each of three angles, all of which cross."""
 

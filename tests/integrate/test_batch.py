@@ -82,6 +82,7 @@ def test_outputs_are_as_exact_as_steps(pendulum):
     assert error.max() < 1e-9 and rates.max() < 1e-8
 
 
+@pytest.mark.slow
 def test_one_direction_for_all_members(pendulum):
     """Values are batched, but the direction is not."""
     ts = jnp.linspace(0.0, 1.0, 5)

@@ -93,6 +93,7 @@ def assert_within(found, expected, tol, times=10.0):
 # --- outputs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 def test_outputs_of_a_motion_by_a_spline(tol):
     """With interpolation across knots, angles were off by 9e-3 and rates by 0.8 at a tolerance of 1e-6."""
@@ -213,6 +214,7 @@ def cam():
     return lambda *x: run(*map(jnp.asarray, x))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 def test_outputs_across_the_knots_of_a_cam(cam, tol):
     """With interpolation across knots, rates were off by up to 0.7 rad/s."""

@@ -168,6 +168,7 @@ def controlled(mechanism, dt, names=NAMES):
     return lambda *inputs: jax.lax.scan(advance, udk.assemble(mechanism), (dt * np.arange(len(inputs[0])), *inputs))[1]
 
 
+@pytest.mark.slow
 def test_steps_are_the_run_of_the_same_inputs():
     mechanism, dt = cart(0.0, [0.0, 0.0]), 0.05
     torque, force = np.sin(np.arange(8.0)), np.cos(np.arange(16.0)).reshape(8, 2)

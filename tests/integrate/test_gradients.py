@@ -100,6 +100,7 @@ def test_derivatives_of_accelerations(method):
         np.testing.assert_allclose(f[ordinary] / scale, e[ordinary] / scale, rtol=0, atol=tol, err_msg=name)
 
 
+@pytest.mark.slow
 def test_derivatives_agree_with_differences():
     """The default where there is no closed form, with sideways gravity and another inertia; and the closed form itself."""
 
@@ -181,8 +182,9 @@ def reverse(**choices):
     return jax.jit(jax.value_and_grad(lambda p: theta(p, **choices)))(P)
 
 
-@pytest.mark.parametrize("mode", [pytest.param(forward, marks=pytest.mark.slow), reverse])
-@pytest.mark.parametrize("method", fast("Elimination"))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [forward, reverse])
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def test_gradient_of_a_trajectory(method, mode):
     value, gradient = mode(method=method)
     np.testing.assert_allclose(value, EXACT["theta"], rtol=1e-8)

@@ -97,7 +97,8 @@ def test_drivers_and_forces(kind, stabilization):
     agree(moved if kind == "drivers" else loaded, chosen, stabilization)
 
 
-@pytest.mark.parametrize("angle", [-0.7, pytest.param(np.pi / 2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", [-0.7, np.pi / 2])
 def test_redundant_rows(angle):
     agree(udk.library.parallelogram(angle=angle, angular_velocity=0.7), METHODS + FORMULATIONS, closed=True)
 

@@ -136,6 +136,7 @@ def test_derivatives_of_other_choices(choice):
     assert_allclose(derivatives[0], jax.jit(jax.jacfwd(end_in_bowl))(P), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_are_single_runs():
     points = P * np.linspace(0.8, 1.2, 13)[:, None]
     batch = jax.jit(jax.vmap(end_in_bowl))(points)

@@ -32,15 +32,10 @@ def differences(f, x, h=1e-4):
     return np.stack([(8 * (f(x + e) - f(x - e)) - f(x + 2 * e) + f(x - 2 * e)) / (12 * h) for e in h * np.eye(len(x))], -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "transform"),
-    [
-        ("splined", jax.jacrev),
-        *(
-            pytest.param(*x, marks=pytest.mark.slow)
-            for x in (("driven", jax.jacfwd), ("driven", jax.jacrev), ("held", jax.jacrev))
-        ),
-    ],
+    [("splined", jax.jacrev), ("driven", jax.jacfwd), ("driven", jax.jacrev), ("held", jax.jacrev)],
 )
 def test_states_change_by_times_as_by_differences(name, transform):
     f = deferred(lambda x: states(ARMS[name], x))
@@ -127,6 +122,7 @@ class Lift(udk.Joint):
         return [two.x - one.x - 0.5 * jnp.cos(t), two.y - one.y - 0.5 * jnp.sin(t) + t**2]
 
 
+@pytest.mark.slow
 def test_assembly_of_joints_that_depend_on_time():
     rod = udk.Mechanism({"rod": udk.Body(1.0, 0.1, [0.5, 0.0])}, {"lift": Lift(["ground", "rod"])})
 

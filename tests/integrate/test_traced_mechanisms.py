@@ -135,7 +135,8 @@ def test_singular_configurations_at_rest_and_passed(start):
     assert_allclose(found.q, known.q, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("derivative", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_derivatives_by_the_geometry(derivative):
     """With respect to the initial angle, compared with the exact motion of a pendulum, and so with differences of runs."""
     end = lambda a: udk.simulate(udk.library.parallelogram(angle=a), TIMES[:5], rtol=1e-11, atol=1e-11).q[-1, 0, 2]  # noqa: E731

@@ -126,7 +126,8 @@ def end_of(mechanism, name, tol=1e-10, **choices):
     return end
 
 
-@pytest.mark.parametrize("damping", [0.3, pytest.param(1e6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [0.3, 1e6])
 def test_first_derivatives(damping):
     """Forward and reverse agree to rounding, and with differences of runs."""
     end = end_of(damped(damping), "force.damper.damping")

@@ -136,6 +136,7 @@ def test_accelerations_are_those_of_the_textbook(at):
     assert found["safe"] == 1
 
 
+@pytest.mark.slow
 def test_accelerations_with_baumgarte_are_those_of_the_textbook():
     gains = udk.Baumgarte(5.0, 7.0)
     at = At(loaded(), gains)

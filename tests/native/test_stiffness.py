@@ -88,6 +88,7 @@ def test_a_run_returns_to_the_explicit_method():
     assert 10 < int(solution.stats["implicit"]) < int(solution.stats["accepted"]) - 60
 
 
+@pytest.mark.slow
 def test_members_in_lanes_are_those_alone():
     """Bit for bit, whether they go on implicitly sooner, later or never."""
     mechanism, ts = damped(1.0), np.linspace(0.0, 1.0, 5)
@@ -106,7 +107,8 @@ def test_members_in_lanes_are_those_alone():
             np.testing.assert_array_equal(x[k], y)
 
 
-@pytest.mark.parametrize("damping", [1e4, pytest.param(1e7, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [1e4, 1e7])
 def test_first_derivatives(damping):
     """Through the change of the method, forward and reverse, and by differences; also of members in lanes."""
     mechanism = damped(damping)

@@ -60,6 +60,7 @@ def test_plus_is_an_operator_factorized_once():
     assert plus.rank == plus.T.rank == 3
 
 
+@pytest.mark.slow
 def test_integers_and_mixed_precision():
     np.testing.assert_allclose(SVD()([[1, 2], [3, 4], [5, 6]]), np.linalg.pinv([[1, 2], [3, 4], [5, 6]]), rtol=1e-13)
     a = jnp.array([[1.0, 2.0], [0.0, 1.0]], jnp.float32)

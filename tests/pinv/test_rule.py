@@ -124,6 +124,7 @@ def test_forward_and_reverse_are_transposes(matrices):
     np.testing.assert_allclose(u, v, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_second_derivatives_in_every_mode(matrices):
     x = solution(Varga(1e-9))
     modes = [(outer, inner) for outer in (jax.jacfwd, jax.jacrev) for inner in (jax.jacfwd, jax.jacrev)]

@@ -223,6 +223,7 @@ def central(function, p, step):
     return jnp.stack([(function(p + h) - function(p - h)) / (2 * step) for h in step * jnp.eye(len(p))], -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
 def test_derivatives_of_the_assembled_state(assembled, start):
     """With redundant rows, with respect to common lengths, masses and the guess: forward and reverse."""

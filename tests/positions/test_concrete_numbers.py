@@ -16,7 +16,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", fast(["through meetings of branches"], CASES))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_positions_of_concrete_and_of_traced_numbers(name):
     make, driver, values = CASES[name]
     mechanism = make()

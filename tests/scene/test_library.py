@@ -141,7 +141,8 @@ def test_the_excavator_is_in_equilibrium_on_its_cylinders(at):
     assert (jnp.abs(torques(angles, 0.0)) > 500.0).all()  # N m, without the weight
 
 
-@pytest.mark.parametrize("driven", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("driven", [False, True])
 def test_the_excavator_moves_for_20_s_without_a_singular_configuration(driven, psi):
     import udkjax
 

@@ -252,6 +252,7 @@ def test_the_engine_takes_places_of_pins_and_the_one_for_pulling_has_no_motors(c
     assert answer["scene"]["drivers"] == [motor]
 
 
+@pytest.mark.slow
 def test_pins_of_any_form_have_an_engine_that_takes_their_places(client):
     text = SIX_BAR.replace("A = [30, 40]", 'A = {from = "O2", length = 50, angle = 53}')
     answer = client.ask("compile", text=text, engine="wasm").json()

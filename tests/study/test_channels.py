@@ -220,6 +220,7 @@ def linkage():
     return mech, channels, deferred(both)
 
 
+@pytest.mark.slow
 def test_derivatives_hold_where_constraints_are_redundant(linkage):
     mech, channels, both = linkage
     x, h = np.array([-0.7, 1.3, 0.9, 1.4, 9.81]), 1e-5

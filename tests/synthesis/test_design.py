@@ -167,6 +167,7 @@ def test_a_rocker_follows_a_function_of_the_crank():
     assert np.max(np.abs(turned - 0.4 * values**1.5)) < 5e-3  # rad
 
 
+@pytest.mark.slow
 def test_a_coupler_goes_through_three_poses():
     poses = np.array([[0.0, 0.0, 0.0], [4.0, 2.0, 0.3], [7.0, 1.0, 0.8]])
     found = udk.design(FOUR_BAR, udk.PoseGoal("coupler", poses, pin="P"), starts=60, results=1, transmission=np.deg2rad(20.0))
@@ -260,6 +261,7 @@ def test_geared_cam_and_redundant_mechanisms_are_designed():
     assert cam[0].loss < 1e-20 and np.max(cam[0].measures[0]) <= 2.0
 
 
+@pytest.mark.slow
 def test_areas_bounds_and_lengths_hold():
     limits = {"areas": {"O": (-2, -2, 1.5), "C": [[10, 0], [14, 1], [12, 5]]}, "bounds": {"pin.O": (-3.4, -1.9)}}
     goal = udk.PathGoal("P", [[6, 12], [4, 10], [2, 8]])
@@ -288,6 +290,7 @@ BY_LENGTHS = udk.Drawing(
 )
 
 
+@pytest.mark.slow
 def test_limits_of_pins_by_lengths_have_exact_derivatives():
     goal, lengths = udk.PathGoal("P", [[6, 12], [4, 10], [2, 8]]), {("B", "P"): (1.0, 2.0), ("O", "A"): (1.0, np.inf)}
     areas = {"P": (0, 0, 1), "B": [[10, 0], [14, 1], [12, 5]]}

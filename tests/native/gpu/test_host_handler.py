@@ -171,6 +171,7 @@ def test_batches_do_not_copy_their_records(request):
     )  # a record has 2,403 numbers
 
 
+@pytest.mark.slow
 def test_a_batch_runs_on_several_threads(request):
     inertias = jnp.linspace(0.3, 0.5, 200)
     expected = np.asarray(jax.jit(jax.vmap(angles))(inertias))

@@ -32,6 +32,7 @@ def test_laws_rise_from_zero_to_one_with_zero_slopes_at_both_ends(name):
     assert_allclose(np.max(np.abs(jax.vmap(second)(np.linspace(0.0, 1.0, 4001)))), peak[name], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_follower_moves_by_the_laws():
     mech = cam()
     at = np.array([30.0, 90.0, 150.0, 200.0, 330.0])

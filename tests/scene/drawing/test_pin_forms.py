@@ -191,6 +191,7 @@ def slider_crank(length=200, along=(2, 0), **pins):
     return udk.Drawing(pins, links, ["O"], [{"link": "piston", "direction": [1, 0]}], units=MM).mechanism()
 
 
+@pytest.mark.slow
 def test_a_pin_on_a_rail_is_that_of_a_slider():
     mech = slider_crank()
     A, P = places(mech)["A"], places(mech)["P"]

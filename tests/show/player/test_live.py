@@ -111,6 +111,7 @@ def test_ten_seconds_are_simulated_where_no_run_is_given():
     assert animation.data["runs"][0]["measures"][0]["name"] == "violation"
 
 
+@pytest.mark.slow
 def test_the_tolerances_are_those_of_the_run(live):
     pendulum = udk.library.simple_pendulum()
     exact = udk.simulate(pendulum, np.linspace(0.0, 0.5, 6), rtol=1e-11, atol=1e-10)

@@ -366,7 +366,8 @@ def test_loops_that_cannot_be_closed_are_reported_and_the_last_motion_stays(open
         assert "Degrees of freedom: 0, 1 in the first motion" in note(page) or "do not close" in note(page)
 
 
-@pytest.mark.parametrize("apart", [3.0, pytest.param(0.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("apart", [3.0, 0.1])
 def test_rows_that_other_numbers_make_redundant_are_found(opened, apart):
     """A bar with a misplaced third pin cannot be mounted on three cranks, or cannot move; in the right place it can."""
     name = "joint.B3.points[0][0]"

@@ -50,6 +50,7 @@ def test_what_does_not_move_tells_nothing(design):
     assert design.scores[0] == -np.inf and np.all(np.isinf(design.standard_errors[0])) and design.order[-1] == 0
 
 
+@pytest.mark.slow
 def test_the_higher_it_is_released_the_more_it_tells(design):
     assert design.scores[2] > design.scores[1] > design.scores[0]
     assert np.all(design.standard_errors[2] < design.standard_errors[1])

@@ -39,6 +39,7 @@ def test_right_derivatives_agree_at_any_tolerance(tol):
     assert np.median(check.ratio) < 1.0
 
 
+@pytest.mark.slow
 def test_errors_of_the_derivatives_themselves_are_measured():
     check = udk.check_gradients(pendulum(*FIRST), DATA, NAMES, tol=1e-7)
     mech = pendulum(*FIRST)

@@ -31,6 +31,7 @@ def test_xarray_selects_methods_by_their_labels(data):
     assert data.method.values.tolist() == ["SVD", "Varga"] and data.sizes["pseudoinverse"] == 2
 
 
+@pytest.mark.slow
 def test_numbers_apply_to_the_choices_that_have_them(data):
     assert np.all(data.result == 0) and np.isnan(data.alpha.values[:2]).all()
     assert data.stabilization.values.tolist() == ["none", "Projection", "Baumgarte(beta=5)", "Baumgarte(beta=5) #2"]

@@ -54,6 +54,7 @@ def data(plan, finished):
     return assemble(plan, finished)
 
 
+@pytest.mark.slow
 def test_each_member_is_as_by_itself(data, pendulum, reference):
     for i, j, k in ((0, 0, 0), (2, 1, 0), (1, 1, 1)):
         mechanism = pendulum.with_parameters({"body.rod.mass": MASSES[i]})
