@@ -33,7 +33,21 @@ MECHANISMS = {
     "excavator": (12, 12, {}),
     "andrews_squeezer": (20, 20, {}),
 }
-GEOMETRY = ("angle", "angles", "length", "lengths", "position", "crank", "rod", "arm", "side", "ground", "sun", "planet")
+GEOMETRY = (
+    "angle",
+    "angles",
+    "length",
+    "lengths",
+    "spacing",
+    "position",
+    "crank",
+    "rod",
+    "arm",
+    "side",
+    "ground",
+    "sun",
+    "planet",
+)
 AT_REST = ("andrews_squeezer",)  # by its publication
 
 
