@@ -23,7 +23,7 @@ from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.unrolled import Unrolled
 from udkjax.expressions import ScalarProgram
 from udkjax.pinv.rank_policy import RankPolicy
-from udkjax.scene.forces import SLIDING_SPEED
+from udkjax.scene.friction import SLIDING_SPEED
 
 SAFE = 1e-12  # pivots relative to their rows above which elimination is trusted here: half of the digits
 GAP = 1e-6, 1e-11  # singular values of D relative to the largest: those that count, and those that do not; in between, neither

@@ -46,6 +46,7 @@ class Analysis(PrintsTable):
         coordinates: number of coordinates.
         row_names: for each row of Psi, its constraint and its index within that constraint.
         redundant_rows: indices of the rows that depend on others; None: unknown.
+        only_switched: whether all rows that depend on others are those of constraints that are switched off.
     """
 
     scales: Scales
@@ -53,6 +54,7 @@ class Analysis(PrintsTable):
     row_names: tuple[tuple[str, int], ...] = eqx.field(static=True)  # for each row of Psi: its constraint, its index in it
     # Rows of Psi to leave out; None if unknown: the guess cannot be closed or moved, or all numbers are traced.
     redundant_rows: tuple[int, ...] | None = eqx.field(static=True)
+    only_switched: bool = eqx.field(static=True, default=False)
 
     def _table(self) -> PrintedTable:
         rows = {
@@ -106,15 +108,19 @@ class Analysis(PrintsTable):
         """The characteristic mass (kg), the mass of the heaviest body."""
         return self.scales.mass
 
-    def with_rows_of(self, mechanism: Mechanism) -> "Analysis":
+    def with_rows_of(self, mechanism: Mechanism, only_switched: bool = False) -> "Analysis":
         """Return the analysis of the mechanism with more constraints, of which rows are redundant is not known.
 
         Its lengths, times and masses stay those of the original mechanism.
+
+        Args:
+            mechanism: The mechanism with more constraints.
+            only_switched: Whether all rows that depend on others are those of constraints that are switched off.
         """
         own = (concrete_scales if mechanism.is_concrete else traced_scales)(mechanism)
         xp = jnp if is_traced((self.scales, own)) else np
         scales = self.scales._replace(rows=own.rows, rank_tol=xp.minimum(self.scales.rank_tol, own.rank_tol))
-        return Analysis(jax.tree.map(number, scales), self.coordinates, _row_names(mechanism), None)
+        return Analysis(jax.tree.map(number, scales), self.coordinates, _row_names(mechanism), None, only_switched)
 
 
 @checked

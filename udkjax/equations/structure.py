@@ -20,7 +20,8 @@ from udkjax.annotations import Number, NumericArray, TreeDef
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.element_setup import attached_bodies
-from udkjax.scene.forces import ForceElement, Friction, Wrench
+from udkjax.scene.forces import ForceElement, Wrench
+from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
 

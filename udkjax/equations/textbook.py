@@ -31,6 +31,7 @@ class TextbookEquations(MechanismSystem):
     baumgarte: Baumgarte | None
     scales: Scales
     redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that elimination leaves out; None: unknown
+    only_switched: bool = eqx.field(static=True, default=False)  # whether unknown ones are those that are switched off
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """Return a = a_F + M^(-1/2) D^+ b."""
@@ -195,7 +196,12 @@ def prepare(
     if isinstance(chosen, Elimination) and not chosen.relative:
         raise ValueError("the rank_tol of Elimination must be relative here: it is compared with the remaining part of each row")
     return TextbookEquations(
-        mechanism=mechanism, method=chosen, baumgarte=baumgarte, scales=analysis.scales, redundant=analysis.redundant_rows
+        mechanism=mechanism,
+        method=chosen,
+        baumgarte=baumgarte,
+        scales=analysis.scales,
+        redundant=analysis.redundant_rows,
+        only_switched=analysis.only_switched,
     )
 
 

@@ -190,7 +190,7 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
     if isinstance(plain, TextbookEquations) and plain.rubs:
         if formulation is not None or not eliminates(plain.method):
             return "it computes friction that depends on the loads of joints by elimination only"
-        if plain.redundant is None or plain.redundant:
+        if plain.redundant or (plain.redundant is None and not plain.only_switched):
             return "friction depends on the loads of joints, and redundant rows share these"
     return reason_for_plain(plain.method, formulation)
 

@@ -47,6 +47,7 @@ from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError, require_output_times
 from udkjax.scene.arguments import checked
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -198,7 +199,7 @@ def simulate(
         if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
-    is_located, located = events is not None, None
+    is_located, located = events is not None or _sticks(mechanism), None
     if isinstance(mechanism, Mechanism) and _may_have_kinks(mechanism):
         from udkjax.integrate.events.kinks import kinks_of
 
@@ -220,7 +221,7 @@ def simulate(
             return _required(solution, throw)  # events may have changed what moved
         if not isinstance(mechanism, Mechanism):
             return _required(solution, throw)
-        if events is not None:
+        if events is not None or _sticks(mechanism):
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
         located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
 
@@ -244,6 +245,11 @@ def _releases(events: Any) -> bool:
     """Return whether an event removes a constraint."""
     listed = () if events is None else events if isinstance(events, Sequence) else (events,)
     return any(getattr(getattr(event, "action", None), "removed", None) for event in listed)
+
+
+def _sticks(mechanism: Any) -> bool:
+    """Return whether a joint has set-valued friction."""
+    return isinstance(mechanism, Mechanism) and any(isinstance(f, Friction) and f.sticks for f in mechanism.forces.values())
 
 
 @cached_by_identity

@@ -140,9 +140,9 @@ class StateOperation(Operation):
         """The operation that computes the tangent part of small changes of states."""
         return FindTangentPart(self.code, self.pseudoinverse, self.formulation)
 
-    def of_events(self, conditions: Conditions, impacts: tuple[int, ...]) -> "EvaluateEvents":
+    def of_events(self, conditions: Conditions, directed: tuple[int, ...]) -> "EvaluateEvents":
         """Return the operation that evaluates conditions and, for some of them, directions of impulses."""
-        return EvaluateEvents(self.code, self.pseudoinverse, self.formulation, conditions, impacts)
+        return EvaluateEvents(self.code, self.pseudoinverse, self.formulation, conditions, directed)
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return self.function(self.code, self.pseudoinverse, self.formulation, width, vector)
@@ -171,20 +171,21 @@ class FindTangentPart(StateOperation):
 
 @dataclass(frozen=True)
 class EvaluateEvents(StateOperation):
-    """Compute accelerations, conditions and directions of impulses at states."""
+    """Compute accelerations, conditions, directions of impulses and forces at states."""
 
     conditions: Conditions | None = None
-    impacts: tuple[int, ...] = ()  # indices of the conditions with directions of impulses
+    directed: tuple[int, ...] = ()  # indices of the conditions with directions of impulses
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         assert self.conditions is not None
         plan = self.pseudoinverse, self.formulation, width, vector
-        return EventStates(self.code, self.conditions, self.impacts, *plan)
+        return EventStates(self.code, self.conditions, self.directed, *plan)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         assert self.conditions is not None
-        directions = len(self.impacts) * self.code.coordinate_count * (2 if self.code.has_mobility else 1)
-        return [(self.code.coordinate_count + len(self.conditions.at_state.outputs) + directions,)]
+        directions = len(self.directed) * self.code.coordinate_count * (2 if self.code.has_mobility else 1)
+        values = len(self.conditions.at_state.outputs) + self.conditions.force_count
+        return [(self.code.coordinate_count + values + directions,)]
 
 
 @dataclass(frozen=True)

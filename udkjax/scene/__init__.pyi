@@ -44,11 +44,11 @@ from udkjax.scene.files import loads as loads
 from udkjax.scene.files import save as save
 from udkjax.scene.forces import Force as Force
 from udkjax.scene.forces import ForceElement as ForceElement
-from udkjax.scene.forces import Friction as Friction
 from udkjax.scene.forces import Spring as Spring
 from udkjax.scene.forces import Torque as Torque
 from udkjax.scene.forces import TorsionSpring as TorsionSpring
 from udkjax.scene.forces import Wrench as Wrench
+from udkjax.scene.friction import Friction as Friction
 from udkjax.scene.held import Held as Held
 from udkjax.scene.held import row_size as row_size
 from udkjax.scene.held import rows_of as rows_of

@@ -17,7 +17,7 @@ from udkjax.annotations import TomlTable
 from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import FieldMetadata, StaticValue
-from udkjax.scene.forces import Friction
+from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.profiles import AbstractProfile, profile_class

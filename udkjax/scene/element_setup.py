@@ -16,7 +16,8 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
 from udkjax.scene.checks import SceneEntry, SceneError, problems_of
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Requirement, StaticValue, given_number
-from udkjax.scene.forces import ForceElement, Friction
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.friction import Friction
 from udkjax.scene.joints import AnyConstraint, Constraint, Joint
 from udkjax.scene.schema import table_of, type_name
 from udkjax.wording import abbreviate

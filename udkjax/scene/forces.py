@@ -1,11 +1,11 @@
-"""Force elements: springs, dampers, applied loads and friction, each defined by a potential energy, by loads, or by both.
+"""Force elements: springs, dampers and applied loads, each defined by a potential energy, by loads, or by both.
 
 Conventions that hold throughout: forces are in ground axes (N), torques are positive anticlockwise and about the centre of mass
 of the body that they act on (N m). Each element lists the loads on its bodies in the order of `bodies`; the loads on body 1 are
 the reactions to the loads on body 2.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import equinox as eqx
@@ -16,17 +16,14 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import Frame, Point, between
-from udkjax.scene.fields import BODY, NOT_NEGATIVE, POSITIVE, RUBBING, given_names, given_number, given_or_none
+from udkjax.scene.fields import BODY, NOT_NEGATIVE, given_names, given_number, given_or_none
 from udkjax.scene.held import Held, given_sampled, value_at
-from udkjax.scene.joints import Joint, Prismatic, Revolute, Slot
 
 Wrench = tuple[Number, Number, Number]  # force x, force y (N, ground axes), torque about the centre of mass (N m)
 
 # Fraction of a spring's length. Ends that are closer count as coincident, because the derivatives of the force's direction lose
 # more digits the closer the ends are: all digits between pins that a joint holds together.
 NEAREST = float(np.sqrt(np.finfo(float).eps))
-
-SLIDING_SPEED = 1e-3  # default speed of sliding at which friction is largest (m/s)
 
 
 class ForceElement(PrintsLine):
@@ -43,8 +40,8 @@ class ForceElement(PrintsLine):
 
     @property
     def may_have_kinks(self) -> bool:
-        """False for the types of this module, whose comparisons of the state only guard against division by zero."""
-        return type(self).__module__ != __name__
+        """False for the types of this package's scenes, whose comparisons of the state only guard against division by zero."""
+        return not type(self).__module__.startswith(f"{__package__}.")
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
         """Return the potential energy V (J), or None; its generalized force is -dV/dq."""
@@ -134,7 +131,7 @@ class TorsionSpring(ForceElement):
         if self.damping is None:
             return None
         frame1, frame2 = frames
-        return _couple(-self.damping * (frame2.omega - frame1.omega))
+        return couple(-self.damping * (frame2.omega - frame1.omega))
 
 
 class Force(ForceElement):
@@ -174,124 +171,7 @@ class Torque(ForceElement):
     value: Float[Array, ""] | Held = eqx.field(converter=given_sampled)
 
     def loads(self, t, *frames):
-        return _couple(value_at(self.value, t))
-
-
-class Friction(ForceElement):
-    """Friction in a joint: a constant torque, or a coefficient times the load that the joint carries, or both.
-
-    In a revolute joint with s = `radius` (omega2 - omega1), the speed of sliding, and the force R between the two bodies, the
-    torque on body 2 is
-
-        -torque tanh((omega2 - omega1) / velocity) - mu(s) radius |R|,
-
-    and on body 1 the opposite. In a slot or a prismatic joint the force along the axis on body 2 is -mu(s) |N|, at its point,
-    with s the speed of point 2 along the axis and N the normal force; on body 1 the opposite. With the `length` of the guide of
-    a prismatic joint, whose middle is point 2, N and the torque T between the bodies press on its edges, and |N| becomes
-    |N / 2 + T / length| + |N / 2 - T / length|. The coefficient is continuous (Brown and McPhee 2016),
-
-        mu(s) = coefficient tanh(4 x) + (static_coefficient - coefficient) x / (x^2 / 4 + 3 / 4)^2 + viscous s,    x = s / speed,
-
-    largest at s = `speed`, and zero at rest: what sticks in reality creeps slowly. R and N follow from the same equations as the
-    accelerations (`udkjax.equations.rubbing`).
-
-    Args:
-        joint: the name of a revolute joint; with a coefficient also of a slot or a prismatic joint.
-        torque: constant torque of dry friction (N m), not negative; needs `velocity`.
-        velocity: relative angular velocity over which the constant torque is smoothed (rad/s), greater than zero.
-        coefficient: coefficient of friction while sliding, not negative.
-        radius: radius of the pin (m), greater than zero; for a revolute joint with a coefficient.
-        static_coefficient: largest coefficient, reached at `speed`, not negative; by default `coefficient`.
-        speed: speed of sliding at which the coefficient is largest (m/s), greater than zero.
-        viscous: growth of the coefficient with the speed of sliding (s/m), not negative.
-        length: length of the guide of a prismatic joint (m), greater than zero; by default only |N| counts.
-    """
-
-    bodies: tuple[str, ...] = eqx.field(static=True, init=False, default_factory=tuple)
-    joint: str = eqx.field(static=True, metadata=RUBBING)
-    torque: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
-    velocity: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)
-    coefficient: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
-    radius: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)
-    static_coefficient: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
-    speed: Float[Array, ""] = eqx.field(converter=given_number, default=SLIDING_SPEED, metadata=POSITIVE)
-    viscous: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
-    length: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)
-
-    @property
-    def rubs(self) -> bool:
-        """True if it depends on the load of its joint."""
-        return self.coefficient is not None
-
-    @staticmethod
-    def mistakes(given: Mapping[str, object], joint: type | None) -> Iterator[str]:
-        """Iterate over the numbers that are missing or do not fit, each as "name: what is wrong".
-
-        Args:
-            given: The numbers by name.
-            joint: The class of the joint; None: unknown.
-        """
-        has_torque, rubs, turns = "torque" in given, "coefficient" in given, joint is None or issubclass(joint, Revolute)
-        if not has_torque and not rubs:
-            yield "coefficient: give a coefficient, or a constant torque"
-        if has_torque != ("velocity" in given):
-            yield "velocity: a constant torque is smoothed over a velocity: give both, or neither"
-        for name in ("radius", "static_coefficient", "viscous", "length"):
-            if name in given and not rubs:
-                yield f"{name}: it belongs to a coefficient, which is missing"
-        if joint is None:
-            return
-        if has_torque and not turns:
-            yield f"torque: a {joint.__name__.lower()} does not turn: give a coefficient"
-        if rubs and turns != ("radius" in given):
-            yield "radius: " + ("missing: the radius of the pin" if turns else "it belongs to a revolute joint")
-        if "length" in given and not issubclass(joint, Prismatic):
-            yield "length: it belongs to a prismatic joint"
-
-    def loads(self, t, *frames):
-        if self.torque is None:
-            return None
-        frame1, frame2 = frames
-        assert self.velocity is not None  # a mistake
-        return _couple(-self.torque * jnp.tanh((frame2.omega - frame1.omega) / self.velocity))
-
-    def rubbing_loads(self, joint: Joint, multipliers: Sequence[Number], t: Number, *frames: Frame) -> Sequence[Wrench]:
-        """Return the loads that depend on the load of the joint, as `loads` does.
-
-        Args:
-            joint: The joint.
-            multipliers: The multipliers of its rows; the loads are homogeneous in these, of degree one.
-            t: Time (s).
-            frames: The frames of its bodies.
-        """
-        frame1, frame2 = frames
-        if isinstance(joint, Revolute):
-            assert self.radius is not None  # a mistake
-            x, y = multipliers
-            speed, square = self.radius * (frame2.omega - frame1.omega), x * x + y * y
-            size = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-            return _couple(-self._coefficient_at(speed) * self.radius * size)
-        assert isinstance(joint, Slot | Prismatic)
-        point, axis = frame2.point(joint.points[1]), frame1.vector((jnp.cos(joint.axis), jnp.sin(joint.axis)))
-        rate = frame2.velocity(joint.points[1])
-        speed = axis.x * (rate.x - frame1.vx + frame1.omega * (point.y - frame1.y))
-        speed = speed + axis.y * (rate.y - frame1.vy - frame1.omega * (point.x - frame1.x))
-        size = jnp.abs(multipliers[0])
-        if self.length is not None:
-            half, couple = multipliers[0] / 2, multipliers[1] / self.length
-            size = jnp.abs(half + couple) + jnp.abs(half - couple)
-        pull = -self._coefficient_at(speed) * size
-        force = Point(pull * axis.x, pull * axis.y)  # on body 2
-        return [_load_at(frame1, point, Point(-force.x, -force.y)), _load_at(frame2, point, force)]
-
-    def _coefficient_at(self, speed: Number) -> Number:
-        """Return mu(s)."""
-        assert self.coefficient is not None
-        x = speed / self.speed
-        total: Number = self.coefficient * jnp.tanh(4 * x)
-        if self.static_coefficient is not None:
-            total = total + (self.static_coefficient - self.coefficient) * x / (x * x / 4 + 0.75) ** 2
-        return total if self.viscous is None else total + self.viscous * speed
+        return couple(value_at(self.value, t))
 
 
 def _load(frame: Frame, point: Float[Array, "2"], force: Point) -> Wrench:
@@ -300,11 +180,11 @@ def _load(frame: Frame, point: Float[Array, "2"], force: Point) -> Wrench:
     return force.x, force.y, arm.x * force.y - arm.y * force.x
 
 
-def _load_at(frame: Frame, point: Point, force: Point) -> Wrench:
+def load_at(frame: Frame, point: Point, force: Point) -> Wrench:
     """Return the load about the centre of mass of a force on a body at a point in ground coordinates."""
     return force.x, force.y, (point.x - frame.x) * force.y - (point.y - frame.y) * force.x
 
 
-def _couple(torque: Number) -> list[Wrench]:
+def couple(torque: Number) -> list[Wrench]:
     """Return the loads of a torque on body 2 and its reaction on body 1, in the order of the bodies."""
     return [(0.0, 0.0, -torque), (0.0, 0.0, torque)]

@@ -29,7 +29,8 @@ from udkjax.scene.element_setup import (
     name_elements,
     without_constants,
 )
-from udkjax.scene.forces import ForceElement, Friction
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.number_fields import (

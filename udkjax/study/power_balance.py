@@ -25,7 +25,8 @@ from udkjax.printing import PrintedTable, format_number, prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
-from udkjax.scene.forces import ForceElement, Friction
+from udkjax.scene.forces import ForceElement
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
 

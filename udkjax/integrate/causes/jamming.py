@@ -9,7 +9,7 @@ import numpy as np
 from udkjax.equations.textbook import prepare
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.pinv import SVD
-from udkjax.scene.forces import Friction
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 

@@ -18,7 +18,6 @@ from udkjax.scene.mechanism import Mechanism
 class AddedJoint(NamedTuple):
     """A joint that an event adds."""
 
-    event: int
     program: ScalarProgram  # computes all numbers of the joint from q and its constant numbers
 
 
@@ -36,7 +35,7 @@ def joint_numbers(phases: Phases) -> list[Array]:
 def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
     """Return the joints that events add."""
     names, joints = bodies_of(phases.mechanisms[SCENE]) or (), []
-    for (event, _), joint in zip(phases.added_by, phases.added, strict=True):
+    for joint in phases.added:
         arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten(arrays)
 
@@ -48,7 +47,7 @@ def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
         closed = jax.make_jaxpr(numbers)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
         inputs = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
         outputs = [x for array in read_jaxpr(graph, closed, inputs) for x in array.flat]
-        joints.append(AddedJoint(event, ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs)))
+        joints.append(AddedJoint(ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs)))
     return tuple(joints)
 
 

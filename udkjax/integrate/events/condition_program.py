@@ -1,6 +1,7 @@
 """Conditions of events as programs of scalars, for machine code."""
 
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from types import FunctionType
 from typing import Any
@@ -15,6 +16,8 @@ from jaxtyping import Array, Float
 from udkjax.expressions import Graph, ScalarProgram, cotangents, read_jaxpr, tangents
 from udkjax.integrate.events.conditions import frames_of, sees_velocity
 from udkjax.integrate.events.event import Event
+from udkjax.integrate.events.phases import Switches
+from udkjax.integrate.events.sticking_joints import forces_of
 from udkjax.native.base.program import UnsupportedError, vector_function
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.identity_cache import cached_by_identity
@@ -66,6 +69,34 @@ def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
 
 
 _concrete_conditions = cached_by_identity(_conditions)
+
+
+def with_forces(conditions: Conditions, events: Sequence[Event], switches: Switches, m: int) -> Conditions:
+    """Return the conditions with the forces of all contacts and joints that the switches hold; as they are if there are none.
+
+    Args:
+        conditions: The conditions.
+        events: All events.
+        switches: The switches.
+        m: The number of rows of the mechanism.
+    """
+    if max(switches.rows, default=-1) < 0:
+        return conditions
+    arrays, rest = eqx.partition(tuple(events), eqx.is_inexact_array)
+    leaves, tree = jax.tree.flatten(arrays)
+    graph = Graph()
+
+    def evaluate(multipliers: Array, *numbers: Array) -> Array:
+        found = eqx.combine(jax.tree.unflatten(tree, numbers), rest)
+        return jnp.stack(list(forces_of(found, switches.rows, switches.joint_rows, multipliers).values()))
+
+    shapes = [(m,), *(np.shape(x) for x in leaves)]
+    arguments = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
+    closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
+    outputs = list(read_jaxpr(graph, closed, arguments)[0].flat)
+    multipliers, *numbers = (list(array.flat) for array in arguments)
+    program = ScalarProgram(graph, [x for array in (*numbers, multipliers) for x in array], outputs)
+    return replace(conditions, forces=program, force_key=_text(program))
 
 
 class _Functions:

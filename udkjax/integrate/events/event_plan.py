@@ -14,6 +14,7 @@ from udkjax.integrate.events.conditions import sees_velocity
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import MOST_KINKS
 from udkjax.integrate.events.phases import Phases, Switches
+from udkjax.integrate.events.sticking_joints import SIDES, StickingJoint
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -30,6 +31,8 @@ class EventPlan:
     max_events: int  # without kinks
     turns: tuple[tuple[int, float, float] | None, ...]  # the side that it turns, with factor and shift
     side_count: int  # the number S of sides
+    added_by: tuple[int, ...]  # for each joint that events add, its event; the last ones are the locks of joints that stick
+    sticking: tuple[StickingJoint, ...]  # the joints that may stick, F
     of_system: bool = False  # whether a user-defined system moves, whose coordinates have no bodies and masses
 
     @cached_property
@@ -52,9 +55,19 @@ class EventPlan:
         return changes
 
     @property
+    def first_kink_side(self) -> int:
+        """The number of sides that do not belong to kinks, which come first."""
+        return SIDES * len(self.sticking)
+
+    @property
+    def has_kinks(self) -> bool:
+        """True if sides belong to kinks."""
+        return self.side_count > self.first_kink_side
+
+    @property
     def room(self) -> int:
         """The largest number of events with all kinks."""
-        return self.max_events + (MOST_KINKS if self.side_count else 0)
+        return self.max_events + (MOST_KINKS if self.has_kinks else 0)
 
     @property
     def count(self) -> int:
@@ -63,7 +76,7 @@ class EventPlan:
 
     @cached_property
     def both_directions(self) -> Int[np.ndarray, "2E"]:
-        """The directions in which zeros count: of conditions, then of contact forces, which fall below zero."""
+        """The directions in which zeros count: of conditions, then of forces, which fall below zero."""
         return np.array([*self.directions, *[-1] * self.count])
 
     @cached_property
@@ -110,7 +123,7 @@ class EventPlan:
 
     @cached_property
     def _contacts(self) -> Bool[np.ndarray, "E C"]:
-        """The switch of each contact that may be held."""
+        """The switch of each contact that may be held, and of each joint that may stick."""
         return np.array(self.switches.contacts, int)[:, None] == np.arange(len(self.first))
 
     @cached_property
@@ -119,15 +132,59 @@ class EventPlan:
 
     @cached_property
     def has_only_contacts(self) -> bool:
-        """True if all switches are those of contacts."""
+        """True if all switches are those of contacts and of joints that stick."""
         return bool(self._switches_of_contacts.all())
+
+    # Joints that may stick, F.
+
+    @cached_property
+    def slides(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the events of joints that may stick."""
+        return np.isin(np.arange(self.count), [x.events for x in self.sticking])
+
+    @cached_property
+    def forwards(self) -> Int[np.ndarray, "F"]:
+        """The event of each joint that slides in the positive direction; that of the other direction follows."""
+        return np.array([x.event for x in self.sticking], int)
+
+    @cached_property
+    def directions_of_sliding(self) -> Int[np.ndarray, "F"]:
+        """The side of each joint that is its direction of sliding; the next one tells whether it is at rest."""
+        return np.array([x.first for x in self.sticking], int)
+
+    @cached_property
+    def locks(self) -> Int[np.ndarray, "F"]:
+        """The switch of each joint by which it sticks."""
+        return np.array(self.switches.contacts, int)[self.forwards]
+
+    @cached_property
+    def _switches_of_locks(self) -> Bool[np.ndarray, "C"]:
+        return np.isin(np.arange(len(self.first)), self.locks)
+
+    def locked(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m F"]:
+        """Return a mask of the joints that stick in a phase."""
+        return phase[..., self.locks]
+
+    def with_locks(self, phase: Bool[Any, "*m C"], locked: Bool[Any, "*m F"], xp: ModuleType) -> Bool[Any, "*m C"]:
+        """Return a phase in which the masked joints stick, and no others."""
+        pairs = self.locks[:, None] == np.arange(len(self.first))
+        return (phase & ~self._switches_of_locks) | xp.any(locked[..., None] & pairs, axis=-2)
+
+    def not_sliding(self, sides: Float[Any, "*m S"], xp: ModuleType) -> Bool[Any, "*m E"]:
+        """Return a mask of the directions of joints in which these do not slide."""
+        direction, at_rest = (sides[..., self.directions_of_sliding + k] for k in range(2))
+        either = [(direction * sign < 0.5) | (at_rest > 0.5) for sign in (1, -1)]
+        position, own = np.zeros((2, self.count), int)
+        position[self.forwards], position[self.forwards + 1] = np.arange(len(self.forwards)), np.arange(len(self.forwards))
+        own[self.forwards + 1] = 1
+        return self.slides & xp.where(own == 1, either[1][..., position], either[0][..., position])
 
     def is_first(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m"]:
         """Return whether a phase is that in which runs begin."""
         return (phase == self.first).all(axis=-1)
 
     def held(self, phase: Bool[Any, "*m C"], xp: ModuleType) -> Bool[Any, "*m E"]:
-        """Return a mask of the contacts at rest in a phase."""
+        """Return a mask of the contacts at rest, and of the joints that stick, in a phase."""
         if xp is np and not phase[..., self._switches_of_contacts].any():  # the usual case
             return np.zeros((*phase.shape[:-1], self.count), bool)
         return xp.any(phase[..., None, :] & self._contacts, axis=-1)
@@ -138,15 +195,19 @@ class EventPlan:
         return (phase & ~off) | on
 
     def free(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m C"]:
-        """Return the phase that follows when all contacts at rest open."""
+        """Return the phase that follows when all contacts at rest open, and all joints that stick slide."""
         return phase & ~self._switches_of_contacts
 
+    def without_contacts(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m C"]:
+        """Return the phase that follows when all contacts at rest open."""
+        return phase & ~(self._switches_of_contacts & ~self._switches_of_locks)
+
     def with_contacts(self, phase: Bool[Any, "*m C"], held: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m C"]:
-        """Return the phase that follows when contacts come to rest."""
+        """Return the phase that follows when contacts come to rest, or joints stick."""
         return phase | xp.any(held[..., None] & self._contacts, axis=-2)
 
     def watched(self, phase: Bool[Any, "*m C"], carried: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m 2E"]:
-        """Return a mask of the conditions, and of the contact forces, that count."""
+        """Return a mask of the conditions, and of the forces, that count."""
         held = self.held(phase, xp)
         return xp.concatenate([~held & ~carried, held], axis=-1)
 
@@ -169,6 +230,8 @@ def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_even
         max_steps=max_steps,
         max_events=max_events,
         turns=tuple(e.action.turn for e in events),
-        side_count=sum(held.smooth.count for held in phases.held),
+        side_count=max([x.sides.stop for x in phases.sided], default=0),
+        added_by=tuple(event for event, _ in phases.added_by),
+        sticking=phases.sticking,
         of_system=not isinstance(phases.mechanisms[0], Mechanism),
     )

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from udkjax.annotations import TreeDef
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import added_joints, joint_numbers
-from udkjax.integrate.events.condition_program import condition_numbers, coordinate_count
+from udkjax.integrate.events.condition_program import condition_numbers, coordinate_count, with_forces
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.event_plan import EventPlan, event_plan
 from udkjax.integrate.events.hybrid import Hybrid, inverse_mass_of
@@ -74,7 +74,10 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
         *(x[None] for x in arrays),
     ]
     run = EventRun(*(x[0] for x in call_host(HostRun(plan, len(hybrid.ts), len(hybrid.q), plain), stop_gradients(inputs))))
-    integers, masks = ("event_index", "closed", "count", "code", "totals"), ("event_phase", "together", "undefined")
+    integers, masks = (
+        ("event_index", "closed", "count", "code", "totals"),
+        ("event_phase", "together", "undefined", "first_phase"),
+    )
     run = run._replace(**{name: getattr(run, name).astype(int) for name in integers})
     return run._replace(**{name: getattr(run, name) > 0.5 for name in masks})
 
@@ -137,9 +140,11 @@ def machine_plan(
         compiled: the mechanisms of the phases.
         conditions: conditions of all events.
     """
-    impacts = [int(k) for k in np.flatnonzero(plan.impacts)]
+    directed = [int(k) for k in (*np.flatnonzero(plan.impacts), *plan.forwards)]
     of_kinks = places_of_kinks(events, phases.held)
-    plans = [phase_plan(which, phases, m, conditions, impacts, of_kinks.sides) for which, m in enumerate(compiled)]
+    rows = [x.plan.operation.code.row_count for x in compiled if x.plan.operation is not None]
+    with_rows = [with_forces(conditions, events, phases.switches, m) for m in rows]
+    plans = [phase_plan(which, phases, m, with_rows[which], directed, of_kinks.sides) for which, m in enumerate(compiled)]
     return MachinePlan(plan, tuple(plans), added_joints(phases), tuple(zip(phases.held, of_kinks.elements, strict=True)))
 
 

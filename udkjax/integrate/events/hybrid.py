@@ -27,6 +27,7 @@ from udkjax.integrate.events.impacts import contact_rows
 from udkjax.integrate.events.kinks import renewed_sides, with_sides
 from udkjax.integrate.events.phases import SCENE, SWITCHED, Added, Phases
 from udkjax.integrate.events.runs import RunState
+from udkjax.integrate.events.sticking_joints import forces_of
 from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.pinv import SVD, Pseudoinverse
@@ -169,8 +170,8 @@ class Hybrid(eqx.Module):
         sides = at.joints[-1] * factor + shift
         return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[SCENE]._forces, at.t, at.q, at.v, sides))
 
-    def values(self, at: RunState, is_free: bool = False) -> StateValues:
-        """Return conditions and their derivatives in a state; with `is_free` (no contact at rest) also directions of impulses."""
+    def values(self, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
+        """Return conditions and their derivatives in a state; see `System.look`."""
         t, q, v, _, added = at
         conditions = self.conditions(added)
         by_t, by_q, by_v = jax.jacfwd(conditions, (0, 1, 2))(t, q, v)
@@ -180,15 +181,17 @@ class Hybrid(eqx.Module):
             mobilities = directions = jnp.zeros_like(normals)
             if is_free and self.plan.of_system:
                 mobilities, directions = jax.vmap(lambda normal: equations.impulse(t, q, v, normal))(normals)
-            elif is_free:
+            elif is_free or is_directed:
                 directions = contact_rows(equations, t, q, normals).directions
             return equations.accelerations(t, q, v), mobilities, directions
 
-        a, mobilities, directions = self.in_phase(at.phase, of_mechanism, by_q, at, is_free=is_free)
+        normals = jnp.where(np.array(self.plan.slides)[:, None], by_v, by_q)
+        a, mobilities, directions = self.in_phase(at.phase, of_mechanism, normals, at, is_free=is_free)
         g, rate = rate_along(conditions, t, q, v, a)
         rates = lambda t, q, v: self.conditions_and_rates(added)(t, q, v)[1]  # noqa: E731
         rate_2 = jnp.where(np.array(self.plan.by_velocity), 0.0, rate_along(rates, t, q, v, a)[1])
-        return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions, mobilities)
+        forces = self.forces(at) if self.plan.sticking and not is_free else jnp.ones(self.count)
+        return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions, mobilities, forces)
 
     def second_rates(self, at: RunState) -> tuple[Float[Array, "n"], Float[Array, "E"]]:
         """Return the rate of the accelerations along the motion, and the second rates of all conditions, at a state."""
@@ -206,14 +209,16 @@ class Hybrid(eqx.Module):
         return jax.jvp(rates, (t, q, v), (jnp.ones(()), v, accelerations(t, q, v)))[1]
 
     def forces(self, at: RunState) -> Float[Array, "E"]:
-        """Return the contact forces in a state, minus the multipliers of the contacts at rest; 1 for all other events."""
-        rows, ones = np.array(self.plan.switches.rows, int), jnp.ones(self.count)
+        """Return the forces of contacts at rest, and the reserves of joints that stick, in a state; 1 for all other events."""
+        switches, ones = self.plan.switches, jnp.ones(self.count)
 
         def of_mechanism(which: int, at: RunState) -> Array:
-            if which == SCENE or not np.any(rows >= 0):
+            if max(switches.rows, default=-1) < 0 or (which == SCENE and not self.plan.sticking):
                 return ones
-            forces = -self.textbook(which, at).multipliers(*at[:3])[np.maximum(rows, 0)]
-            return jnp.where(self.plan.held(at.phase, jnp), forces, ones)
+            multipliers = self.textbook(which, at).multipliers(*at[:3])
+            forces = forces_of(self.events, switches.rows, switches.joint_rows, multipliers)
+            counts = self.plan.held(at.phase, jnp) | np.array(self.plan.slides)
+            return jnp.where(counts, jnp.stack([jnp.asarray(forces.get(k, 1.0), float) for k in range(self.count)]), ones)
 
         return self.in_phase(at.phase, of_mechanism, at)
 

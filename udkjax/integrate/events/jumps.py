@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from udkjax.integrate.events.crossings import ConditionValues
+from udkjax.integrate.events.crossings import NO_EVENT, ConditionValues
 from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions, rows_of_system
 from udkjax.integrate.events.runs import MemberIndices, RunState, take
+from udkjax.integrate.events.sticking import Modes, settle_friction
 from udkjax.integrate.events.system import StateValues, System
 from udkjax.transforms.gradients import stop_gradients
 
@@ -32,6 +33,7 @@ def apply_event(
     values: ConditionValues,
     state_values: StateValues,
     closed: Int[Any, "b E"] | None = None,
+    modes: Modes | None = None,
 ) -> JumpResult:
     """Apply the action of event k of each member, or, if k >= E, release the contact of event k - E.
 
@@ -43,7 +45,26 @@ def apply_event(
         values: the conditions in these states.
         state_values: derivatives of the conditions, and directions of impulses.
         closed: the states of the contacts that take part, OPEN, TOUCHES or SLOW; None: not known yet.
+        modes: the modes of joints with set-valued friction after the event; None: not known yet.
     """
+    found = _apply_event(system, members, k, before, values, state_values, closed)
+    if not system.plan.sticking:
+        return found
+    stopped = system.xp.where(system.xp.asarray(system.plan.slides)[k % system.plan.count], k, NO_EVENT)
+    state, failed = settle_friction(system, members, found.state, stopped, modes)
+    return found._replace(state=state, blocked=found.blocked | failed)
+
+
+def _apply_event(
+    system: System,
+    members: MemberIndices,
+    k: Int[Any, "b"],
+    before: RunState,
+    values: ConditionValues,
+    state_values: StateValues,
+    closed: Int[Any, "b E"] | None,
+) -> JumpResult:
+    """Apply events, without what follows for joints with set-valued friction."""
     plan, xp = system.plan, system.xp
     releases, e = k >= plan.count, k % plan.count
     t, q, v, phase, joints = before
@@ -52,7 +73,7 @@ def apply_event(
     after = xp.where(releases[:, None], phase, plan.after(phase, e, xp))
     blocked, adds = xp.zeros_like(releases), ~releases & xp.asarray(plan.adds)[e]
     if plan.adds.any() and (xp is not np or adds.any()):
-        joints = system.add_joints(members, xp.where(adds, e, -1), q, joints)
+        joints = system.add_joints(members, adds[:, None] & (e[:, None] == np.array(plan.added_by)), q, joints)
         # The new velocities satisfy the phase without its contacts at rest, since these contacts may open.
         q1, _ = system.project(members, RunState(t, q, v, after, joints))
         _, v1 = system.project(members, RunState(t, q1, v, plan.free(after), joints), is_free=True)
@@ -60,7 +81,8 @@ def apply_event(
         moved = moved if xp is np else stop_gradients(moved)
         blocked = adds & (xp.max(moved, axis=-1) > ATTACHABLE)
         q, v = (xp.where(adds[:, None], x, y) for x, y in ((q1, q), (v1, v)))
-    state, acts = RunState(t, q, v, after, joints), (releases | xp.asarray(plan.changes)[e])[:, None]
+    acts = ((releases | xp.asarray(plan.changes)[e]) & ~xp.asarray(plan.slides)[e])[:, None]
+    state = RunState(t, q, v, after, joints)
     if not plan.impacts.any() or (xp is np and not acts.any()):
         return JumpResult(state, None, blocked)
 
@@ -73,8 +95,8 @@ def apply_event(
         rows = rows_of_directions(state_values.by_q, state_values.directions, take(system.inverse_mass, members))
 
     def second_rates(v: Any) -> Any:
-        after = free._replace(v=v)
-        return system.look(members, after if xp is np else stop_gradients(after), is_free=True).rate_2
+        after = state._replace(v=v, phase=plan.without_contacts(state.phase))
+        return system.look(members, after if xp is np else stop_gradients(after), is_free=not plan.sticking).rate_2
 
     hit = hit_contacts(system.contacts(members), k, v, held, values, rows, state_values.rate, second_rates, closed, xp)
     contacts = hit._replace(

@@ -165,11 +165,14 @@ def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, "SmoothLoads", b
             yield name, smooth_loads(traced, len(element.breakpoints) > 0), k not in sampled and has_numbers
 
 
-def with_held_forces(mechanism: Mechanism) -> tuple[Mechanism, tuple[HeldElement, ...], tuple[Event, ...]]:
-    """Return a mechanism with held forces, what these are, and the events at which their sides turn; without kinks, itself."""
+def with_held_forces(mechanism: Mechanism, first: int = 0) -> tuple[Mechanism, tuple[HeldElement, ...], tuple[Event, ...]]:
+    """Return a mechanism with held forces, what these are, and the events at which their sides turn; without kinks, itself.
+
+    `first` is the number of other sides, which come first.
+    """
     if not isinstance(mechanism, Mechanism):
         return mechanism, (), ()
-    elements, events, forces, first = [], [], list(mechanism._forces), 0
+    elements, events, forces = [], [], list(mechanism._forces)
     for name, smooth, can_be_held in _smooth_forces(mechanism):
         if not smooth.count or not can_be_held:
             continue
@@ -190,14 +193,16 @@ def with_held_forces(mechanism: Mechanism) -> tuple[Mechanism, tuple[HeldElement
 
 
 def renewed_sides(elements: Sequence[HeldElement], forces: Sequence[Any], t: Any, q: Any, v: Any, sides: Any) -> Array:
-    """Return all sides at a state: those not known yet, and those that depend on others."""
-    result = []
+    """Return all sides at a state, with those of kinks that are not known yet or depend on others."""
+    if not elements:
+        return sides
+    result = list(sides[: elements[0].first])
     for held in elements:
         element, q3, v3 = forces[held.force].element, jnp.reshape(q, (-1, 3)), jnp.reshape(v, (-1, 3))
         numbers = [x for leaf in jax.tree.leaves(element) for x in jnp.ravel(leaf)]
         state = [x for y in (q3, v3) for b in held.bodies for x in y[b]]
         result += held.smooth.renewal([*numbers, t, *state, *sides[held.sides]])
-    return jnp.stack([jnp.asarray(s, float) for s in result]) if result else jnp.zeros(0)
+    return jnp.stack([jnp.asarray(s, float) for s in result])
 
 
 class KinkPlaces(NamedTuple):
@@ -222,9 +227,9 @@ def places_of_kinks(events: Sequence[Event], held: Sequence[HeldElement]) -> Kin
     return KinkPlaces(tuple(sides), tuple(elements))
 
 
-def places_of_sides(mechanism: Mechanism, held: Sequence[HeldElement]) -> tuple[int, ...]:
-    """Return the places of all sides among all numbers of a mechanism."""
-    sides = [np.arange(x.first, x.first + x.smooth.count) + 1.0 for x in held]
+def places_of_sides(mechanism: Mechanism, held: Sequence[Any]) -> tuple[int, ...]:
+    """Return the places of all sides among all numbers of a mechanism; `held` has all forces with sides, in order."""
+    sides = [np.arange(x.sides.start, x.sides.stop) + 1.0 for x in held]
     zeros = jax.tree.map(lambda x: np.zeros(np.shape(x)), mechanism)
     marked = eqx.tree_at(lambda m: [m._forces[x.force].sides for x in held], zeros, sides)
     numbers = np.concatenate([np.ravel(x) for x in jax.tree.leaves(marked)])

@@ -14,16 +14,19 @@ from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, f
 from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
 from udkjax.integrate.events.kinks import FREE, MOST_KINKS
-from udkjax.integrate.events.runs import AGAIN, BEGIN, RECORD, MemberIndices, MemberRuns, RunState, take
-from udkjax.integrate.events.system import StateValues, System
+from udkjax.integrate.events.runs import AGAIN, BEGIN, RECORD, MemberIndices, MemberRuns, take
+from udkjax.integrate.events.sticking import begin_with_friction
+from udkjax.integrate.events.system import StateValues, System, condition_values
 from udkjax.integrate.solution import Result
-from udkjax.transforms.gradients import stop_gradients
 
 CLOSED_FIELD, INDEX_FIELD = RECORD.index("closed"), RECORD.index("event_index")
 
 
 def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
     """Run from the start to the last output time, or to an event that ends the run."""
+    if system.plan.sticking:
+        runs = system.when(runs.running, partial(begin_with_friction, system), runs)
+        runs = runs._replace(first_phase=runs.phase + False, first_sides=system.sides(None, runs.joints) + 0.0)
 
     def change(runs: MemberRuns) -> MemberRuns:
         runs = system.when(runs.running & (runs.event == NO_EVENT), system.advance, runs)
@@ -39,7 +42,7 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     values, state_values = condition_values(system, members, state)
     values = values._replace(scale=xp.maximum(values.scale, take(runs.scale, members)))  # scales never decrease
     size, is_current = xp.abs(values.h), np.arange(E) == event[:, None]
-    carried = take(runs.carried, members) & (size <= CLOSED * values.scale) | _unheld(system, members, state.joints)
+    carried = _carried(system, members, take(runs.carried, members) & (size <= CLOSED * values.scale), state.joints)
     undefined, ends = ~xp.isfinite(values.h), state.t >= take(system.end, members)
     # A located condition keeps its side until its event happens; any other nonzero condition is on the side of its sign.
     known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale)
@@ -87,18 +90,6 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     return system.when(happens, jump, runs)
 
 
-def condition_values(system: System, members: MemberIndices, state: RunState) -> tuple[ConditionValues, StateValues]:
-    """Return the conditions of members at their states, and all quantities evaluated in these states."""
-    xp, state_values, unit = system.xp, system.look(members, state), take(system.coordinates, members)
-    rate, t = take(system.rate, members)[:, None], state.t[:, None]
-    by_q = xp.abs(state_values.by_q) * xp.maximum(unit, xp.abs(state.q))[:, None]
-    by_v = xp.abs(state_values.by_v) * xp.maximum(unit * rate, xp.abs(state.v))[:, None]
-    scale = xp.maximum(xp.maximum(by_q, by_v).max(2), xp.abs(state_values.by_t) * xp.maximum(1 / rate, xp.abs(t)))
-    scale = xp.where(xp.isfinite(scale), scale, 0.0)  # a condition that is NaN has no scale
-    scale = scale if xp is np else stop_gradients(scale)
-    return ConditionValues(state_values.g, state_values.rate, state_values.rate_2, state_values.a, scale), state_values
-
-
 def _settled(system: System, runs: MemberRuns, members: MemberIndices) -> Bool[Any, "b E"]:
     """Return a mask of the conditions settled by the last event: of its contacts, and its own if the event changes nothing."""
     xp, plan = system.xp, system.plan
@@ -120,7 +111,8 @@ def _jump(
     after, contacts, blocked = apply_event(system, members, k, before, values, state_values)
     code = xp.where(xp.asarray(plan.stops)[e] & ~releases, Result.event_stop, Result.successful)
     is_current = np.arange(2 * E) == e[:, None]
-    sides = xp.where(is_current, xp.where((xp.asarray(plan.impacts | plan.kinks)[e] | releases)[:, None], 1, -sides), sides)
+    falls = xp.asarray(plan.impacts | plan.kinks | plan.slides)[e] | releases
+    sides = xp.where(is_current, xp.where(falls[:, None], 1, -sides), sides)
     noted, others, closed = k[:, None], xp.zeros((len(k), 0), bool), xp.full(held.shape, OPEN)
     if contacts is not None:
         closed = contacts.closed
@@ -137,6 +129,8 @@ def _jump(
         is_closed = xp.concatenate([closed, closed], axis=1) > OPEN
         sides = xp.where(is_closed, 1, xp.where(xp.concatenate([turned_back, xp.zeros_like(turned_back)], axis=1), 0, sides))
     code = xp.where(blocked, Result.event_impossible, code)
+    if plan.sticking:  # joints slide, and forces stay, on the allowed side of zero
+        sides = xp.where(np.append(plan.slides, plan.slides), 1, sides)
 
     count = take(runs.count, members)
     is_noted = xp.concatenate([xp.ones_like(others, shape=(len(k), 1)), others], axis=1)
@@ -146,9 +140,9 @@ def _jump(
     is_full = (count - kinks + total > plan.max_events) & ~is_kink
     # So many kinks are a force that chatters: its comparisons are no longer held.
     chatters = (is_kink & (kinks + 1 >= MOST_KINKS))[:, None]
-    turned = xp.where(chatters, FREE, turned)
+    turned = xp.where(chatters & (np.arange(plan.side_count) >= plan.first_kink_side), FREE, turned)
     after = after._replace(joints=system.with_sides(members, after.joints, turned))
-    carried = carried | _unheld(system, members, after.joints)
+    carried = _carried(system, members, carried, after.joints)
     code = xp.where(is_full, Result.event_limit, code)
     rows = xp.where(is_noted & ~is_full[:, None], count[:, None] + xp.cumsum(is_noted, axis=1) - 1, K)
     stays = (is_full | blocked)[:, None]
@@ -185,17 +179,17 @@ def _jump(
 def _kink_count(system: System, runs: MemberRuns, members: MemberIndices) -> Int[Any, "b"]:
     """Return the number of kinks so far."""
     plan, index = system.plan, take(runs.record[INDEX_FIELD], members)
-    if not plan.side_count:
+    if not plan.has_kinks:
         return system.xp.zeros(len(index), int)
     return system.xp.sum((index >= 0) & (index < plan.count) & system.xp.asarray(plan.kinks)[index % plan.count], axis=1)
 
 
-def _unheld(system: System, members: MemberIndices, joints: Any) -> Bool[Any, "b E"]:
-    """Return a mask of the kinks whose sides are not held."""
+def _carried(system: System, members: MemberIndices, carried: Bool[Any, "b E"], joints: Any) -> Bool[Any, "b E"]:
+    """Return a mask of the conditions that do not count: of contacts that are carried, and of sides that do not hold."""
     plan, sides = system.plan, system.sides(members, joints)
-    if not plan.side_count:
-        return system.xp.zeros((len(sides), plan.count), bool)
-    return ~system.xp.isfinite(sides)[:, plan.side_of] & plan.kinks
+    if plan.sticking:
+        carried = (carried & ~plan.slides) | plan.not_sliding(sides, system.xp)
+    return carried | (~system.xp.isfinite(sides)[:, plan.side_of] & plan.kinks) if plan.has_kinks else carried
 
 
 def _may_follow(

@@ -85,8 +85,8 @@ class MachineSystem:
         if not self.plan.of_system:
             self.coordinates = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
         E = self.plan.count
-        contacts = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
-        self._watched = [np.append(np.arange(E), E + contacts[: x.contact_count]) for x in plan.phases]
+        holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
+        self._watched = [np.append(np.arange(E), E + holds[: x.force_count]) for x in plan.phases]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
     def contacts(self, members: MemberIndices) -> Contacts:
@@ -95,7 +95,7 @@ class MachineSystem:
         numbers = take(self._restitution, members), take(self.rate, members)
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, *numbers)
 
-    def look(self, members: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
+    def look(self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
         """Evaluate the conditions of members at states."""
         return StateValues(*self._by_phase(members, at, PhaseCode.at))
 
@@ -122,14 +122,14 @@ class MachineSystem:
         is_first = self.plan.is_first(phase)
         yield from ((which, here) for which, here in ((SCENE, is_first), (SWITCHED, ~is_first)) if here.any())
 
-    def add_joints(self, members: MemberIndices, event: Int[np.ndarray, "b"], q: np.ndarray, joints: Any) -> Any:
-        """Return the numbers of the joints that events have added, with those that `event` adds at q; -1: no event."""
+    def add_joints(self, members: MemberIndices, new: Bool[np.ndarray, "b A"], q: np.ndarray, joints: Any) -> Any:
+        """Return the numbers of the joints that events have added, with new ones, added at q."""
         indices, start = self._all if members is None else members, 0
-        for joint, numbers in zip(self._added, joints[:-1], strict=True):
-            count, new = len(joint.program.inputs) - q.shape[1], event == joint.event
-            if new.any():
-                inputs = self._joint_numbers[indices[new], start : start + count]
-                numbers[indices[new]] = evaluate_joint(joint, q[new], inputs)
+        for joint, numbers, here in zip(self._added, joints[:-1], new.T, strict=True):
+            count = len(joint.program.inputs) - q.shape[1]
+            if here.any():
+                inputs = self._joint_numbers[indices[here], start : start + count]
+                numbers[indices[here]] = evaluate_joint(joint, q[here], inputs)
             start += count
         return joints
 
@@ -149,7 +149,9 @@ class MachineSystem:
 
     def first_sides(self, at: RunState) -> Float[np.ndarray, "B S"]:
         """Return the sides of all members at the start."""
-        return self._renew(None, at, np.full_like(at.joints[-1], FREE))
+        unknown = np.full_like(at.joints[-1], FREE)
+        unknown[:, : self.plan.first_kink_side] = 0.0
+        return self._renew(None, at, unknown)
 
     def _renew(self, members: MemberIndices, at: RunState, sides: np.ndarray) -> np.ndarray:
         result = sides.copy()
@@ -240,10 +242,11 @@ class MachineSystem:
         """Store the results and ends of the runs that stop."""
         status, (n, fails) = stretch.info[:, STATUS], (runs.q.shape[1], ~known)
         unresolved = (status == Status.UNRESOLVED) & ~drifts
-        if self.plan.side_count:  # perhaps a force that chatters: the run goes on with its comparisons
-            chatters = unresolved & np.isfinite(runs.joints[-1][members]).all(1)
+        if self.plan.has_kinks:  # perhaps a force that chatters: the run goes on with its comparisons
+            of_kinks = runs.joints[-1][:, self.plan.first_kink_side :]
+            chatters = unresolved & np.isfinite(of_kinks[members]).all(1)
             freed, unresolved = members[chatters], unresolved & ~chatters
-            runs.joints[-1][freed], self.lost_kinks[freed], runs.running[freed] = FREE, runs.t[freed], True
+            of_kinks[freed], self.lost_kinks[freed], runs.running[freed] = FREE, runs.t[freed], True
             known, fails = known | chatters, fails & ~chatters
         self.unresolved[members] |= unresolved
         code = np.where(drifts, Result.drift, failure(status, np))

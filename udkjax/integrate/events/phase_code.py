@@ -43,9 +43,9 @@ class PhasePlan(NamedTuple):
     sides_of_events: tuple[tuple[int, int], ...]  # places of sides among the numbers of events, with the index of the side
 
     @property
-    def contact_count(self) -> int:
-        """The number of contacts whose forces are watched."""
-        return 0 if self.run.conditions is None else len(self.run.conditions.rows)
+    def force_count(self) -> int:
+        """The number of watched forces."""
+        return 0 if self.run.conditions is None else self.run.conditions.force_count
 
     @property
     def count(self) -> int:
@@ -58,7 +58,7 @@ def phase_plan(
     phases: Phases,
     compiled: CompiledMechanism,
     conditions: Conditions,
-    impacts: Sequence[int],
+    directed: Sequence[int],
     of_kinks: tuple[tuple[int, int], ...],
 ) -> PhasePlan:
     """Return the operations of the phases of the mechanism `which`, SCENE or SWITCHED.
@@ -67,23 +67,23 @@ def phase_plan(
         which: the mechanism.
         phases: all phases.
         compiled: the mechanism, compiled.
-        conditions: conditions of all events.
-        impacts: the events that are impacts.
+        conditions: conditions of all events, with forces.
+        directed: the events whose directions of impulses are needed.
         of_kinks: the places of sides among the numbers of events, each with the index of its side.
     """
     run, added, active = compiled.plan.operation, [name for _, name in phases.added_by], ()
     assert run is not None  # checked by the caller
-    mechanism, joints, rows = compiled.samples.stand_in(compiled.textbook.mechanism), [()] * len(added), ()
+    mechanism, joints = compiled.samples.stand_in(compiled.textbook.mechanism), [()] * len(added)
+    without = replace(conditions, forces=None, force_key="")
     if which == SWITCHED:
-        active = places_of_switches(mechanism, phases.switches.names)
-        joints, rows = places_of_joints(mechanism, added), tuple(row for row in phases.switches.rows if row >= 0)
+        active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, added)
     return PhasePlan(
-        run=run.watching(replace(conditions, rows=rows)),
-        states=run.accelerations.of_events(conditions, tuple(impacts)),
+        run=run.watching(conditions if which == SWITCHED else without),  # nothing is held that could let go
+        states=run.accelerations.of_events(conditions if phases.sticking else without, tuple(directed)),
         marking=_marking(compiled.textbook) if run.code.marks_rows else None,
         projected=compiled.plan.projected,
         project=run.accelerations.projection if added else None,
-        joints=(*joints, places_of_sides(mechanism, phases.held) if phases.held else ()),
+        joints=(*joints, places_of_sides(mechanism, phases.sided) if phases.sided else ()),
         active=active,
         sides_of_events=of_kinks,
     )
@@ -199,11 +199,15 @@ class PhaseCode:
         (results,) = call_members(*inputs, of_states, operation=operation, times=2)
         values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
         directions, mobilities = np.zeros((2, b, conditions.own_count, n))
-        if operation.impacts:
-            found = results[:, self._places[-1][0].stop :].reshape(b, -1, len(operation.impacts), n)
+        start, end = self._places[-1][0].stop, results.shape[1] - conditions.force_count
+        if operation.directed:
+            found = results[:, start:end].reshape(b, -1, len(operation.directed), n)
             for array, x in zip((directions, mobilities), found.swapaxes(0, 1), strict=False):
-                array[:, list(operation.impacts)] = x
-        return StateValues._make([*values, directions, mobilities])
+                array[:, list(operation.directed)] = x
+        forces = np.ones((b, conditions.own_count))
+        if conditions.force_count:
+            forces[:, np.array(self._switches.rows) >= 0] = results[:, end:]
+        return StateValues._make([*values, directions, mobilities, forces])
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of members, projected to the constraints of their phases."""

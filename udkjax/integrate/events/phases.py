@@ -23,6 +23,7 @@ from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import HeldElement
+from udkjax.integrate.events.sticking_joints import Sticking, StickingJoint
 from udkjax.integrate.events.switched import switch, switched, with_switched_friction
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.joints import Constraint, Joint
@@ -40,8 +41,9 @@ class Switches(NamedTuple):
     first: tuple[bool, ...] = ()  # the phase in which a run begins: constraints of the scene are on, all others are off
     removed: tuple[tuple[bool, ...], ...] = ()  # (E, C)
     added: tuple[tuple[bool, ...], ...] = ()  # (E, C)
-    contacts: tuple[int, ...] = ()  # the switch that holds the contact of an event; -1: none
+    contacts: tuple[int, ...] = ()  # the switch that holds the contact, or the joint that may stick, of an event; -1: none
     rows: tuple[int, ...] = ()  # the row of Psi of that switch; -1: none
+    joint_rows: tuple[tuple[int, ...], ...] = ()  # the rows of the joint that this switch locks; empty: it locks none
     switch_of_row: tuple[int, ...] = ()  # -1: a row of the scene that no event changes
     redundant: tuple[bool, ...] = ()  # rows of the scene that depend on others while all constraints of the scene hold
 
@@ -58,10 +60,16 @@ class Phases(eqx.Module):
 
     mechanisms: tuple[Any, ...]  # mechanisms, or one traced system
     analyses: tuple[Analysis | None, ...]
-    added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, without the numbers that depend on the state at the event
+    added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, and of sticking, without the numbers that depend on the state
     added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # for each added joint its event and its switch
     switches: Switches = eqx.field(static=True)
     held: tuple[HeldElement, ...] = eqx.field(static=True, default=())  # the forces with held sides
+    sticking: tuple[StickingJoint, ...] = eqx.field(static=True, default=())  # the joints that may stick
+
+    @property
+    def sided(self) -> tuple[StickingJoint | HeldElement, ...]:
+        """All forces with sides, in the order of the sides."""
+        return (*self.sticking, *self.held)
 
     def mechanism(self, which: int, phase: Bool[Array, "C"], added: Added) -> Any:
         """Return the mechanism of a phase, with the joints that events have added and the sides of its comparisons.
@@ -72,9 +80,9 @@ class Phases(eqx.Module):
             added: the joints and the sides.
         """
         mechanism, (*joints, sides) = self.mechanisms[which], added
-        for held in self.held:
-            at = lambda m, k=held.force: m._forces[k].sides  # noqa: E731
-            mechanism = eqx.tree_at(at, mechanism, sides[held.sides])
+        for sided in self.sided:
+            at = lambda m, k=sided.force: m._forces[k].sides  # noqa: E731
+            mechanism = eqx.tree_at(at, mechanism, sides[sided.sides])
         if which == SCENE:
             return mechanism
         for (_, name), joint in zip(self.added_by, joints, strict=True):
@@ -91,6 +99,7 @@ class Phases(eqx.Module):
         switches, none = self.switches, (False,) * len(self.switches.names)
         more = {name: (*getattr(switches, name), *[none] * count) for name in ("removed", "added")}
         more |= {name: (*getattr(switches, name), *[-1] * count) for name in ("contacts", "rows")}
+        more |= {"joint_rows": (*switches.joint_rows, *[()] * count)}
         found = replace(self, held=held, switches=switches._replace(**more))
         forces = [mechanism._forces[x.force] for _ in self.mechanisms for x in held]
         return eqx.tree_at(lambda p: [m._forces[x.force] for m in p.mechanisms for x in held], found, forces)
@@ -107,21 +116,26 @@ class _Switch(NamedTuple):
     name: str  # in the mechanism with all switches
     public: str  # the name by which events release it; "" for contacts
     constraint: Constraint
-    event: int  # the event that adds it, or whose contact it holds; -1: it is a constraint of the scene
+    event: int  # the event that adds it, or whose contact or joint it holds; -1: it is a constraint of the scene
+    locks: str = ""  # the joint that it locks
 
 
-def phases_of(mechanism: Any, events: Sequence[Event], analysis: Analysis | None) -> Phases:
+def phases_of(scene: Sticking, events: Sequence[Event], analysis: Analysis | None) -> Phases:
     """Return the phases of a mechanism, or of a system, with events. A system has one phase."""
-    switches, E = _switches(mechanism, events) if isinstance(mechanism, Mechanism) else [], len(events)
+    mechanism, E = scene.mechanism, len(events)
+    switches = _switches(scene, events) if isinstance(mechanism, Mechanism) else []
     if not switches:
-        none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E)
+        none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E, joint_rows=((),) * E)
         return Phases((mechanism.without_origin,), (analysis,), (), (), none)
     assert isinstance(mechanism, Mechanism)
     assert analysis is not None  # a mechanism has one
     whole = _with(mechanism, switches)
-    with_all = analysis.with_rows_of(whole)
+    adds_any = any(x.public and x.event >= 0 for x in switches)  # which may depend on others
+    with_all = analysis.with_rows_of(whole, only_switched=analysis.redundant_rows == () and not adds_any)
     row_names, names = [name for name, _ in with_all.row_names], [x.name for x in switches]
     contacts = {x.event: k for k, x in enumerate(switches) if not x.public}
+    locks = [(event, k) for k, x in enumerate(switches) if x.locks for event in (x.event, x.event + 1)]
+    contacts, locked = contacts | dict(locks), {event: switches[k].locks for event, k in locks}
     table = Switches(
         names=tuple(names),
         first=tuple(x.event < 0 for x in switches),
@@ -129,13 +143,15 @@ def phases_of(mechanism: Any, events: Sequence[Event], analysis: Analysis | None
         added=tuple(tuple(x.public != "" and x.event == k for x in switches) for k in range(E)),
         contacts=tuple(contacts.get(k, -1) for k in range(E)),
         rows=tuple(row_names.index(names[contacts[k]]) if k in contacts else -1 for k in range(E)),
+        joint_rows=tuple(tuple(r for r, name in enumerate(row_names) if name == locked.get(k)) for k in range(E)),
         switch_of_row=tuple(names.index(name) if name in names else -1 for name in row_names),
         redundant=tuple(row in analysis.redundant for row in with_all.row_names),
     )
-    added = [x for x in switches if x.public and x.event >= 0]
+    added = [x for x in switches if (x.public and x.event >= 0) or x.locks]
     mechanisms = mechanism.without_origin, whole
     joints: Any = tuple(x.constraint for x in added)
-    return Phases(mechanisms, (analysis, with_all), joints, tuple((x.event, x.name) for x in added), table)
+    added_by = tuple((x.event, x.name) for x in added)
+    return Phases(mechanisms, (analysis, with_all), joints, added_by, table, sticking=scene.joints)
 
 
 def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:
@@ -144,8 +160,12 @@ def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:
     return event.action.removed | ({addition[0]} if addition else frozenset())
 
 
-def _switches(mechanism: Mechanism, events: Sequence[Event]) -> list[_Switch]:
-    """Return the switches: constraints of the scene, then added joints, then contacts. Raises `ValueError` for unknown names."""
+def _switches(scene: Sticking, events: Sequence[Event]) -> list[_Switch]:
+    """Return the switches: constraints of the scene, joints that events add, contacts, joints that stick.
+
+    Raises `ValueError` for unknown names.
+    """
+    mechanism: Mechanism = scene.mechanism
     additions = [(k, e.action.addition(mechanism, f"event {quote(e.name)}")) for k, e in enumerate(events)]
     added = [(k, *found) for k, found in additions if found is not None]
     known, released = [*mechanism.constraints, *(name for _, name, _ in added)], set()
@@ -167,7 +187,9 @@ def _switches(mechanism: Mechanism, events: Sequence[Event]) -> list[_Switch]:
 
     found += [_Switch(unique(name), name, joint, k) for k, name, joint in added]
     contacts = [(k, e) for k, e in enumerate(events) if e.action.rest == "hold"]
-    return found + [_Switch(unique(f"{e.name}.contact"), "", HeldContact.of(e, mechanism), k) for k, e in contacts]
+    found += [_Switch(unique(f"{e.name}.contact"), "", HeldContact.of(e, mechanism), k) for k, e in contacts]
+    locks = zip(scene.joints, scene.locks, strict=True)
+    return found + [_Switch(unique(f"{x.name}.stick"), "", lock, x.event, x.name) for x, lock in locks]
 
 
 def _with(mechanism: Mechanism, switches: Sequence[_Switch]) -> Mechanism:

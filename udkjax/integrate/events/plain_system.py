@@ -83,9 +83,9 @@ class PlainSystem:
         e = [jnp.asarray(e.action.rebound, float) for e in self.hybrid.events]
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, jnp.stack(e)[None], self.rate)
 
-    def look(self, members: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
+    def look(self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
         """Evaluate a state."""
-        return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free))
+        return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free, is_directed))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
         """Return positions and velocities that the phase of a state allows."""
@@ -99,14 +99,13 @@ class PlainSystem:
         q, v = self.hybrid.in_phase(state.phase, of_mechanism, state, is_free=is_free)
         return q[None], v[None]
 
-    def add_joints(self, members: MemberIndices, event: Int[Array, "1"], q: Float[Array, "1 n"], joints: Added) -> Added:
-        """Return the joints that events have added, with the joint that `event` adds at q; -1: no event."""
+    def add_joints(self, members: MemberIndices, new: Bool[Array, "1 A"], q: Float[Array, "1 n"], joints: Added) -> Added:
+        """Return the joints that events have added, with new ones, added at q."""
         phases, sides = self.hybrid.phases, joints[-1]
-        new = (phases.joint_at(i, q[0]) for i in range(len(joints) - 1))
-        is_new = (event[0] == by for by, _ in phases.added_by)
+        added = (phases.joint_at(i, q[0]) for i in range(len(joints) - 1))
         chosen = (
             jax.tree.map(lambda x, y, chosen=chosen: jnp.where(chosen, x, y), x, y)
-            for chosen, x, y in zip(is_new, new, joints[:-1], strict=True)
+            for chosen, x, y in zip(new[0], added, joints[:-1], strict=True)
         )
         return (*chosen, sides)
 

@@ -10,14 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.annotations import TreeDef
-from udkjax.integrate.events.crossings import ZERO_RATE
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO_RATE
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.host_run import run_by_machine_code
 from udkjax.integrate.events.hybrid import Hybrid, rate_along
 from udkjax.integrate.events.jumps import apply_event
-from udkjax.integrate.events.loop import condition_values
 from udkjax.integrate.events.plain_system import PlainSystem, run_plain, with_member, without_member
 from udkjax.integrate.events.runs import EventRun, RunState
+from udkjax.integrate.events.sticking import modes_of, settle_friction
+from udkjax.integrate.events.system import condition_values
 from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.deferred import deferred
@@ -181,6 +182,10 @@ def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
         return jax.lax.cond(goes_on, lambda: _integrate_piece(system, ts, found, width, start), skip)
 
     state = hybrid.first_state()._replace(t=ts[0])
+    if system.plan.sticking:
+        began = with_member(state._replace(phase=found.first_phase, joints=(*state.joints[:-1], found.first_sides)))
+        start, _ = settle_friction(system, None, with_member(state), jnp.array([NO_EVENT]), modes_of(system, None, began))
+        state = without_member(start)
     end, out = jax.lax.scan(piece, PieceStart(state, jnp.array(0), jnp.array(0), jnp.zeros(())), None, length=pieces)
     rows = out.rows.ravel()
     q, v = (jnp.full((T, n), jnp.inf).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
@@ -249,7 +254,7 @@ def _apply_at_fixed_time(
     k = jnp.where(index >= 2 * E, index - 2 * E, index)
     values, _ = condition_values(system, None, with_member(state))
     h, rate, a = values.h[0, k % E], values.rate[0, k % E], values.a[0]
-    if system.plan.held_at_rest.any():
+    if system.plan.held_at_rest.any() or system.plan.sticking:
         force = lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v))[k % E]  # noqa: E731
         h, rate = (jnp.where(k >= E, *x) for x in zip(rate_along(force, *state[:3], a), (h, rate), strict=True))
     h = h - stop_gradients(h)
@@ -261,7 +266,10 @@ def _apply_at_fixed_time(
     _, of_h = _second_order(d, hybrid, state)
     d = d - jnp.where(is_transversal, of_h[k % E] / stop_gradients(rate), 0.0)
     before = with_member(_moved(hybrid, state, d, a))
-    after = apply_event(system, None, k[None], before, *condition_values(system, None, before), found.closed[j][None]).state
+    values = condition_values(system, None, before)
+    at_end = with_member(state._replace(phase=found.event_phase[j], joints=(*state.joints[:-1], found.sides[j])))
+    modes = modes_of(system, None, at_end) if system.plan.sticking else None
+    after = apply_event(system, None, k[None], before, *values, found.closed[j][None], modes).state
     after = without_member(after)._replace(phase=found.event_phase[j])
     after = after._replace(joints=(*after.joints[:-1], found.sides[j]))
     fixed = _moved(hybrid, after, -d, hybrid.values(after).a)._replace(t=state.t)

@@ -54,6 +54,8 @@ class EventRun(NamedTuple):
     undefined: Bool[Any, "*m E"]
     code: Int[Any, "*m"]
     totals: Int[Any, "*m 5"]  # steps tried, accepted, right-hand sides, projections, implicit steps
+    first_phase: Bool[Any, "*m C"]  # phase at the start
+    first_sides: Float[Any, "*m S"]  # sides at the start
 
 
 EVENT_STATES = ("event_time", "event_q", "event_v")
@@ -70,7 +72,8 @@ RECORD = (
 def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
     """Return the shapes of the fields of a run of T output times and n coordinates, with room for `room` events."""
     E, K, C, S = plan.count, room, len(plan.first), plan.side_count
-    return EventRun((T, n), (T, n), (), (K,), (K, 2, n), (K, 2, n), (K,), (K, C), (K,), (K, E), (K, S), (), (E,), (E,), (), (5,))
+    of_events = (K,), (K, 2, n), (K, 2, n), (K,), (K, C), (K,), (K, E), (K, S)
+    return EventRun((T, n), (T, n), (), *of_events, (), (E,), (E,), (), (5,), (C,), (S,))
 
 
 class MemberRuns(NamedTuple):
@@ -94,6 +97,8 @@ class MemberRuns(NamedTuple):
     count: Int[Any, "B"]  # number of events
     record: tuple[Any, ...]  # fields `RECORD` of `EventRun`, with one more row as a sink for entries without an event
     window: Any  # `Window` of the plain form; else None
+    first_phase: Bool[Any, "B C"]  # phase at the start
+    first_sides: Float[Any, "B S"]  # sides at the start
 
     def state(self, members: MemberIndices) -> RunState:
         """Return the states of members."""
@@ -154,6 +159,8 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
         count=xp.zeros(B, int),
         record=tuple(xp.full((B, *shapes[name]), value) for name, value in values.items()),
         window=window,
+        first_phase=state.phase,
+        first_sides=xp.zeros((B, plan.side_count)),
     )
 
 
@@ -161,5 +168,5 @@ def results(plan: EventPlan, runs: MemberRuns, ts: Float[Any, "B T"], unresolved
     """Return the results of finished runs; an output at the time of the last state is that state."""
     last, record = (ts == runs.t[:, None])[..., None], (x[:, : plan.room] for x in runs.record)
     q, v = xp.where(last, runs.q[:, None], runs.qs), xp.where(last, runs.v[:, None], runs.vs)
-    ends = runs.count, unresolved, runs.undefined, runs.code, runs.totals
+    ends = runs.count, unresolved, runs.undefined, runs.code, runs.totals, runs.first_phase, runs.first_sides
     return EventRun._make([q, v, runs.t, *record, *ends])

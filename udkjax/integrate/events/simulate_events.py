@@ -32,6 +32,7 @@ from udkjax.integrate.events.kinks import FREE, MOST_KINKS, renewed_sides, with_
 from udkjax.integrate.events.phases import SCENE, Phases, phases_of
 from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.events.runs import RECORD, EventRun
+from udkjax.integrate.events.sticking_joints import SIDES, with_sticking_joints
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation
@@ -157,7 +158,10 @@ def _expand_concrete(mechanism: Any, analysis: Analysis | None, has_none: bool, 
 
 def _expand(mechanism: Any, events: Sequence[ExpandsToEvents] | None, analysis: Analysis | None) -> Prepared:
     found = () if events is None else expand_events(events, mechanism)
-    phases, (smooth, held, kinks) = phases_of(mechanism, found, analysis), with_held_forces(mechanism)
+    scene = with_sticking_joints(mechanism, len(found))
+    found = (*found, *scene.events)
+    phases = phases_of(scene, found, analysis)
+    smooth, held, kinks = with_held_forces(scene.mechanism, SIDES * len(scene.joints))
     return ((*found, *kinks), phases.with_kinks(smooth, held, len(kinks))) if held else (found, phases)
 
 
@@ -211,7 +215,8 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
 
 def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
     """Return the sides of all comparisons at the start."""
-    free = jnp.full(sum(held.smooth.count for held in phases.held), FREE)
+    of_kinks = jnp.full(sum(held.smooth.count for held in phases.held), FREE)
+    free = jnp.concatenate([jnp.zeros(SIDES * len(phases.sticking)), of_kinks])
     at = problem.ts[0], problem.q, problem.v, free
     return stop_gradients(renewed_sides(phases.held, phases.mechanisms[SCENE]._forces, *at))
 

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.arrays import make_module, number
-from udkjax.scene.forces import Friction, Wrench
+from udkjax.scene.forces import Wrench
+from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 
@@ -41,29 +42,35 @@ def _switched(cls: type) -> Any:
     return Switched
 
 
-class SwitchedFriction(Friction):
-    """Friction that is off without its joint."""
+@cache
+def _switched_friction(cls: type) -> Any:
+    """Return the subclass of a class of friction that is off without its joint."""
 
-    active: Float[Array, ""] = eqx.field(default=1.0)
+    class SwitchedFriction(cls):
+        active: Float[Array, ""] = eqx.field(default=1.0)
 
-    def loads(self, t, *frames):
-        loads = super().loads(t, *frames)
-        return None if loads is None else [self._switched(load) for load in loads]
+        def loads(self, t, *frames):
+            loads = super().loads(t, *frames)
+            return None if loads is None else [self._switched(load) for load in loads]
 
-    def rubbing_loads(self, joint, multipliers, t, *frames):
-        return [self._switched(load) for load in super().rubbing_loads(joint, multipliers, t, *frames)]
+        def rubbing_loads(self, joint, multipliers, t, *frames):
+            return [self._switched(load) for load in super().rubbing_loads(joint, multipliers, t, *frames)]
 
-    def _switched(self, load: Wrench) -> Wrench:
-        x, y, torque = load
-        return self.active * x, self.active * y, self.active * torque
+        def _switched(self, load: Wrench) -> Wrench:
+            x, y, torque = load
+            return self.active * x, self.active * y, self.active * torque
+
+    return SwitchedFriction
 
 
 def with_switched_friction(forces: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return force elements, with friction of the joints `names` as `SwitchedFriction`."""
+    """Return force elements, with friction of the joints `names` switched on with them."""
     result = {}
     for name, force in forces.items():
         is_switched = isinstance(force, Friction) and force.joint in names
-        result[name] = make_module(SwitchedFriction, **vars(force), active=number(1.0)) if is_switched else force
+        result[name] = force
+        if is_switched:
+            result[name] = make_module(_switched_friction(type(force)), **vars(force), active=number(1.0))
     return result
 
 
@@ -79,7 +86,9 @@ def switch(mechanism: Mechanism, names: Sequence[str], active: Sequence[Any]) ->
 
 def _switched_elements(mechanism: Mechanism, names: Sequence[str]) -> list[tuple[str, Any]]:
     constraints, forces = mechanism.constraints, mechanism._forces
-    return [(name, constraints[name]) for name in names] + [(f.joint, f) for f in forces if isinstance(f, SwitchedFriction)]
+    return [(name, constraints[name]) for name in names] + [
+        (f.joint, f) for f in forces if isinstance(f, Friction) and hasattr(f, "active")
+    ]
 
 
 def places_of_switches(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[int, int], ...]:

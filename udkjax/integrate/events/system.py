@@ -4,11 +4,14 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udkjax.integrate.events.crossings import ConditionValues
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import Contacts
-from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState
+from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
+from udkjax.transforms.gradients import stop_gradients
 
 
 class StateValues(NamedTuple):
@@ -23,6 +26,7 @@ class StateValues(NamedTuple):
     by_v: Float[Any, "*m E n"]
     directions: Float[Any, "*m E n"]  # directions of impulses; arbitrary for events that are not impacts
     mobilities: Float[Any, "*m E n"]  # of a system, M^(-1) g_q: the directions without constraints
+    forces: Float[Any, "*m E"]  # forces of contacts, and reserves of joints that stick; arbitrary for others
 
 
 class System(Protocol):
@@ -48,16 +52,19 @@ class System(Protocol):
         """Return the contacts of members."""
         ...
 
-    def look(self, members: MemberIndices, at: RunState, is_free: bool = False) -> StateValues:
-        """Evaluate the conditions of members at states; if `is_free`, the phases have no contacts at rest."""
+    def look(self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
+        """Evaluate the conditions of members at states; if `is_free`, no contact is at rest, and no joint sticks.
+
+        Directions of impulses are evaluated if `is_free` or `is_directed`.
+        """
         ...
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:
         """Return the states projected to the constraints of their phases."""
         ...
 
-    def add_joints(self, members: MemberIndices, event: Int[Any, "b"], q: Float[Any, "b n"], joints: Any) -> Any:
-        """Return the joints that events have added, with those that `event` adds at q; -1: no event."""
+    def add_joints(self, members: MemberIndices, new: Bool[Any, "b A"], q: Float[Any, "b n"], joints: Any) -> Any:
+        """Return the joints that events have added, with new ones, added at q."""
         ...
 
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
@@ -83,3 +90,17 @@ class System(Protocol):
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
         """Return the runs after changing them until none is running."""
         ...
+
+
+def condition_values(
+    system: System, members: MemberIndices, state: RunState, is_directed: bool = False
+) -> tuple[ConditionValues, StateValues]:
+    """Return the conditions of members at their states, and all quantities evaluated in these states."""
+    xp, state_values, unit = system.xp, system.look(members, state, is_directed=is_directed), take(system.coordinates, members)
+    rate, t = take(system.rate, members)[:, None], state.t[:, None]
+    by_q = xp.abs(state_values.by_q) * xp.maximum(unit, xp.abs(state.q))[:, None]
+    by_v = xp.abs(state_values.by_v) * xp.maximum(unit * rate, xp.abs(state.v))[:, None]
+    scale = xp.maximum(xp.maximum(by_q, by_v).max(2), xp.abs(state_values.by_t) * xp.maximum(1 / rate, xp.abs(t)))
+    scale = xp.where(xp.isfinite(scale), scale, 0.0)  # a condition that is NaN has no scale
+    scale = scale if xp is np else stop_gradients(scale)
+    return ConditionValues(state_values.g, state_values.rate, state_values.rate_2, state_values.a, scale), state_values

@@ -96,12 +96,12 @@ WANTED, UNDER_WAY = 1, 2  # states of a landing: a step from the point before th
 ACROSS_BREAK = 8 * UNIT  # longest time, in smallest steps, from the last state before a breakpoint to the first one after it
 SHORTEST_SPAN = 100  # shortest span, in smallest steps, that is refined
 VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is unresolved, or NaN
-FORCE_STEP = 1e-7  # time difference, in T, for the rate of a contact force
+FORCE_STEP = 1e-7  # time difference, in T, for the rate of a force
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions g(t, q, v), and contact forces, that a run watches; compared by `key` and `rows`.
+    """Conditions g(t, q, v), and forces of constraints, that a run watches; compared by `key` and `force_key`.
 
     Attributes:
         key: texts of the programs.
@@ -109,7 +109,9 @@ class Conditions:
         at_state: g, rates, second rates, and the derivatives of all g with respect to t, q and v, from the same inputs.
         number_count: number of numbers of the conditions.
         by_velocity: mask of the conditions that depend on velocities; they have no second rates.
-        rows: rows of Psi whose multipliers, with opposite sign, are watched after the conditions.
+        forces: functions of the multipliers of all rows of Psi, watched after the conditions: the forces of contacts, and how far
+            the forces of sticking joints are from their limits; from the numbers of the conditions and lambda. None: no forces.
+        force_key: text of that program.
     """
 
     key: Hashable
@@ -117,7 +119,8 @@ class Conditions:
     at_state: ScalarProgram = field(compare=False)
     number_count: int = field(compare=False)
     by_velocity: tuple[bool, ...] = field(compare=False)
-    rows: tuple[int, ...] = ()
+    forces: ScalarProgram | None = field(compare=False, default=None)
+    force_key: Hashable = ""
 
     # Number of values of the end of a run before the sides: the event, or -1; the time; the largest violation at a node.
     head: ClassVar[int] = 3
@@ -128,9 +131,14 @@ class Conditions:
         return len(self.program.outputs) // 2
 
     @property
+    def force_count(self) -> int:
+        """The number of watched forces."""
+        return 0 if self.forces is None else len(self.forces.outputs)
+
+    @property
     def count(self) -> int:
-        """The number of watched conditions and contact forces."""
-        return self.own_count + len(self.rows)
+        """The number of watched conditions and forces."""
+        return self.own_count + self.force_count
 
     def output_count(self, n: int) -> int:
         """Return the number of values that a run with n coordinates returns about its end."""

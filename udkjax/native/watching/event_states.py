@@ -5,11 +5,12 @@ For a state (t, q, v) it returns, concatenated:
     a                        the accelerations (n,)
     g, g_dot, g_ddot         conditions with first and second rates along the motion (E,) each
     g_t, g_q, g_v            their derivatives (E,), (E, n), (E, n)
-    d                        directions of impulses along g_q, only of impacts, (impacts, n)
-    M^(-1) g_q               the same without constraints, only where M is a function of the state, (impacts, n)
+    d                        directions of impulses along g_q, of some conditions, (directed, n)
+    M^(-1) g_q               the same without constraints, only where M is a function of the state, (directed, n)
+    f                        forces of constraints (F,)
 
 A direction d = P M^(-1) g_q^T is the change of velocity by a unit impulse along g_q, with P the projector on the tangent space,
-so that W_ij = g_q,i d_j.
+so that W_ij = g_q,i d_j. For conditions that depend on velocities, g_v takes the place of g_q.
 """
 
 from udkjax.native.base.ir import Function, Value
@@ -17,6 +18,7 @@ from udkjax.native.base.layout import Lane
 from udkjax.native.base.program import write
 from udkjax.native.run.state_functions import StateAccelerations, StateTangentPart
 from udkjax.native.watching.conditions import Conditions
+from udkjax.native.watching.watched_forces import write_forces
 
 
 class EventStates(StateTangentPart, StateAccelerations):
@@ -29,20 +31,30 @@ class EventStates(StateTangentPart, StateAccelerations):
     found = ()
 
     def __init__(
-        self, code, conditions: Conditions, impacts: tuple[int, ...], pseudoinverse, formulation, width: int, vector: int
+        self, code, conditions: Conditions, directed: tuple[int, ...], pseudoinverse, formulation, width: int, vector: int
     ):
-        self.conditions, self.impacts = conditions, impacts
+        self.conditions, self.directed = conditions, directed
         super().__init__(code, pseudoinverse, formulation, width, vector)
         self.places.add("event numbers", conditions.number_count)
         self.places.add("event values", len(conditions.at_state.outputs))
         self.places.add("inverse mass", self.n)
-        self.places.add("directions", len(impacts) * self.n)
-        self.places.add("mobilities", len(impacts) * self.n if code.has_mobility else 0)
+        self.places.add("directions", len(directed) * self.n)
+        self.places.add("mobilities", len(directed) * self.n if code.has_mobility else 0)
+        if conditions.forces is not None:
+            self.places.add("multipliers", self.m)
+        self.places.add("forces", conditions.force_count)
 
     @property
     def solving(self) -> list[str]:
-        of_impacts = ["tangent_part", *(["mobility"] if self.plan.code.has_mobility else [])]
-        return ["accelerations", *(of_impacts if self.impacts else [])]
+        of_directions = ["tangent_part", *(["mobility"] if self.plan.code.has_mobility else [])]
+        return ["accelerations", *(of_directions if self.directed else [])]
+
+    def program_names(self) -> list[str]:
+        return [*super().program_names(), *(["multipliers"] if self.conditions.forces else [])]
+
+    @property
+    def arrays(self):
+        return super().arrays | ({"multipliers": ("work", self.places["multipliers"])} if self.conditions.forces else {})
 
     def begin_member(self, f: Function, lane: Value, member: Value):
         given = self.member_address(f, "event_numbers", member)
@@ -62,14 +74,20 @@ class EventStates(StateTangentPart, StateAccelerations):
         inputs += [("work", p["event numbers"] + i) for i in range(self.conditions.number_count)]
         outputs = [("work", p["event values"] + k) for k in range(len(program.outputs))]
         self.functions.append(write(program, "conditions", self.plan.width, ("work",), inputs, outputs))
+        if self.conditions.forces is not None:
+            self.functions.append(write_forces(self.conditions, self, "event numbers"))
 
     def _evaluate(self, f: Function, s: Lane):
         StateAccelerations._evaluate(self, f, s)
         f.call("conditions", f.given["work"])
+        if self.conditions.forces is not None:
+            self.invoke(f, "multipliers")
+            f.call("own_forces", f.given["work"])
         count = self.conditions.own_count
-        for k, event in enumerate(self.impacts):
+        for k, event in enumerate(self.directed):
+            start = 4 * count + (event + (count if self.conditions.by_velocity[event] else 0)) * self.n
             with f.each(self.n) as i:
-                normal = self.entry(f, "event values", i + (4 * count + event * self.n))
+                normal = self.entry(f, "event values", i + start)
                 self.put_entry(f, "state dv", i, normal * self.entry(f, "inverse mass", i))
                 self.put_entry(f, "state dq", i, 0.0)
             if self.plan.code.has_mobility:
@@ -85,8 +103,9 @@ class EventStates(StateTangentPart, StateAccelerations):
         counts = {
             "result a": self.n,
             "event values": len(self.conditions.at_state.outputs),
-            "directions": len(self.impacts) * self.n,
-            "mobilities": len(self.impacts) * self.n if self.plan.code.has_mobility else 0,
+            "directions": len(self.directed) * self.n,
+            "mobilities": len(self.directed) * self.n if self.plan.code.has_mobility else 0,
+            "forces": self.conditions.force_count,
         }
         with self.each_lane(f, s.active) as k:
             to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))

@@ -48,8 +48,9 @@ class WatchMemory(Trajectory):
             self.places.add(f"condition {name}", conditions.count)
         for name in ("hit1", "hit2"):
             self.places.add(f"condition {name}", conditions.count)
-        if conditions.rows:
+        if conditions.forces is not None:
             self.places.add("multipliers", self.m)
+        self.places.add("forces", conditions.force_count)
         for name in ("force q", "sure q", "sure v", "middle q", "middle v", "node a", "before q", "before v", "before a"):
             self.places.add(name, self.n)
 

@@ -19,6 +19,7 @@ from udkjax.native.watching.condition_intervals import write_classification
 from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, MIDDLE, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate
 from udkjax.native.watching.watch_memory import WatchMemory
+from udkjax.native.watching.watched_forces import write_forces
 
 
 class Watching(WatchMemory):
@@ -52,11 +53,11 @@ class Watching(WatchMemory):
         s.where(begins, fresh=s.t1)
 
     def program_names(self) -> list[str]:
-        return [*super().program_names(), *(["multipliers"] if self.conditions.rows else [])]
+        return [*super().program_names(), *(["multipliers"] if self.conditions.forces else [])]
 
     @property
     def arrays(self):
-        return super().arrays | ({"multipliers": ("work", self.places["multipliers"])} if self.conditions.rows else {})
+        return super().arrays | ({"multipliers": ("work", self.places["multipliers"])} if self.conditions.forces else {})
 
     def _write_conditions(self):
         """Write `conditions(work)`: the conditions and their rates, at `state t`, `state q`, `result v` and `node a`."""
@@ -67,22 +68,25 @@ class Watching(WatchMemory):
         inputs += [("work", p["condition numbers"] + i) for i in range(conditions.number_count)]
         outputs = [("work", p[f"condition {name}"] + c) for name in ("g", "rate") for c in range(conditions.own_count)]
         self.functions.append(write(conditions.program, "own_conditions", self.plan.width, ("work",), inputs, outputs))
+        if conditions.forces is not None:
+            self.functions.append(write_forces(conditions, self))
         f, s = self.function("conditions")
         f.call("own_conditions", f.given["work"])
-        if conditions.rows:
+        if conditions.forces is not None:
             self._write_forces(f, s)
 
     def _write_forces(self, f: Function, s: Lane):
-        """Write the forces of contacts at rest, NaN if a pivot is too small, and their rates by differences."""
+        """Write the forces of constraints, NaN if a pivot is too small, and their rates by differences."""
         self.copy(f, "state q", "force q")
         self.copy(f, "result v", "state v")
         step, before = f.const(FORCE_STEP, DOUBLE, f.width) / s.omega, getattr(s, "state t")
         ahead, nan = self.broadcast(f, step), f.const(float("nan"), DOUBLE, f.width)
         for name in ("g", "rate"):
             self.invoke(f, "multipliers")
-            for k, row in enumerate(self.conditions.rows):
-                place, c = f.like(row, INT, 1) + self.places["multipliers"], f.like(self.conditions.own_count + k, INT, 1)
-                force = f.select(s.safe > 0.5, -f.load(f.given["work"], place * f.width, f.width), nan)
+            f.call("own_forces", f.given["work"])
+            for k in range(self.conditions.force_count):
+                place, c = f.like(k, INT, 1) + self.places["forces"], f.like(self.conditions.own_count + k, INT, 1)
+                force = f.select(s.safe > 0.5, f.load(f.given["work"], place * f.width, f.width), nan)
                 self.put_condition(f, name, c, force if name == "g" else (force - self.condition(f, "g", c)) / step)
             if name == "g":
                 setattr(s, "state t", before + step)

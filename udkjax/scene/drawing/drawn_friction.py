@@ -1,11 +1,13 @@
 """Friction of a drawing, in its pins, slides and slots."""
 
+from typing import Literal
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, pair_mistakes
-from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, POSITIVE, SLIDE, SLOT, given_names, given_number, given_or_none
-from udkjax.scene.forces import SLIDING_SPEED, Friction
+from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, POSITIVE, SLIDE, SLOT, given_names, given_or_none
+from udkjax.scene.friction import SLIDING_SPEED, Friction
 from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.schema import table_of
 from udkjax.wording import quote
@@ -28,9 +30,14 @@ class PinFriction(DrawnElement):
     coefficient: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
     radius: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m
     static_coefficient: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)
-    speed: Float[Array, ""] = eqx.field(converter=given_number, default=SLIDING_SPEED, metadata=POSITIVE)  # m/s
+    speed: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m/s
     viscous: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=NOT_NEGATIVE)  # s/m
     length: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # m
+    law: Literal["smooth", "set-valued"] = eqx.field(static=True, default="smooth")
+
+    def __post_init__(self):
+        if self.speed is None and self.law == "smooth":
+            self.speed = given_or_none(SLIDING_SPEED)
 
     @property
     def measured_as(self):

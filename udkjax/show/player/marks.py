@@ -16,7 +16,8 @@ from udkjax.annotations import JsonObject
 from udkjax.integrate.events.conditions import Gap
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver
-from udkjax.scene.forces import Force, ForceElement, Friction, Spring, Torque, TorsionSpring
+from udkjax.scene.forces import Force, ForceElement, Spring, Torque, TorsionSpring
+from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
 from udkjax.scene.joints import (
     Cam,

@@ -1,0 +1,22 @@
+"""The program of the forces that a run watches (`Conditions.forces`), for modules with multipliers in their memory."""
+
+from udkjax.native.base.ir import Function
+from udkjax.native.base.program import write
+from udkjax.native.run.trajectory import Trajectory
+from udkjax.native.watching.conditions import Conditions
+
+
+def write_forces(conditions: Conditions, module: Trajectory, numbers: str = "condition numbers") -> Function:
+    """Return `own_forces(work)`, which computes the array `forces` from `multipliers` and `numbers`.
+
+    Args:
+        conditions: the conditions, with forces.
+        module: the module, whose memory has these arrays.
+        numbers: the array of the numbers of the conditions.
+    """
+    assert conditions.forces is not None  # checked by the caller
+    p = module.places
+    inputs = [("work", p[numbers] + i) for i in range(conditions.number_count)]
+    inputs += [("work", p["multipliers"] + i) for i in range(module.m)]
+    outputs = [("work", p["forces"] + k) for k in range(conditions.force_count)]
+    return write(conditions.forces, "own_forces", module.plan.width, ("work",), inputs, outputs)
