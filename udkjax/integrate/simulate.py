@@ -47,7 +47,7 @@ from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError, require_output_times
 from udkjax.scene.arguments import checked
-from udkjax.scene.friction import Friction
+from udkjax.scene.friction import may_stick
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     import diffrax
 
 MAX_STEPS = 100_000  # default; at a few microseconds per step, a small scene that gets stuck ends within a second
-MAX_EVENTS = 64  # default; also the length of the arrays of events
+MAX_EVENTS, MAX_EVENTS_STICKING = 64, 256  # defaults, without and with joints that stick; also the length of the arrays of events
 
 
 @checked
@@ -78,7 +78,7 @@ def simulate(
     analysis: Analysis | None = None,
     engine: Literal["auto", "native", "diffrax", "jax"] = "auto",
     events: Any = None,
-    max_events: int = MAX_EVENTS,
+    max_events: int | None = None,
     stepsize_controller: "diffrax.AbstractStepSizeController | None" = None,
 ) -> Solution:
     """Integrate the equations of motion q'' = a(t, q, q') of a mechanism; return its states at output times.
@@ -131,7 +131,7 @@ def simulate(
             with only `Log` and `Stop` they also have second derivatives. Jumps and kinks of user-defined forces (`where`, `max`,
             `abs`, `floor` of the state) are located in the same way, without being listed; `Solution.unlocated` is the time from
             which they are not located.
-        max_events: the largest number of events.
+        max_events: the largest number of events; by default 64, and 256 with friction by which joints stick.
         stepsize_controller: a step size controller of diffrax, for constant steps `diffrax.ConstantStepSize()` with `dt0`; by
             default a controller of every coordinate and velocity, by rtol and atol.
 
@@ -199,7 +199,8 @@ def simulate(
         if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
-    is_located, located = events is not None or _sticks(mechanism), None
+    sticks = isinstance(mechanism, Mechanism) and may_stick(mechanism._forces)
+    is_located, located = events is not None or sticks, None
     if isinstance(mechanism, Mechanism) and _may_have_kinks(mechanism):
         from udkjax.integrate.events.kinks import kinks_of
 
@@ -216,12 +217,13 @@ def simulate(
             raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
-        solution = simulate_events(system, events, analysis, ts, state, closure, choices, max_events)
+        most = (MAX_EVENTS_STICKING if sticks else MAX_EVENTS) if max_events is None else max_events
+        solution = simulate_events(system, events, analysis, ts, state, closure, choices, most)
         if not _has_failed(solution.code) or not is_concrete or int(solution.stats.get("events", 0)):
             return _required(solution, throw)  # events may have changed what moved
         if not isinstance(mechanism, Mechanism):
             return _required(solution, throw)
-        if events is not None or _sticks(mechanism):
+        if events is not None or sticks:
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
         located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
 
@@ -245,11 +247,6 @@ def _releases(events: Any) -> bool:
     """Return whether an event removes a constraint."""
     listed = () if events is None else events if isinstance(events, Sequence) else (events,)
     return any(getattr(getattr(event, "action", None), "removed", None) for event in listed)
-
-
-def _sticks(mechanism: Any) -> bool:
-    """Return whether a joint has set-valued friction."""
-    return isinstance(mechanism, Mechanism) and any(isinstance(f, Friction) and f.sticks for f in mechanism.forces.values())
 
 
 @cached_by_identity

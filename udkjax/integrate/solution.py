@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import Numbers
 from udkjax.arrays import number
@@ -73,7 +73,7 @@ CAUSES = {
     Result.event_limit: "there were more events than `max_events`: raise it, or look for what makes them follow so closely",
     Result.beyond_contact: "the run starts beyond a contact or limit, where its condition is negative already",
     Result.event_impossible: "an event asks for what the constraints do not allow: an impact in a direction in which they leave "
-    "no motion, or a joint attached where it is open",
+    "no motion, a joint attached where it is open, or joints that neither stick nor slide, as their friction jams them",
     Result.invalid_argument: "an argument of this run cannot be used: output times that do not increase, a state that is not "
     "finite, a tolerance or first step that is not positive, or a number of the scene or of an event that cannot be: one that is "
     "not finite, a mass that is not positive, knots that do not increase, a lower limit above the upper one",
@@ -121,6 +121,7 @@ class Solution(PrintsTable):
         bodies: the names of the bodies, in the order of q and v.
         unlocated: time (s) from which jumps and kinks of forces are not located, so that derivatives do not pass through them;
             infinite if all are located, None if there are none.
+        sticking: for each joint with set-valued friction, whether it sticks at the output times; None without any.
     """
 
     ts: Float[Array, "T"]
@@ -135,6 +136,7 @@ class Solution(PrintsTable):
     choices: tuple[tuple[str, str], ...] = eqx.field(static=True)  # `settings`, hashable
     events: "Events | None" = None  # `Events` of a run with events
     unlocated: Float[Array, ""] | None = None
+    sticking: dict[str, Bool[Array, "T"]] | None = None
     found_cause: Any = eqx.field(static=True, default=None, repr=False)  # `FoundCause` of a single run that failed
 
     @property

@@ -1,6 +1,6 @@
 """Friction in joints: smooth, or set-valued, so that joints stick."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -190,3 +190,8 @@ class Friction(ForceElement):
             if self.static_coefficient is not None:
                 total = total + (self.static_coefficient - self.coefficient) * x / (x * x / 4 + 0.75) ** 2
         return total if self.viscous is None else total + self.viscous * speed
+
+
+def may_stick(forces: Iterable[ForceElement]) -> bool:
+    """Return whether one of some force elements is friction with the set-valued law."""
+    return any(isinstance(force, Friction) and force.sticks for force in forces)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from udkjax.arrays import is_traced, is_within_jit, number, put_arrays
 from udkjax.devices import computing_on_host, on_host
@@ -28,10 +28,11 @@ from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand
 from udkjax.integrate.events.event_plan import event_plan
 from udkjax.integrate.events.host_run import HostRun, concrete_plan, event_arrays
 from udkjax.integrate.events.hybrid import Hybrid
-from udkjax.integrate.events.kinks import FREE, MOST_KINKS, renewed_sides, with_held_forces
+from udkjax.integrate.events.kinks import FREE, renewed_sides, with_held_forces
+from udkjax.integrate.events.listing import Listing, listing, names_of_events
 from udkjax.integrate.events.phases import SCENE, Phases, phases_of
 from udkjax.integrate.events.replay import run_events
-from udkjax.integrate.events.runs import RECORD, EventRun
+from udkjax.integrate.events.runs import EventRun
 from udkjax.integrate.events.sticking_joints import SIDES, with_sticking_joints
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.problem import Problem
@@ -46,13 +47,6 @@ from udkjax.transforms.gradients import stop_gradients
 from udkjax.wording import quote
 
 UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-9 T; crossings may be missed: {}"
-
-
-class Kinks(NamedTuple):
-    """The kinks of the forces in a run."""
-
-    count: Int[Array, ""]
-    unlocated: Float[Array, ""]  # the time from which they are not located (s); else infinite
 
 
 class Given(NamedTuple):
@@ -108,15 +102,16 @@ def simulate_events(
         found = (_run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run)(given)
     found, reasons = found
     names = tuple(e.name for e in listed if e.action.turn is None)
+    seen = given.ts, listed, phases, max_events
     if is_within_jit() or is_traced(given):
         solution = _solution if is_within_jit() else _compiled_solution
-        return solution(mechanism, names, given, *_without_kinks(found, names, given, jnp), reasons, None)
+        return solution(mechanism, given, listing(found, *seen, jnp), reasons, None)
     found = jax.tree.map(np.asarray, found)  # JAX would compile a program for each operation
     if np.isfinite(found.unresolved[: len(names)]).any():
         fast = [f"{quote(name)} from {t:.6g} s on" for name, t in zip(names, found.unresolved) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
-    found, kinks = _without_kinks(found, names, given, np)
-    return put_arrays(_solution(mechanism, names, given, found, kinks, reasons, int(found.count)))
+    found = listing(found, *seen, np)
+    return put_arrays(_solution(mechanism, given, found, reasons, int(found.run.count)))
 
 
 def _run_at_once(mechanism: Any, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
@@ -224,16 +219,9 @@ def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
 _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
 
 
-def _solution(
-    mechanism: Any,
-    names: tuple[str, ...],
-    given: Given,
-    found: EventRun,
-    kinks: Kinks | None,
-    reasons: tuple[str, ...],
-    count: int | None,
-) -> Solution:
+def _solution(mechanism: Any, given: Given, listed: Listing, reasons: tuple[str, ...], count: int | None) -> Solution:
     """Return the solution with `count` events, or, for a traced count (None), padded to `max_events`."""
+    (found, kinks, sticking), names = listed, names_of_events(given.events, given.phases)
     xp: Any = jnp if count is None else np
     names_of_bodies, choices = bodies_of(mechanism), given.choices
     bodies = (-1, coordinate_count(mechanism)) if names_of_bodies is None else (-1, len(names_of_bodies), 3)
@@ -255,7 +243,7 @@ def _solution(
         count=found.count,
         unresolved=found.unresolved,
         undefined=found.undefined,
-        names=(*names, *(f"{name} lets go" for name in names), *(f"{name} rests" for name in names)),
+        names=names,
     )
     stats = {
         "steps": found.totals[0],
@@ -286,26 +274,8 @@ def _solution(
         choices=tuple(settings.items()),
         events=listing if names else None,
         unlocated=None if kinks is None else kinks.unlocated,
+        sticking=sticking,
     )
 
 
 _compiled_solution = deferred(_solution)
-
-
-def _without_kinks(found: EventRun, names: tuple[str, ...], given: Given, xp: Any) -> tuple[EventRun, Kinks | None]:
-    """Return a run with the events of the user alone, and its kinks; None without any."""
-    E, own = len(given.events), len(names)
-    if own == E:
-        return found, None
-    k = xp.arange(len(found.event_index))
-    is_event = k < found.count
-    is_kink = is_event & (found.event_index % E >= own)
-    order = xp.argsort(xp.where(is_event & ~is_kink, k, len(k)), stable=True)[: given.max_events]
-    index = found.event_index // E * own + found.event_index % E
-    per_event = {name: getattr(found, name)[order] for name in RECORD} | {"event_index": index[order]}
-    count, last = xp.sum(is_kink), found.unresolved[own:].min()
-    full = xp.where(count >= MOST_KINKS, xp.max(xp.where(is_kink, found.event_time, -xp.inf)), xp.inf)
-    run = found._replace(
-        **per_event, count=found.count - count, unresolved=found.unresolved[:own], undefined=found.undefined[:own]
-    )
-    return run, Kinks(count, xp.minimum(last, full))

@@ -18,7 +18,7 @@ from udkjax.integrate.events.actions import Action, Displacement
 from udkjax.integrate.events.conditions import BodyCondition, Frames
 from udkjax.integrate.events.event import Event
 from udkjax.scene.fields import given_number
-from udkjax.scene.friction import Friction
+from udkjax.scene.friction import Friction, may_stick
 from udkjax.scene.joints import Angle, Joint, Revolute
 from udkjax.scene.mechanism import Mechanism
 
@@ -113,7 +113,7 @@ def with_sticking_joints(mechanism: Any, first_event: int) -> Sticking:
         mechanism: The scene.
         first_event: The number of other events, which come first.
     """
-    if not isinstance(mechanism, Mechanism) or not any(isinstance(f, Friction) and f.sticks for f in mechanism._forces):
+    if not isinstance(mechanism, Mechanism) or not may_stick(mechanism._forces):
         return Sticking(mechanism, (), ())
     mechanism = mechanism.without_origin
     forces, joints, events = list(mechanism._forces), [], []
