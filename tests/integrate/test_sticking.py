@@ -142,7 +142,7 @@ def test_belt_makes_a_limit_cycle():
     starts = last / v + (slip + stick) * np.arange(15)
     solution = udk.simulate(belt(static, sliding, k, m, v), [0.0, *starts], **TOL)
     np.testing.assert_allclose(solution.q[1:, 1, 0], last, atol=1e-10)
-    np.testing.assert_allclose(solution.events.of("S slips"), starts, atol=1e-10)
+    np.testing.assert_allclose(solution.events.of("S slips"), starts[:-1], atol=1e-10)
     np.testing.assert_allclose(solution.events.of("S sticks"), starts[:-1] + slip, atol=1e-10)
 
 

@@ -170,7 +170,7 @@ class Hybrid(eqx.Module):
         sides = at.joints[-1] * factor + shift
         return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[SCENE]._forces, at.t, at.q, at.v, sides))
 
-    def values(self, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
+    def values(self, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False) -> StateValues:
         """Return conditions and their derivatives in a state; see `System.look`."""
         t, q, v, _, added = at
         conditions = self.conditions(added)
@@ -190,7 +190,7 @@ class Hybrid(eqx.Module):
         g, rate = rate_along(conditions, t, q, v, a)
         rates = lambda t, q, v: self.conditions_and_rates(added)(t, q, v)[1]  # noqa: E731
         rate_2 = jnp.where(np.array(self.plan.by_velocity), 0.0, rate_along(rates, t, q, v, a)[1])
-        forces = self.forces(at) if self.plan.sticking and not is_free else jnp.ones(self.count)
+        forces = self.forces(at) if has_forces else jnp.ones(self.count)
         return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions, mobilities, forces)
 
     def second_rates(self, at: RunState) -> tuple[Float[Array, "n"], Float[Array, "E"]]:

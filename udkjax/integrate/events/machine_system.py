@@ -95,7 +95,9 @@ class MachineSystem:
         numbers = take(self._restitution, members), take(self.rate, members)
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, *numbers)
 
-    def look(self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
+    def look(
+        self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
+    ) -> StateValues:
         """Evaluate the conditions of members at states."""
         return StateValues(*self._by_phase(members, at, PhaseCode.at))
 
@@ -213,6 +215,15 @@ class MachineSystem:
         if b.size:
             places = members[b], output[b, k]
             runs.qs[places], runs.vs[places] = stretch.q[b, k + 1], stretch.v[b, k + 1]
+        # Outputs between the last step and a crossing, whose time was corrected after the step.
+        b, k = np.nonzero((~rows & (times < stretch.t[:, None]) & (status == Status.CROSSED)[:, None])[:, 1:-1])
+        if b.size:
+            n, last = runs.q.shape[1], stretch.info[b]
+            span = stretch.t[b] - last[:, TIME]
+            share = np.where(span > 0, (times[b, k + 1] - stretch.t[b]) / np.where(span > 0, span, 1.0), 0.0)[:, None]
+            places = members[b], output[b, k]
+            runs.qs[places] = stretch.q_end[b] + share * (stretch.q_end[b] - last[:, INFO : INFO + n])
+            runs.vs[places] = stretch.v_end[b] + share * (stretch.v_end[b] - last[:, INFO + n :])
         runs.totals[members, :3] += counts
         runs.totals[members, 4] += stretch.info[:, IMPLICIT].astype(int)
         if self._is_projected[which]:

@@ -83,9 +83,11 @@ class PlainSystem:
         e = [jnp.asarray(e.action.rebound, float) for e in self.hybrid.events]
         return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, jnp.stack(e)[None], self.rate)
 
-    def look(self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
+    def look(
+        self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
+    ) -> StateValues:
         """Evaluate a state."""
-        return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free, is_directed))
+        return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free, is_directed, has_forces))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
         """Return positions and velocities that the phase of a state allows."""

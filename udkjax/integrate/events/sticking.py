@@ -156,7 +156,7 @@ def _decide(
     def step(pivot: _Pivot) -> _Pivot:
         modes = _modes(candidates, pivot, xp)
         trial = with_modes(system, members, at, modes)
-        found = system.look(members, trial)
+        found = system.look(members, trial, has_forces=True)
         a = found.rate[..., forwards]
         reserves = [found.forces[..., forwards + k] for k in (0, 1)]
         floor = STILL * xp.maximum(xp.abs(reserves[0]), xp.abs(reserves[1]))
@@ -201,7 +201,7 @@ def _guess(
     def improve(share: Any) -> Any:
         """Return the forces as shares of the limits, from those before."""
         trial = with_modes(system, members, at, Modes(none, xp.where(known.rest, share, known.sliding), known.rest))
-        found = system.look(members, trial)
+        found = system.look(members, trial, has_forces=True)
         a, limit = found.rate[..., plan.forwards] / size, size * found.forces[..., plan.forwards]
         force = share * limit
         for _ in range(SWEEPS):

@@ -52,10 +52,12 @@ class System(Protocol):
         """Return the contacts of members."""
         ...
 
-    def look(self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False) -> StateValues:
+    def look(
+        self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
+    ) -> StateValues:
         """Evaluate the conditions of members at states; if `is_free`, no contact is at rest, and no joint sticks.
 
-        Directions of impulses are evaluated if `is_free` or `is_directed`.
+        Directions of impulses are evaluated if `is_free` or `is_directed`, forces if `has_forces`.
         """
         ...
 
