@@ -47,7 +47,7 @@ from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError, require_output_times
 from udkjax.scene.arguments import checked
-from udkjax.scene.friction import may_stick
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -199,7 +199,7 @@ def simulate(
         if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
-    sticks = isinstance(mechanism, Mechanism) and may_stick(mechanism._forces)
+    sticks = isinstance(mechanism, Mechanism) and Friction.may_stick(mechanism._forces)
     is_located, located = events is not None or sticks, None
     if isinstance(mechanism, Mechanism) and _may_have_kinks(mechanism):
         from udkjax.integrate.events.kinks import kinks_of

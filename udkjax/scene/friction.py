@@ -80,6 +80,11 @@ class Friction(ForceElement):
         return self.law == "set-valued"
 
     @staticmethod
+    def may_stick(forces: Iterable[ForceElement]) -> bool:
+        """Return whether one of some force elements is friction with the set-valued law."""
+        return any(isinstance(force, Friction) and force.sticks for force in forces)
+
+    @staticmethod
     def mistakes(given: Mapping[str, object], joint: type | None) -> Iterator[str]:
         """Iterate over the numbers that are missing or do not fit, each as "name: what is wrong".
 
@@ -190,8 +195,3 @@ class Friction(ForceElement):
             if self.static_coefficient is not None:
                 total = total + (self.static_coefficient - self.coefficient) * x / (x * x / 4 + 0.75) ** 2
         return total if self.viscous is None else total + self.viscous * speed
-
-
-def may_stick(forces: Iterable[ForceElement]) -> bool:
-    """Return whether one of some force elements is friction with the set-valued law."""
-    return any(isinstance(force, Friction) and force.sticks for force in forces)

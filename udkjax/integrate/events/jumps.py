@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from udkjax.integrate.events.crossings import NO_EVENT, ConditionValues
 from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions, rows_of_system
 from udkjax.integrate.events.runs import MemberIndices, RunState, take
-from udkjax.integrate.events.sticking import Modes, settle_friction
+from udkjax.integrate.events.sticking import FrictionModes, settle_friction
 from udkjax.integrate.events.system import StateValues, System
 from udkjax.transforms.gradients import stop_gradients
 
@@ -33,7 +33,7 @@ def apply_event(
     values: ConditionValues,
     state_values: StateValues,
     closed: Int[Any, "b E"] | None = None,
-    modes: Modes | None = None,
+    modes: FrictionModes | None = None,
 ) -> JumpResult:
     """Apply the action of event k of each member, or, if k >= E, release the contact of event k - E.
 

@@ -23,7 +23,7 @@ from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import HeldElement
-from udkjax.integrate.events.sticking_joints import Sticking, StickingJoint
+from udkjax.integrate.events.sticking_joints import StickingJoint, lock_of
 from udkjax.integrate.events.switched import switch, switched, with_switched_friction
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.joints import Constraint, Joint
@@ -120,17 +120,20 @@ class _Switch(NamedTuple):
     locks: str = ""  # the joint that it locks
 
 
-def phases_of(scene: Sticking, events: Sequence[Event], analysis: Analysis | None) -> Phases:
+def phases_of(
+    mechanism: Any, events: Sequence[Event], analysis: Analysis | None, sticking: tuple[StickingJoint, ...] = ()
+) -> Phases:
     """Return the phases of a mechanism, or of a system, with events. A system has one phase."""
-    mechanism, E = scene.mechanism, len(events)
-    switches = _switches(scene, events) if isinstance(mechanism, Mechanism) else []
+    E = len(events)
+    switches = _switches(mechanism, events, sticking) if isinstance(mechanism, Mechanism) else []
     if not switches:
         none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E, joint_rows=((),) * E)
         return Phases((mechanism.without_origin,), (analysis,), (), (), none)
     assert isinstance(mechanism, Mechanism)
     assert analysis is not None  # a mechanism has one
     whole = _with(mechanism, switches)
-    adds_any = any(x.public and x.event >= 0 for x in switches)  # which may depend on others
+    # A joint that an event adds may depend on others.
+    adds_any = any(x.public and x.event >= 0 for x in switches)
     with_all = analysis.with_rows_of(whole, only_switched=analysis.redundant_rows == () and not adds_any)
     row_names, names = [name for name, _ in with_all.row_names], [x.name for x in switches]
     contacts = {x.event: k for k, x in enumerate(switches) if not x.public}
@@ -151,7 +154,7 @@ def phases_of(scene: Sticking, events: Sequence[Event], analysis: Analysis | Non
     mechanisms = mechanism.without_origin, whole
     joints: Any = tuple(x.constraint for x in added)
     added_by = tuple((x.event, x.name) for x in added)
-    return Phases(mechanisms, (analysis, with_all), joints, added_by, table, sticking=scene.joints)
+    return Phases(mechanisms, (analysis, with_all), joints, added_by, table, sticking=sticking)
 
 
 def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:
@@ -160,12 +163,11 @@ def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:
     return event.action.removed | ({addition[0]} if addition else frozenset())
 
 
-def _switches(scene: Sticking, events: Sequence[Event]) -> list[_Switch]:
+def _switches(mechanism: Mechanism, events: Sequence[Event], sticking: Sequence[StickingJoint]) -> list[_Switch]:
     """Return the switches: constraints of the scene, joints that events add, contacts, joints that stick.
 
     Raises `ValueError` for unknown names.
     """
-    mechanism: Mechanism = scene.mechanism
     additions = [(k, e.action.addition(mechanism, f"event {quote(e.name)}")) for k, e in enumerate(events)]
     added = [(k, *found) for k, found in additions if found is not None]
     known, released = [*mechanism.constraints, *(name for _, name, _ in added)], set()
@@ -188,8 +190,8 @@ def _switches(scene: Sticking, events: Sequence[Event]) -> list[_Switch]:
     found += [_Switch(unique(name), name, joint, k) for k, name, joint in added]
     contacts = [(k, e) for k, e in enumerate(events) if e.action.rest == "hold"]
     found += [_Switch(unique(f"{e.name}.contact"), "", HeldContact.of(e, mechanism), k) for k, e in contacts]
-    locks = zip(scene.joints, scene.locks, strict=True)
-    return found + [_Switch(unique(f"{x.name}.stick"), "", lock, x.event, x.name) for x, lock in locks]
+    joints = mechanism.joints
+    return found + [_Switch(unique(f"{x.name}.stick"), "", lock_of(joints[x.name]), x.event, x.name) for x in sticking]
 
 
 def _with(mechanism: Mechanism, switches: Sequence[_Switch]) -> Mechanism:

@@ -155,7 +155,7 @@ def _expand(mechanism: Any, events: Sequence[ExpandsToEvents] | None, analysis: 
     found = () if events is None else expand_events(events, mechanism)
     scene = with_sticking_joints(mechanism, len(found))
     found = (*found, *scene.events)
-    phases = phases_of(scene, found, analysis)
+    phases = phases_of(scene.mechanism, found, analysis, scene.joints)
     smooth, held, kinks = with_held_forces(scene.mechanism, SIDES * len(scene.joints))
     return ((*found, *kinks), phases.with_kinks(smooth, held, len(kinks))) if held else (found, phases)
 

@@ -1,4 +1,4 @@
-"""Which joints with set-valued friction stick, and in which direction the others slide.
+"""Decisions about joints with set-valued friction: whether they stick, or in which direction they slide.
 
 Joints that are at rest relative to each other carry any force within their limits; joints that slide carry their friction. A
 joint i at rest, with acceleration a_i, force f_i and limit c_i, obeys
@@ -38,7 +38,7 @@ REPETITIONS, SWEEPS = 10, 20
 BLOCK_STEPS, SINGLE_STEPS = 2, 8
 
 
-class Modes(NamedTuple):
+class FrictionModes(NamedTuple):
     """The modes of joints that may stick."""
 
     locked: Bool[Any, "*m F"]
@@ -46,8 +46,8 @@ class Modes(NamedTuple):
     at_rest: Bool[Any, "*m F"]  # joints that others keep at rest
 
 
-class _Candidates(NamedTuple):
-    """What is known of the joints at one instant."""
+class _JointsAtRest(NamedTuple):
+    """The joints at one instant, those at rest among them."""
 
     rest: Bool[Any, "*m F"]  # whether their speeds are zero
     sliding: Float[Any, "*m F"]  # the directions of all others
@@ -64,14 +64,14 @@ class _Pivot(NamedTuple):
     done: Any
 
 
-def modes_of(system: System, members: MemberIndices, at: RunState) -> Modes:
+def modes_of(system: System, members: MemberIndices, at: RunState) -> FrictionModes:
     """Return the modes of the joints of members."""
     plan, sides = system.plan, system.sides(members, at.joints)
     direction, rest = (sides[..., plan.directions_of_sliding + k] for k in range(2))
-    return Modes(plan.locked(at.phase), direction, rest > 0.5)
+    return FrictionModes(plan.locked(at.phase), direction, rest > 0.5)
 
 
-def with_modes(system: System, members: MemberIndices, at: RunState, modes: Modes) -> RunState:
+def with_modes(system: System, members: MemberIndices, at: RunState, modes: FrictionModes) -> RunState:
     """Return the states with other modes; NumPy arrays of sides change in place."""
     plan, xp = system.plan, system.xp
     sides = system.sides(members, at.joints)
@@ -81,7 +81,7 @@ def with_modes(system: System, members: MemberIndices, at: RunState, modes: Mode
 
 
 def settle_friction(
-    system: System, members: MemberIndices, at: RunState, stopped: Int[Any, "*m"], given: Modes | None = None
+    system: System, members: MemberIndices, at: RunState, stopped: Int[Any, "*m"], given: FrictionModes | None = None
 ) -> tuple[RunState, Bool[Any, "*m"]]:
     """Decide which joints stick, and in which direction the others slide.
 
@@ -124,8 +124,8 @@ def begin_with_friction(system: System, runs: MemberRuns, members: MemberIndices
 
 
 def _decide(
-    system: System, members: MemberIndices, at: RunState, before: Modes, stopped: Int[Any, "*m"]
-) -> tuple[Modes, Bool[Any, "*m"]]:
+    system: System, members: MemberIndices, at: RunState, before: FrictionModes, stopped: Int[Any, "*m"]
+) -> tuple[FrictionModes, Bool[Any, "*m"]]:
     plan, xp = system.plan, system.xp
     E, forwards = plan.count, plan.forwards
     free = with_modes(system, members, at, before._replace(locked=before.locked & False))
@@ -140,10 +140,10 @@ def _decide(
     moves = diagonal > BLOCKED * mobility
     size = xp.sqrt(xp.where(moves, diagonal, 1.0))
     if xp is np and not rest.any():
-        return Modes(rest, xp.sign(speed), rest), xp.zeros(at.t.shape, bool)
+        return FrictionModes(rest, xp.sign(speed), rest), xp.zeros(at.t.shape, bool)
     at = _with_locks(system, members, at, rest & ~before.locked)
     W = xp.where(moves[..., None, :] & moves[..., :, None], W / size[..., None, :] / size[..., :, None], 0.0)
-    candidates = _Candidates(rest, xp.sign(speed), W, before.locked, scale * rate)
+    candidates = _JointsAtRest(rest, xp.sign(speed), W, before.locked, scale * rate)
 
     left = xp.where(leaves[0], 1.0, xp.where(leaves[1], -1.0, 0.0))
     kept = xp.where(before.at_rest & rest, before.direction, 0.0)
@@ -192,7 +192,7 @@ def _decide(
 
 
 def _guess(
-    system: System, members: MemberIndices, at: RunState, known: _Candidates, size: Any, direction: Float[Any, "*m F"]
+    system: System, members: MemberIndices, at: RunState, known: _JointsAtRest, size: Any, direction: Float[Any, "*m F"]
 ) -> Float[Any, "*m F"]:
     """Return the direction of each joint at rest at its limit, 0 within it, for limits that are nearly right."""
     plan, xp, F = system.plan, system.xp, len(system.plan.forwards)
@@ -200,7 +200,7 @@ def _guess(
 
     def improve(share: Any) -> Any:
         """Return the forces as shares of the limits, from those before."""
-        trial = with_modes(system, members, at, Modes(none, xp.where(known.rest, share, known.sliding), known.rest))
+        trial = with_modes(system, members, at, FrictionModes(none, xp.where(known.rest, share, known.sliding), known.rest))
         found = system.look(members, trial, has_forces=True)
         a, limit = found.rate[..., plan.forwards] / size, size * found.forces[..., plan.forwards]
         force = share * limit
@@ -224,7 +224,7 @@ def _guess(
     return xp.where(xp.abs(share) > 1 - CLOSED, xp.sign(share), 0.0)
 
 
-def _modes(known: _Candidates, pivot: _Pivot, xp: ModuleType) -> Modes:
+def _modes(known: _JointsAtRest, pivot: _Pivot, xp: ModuleType) -> FrictionModes:
     """Return the modes of a set of joints within their limits: as many locked ones as have independent rows."""
     locked, remainder = xp.zeros_like(known.rest), known.W
     F = known.W.shape[-1]
@@ -239,4 +239,4 @@ def _modes(known: _Candidates, pivot: _Pivot, xp: ModuleType) -> Modes:
             locked = locked | (takes[..., None] & (np.arange(F) == i))
     moves = xp.diagonal(remainder, axis1=-2, axis2=-1) > CARRIED
     at_rest = known.rest & ~locked & ~moves & ~pivot.departs
-    return Modes(locked, xp.where(known.rest, xp.where(pivot.within, 0.0, pivot.direction), known.sliding), at_rest)
+    return FrictionModes(locked, xp.where(known.rest, xp.where(pivot.within, 0.0, pivot.direction), known.sliding), at_rest)

@@ -18,7 +18,7 @@ from udkjax.integrate.events.actions import Action, Displacement
 from udkjax.integrate.events.conditions import BodyCondition, Frames
 from udkjax.integrate.events.event import Event
 from udkjax.scene.fields import given_number
-from udkjax.scene.friction import Friction, may_stick
+from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Angle, Joint, Revolute
 from udkjax.scene.mechanism import Mechanism
 
@@ -67,12 +67,12 @@ class SlidingSpeed(BodyCondition):
 
         Args:
             multipliers: The multipliers of the joint.
-            lock: That of the constraint by which it sticks.
+            lock: The multiplier of the constraint by which it sticks.
         """
         return self.friction.largest_force(self.joint, multipliers) - self.sign * lock
 
 
-class Slide(Action):
+class StickOrSlip(Action):
     """A joint with set-valued friction begins to slide, ends sliding or turns round; the run decides which."""
 
 
@@ -100,11 +100,6 @@ class Sticking(NamedTuple):
     joints: tuple[StickingJoint, ...]
     events: tuple[Event, ...]  # two for each joint
 
-    @property
-    def locks(self) -> list[Joint]:
-        """The constraint of each joint by which it sticks, without its position."""
-        return [_lock(self.mechanism.joints[x.name]) for x in self.joints]
-
 
 def with_sticking_joints(mechanism: Any, first_event: int) -> Sticking:
     """Return a mechanism with directed frictions, and their events.
@@ -113,7 +108,7 @@ def with_sticking_joints(mechanism: Any, first_event: int) -> Sticking:
         mechanism: The scene.
         first_event: The number of other events, which come first.
     """
-    if not isinstance(mechanism, Mechanism) or not may_stick(mechanism._forces):
+    if not isinstance(mechanism, Mechanism) or not Friction.may_stick(mechanism._forces):
         return Sticking(mechanism, (), ())
     mechanism = mechanism.without_origin
     forces, joints, events = list(mechanism._forces), [], []
@@ -125,12 +120,13 @@ def with_sticking_joints(mechanism: Any, first_event: int) -> Sticking:
         joints.append(StickingJoint(name, k, first_event + len(events), SIDES * len(joints)))
         for sign, text in ((1.0, "forwards"), (-1.0, "backwards")):
             condition = SlidingSpeed(joint.bodies, joint, force, number(sign))
-            events.append(Event(condition, Slide(), -1, f"{name} slides {text}"))
+            events.append(Event(condition, StickOrSlip(), -1, f"{name} slides {text}"))
     mechanism = eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces))
     return Sticking(mechanism, tuple(joints), tuple(events))
 
 
-def _lock(joint: Any) -> Joint:
+def lock_of(joint: Any) -> Joint:
+    """Return the constraint by which a joint sticks, without its position."""
     return Angle(joint.bodies) if isinstance(joint, Revolute) else Displacement(joint.bodies, joint.points, joint.axis)
 
 
