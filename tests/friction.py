@@ -1,6 +1,7 @@
 """Mechanisms with friction that depends on the loads of joints, and their equations in minimal coordinates for SciPy."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -21,7 +22,7 @@ def _root(function: Callable[[float], float]) -> float:
     return float(np.asarray(brentq(function, -1e4, 1e4, xtol=1e-13)))
 
 
-def pendulum(**friction: float) -> udk.Mechanism:
+def pendulum(**friction: Any) -> udk.Mechanism:
     """Return a pendulum of 2 kg, 0.03 kg m^2 and 0.5 m on a thick pin, from rest at the height of the pin."""
     return udk.Mechanism(
         {"bob": udk.Body(2.0, 0.03, [0.5, 0.0])},
@@ -47,7 +48,7 @@ def pendulum_by_scipy(ts: np.ndarray, law: Callable[[float], float], radius: flo
     return found.y[0]
 
 
-def cart(coefficient: float = 0.2, length: float | None = None, **more: float) -> udk.Mechanism:
+def cart(coefficient: float = 0.2, length: float | None = None, **more: Any) -> udk.Mechanism:
     """Return a cart of 1.5 kg on a rail, and a pendulum of 0.8 kg and 0.4 m hanging from its centre at 60 degrees."""
     x, y = 0.4 * np.sin(np.pi / 3), -0.4 * np.cos(np.pi / 3)
     return udk.Mechanism(
@@ -104,7 +105,7 @@ def drawer(coefficient: float, reach: float = 0.2, length: float = 0.1) -> udk.M
     )
 
 
-def rubbing(mechanism: udk.Mechanism, coefficient: float = 0.2, radius: float = 0.03, **more: float) -> udk.Mechanism:
+def rubbing(mechanism: udk.Mechanism, coefficient: float = 0.2, radius: float = 0.03, **more: Any) -> udk.Mechanism:
     """Return a mechanism without drivers, with friction in all of its revolutes, slides and slots."""
     base, forces = mechanism.without_origin, dict(mechanism.forces)
     for name, joint in base.joints.items():

@@ -1,5 +1,6 @@
 """Runs with set-valued friction: closed forms, energy, lanes, derivatives through stick and slip."""
 
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ import udkjax as udk
 from tests.friction import G, pendulum
 
 TOL: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-11}
-STICKS = {"law": "set-valued"}
+STICKS: Any = {"law": "set-valued"}
 
 
 def block(angle: float, uphill: float = 0.0, **friction: Any) -> udk.Mechanism:
@@ -68,7 +69,7 @@ def sticking(mechanism: udk.Mechanism, coefficient: float = 0.2, radius: float =
     """Return a mechanism without drivers, with set-valued friction in all of its revolutes, slides and slots."""
     base, forces = mechanism.without_origin, dict(mechanism.forces)
     for name, joint in base.joints.items():
-        arm = {"radius": radius} if isinstance(joint, udk.Revolute) else {}
+        arm: dict[str, Any] = {"radius": radius} if isinstance(joint, udk.Revolute) else {}
         forces[f"rub {name}"] = udk.Friction(name, coefficient=coefficient, **arm, **STICKS)
     return udk.Mechanism(base.bodies, base.joints, {}, forces, mechanism.gravity, mechanism.name)
 
@@ -163,7 +164,7 @@ def test_pendulum_stops_away_from_the_bottom():
     while True:
         stop = lambda _, y: y[1]  # noqa: E731
         stop.terminal, stop.direction = True, -sign
-        rate = lambda _, y, sign=sign: [y[1], acceleration(*y, sign)]  # noqa: E731
+        rate = lambda _, y, sign=sign: [y[1], acceleration(y[0], y[1], sign)]  # noqa: E731
         found = solve_ivp(rate, (t, t + 10.0), state, "DOP853", events=stop, rtol=1e-12, atol=1e-12)
         t, state, sign = float(found.t[-1]), [float(found.y[0, -1]), 0.0], -sign
         times.append(t)

@@ -1,6 +1,6 @@
 """Friction of a drawing, in its pins, slides and slots."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -59,7 +59,7 @@ class PinFriction(DrawnElement):
     def parts(self, placement):
         joint = self._joint(placement)
         assert joint is not None  # a mistake
-        numbers = {name: value for name, value in table_of(self).items() if name not in ("pin", "slide", "slot", "of")}
+        numbers: dict[str, Any] = {k: x for k, x in table_of(self).items() if k not in ("pin", "slide", "slot", "of")}
         return Parts(force=Friction(joint, **numbers))
 
     def _joint(self, layout: PinLayout) -> str | None:
