@@ -32,6 +32,7 @@ from udkjax.native.wasm import compile_wasm, wasm_module
 from udkjax.positions.assembly import State
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.units import units_of
 
@@ -140,7 +141,8 @@ def _engine(
     }
     data |= _places(dressed, pull)
     problem = _problem(dressed, analysis, rtol, atol)
-    data["why"] = problem.compiled.plan.why_not_native
+    stuck = "a page does not know joints that stick" if Friction.may_stick(mechanism._forces) else ""
+    data["why"] = problem.compiled.plan.why_not_native or stuck
     data["closing"] = _closing(analysis)
     modules = {"close": _close(dressed)} if held is None else {}
     if data["marks"]:

@@ -1,7 +1,6 @@
 """Events of a portable engine: their data for a page, and the operations that run to the next event and evaluate states."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,10 +8,10 @@ from jaxtyping import Array
 
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events import impacts as law
-from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions
+from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions, with_forces
 from udkjax.integrate.events.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
-from udkjax.integrate.events.phases import HeldContact
+from udkjax.integrate.events.phases import HeldContact, Switches
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import EvaluateEvents
 from udkjax.native.runs import RunStates
@@ -93,7 +92,11 @@ class PortableEvents:
 
     def watched_by(self, operation: RunStates, rows: tuple[int, ...] = ()) -> RunStates:
         """Return the run that ends where a condition, or the force of a contact in one of the rows of Psi, crosses zero."""
-        return operation if self._conditions is None else operation.watching(replace(self._conditions, rows=rows))
+        if self._conditions is None:
+            return operation
+        E, m = len(self._events), operation.code.row_count
+        held = Switches(rows=(*rows, *[-1] * (E - len(rows))), joint_rows=((),) * E)
+        return operation.watching(with_forces(self._conditions, self._events, held, m))
 
     def states_of(self, run: RunStates) -> EvaluateEvents:
         """Return the operation that evaluates conditions, their rates and slopes, and directions of impulses at states."""
