@@ -7,6 +7,7 @@ A study is one module. Its docstring gives the claim and its reasons. It has
     headline(data) -> str              the claim in figures, in one line; the README quotes it
     figure(data) -> Figure             drawn from the data alone
     page(data), html(data) -> str      pages of its own, NAME.md and NAME.html, if the study has them
+    table(data) -> str                 udkjax/study/NAME.json, which the package reads, if the study has it
 """
 
 import inspect
@@ -28,6 +29,7 @@ from udkjax.integrate.solution import versions
 from udkjax.scene import Mechanism, dumps
 
 HERE = Path(__file__).parent
+PACKAGE_DATA = HERE.parent / "udkjax" / "study"
 NAMES = tuple(sorted(file.stem for file in HERE.glob("*.py") if file.stem not in ("__init__", "__main__", "common")))
 DPI = 110
 COLOURS = 128  # colours of a figure: enough for lines and a colour map, and a third of the size
@@ -64,9 +66,10 @@ def redraw(name: str, out: Path | None = None) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     module.figure(data).savefig(file, dpi=DPI)
     Image.open(file).convert("RGB").quantize(COLOURS).save(file, optimize=True)
-    for function, suffix in (("page", "md"), ("html", "html")):
+    for function, suffix, folder in (("page", "md", HERE), ("html", "html", HERE), ("table", "json", PACKAGE_DATA)):
         if hasattr(module, function):
-            ((HERE if out is None else out) / f"{name}.{suffix}").write_text(getattr(module, function)(data), encoding="utf-8")
+            text = getattr(module, function)(data)
+            ((folder if out is None else out) / f"{name}.{suffix}").write_text(text, encoding="utf-8")
     failed = [part for part, true in module.holds(data).items() if not true]
     print(f"{name} ({data.attrs['seconds']} s): {module.headline(data)}")
     print(f"  {data_file(name, out)}, {file}", *(f"\n  DOES NOT HOLD: {part}" for part in failed))
@@ -90,12 +93,12 @@ def described(data: xarray.Dataset, scene: Mechanism | str, settings: Mapping[st
     return data.assign_attrs(scene=text, settings=json.dumps(numbers), seed="none" if seed is None else seed)
 
 
-def tracked(items: Sequence[Item] | Iterable[Item], what: str) -> Iterator[Item]:
-    """Iterate over the parts of a study; say on stderr the current one and its time so far."""
-    items, start = list(items), time.perf_counter()
-    end = "\r" if sys.stderr.isatty() else "\n"
+def tracked(items: Sequence[Item] | Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+    """Iterate over the parts of a study; say on stderr the current one, of their number or `total`, and the time so far."""
+    items, start = items if total else list(items), time.perf_counter()
+    end, count = "\r" if sys.stderr.isatty() else "\n", total or len(items)
     for number, item in enumerate(items, 1):
-        print(f"{what}: {number} of {len(items)}, {time.perf_counter() - start:.0f} s   ", end=end, file=sys.stderr, flush=True)
+        print(f"{what}: {number} of {count}, {time.perf_counter() - start:.0f} s   ", end=end, file=sys.stderr, flush=True)
         yield item
 
 

@@ -10,6 +10,8 @@ import xarray
 
 from experiments.parts.atlas_tables import CELL, COMPARED, frame, geometric, mean_error, recommendations, silent
 
+AXES = {"gains": "gain", "two gains": "ratio", "thresholds": "threshold"}  # of the parts that vary a number
+
 
 def html(data: xarray.Dataset) -> str:
     """Return the page: curves of time against error, gains, thresholds and silent failures, by mechanism."""
@@ -28,16 +30,18 @@ def html(data: xarray.Dataset) -> str:
         }.get(part, formulation)
         points = [[_short(x) for x in row] for row in curve.reset_index().to_numpy()]
         curves.append({"problem": problem, "part": part, "label": label, "points": points, "wrong": int(wrong[some.index].sum())})
-    for part, axis in (("gains", "gain"), ("thresholds", "threshold")):
-        for (problem, method, stabilization, tol), some in runs[runs.part == part].groupby(
-            ["problem", "method", "stabilization", "tol"], sort=False
+    for part, axis in AXES.items():
+        chosen = runs[runs.part.isin([part, f"{part}, Greville"])]
+        chosen = chosen.assign(ratio=(chosen.beta / chosen.gain).round(2), alpha=chosen.gain if part == "two gains" else 0.0)
+        for (problem, method, stabilization, alpha, tol), some in chosen.groupby(
+            ["problem", "method", "stabilization", "alpha", "tol"], sort=False
         ):
             by = some.groupby(axis)
             points = [
                 [_short(x), _short(mean_error(s.error)), _short(s.right_hand_sides.mean()), int((s.result != 0).sum())]
                 for x, s in by
             ]
-            label = f"{method}, {stabilization}" if part == "thresholds" else method
+            label = {"thresholds": f"{method}, {stabilization}", "two gains": f"alpha = {alpha:g} 1/s"}.get(part, method)
             lines.append({"problem": problem, "part": part, "label": label, "tol": _short(tol), "points": points})
     for (problem, stabilization), some in runs.groupby(["problem", "stabilization"], sort=False):
         failures.append([problem, stabilization, len(some), int(wrong[some.index].sum()), int((some.result != 0).sum())])

@@ -2,21 +2,25 @@
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 import udkjax as udk
+from experiments.parts.closed_chains import bennett, bricard
 from udkjax.study.accuracy import exact_coordinates, pendulum
 
 STARTS = 8  # of each mechanism
+RANK = 1e-9  # of the largest singular value; below it, rows depend on others
+
+Model: TypeAlias = udk.Mechanism | udk.ConstrainedSystem
 
 
 class Problem(NamedTuple):
     """A mechanism that starts in several ways, and runs for `end` seconds."""
 
     title: str
-    build: Callable[[float], udk.Mechanism]  # of the varied number: the bodies are placed and move accordingly
+    build: Callable[[float], Model]  # of the varied number: the bodies are placed and move accordingly
     varied: tuple[float, float]  # its least and its largest value
     end: float  # s
     crosses: bool = False  # whether the rank of the Jacobian falls on the way
@@ -26,7 +30,7 @@ class Problem(NamedTuple):
     exact: Callable[[udk.Mechanism, np.ndarray, udk.State], np.ndarray] | None = None
 
     @property
-    def mechanism(self) -> udk.Mechanism:
+    def mechanism(self) -> Model:
         """The mechanism, in its first start."""
         return _built(self, 0)
 
@@ -38,11 +42,22 @@ class Problem(NamedTuple):
     @property
     def redundant(self) -> bool:
         """True if rows of the Jacobian depend on others in every position."""
-        return udk.analyse(self.mechanism).redundant_rows != ()
+        model = self.mechanism
+        if isinstance(model, udk.Mechanism):
+            return udk.analyse(model).redundant_rows != ()
+        assert model.q0 is not None and model.constraint is not None
+        values = udk.singular_values(model, 0.0, model.q0)
+        rows = np.size(model.constraint(0.0, model.q0))
+        return int((values > RANK * values[0]).sum()) < rows
 
     @property
     def lengths(self) -> np.ndarray:
-        """The scales of x, y and the angle by which errors are divided: the mechanism's length (m) and one radian."""
+        """The scales of x, y and the angle by which errors are divided: the mechanism's length (m) and one radian.
+
+        Of a system, a single one: its coordinates are of the order of one.
+        """
+        if not isinstance(self.mechanism, udk.Mechanism):
+            return np.ones(1)
         length = float(udk.analyse(self.mechanism).length)
         return np.array([length, length, 1.0])
 
@@ -72,7 +87,7 @@ def _squares(mechanism: udk.Mechanism, ts: np.ndarray, state: udk.State) -> np.n
 
 
 @cache
-def _built(problem: Problem, start: int) -> udk.Mechanism:
+def _built(problem: Problem, start: int) -> Model:
     return problem.build(float(np.linspace(*problem.varied, STARTS)[start]))
 
 
@@ -189,4 +204,6 @@ PROBLEMS: dict[str, Problem] = {
     "rubbing": Problem("a four-bar with friction in its pins", _rubbing, (3, 8), 3.0, conserves=False),
     "small": Problem("the paper's linkage, a millionth of the size", _scaled(1e-6), (-50, -30), 10.0, exact=_parallel),
     "large": Problem("the paper's linkage, a million times the size", _scaled(1e6), (-50, -30), 10.0, exact=_parallel),
+    "Bennett": Problem("Bennett's spatial four-bar", bennett, (1.7, 2.4), 3.0),
+    "Bricard": Problem("Bricard's spatial six-bar", bricard, (1.4, 1.7), 2.0),
 }

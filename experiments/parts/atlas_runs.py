@@ -1,10 +1,12 @@
-"""The runs of the atlas: for each mechanism five sweeps, each along one of the choices that somebody has to make.
+"""The runs of the atlas: for each mechanism several sweeps, each along one of the choices that somebody has to make.
 
 `methods`: the pseudoinverse and the stabilization. `integrators`: the solver. `formulations`: how the accelerations are found.
-`gains`: Baumgarte's. `thresholds`: of the rank. Every run is compared with its reference at the same instants.
+`gains`: Baumgarte's, equal ones. `two gains`: those on Psi_dot and on Psi, which differ. `thresholds`: of the rank. Every run is
+compared with its reference at the same instants.
 """
 
 from collections.abc import Callable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,12 +17,12 @@ import xarray
 
 import udkjax as udk
 from experiments.parts.atlas_own import BraunGoldfarb, HalfImplicit
-from experiments.parts.atlas_problems import Problem
+from experiments.parts.atlas_problems import Model, Problem
 from experiments.parts.atlas_reference import Reference
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 COARSE = TOLERANCES[1:8:3]  # where the tolerance is not what is asked for
-MAX_STEPS = 4_000  # several times what a run takes that gets on
+MAX_STEPS = 3_000  # several times what a run takes that gets on
 METHODS: dict[str, Callable[[float | None], Any]] = {
     "Auto": lambda x: udk.Auto(x),
     "Elimination": lambda x: udk.Elimination(x),
@@ -62,6 +64,9 @@ SLOW_FORMULATIONS: dict[str, Any] = {
     "partitioning": udk.CoordinatePartitioning(),
 }
 GAINS = tuple(float(x) for x in np.geomspace(0.5, 1000.0, 16).round(2))
+GAIN_PAIRS = tuple(
+    (a, round(a * ratio, 2)) for a, ratio in product((2.0, 5.0, 10.0, 20.0, 50.0), (0.25, 0.5, 0.7, 1.4, 2.0, 4.0))
+)
 THRESHOLDS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 
 
@@ -73,21 +78,24 @@ class Part(NamedTuple):
     starts: int | None = None  # None: all
     steps: bool = False  # whether the tolerances are steps, relative to the duration
     timed: bool = False  # whether each method runs by itself, since the time of a chunk is shared by steps, whatever they cost
+    repeats: bool = False  # whether runs with projection are timed twice; the first time may include the loading of code
 
 
 def cell(**chosen: Any) -> dict[str, Any]:
     """Return a cell, by default the package's own choices."""
     names = {"method": "Auto", "stabilization": "projection", "solver": "default", "formulation": "Udwadia-Kalaba"}
-    return names | {"gain": np.nan, "threshold": np.nan} | chosen
+    return names | {"gain": np.nan, "beta": np.nan, "threshold": np.nan} | chosen
 
 
 def parts(problem: Problem) -> dict[str, Part]:
     """Return the sweeps of a mechanism by name."""
     found = {
-        "methods": Part([cell(method=m, stabilization=s) for m in METHODS for s in STABILIZATIONS], timed=True),
-        "integrators": Part([cell(solver=s) for s in SOLVERS]),
+        "methods": Part([cell(method=m, stabilization=s) for m in METHODS for s in STABILIZATIONS], timed=True, repeats=True),
+        "integrators": Part([cell(solver=s) for s in SOLVERS], repeats=True),
         "formulations": Part([cell(formulation=f) for f in FORMULATIONS]),
-        "gains": Part([cell(method=m, stabilization="gains", gain=g) for m in ("Auto", "Greville") for g in GAINS]),
+        "gains": Part([cell(stabilization="gains", gain=g, beta=g) for g in GAINS]),
+        "gains, Greville": Part([cell(method="Greville", stabilization="gains", gain=g, beta=g) for g in GAINS], COARSE),
+        "two gains": Part([cell(stabilization="two gains", gain=a, beta=b) for a, b in GAIN_PAIRS], TOLERANCES[1:8:2], 6),
     }
     if problem.thorough:  # programs that XLA compiles for seconds, and rank thresholds where ranks are at stake
         found["multistep"] = Part([cell(solver=s) for s in MULTISTEP], TOLERANCES[1:8:2], 2)
@@ -102,10 +110,11 @@ def parts(problem: Problem) -> dict[str, Part]:
 
 def settings(chosen: Mapping[str, Any], alone: bool = False) -> dict[str, Any]:
     """Return the arguments of `simulate` for a cell; those that it shares with all cells are left out."""
-    gain, threshold, name = chosen["gain"], chosen["threshold"], chosen["method"]
+    threshold, name = chosen["threshold"], chosen["method"]
+    own = (STABILIZATIONS | OWN).get(chosen["stabilization"])
     solver = (SOLVERS | MULTISTEP | CONSTANT).get(chosen["solver"])
     formulation = (FORMULATIONS | SLOW_FORMULATIONS).get(chosen["formulation"])
-    found: dict[str, Any] = {"stabilization": (STABILIZATIONS | OWN).get(chosen["stabilization"]) or udk.Baumgarte(gain, gain)}
+    found: dict[str, Any] = {"stabilization": own or udk.Baumgarte(chosen["gain"], chosen["beta"])}
     if formulation is not None:
         found["formulation"] = formulation
     elif alone and name in DENSE:  # all dense methods share a program
@@ -118,29 +127,43 @@ def settings(chosen: Mapping[str, Any], alone: bool = False) -> dict[str, Any]:
     return found
 
 
-def compare(problem: Problem, expected: Reference) -> Callable[[udk.Mechanism, udk.Solution], Any]:
+def compare(problem: Problem, expected: Reference) -> Callable[[Model, udk.Solution], Any]:
     """Return a measure of a run: its largest error, relative to the problem's lengths, against the reference of its start."""
     states = problem.states(len(expected.q))
     starts = jnp.asarray(np.stack([np.concatenate([s.q, s.v]) for s in states]))
     q, lengths = jnp.asarray(expected.q), jnp.asarray(problem.lengths)
 
-    def error(mechanism: udk.Mechanism, run: udk.Solution):
+    def error(mechanism: Model, run: udk.Solution):
         begun = jnp.concatenate([run.q[0], run.v[0]])
-        start = jnp.argmin(jnp.square(starts - begun).sum((1, 2)))
+        start = jnp.argmin(jnp.square(starts - begun).reshape(len(starts), -1).sum(1))
         return jnp.max(jnp.abs(run.q - q[start]) / lengths)
 
     return error
 
 
-def run(problem: Problem, expected: Reference, part: Part, out: Path | None) -> list[xarray.Dataset]:
-    """Run a part of the atlas, in one sweep or several; an interrupted sweep goes on from the chunks in the folder `out`."""
+def run(problem: Problem, expected: Reference, part: Part, out: Path | None) -> list[tuple[list[dict[str, Any]], xarray.Dataset]]:
+    """Run a part of the atlas, in one sweep or several; return the cells of each and its data.
+
+    An interrupted sweep goes on from the chunks in the folder `out`.
+    """
     groups: dict[str, list[dict[str, Any]]] = {}
     for one in part.cells:
-        groups.setdefault(one["method"] if part.timed else "", []).append(one)
+        name = one["method"] if part.timed else ""
+        groups.setdefault(f"{name}, projection" if part.repeats and one["stabilization"] == "projection" else name, []).append(
+            one
+        )
     if part.steps:  # of which a sweep takes one
         parts = [part._replace(tolerances=(step,)) for step in part.tolerances]
-        return [_sweep(problem, expected, one, one.cells, out and out / str(k)) for k, one in enumerate(parts)]
-    return [_sweep(problem, expected, part, cells, out and out / name) for name, cells in groups.items()]
+        return [(one.cells, _sweep(problem, expected, one, one.cells, out and out / str(k))) for k, one in enumerate(parts)]
+    found = []
+    for name, cells in groups.items():
+        data = _sweep(problem, expected, part, cells, out and out / name)
+        if name.endswith("projection"):
+            again = _sweep(problem, expected, part, cells, out and out / f"{name}, again")
+            least, most = np.minimum(data.seconds, again.seconds), np.maximum(data.seconds, again.seconds)
+            data = data.assign(seconds=least, slower=most)
+        found.append((cells, data))
+    return found
 
 
 def _sweep(problem: Problem, expected: Reference, part: Part, cells: list[dict[str, Any]], out: Path | None) -> xarray.Dataset:

@@ -7,6 +7,8 @@ import numpy as np
 import pandas
 import xarray
 
+from experiments.parts.atlas_problems import PROBLEMS
+
 Runs: TypeAlias = Any  # a table or a column of pandas, which its types cannot tell apart
 TARGETS = (1e-3, 1e-6, 1e-9)  # errors that somebody may want
 LOST = 0.01  # relative to the mechanism's length, or rad
@@ -24,7 +26,8 @@ def frame(data: xarray.Dataset) -> Runs:
         if variable.dims == ("run",):
             labels = variable.attrs.get("flag_meanings")
             found[name] = np.array(json.loads(labels))[variable.values] if labels else variable.values.astype(float)
-    return pandas.DataFrame(found)
+    size = data.sizes["run"]
+    return pandas.DataFrame({name: np.full(size, np.nan) for name in ("beta", "slower")} | found)
 
 
 def silent(runs: Runs) -> Runs:
@@ -90,14 +93,16 @@ def default_against_best(runs: Runs) -> dict[tuple[str, float], float]:
 
 def gains(runs: Runs) -> dict[str, float]:
     """Return how gains compare: the error of safe ones relative to projection's, and what large ones cost in right-hand sides."""
-    chosen = runs[(runs.part == "gains") & (runs.method == "Auto") & runs.problem.isin(["hanging", "four-bar", "scissors"])]
+    several = runs.part.isin(["gains", "two gains"]) & (runs.method == "Auto")
+    chosen = runs[several & runs.problem.isin(["hanging", "four-bar", "scissors"])]
     key = ["problem", "tol", "start"]
     default = runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)].set_index(key)
     beside = default.reindex(pandas.MultiIndex.from_frame(chosen[key]))
     error = chosen.error.to_numpy() / np.maximum(beside.error.to_numpy(), 1e-12)
     work = chosen.right_hand_sides.to_numpy() / beside.right_hand_sides.to_numpy()
-    safe, large = (chosen.gain > 2) & (chosen.gain < 30), chosen.gain > 200
-    return {"ordinary": float(np.nanmedian(error[safe])), "dear": float(np.nanmedian(work[large]))}
+    equal, safe, large = chosen.part == "gains", (chosen.gain > 2) & (chosen.gain < 30), chosen.gain > 200
+    found = {"ordinary": error[equal & safe], "dear": work[equal & large], "unequal": error[~equal & safe]}
+    return {name: float(np.nanmedian(values)) for name, values in found.items() if len(values)}
 
 
 def words(cell: tuple[str, ...]) -> str:
@@ -150,8 +155,8 @@ def markdown(data: xarray.Dataset) -> str:
         "[the data](data/atlas.nc) (CC0), [the claims](atlas.py).",
         "",
         "The tolerance (`rtol`, and `atol` relative to the mechanism's length) at which the default has an error, its time in a "
-        "batch on one core, and the setting that takes the least time. Times were measured once, beside other programs; counts "
-        "of right-hand sides do not depend on that.",
+        f"batch on one core, and the setting that takes the least time. {_times(runs)} Counts of right-hand sides have no "
+        "such uncertainty.",
         "",
         _row(heads),
         "|---" * len(heads) + "|",
@@ -169,6 +174,29 @@ def markdown(data: xarray.Dataset) -> str:
         refused = int((some.result != 0).sum())
         lines.append(_row((titles[problem], stabilization, f"{len(some):,}", int(wrong[some.index].sum()), f"{refused:,}")))
     return "\n".join(lines) + "\n"
+
+
+def _times(runs: Runs) -> str:
+    if not np.isfinite(found := uncertainty(runs)):
+        return "Times were measured once, beside other programs."
+    return f"Times of pseudoinverses and integrators are the lesser of two; the greater is longer by {found:.0%} in the median."
+
+
+def uncertainty(runs: Runs) -> float:
+    """Return by how much a time that was taken twice exceeds the lesser one, relative to it, in the median; NaN if none was."""
+    return float((runs.slower / runs.seconds).median()) - 1
+
+
+def table(data: xarray.Dataset) -> str:
+    """Return as JSON, for each mechanism, the tolerances at which the default has the errors that somebody may want."""
+    titles = json.loads(data.titles)
+    rows: dict[str, dict[str, Any]] = {}
+    for row in recommendations(frame(data)):
+        name = row["problem"]
+        one = rows.setdefault(name, {"name": str(PROBLEMS[name].mechanism.name), "title": titles[name], "tolerances": {}})
+        if np.isfinite(row["tol"]):
+            one["tolerances"][f"{row['error']:.0e}"] = float(f"{row['tol']:.0e}")
+    return json.dumps(list(rows.values()), indent=1) + "\n"
 
 
 def _row(cells: tuple[Any, ...]) -> str:

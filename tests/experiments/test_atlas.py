@@ -8,10 +8,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from experiments.common import PACKAGE_DATA, load
 from experiments.parts.atlas_problems import PROBLEMS
 from experiments.parts.atlas_reference import reference
 from experiments.parts.atlas_runs import compare, parts, run
-from experiments.parts.atlas_tables import DEFAULT, price, silent, words
+from experiments.parts.atlas_tables import DEFAULT, price, silent, table, words
 from experiments.parts.reference_equations import evaluate, evaluate_all
 
 
@@ -65,6 +66,18 @@ def test_equations_of_several_states_are_those_of_each():
 
 
 @pytest.mark.slow
+def test_the_package_reads_the_table_of_the_committed_data():
+    assert (PACKAGE_DATA / "atlas.json").read_text(encoding="utf-8") == table(load("atlas"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Bennett", "Bricard"])
+def test_chains_in_space_move_as_their_quadratic_rows_say(name):
+    problem = PROBLEMS[name]._replace(end=1.0)
+    assert problem.redundant and reference(problem, 2).apart.max() < 1e-11
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_starts_are_closed(name):
     problem = PROBLEMS[name]
@@ -80,10 +93,12 @@ def test_a_cell_is_compared_with_its_own_start():
     expected = reference(problem, 3)
     assert expected.apart.max() < 1e-12 and expected.q.shape == (3, 21, 4, 3)
     part = parts(problem)["integrators"]
-    (data,) = run(problem, expected, part._replace(cells=part.cells[3:4], tolerances=(1e-4, 1e-8)), None)
+    part = part._replace(cells=part.cells[3:4], tolerances=(1e-4, 1e-8))
+    ((cells, data),) = run(problem, expected, part, None)
+    assert cells == part.cells and (data.slower >= data.seconds).all()
     wrong = data.wrong.values.reshape(2, 3)
     assert (wrong[0] < 1e-2).all() and (wrong[1] < 1e-6).all()
     shifted = expected._replace(q=expected.q[[1, 2, 0]])
     assert callable(compare(problem, expected))
-    (data,) = run(problem, shifted, part._replace(cells=part.cells[3:4], tolerances=(1e-8,)), None)
+    ((_, data),) = run(problem, shifted, part._replace(tolerances=(1e-8,)), None)
     assert data.wrong.values.min() > 1e-2

@@ -55,66 +55,6 @@ def steady_spin(lean, turn, mass=1.5, radius=0.4):
     return (across * turn**2 * s * c - mass * G * radius * s) / (turn * c * (along + mass * radius**2))
 
 
-# --- closed chains of revolute joints in space, by the points P and the axes u of their joints
-
-
-def screw(angle, length, twist):
-    """The frame of the next joint: turned about z, moved along x, twisted about x."""
-    c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(twist), np.sin(twist)
-    return np.array([[c, -s * ct, s * st, length * c], [s, c * ct, -c * st, length * s], [0, st, ct, 0], [0, 0, 0, 1]])
-
-
-def chain(lengths, twists, angles):
-    """The points and axes of all joints but the first two, the ends of the fixed link, which are returned as well."""
-    frames = [np.eye(4)]
-    for angle, length, twist in zip(angles[:-1], lengths, twists, strict=False):
-        frames.append(frames[-1] @ screw(angle, length, twist))
-    last = np.linalg.inv(screw(0.0, lengths[-1], twists[-1]))
-    assert np.allclose(frames[-1][:3, 3], last[:3, 3])  # the given angles close the chain
-    points, axes = (np.array([frame[:3, k] for frame in frames]) for k in (3, 2))
-    return points, axes
-
-
-def closed_chain(lengths, twists, angles, mass=1.0, inertia=0.05):
-    """A closed chain of links between joints: all points and axes between those of the fixed link, with its state at rest.
-
-    Each link keeps its length, and its common normal and the angle with the axes at its ends; axes keep their length.
-    """
-    points, axes = chain(lengths, twists, angles)
-    count = len(lengths) - 2
-    fixed = points[[0, -1]], axes[[0, -1]]
-
-    def constraint(t, q):
-        P, u = q.reshape(2, count, 3)
-        P = jnp.concatenate([fixed[0][:1], P, fixed[0][1:]])
-        u = jnp.concatenate([fixed[1][:1], u, fixed[1][1:]])
-        links = P[1:] - P[:-1]
-        rows = [jnp.sum(links**2, 1) - np.square(lengths[:-1]), jnp.sum(links * u[:-1], 1), jnp.sum(links * u[1:], 1)]
-        rows += [jnp.sum(u[:-1] * u[1:], 1) - np.cos(twists[:-1]), jnp.sum(u[1:-1] ** 2, 1) - 1.0]
-        return jnp.concatenate(rows)
-
-    masses = np.repeat([mass, inertia], 3 * count)
-    weight = np.concatenate([np.tile([0.0, mass * G, 0.0], count), np.zeros(3 * count)])
-    system = udk.ConstrainedSystem(lambda q: jnp.diag(masses), constraint=constraint, potential=lambda t, q: weight @ q)
-    q = np.concatenate([points[1:-1].ravel(), axes[1:-1].ravel()])
-    return system, udk.State(q, np.zeros_like(q))
-
-
-def bennett(first=2.0):
-    """Bennett's four-bar: lengths 1 and 0.7 in the ratio of the sines of their twists."""
-    alpha = np.deg2rad(50.0)
-    beta = np.arcsin(0.7 * np.sin(alpha))
-    second = 2 * np.arctan(np.sin((alpha + beta) / 2) / np.sin((beta - alpha) / 2) / np.tan(first / 2))
-    angles = [first, second, -first, -second]
-    return closed_chain([1.0, 0.7, 1.0, 0.7], [alpha, beta, alpha, beta], angles)
-
-
-def bricard():
-    """Bricard's six-bar of equal links with right twists: first along the edges of a cube."""
-    right = np.pi / 2
-    return closed_chain([1.0] * 6, [right, -right] * 3, [right, right] * 3)
-
-
 def satellites(distance, rate, masses=(2.0, 1.0)):
     """Two satellites about a centre of unit attraction: the second circles the first at a fixed distance, in a tilted plane."""
 

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
+from experiments.parts import closed_chains
 from tests.integrate import own_systems
 from tests.integrate.own_systems import G
 
@@ -62,12 +63,13 @@ def test_a_disc_rolls_in_a_circle():
 
 @pytest.mark.parametrize(
     ("chain", "rows", "rank"),
-    [pytest.param(own_systems.bennett, 14, 11, id="Bennett"), pytest.param(own_systems.bricard, 24, 23, id="Bricard")],
+    [pytest.param(closed_chains.bennett, 14, 11, id="Bennett"), pytest.param(closed_chains.bricard, 24, 23, id="Bricard")],
 )
 @pytest.mark.slow
 def test_an_overconstrained_chain_in_space(chain, rows, rank):
     """One freedom where counting finds none: rank n - 1 of more rows; closed and conservative for 100 s."""
-    system, start = chain()
+    system = chain()
+    start = udk.State(system.q0, system.v0)
     values = udk.singular_values(system, 0.0, start.q)
     assert int(np.sum(values > 1e-9 * values[0])) == rank == len(start.q) - 1
     ts = np.linspace(0.0, 100.0, 401)
@@ -84,8 +86,8 @@ def test_an_overconstrained_chain_in_space(chain, rows, rank):
 @pytest.mark.slow
 def test_the_angles_of_bricards_chain():
     """Its threefold symmetry relates alternate angles: cos a + cos b + cos a cos b = 0."""
-    system, start = own_systems.bricard()
-    q = run(system, start.q, start.v).q
+    system = closed_chains.bricard()
+    q = run(system, system.q0, system.v0).q
     axes = np.asarray(q)[:, 12:].reshape(len(TS), 4, 3)
     points = np.asarray(q)[:, :12].reshape(len(TS), 4, 3)
     links = np.diff(points, axis=1)

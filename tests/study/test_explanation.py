@@ -98,6 +98,14 @@ def test_a_driven_mechanism_with_rows_in_radians():
     assert max(fed.checks.values()) < 1e-12
 
 
+def test_tolerances_that_motions_needed():
+    """The text has the ranges of all mechanisms of the atlas, and tolerances of mechanisms with this name."""
+    text = str(udk.explain(udk.library.parallelogram())).partition("\n10. ")[2]
+    assert "1e-07 for the paper's linkage, turning" in text and "error 1e-06: " in text and "crank-rocker" not in text
+    other = str(udk.explain(udk.Mechanism({"stone": udk.Body(2.0, 1.0)}))).partition("\n10. ")[2]
+    assert "error 1e-06: " in other and "linkage" not in other
+
+
 def test_a_free_body_falls():
     found = udk.explain(udk.Mechanism({"stone": udk.Body(2.0, 1.0)}))
     assert_allclose(found.a, [0, -G, 0])

@@ -10,7 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from tests.integrate.own_systems import G, bennett, bricard, disc
+from experiments.parts.closed_chains import bennett, bricard
+from tests.integrate.own_systems import G, disc
 from udkjax.scene.checks import SceneError
 from udkjax.study.sweep.dimensions import SweepError
 
@@ -164,8 +165,9 @@ def test_mistakes_of_a_sweep():
 @pytest.mark.slow
 def test_diagnosis_of_overconstrained_chains():
     """Bennett's four-bar has 14 rows of rank 11, Bricard's six-bar 24 of 23: one freedom each."""
-    for (system, state), rank in ((bennett(), 11), (bricard(), 23)):
-        found = udk.diagnose(system, state)
+    for system, rank in ((bennett(), 11), (bricard(), 23)):
+        assert system.q0 is not None and system.v0 is not None
+        found = udk.diagnose(system, udk.State(system.q0, system.v0))
         assert found.rank == found.ordinary_rank == rank
         assert found.degrees_of_freedom == 1
         assert found.can_move

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from udkjax.equations import determinacy
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.recommended import tolerance_lines
 from udkjax.study.report import plain, row_label
 from udkjax.wording import plural
 
@@ -100,7 +101,7 @@ class Explanation(NamedTuple):
         parts += [_right_hand_side(self, rows), _pseudoinverse(self, rows, columns)] if rows else []
         parts += [_accelerations(self, columns)]
         parts += [_multipliers(self, rows)] if rows else []
-        return "\n\n".join("\n".join(lines) for lines in [*parts, _gauss(self), _checks(self)])
+        return "\n\n".join("\n".join(lines) for lines in [*parts, _gauss(self), _checks(self), _tolerances(self)])
 
     def __repr__(self) -> str:
         return f"Explanation({self.mechanism.name!r}, t = {self.t:g}, rank {self.rank} of {len(self.psi)} rows)"
@@ -234,6 +235,11 @@ def _checks(e: Explanation) -> list[str]:
         "9. Checks: relative residuals, zero up to rounding",
         *(f"  {name:<{width}}  {x:.1e}" for name, x in e.checks.items()),
     ]
+
+
+def _tolerances(e: Explanation) -> list[str]:
+    title = "10. Motions: `rtol`, and `atol` relative to the mechanism's length, at which `simulate` had an error in the atlas"
+    return [title, *tolerance_lines(e.mechanism.name)]
 
 
 def _width(names: list[str]) -> int:
