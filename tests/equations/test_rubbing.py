@@ -11,6 +11,7 @@ from tests.run_programs import evaluate_programs
 from udkjax.equations.rubbing import rubbing_loads, settled_multipliers
 from udkjax.equations.textbook import prepare
 
+MOVING = {"a": udk.Body(1.0, 0.1, [0.4, 0.1], 0.3), "b": udk.Body(2.0, 0.3, [0.9, 0.3], 0.3)}
 MECHANISMS = {
     "pendulum": lambda: pendulum(coefficient=0.3, radius=0.1),
     "cart": lambda: cart(0.3, 0.2, static_coefficient=0.4, viscous=0.1),
@@ -18,6 +19,7 @@ MECHANISMS = {
     "slider-crank": lambda: rubbing(udk.library.slider_crank()),
     "trammel": lambda: rubbing(udk.library.elliptic_trammel()),
     "chain": lambda: rubbing(udk.library.double_pendulum(), radius=0.2),
+    "moving guide": lambda: rubbing(udk.Mechanism(MOVING, {"S": udk.Prismatic(["a", "b"], [[0.1, 0.2], [0.3, 0.1]], 0.5)})),
 }
 
 
@@ -28,7 +30,10 @@ def states(mechanism: udk.Mechanism, count: int) -> list[tuple[jnp.ndarray, jnp.
     return [(q, equations.tangent_part(0.0, q, q, q, jnp.asarray(rng.normal(size=q.size))).dv) for _ in range(count)]
 
 
-@pytest.mark.parametrize("name", ["pendulum", *(pytest.param(x, marks=pytest.mark.slow) for x in MECHANISMS if x != "pendulum")])
+FAST = "pendulum", "moving guide"
+
+
+@pytest.mark.parametrize("name", [*FAST, *(pytest.param(x, marks=pytest.mark.slow) for x in MECHANISMS if x not in FAST)])
 def test_elimination_agrees_with_the_textbook(name):
     mechanism = MECHANISMS[name]()
     equations, numbers = (
