@@ -40,12 +40,35 @@ def test_designs_are_found_shown_and_written(folder, capsys):
     assert udkjax("design", goal, "--starts", 30, "--results", 1, "--out", folder / "out", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     (one,) = found["designs"]
+    report = one["report"]
+    assert report["deviation"] == "at most 0 mm off on a path of 27.7333 mm"
+    assert (
+        report["pin P"] == "20, 10 mm"
+        and report["type"].startswith("crank-rocker")
+        and "deg at B" in report["transmission angle"]
+    )
+    assert report["lengths of crank"].startswith("O-A ") and report["lengths of crank"].endswith(" mm")
     assert one["loss"] < 1e-20 and one["turns"] and one["transmission"] >= np.sin(np.deg2rad(10)) - 1e-6
     mech = udk.load(folder / "out" / "design1.toml")
     np.testing.assert_allclose(mech.parameters()["pin.P"], [0.02, 0.01], atol=1e-9)
     np.testing.assert_allclose(mech.parameters()["pin.A"], one["parameters"]["pin.A"], rtol=1e-9, atol=1e-12)
     assert 0.002 * (1 - 1e-6) <= np.linalg.norm(np.subtract(one["parameters"]["pin.A"], one["parameters"]["pin.O"])) <= 0.06
-    assert (folder / "out" / "design1.html").stat().st_size > 10_000
+    page = (folder / "out" / "design1.html").read_text()
+    assert len(page) > 10_000 and page.count('"kind":"target"') == 3 and '"live":{' in page and '"motor.motor' in page
+
+
+@pytest.mark.slow
+def test_a_design_far_from_its_goal_has_an_exit_code_of_its_own_and_targets_come_from_a_table(folder, capsys):
+    """A crank of at most 8 mm cannot lead a point along such a zigzag."""
+    (folder / "path.csv").write_text("x,y,remark\n0,0,start\n40,60,\n80,-60,\n120,60,\n160,0,end\n")
+    goal = folder / "goal.toml"
+    goal.write_text(GOAL.replace("[[20, 10], [5, 17], [0, 7]]", '"path.csv"').replace("most = 60", "most = 8"))
+    assert udkjax("design", goal, "--starts", 30, "--results", 1) == 3
+    printed = capsys.readouterr()
+    assert "not a fit: at most " in printed.out and "mm off on a path of 397." in printed.err
+    (folder / "path.csv").write_text("x,y\n0,0\n40\n80,1\n")
+    assert udkjax("design", goal) == 2
+    assert "goal.targets: line 3 of path.csv must begin with 2 numbers" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

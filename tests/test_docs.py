@@ -124,6 +124,13 @@ def test_its_links_lead_somewhere(page):
             assert (page.parent / target).exists(), target
 
 
+@every_page
+def test_a_page_with_commands_says_where_the_command_is(page):
+    text = page.read_text()
+    if re.search(r"```sh\n(?:[^`]*\n)?udkjax ", text):
+        assert ".venv/bin" in text
+
+
 # --- names
 
 

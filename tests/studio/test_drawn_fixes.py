@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.studio.tasks import TEMPLATES, compile_drawing, diagnose_drawing, template_text
+from udkjax.studio.tasks import DRAWN, TEMPLATES, compile_drawing, diagnose_drawing, template_text
 
+NAMES = (*TEMPLATES, *DRAWN)
 PART = 0.3  # of the duration that the studio shows
 INSTANTS = 7
 
@@ -22,8 +23,12 @@ def all_fixes(text):
     return found, [fix for redundancy in found["sets"] for fix in redundancy["fixes"]]
 
 
+def test_every_scene_of_the_library_is_a_template():
+    assert {*udk.library.__all__} <= {*TEMPLATES}
+
+
 @pytest.mark.parametrize(
-    "template", ["parallelogram", *(pytest.param(name, marks=pytest.mark.slow) for name in TEMPLATES if name != "parallelogram")]
+    "template", ["parallelogram", *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES if name != "parallelogram")]
 )
 def test_every_fix_can_be_read_and_removes_redundancy(template):
     text = template_text(template)
@@ -37,7 +42,7 @@ def test_every_fix_can_be_read_and_removes_redundancy(template):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize("template", NAMES)
 def test_every_fix_leaves_the_motion_as_it_was(template):
     text = template_text(template)
     scene = compile_drawing(text)["scene"]

@@ -1,16 +1,20 @@
 """`udkjax design`."""
 
+import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 from udkjax.cli.common import Json, fail, refuse, show
+from udkjax.cli.exits import NO_FIT
 from udkjax.extras import OptionalImport
 
 with OptionalImport():
     import tyro
 
 Goal = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GOAL.toml")]
+
+TURN_INSTANTS = 241  # of a turn on a page
 
 
 def design(
@@ -22,7 +26,10 @@ def design(
     out: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Find mechanisms for a prescribed path, poses, or function; exit with 1 if no mechanism is found.
+    """Find mechanisms for a prescribed path, poses, or function.
+
+    The command exits with 1 if no mechanism is found, and with 3 if the best one is not a fit: it misses a target by more than a
+    tenth of their extent.
 
     The loss of a design is the weighted sum of squares of its residuals, the distances from the goal. With `complete = true` in
     the file, all four-bars through nine points, or five poses, are found, and --starts and --seed are ignored.
@@ -37,10 +44,9 @@ def design(
     for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
         if value < minimum:
             refuse(f"--{name} {value}: must be at least {minimum}")
-    import numpy as np
-
     from udkjax.show.summary import table
     from udkjax.synthesis.complete.complete_design import CompleteSearch
+    from udkjax.synthesis.fit import design_lines, deviation_of
     from udkjax.synthesis.goal_file import read_design
 
     try:
@@ -53,28 +59,31 @@ def design(
     designs = search(starts, seed, results)
     mech = search.problem.mechanism
     lines = {"starts": f"{starts}; {len(designs.losses)} ended within the limits"}
-    for k, candidate in enumerate(designs):
-        lines[f"design {k + 1}"] = f"loss {candidate.loss:.8g}, largest residual {np.max(np.abs(candidate.residuals)):.3g}"
+    reports = [design_lines(candidate, search.problem.goal) for candidate in designs]
+    tables = [table(f"design {k + 1}: loss {designs[k].loss:.8g}", report) for k, report in enumerate(reports)]
     if out is not None:
         lines["files in"] = _write(designs, search.problem.goal, out)
     listed = [
         {
             "loss": candidate.loss,
+            "report": report,
             "transmission": candidate.transmission,
             "turns": candidate.turns,
             "values": candidate.values,
             "residuals": candidate.residuals,
             "parameters": candidate.parameters,
         }
-        for candidate in designs
+        for candidate, report in zip(designs, reports, strict=True)
     ]
     show(
         {"starts": starts, "losses": designs.losses, "reason": designs.reason, "designs": listed},
-        table(f"designs of {mech.name or 'a mechanism'}", lines),
+        "\n\n".join([table(f"designs of {mech.name or 'a mechanism'}", lines), *tables]),
         json,
     )
     if not len(designs):
         fail(f"no mechanism was found: {designs.reason}")
+    if not deviation_of(designs[0], search.problem.goal).is_fit:
+        fail(reports[0]["deviation"], NO_FIT)
 
 
 def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
@@ -127,12 +136,30 @@ def _show_all(file: Path, search: Any, results: int, out: Path | None, json: boo
 
 
 def _write(designs: Iterable[Any], goal: Any, out: Path) -> str:
-    """Write each design as a drawing and as an animated page; return the folder."""
+    """Write each design as a drawing and as a page; return the folder."""
     import udkjax as udk
 
     out.mkdir(parents=True, exist_ok=True)
-    traces = [goal.point] if isinstance(goal, udk.PathGoal) else None
     for k, candidate in enumerate(designs):
         udk.save(candidate.mechanism, out / f"design{k + 1}.toml")
-        udk.animate(candidate.mechanism, candidate.motion(), measures=(), traces=traces).save(out / f"design{k + 1}.html")
+        _page(candidate, goal).save(out / f"design{k + 1}.html")
     return str(out)
+
+
+def _page(candidate: Any, goal: Any) -> Any:
+    """Return a design as a page with the targets: live for one turn of its motor, or else the motion over the driver's values."""
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.positions.drive import constant_speed
+
+    mech, driver = candidate.mechanism, candidate.driver
+    traces = [goal.point] if isinstance(goal, udk.PathGoal) and goal.at is None else None
+    targets = goal.targets[:, :2] if goal.has_place else None
+    speed = constant_speed(mech, driver) if isinstance(driver, str) else 0.0
+    if candidate.turns and speed:
+        sol = udk.simulate(mech, np.linspace(0.0, 2 * np.pi / abs(speed), TURN_INSTANTS), throw=False)
+        live = [name for name in mech.parameters() if name.startswith("pin.") or name == f"motor.{driver}.speed"]
+        with contextlib.suppress(ValueError):  # a page cannot simulate it
+            return udk.animate(mech, sol, traces=traces, targets=targets, live=live)
+    return udk.animate(mech, candidate.motion(), measures=(), traces=traces, targets=targets)

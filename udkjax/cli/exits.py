@@ -10,6 +10,7 @@ from udkjax.extras import MissingExtraError
 
 BAD_RUN = 1  # the command ran, and failed
 BAD_INPUT = 2  # the command did not run: wrong options, an unreadable file, a missing package; tyro uses the same code
+NO_FIT = 3  # a design was found, but its motion is far from the goal
 INTERRUPTED = 130  # Ctrl-C, as in a shell
 
 
@@ -24,10 +25,10 @@ def refuse(problem: object) -> NoReturn:
     sys.exit(BAD_INPUT)
 
 
-def fail(problem: object) -> NoReturn:
+def fail(problem: object, code: int = BAD_RUN) -> NoReturn:
     """Print the cause of a failed run, and exit."""
     say(str(problem))
-    sys.exit(BAD_RUN)
+    sys.exit(code)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: object) -> None:

@@ -23,7 +23,8 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show import fit_figures, sweep_figures
 from udkjax.show.player.mark_kinds import MarkKind
-from udkjax.show.player.marks import body_points, marks, to_ground
+from udkjax.show.player.mark_places import body_points, to_ground
+from udkjax.show.player.marks import marks
 from udkjax.show.player.player_data import trace_anchors
 from udkjax.show.style import COLOURS, DASHES, MARKERS, legend, plain
 from udkjax.study.accuracy import largest_violation

@@ -8,6 +8,8 @@ from udkjax.synthesis.design import DesignSearch as DesignSearch
 from udkjax.synthesis.design import design as design
 from udkjax.synthesis.designs import Designs as Designs
 from udkjax.synthesis.designs import FoundDesign as FoundDesign
+from udkjax.synthesis.fit import design_lines as design_lines
+from udkjax.synthesis.fit import deviation_of as deviation_of
 from udkjax.synthesis.goal_file import read_design as read_design
 from udkjax.synthesis.goals import FunctionGoal as FunctionGoal
 from udkjax.synthesis.goals import PathGoal as PathGoal

@@ -1,6 +1,8 @@
 """A design in a file: the mechanism, its goals and its limits, in units of the file."""
 
+import csv
 import inspect
+import io
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,7 +18,7 @@ from udkjax.synthesis.complete.complete_design import CompleteSearch
 from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
-from udkjax.wording import quote, unknown_key
+from udkjax.wording import plural, quote, unknown_key
 
 TOP = (
     "mechanism",
@@ -46,6 +48,8 @@ GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
         {"output": "", "values": "value", "targets": "output", "start": "", "output_start": "", "line": ""},
     ),
 }
+# Columns of a table of targets: x, y; x, y, angle; value of the driver, output.
+COLUMNS = {"path": 2, "poses": 3, "function": 2}
 # The kinds of motion goals, each with the unit of its measure; "effort" is the unit of the driver's effort. Below: further keys.
 MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
     "torque": (TorqueGoal, "effort"),
@@ -84,7 +88,7 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     if problems:
         raise SceneError(problems, name)
     mechanism = load(Path(path).parent / str(table["mechanism"]))
-    goal = _read_goal(mechanism, table["goal"], units, problems)
+    goal = _read_goal(mechanism, _with_table(table["goal"], Path(path).parent, problems), units, problems)
     bounds = _read_bounds(mechanism, table.get("bounds", {}), units, problems)
     lengths = _read_lengths(table.get("length", []), units, problems)
     terms = [_read_motion(k, mechanism, entry, units, problems) for k, entry in enumerate(table.get("motion", []))]
@@ -108,6 +112,25 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
         if isinstance(problem, SceneError):
             raise
         raise SceneError([str(problem)], name) from None
+
+
+def _with_table(goal: Any, folder: Path, problems: list[str]) -> Any:
+    """Return a goal with its targets as numbers, read from a table if it names one; a function's table has its values, too."""
+    if not isinstance(goal, Mapping) or not isinstance(goal.get("targets"), str) or goal.get("kind") not in COLUMNS:
+        return goal
+    file, columns, rows = folder / goal["targets"], COLUMNS[goal["kind"]], []
+    for k, row in enumerate(csv.reader(io.StringIO(file.read_text(encoding="utf-8-sig")))):
+        try:
+            numbers = [float(x) for x in row[:columns]]
+        except ValueError:
+            numbers = []
+        if len(numbers) == columns:
+            rows.append(numbers)
+        elif any(map(str.strip, row)) and k:  # the first line may be a heading
+            problems.append(f"goal.targets: line {k + 1} of {file.name} must begin with {plural(columns, 'number')}")
+    if goal["kind"] != "function":
+        return {**goal, "targets": rows}
+    return {**goal, "values": [row[0] for row in rows], "targets": [row[1] for row in rows]}
 
 
 def _read_goal(mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> Goal | None:

@@ -174,7 +174,7 @@ def test_every_kind_of_mark_is_drawn(tmp_path):
     )
     (contact,) = udk.Contact("free").expand(mech)
     assert isinstance(contact.condition, Gap)
-    every = marks(mech, mech.q0[None], gaps=[contact.condition])
+    every = marks(mech, mech.q0[None], gaps=[contact.condition], targets=[(1.0, 2.0)])
     found = {mark["kind"] for mark in every}
     assert found == SYMBOLS.keys()
     view = view_of((-1, -1, 4, 2), 600)

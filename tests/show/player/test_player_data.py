@@ -14,7 +14,8 @@ from tests.show.player.conftest import Motion
 from udkjax.integrate.events.conditions import Gap
 from udkjax.native.base.steps import Status
 from udkjax.show.player.animation import FailedRunWarning
-from udkjax.show.player.marks import body_points, corners_of, marks, to_ground
+from udkjax.show.player.mark_places import body_points, corners_of, to_ground
+from udkjax.show.player.marks import marks
 from udkjax.show.player.measure_curves import measures_of, reaction_arrows
 from udkjax.show.player.page import page
 from udkjax.show.player.player_data import PRECISION, run_record

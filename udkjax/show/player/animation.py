@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget
 
 LIVE_SECONDS, LIVE_INSTANTS = 10.0, 501  # duration and output times of a live page without a given run
+USUAL_MEASURES = ("violation", "energy", "rank")
 FRAME_HEIGHT = 560  # height of the player inside another page (px)
 
 
@@ -142,10 +143,11 @@ def animate(
     solution: ShownMotion | Mapping[str, ShownMotion] | None = None,
     *,
     drawing: PlacesBodies | None = None,
-    measures: Measures = ("violation", "energy", "rank"),
+    measures: Measures = USUAL_MEASURES,
     reactions: bool = False,
     traces: Traces | None = None,
     shapes: BodyPoints | None = None,
+    targets: ArrayLike | None = None,
     title: str | None = None,
     live: Live = False,
     events: ExpandsToEvents | Sequence[ExpandsToEvents] = (),
@@ -167,6 +169,7 @@ def animate(
         traces: joints, bodies (their centres of mass) or points of bodies, ("coupler", (x, y)), whose paths are drawn; by default
             the moving pins, up to eight.
         shapes: further points (n, 2) of bodies by name, in the bodies' frames (m), that the drawn bodies pass through.
+        targets: wanted places (n, 2) on the ground (m), which are marked.
         title: title; by default the mechanism's name.
         live: parameters (`parameters()`), or single entries of them, that get sliders in a live page. Such a page simulates the
             motion again when a number changes, and lets the reader pull bodies. {"pin.B[0]": (0.5, 2.0)} sets the range of a
@@ -204,7 +207,7 @@ def animate(
         require_history(f"solution[{label!r}]" if label else "solution", run, {"mechanism": mech})
         conditions = [event.condition for event in (expand_events(events, mech) if events else ())]
         gaps = [condition for condition in conditions if isinstance(condition, Gap)]
-        records.append((mech, *run_record(mech, run, label, measures, reactions, traces, shapes, gaps)))
+        records.append((mech, *run_record(mech, run, label, measures, reactions, traces, shapes, gaps, targets)))
         if failure := failure_of(run):
             failures[label] = failure
             warnings.warn(f"run {label!r} failed: {failure}" if label else f"the run failed: {failure}", FailedRunWarning, 2)
@@ -230,7 +233,9 @@ def _live_runs(
         runs = dict(zip(mechanism, solutions, strict=True)) if isinstance(mechanism, Mapping) else solutions[0]
     own_measures: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
     efforts = ["effort"] if any(mech.driver_names for mech in mechanisms) else []
-    wanted = dict.fromkeys([*own_measures, "violation", "energy", *efforts])  # the page updates violation, energy and effort
+    # The page updates violation, energy and effort. Unless others are asked for, the effort is shown first.
+    first = () if measures == USUAL_MEASURES else own_measures
+    wanted = dict.fromkeys([*first, *efforts, "energy", "violation"])
     return runs, {name: own_measures.get(name) for name in wanted if name != "rank"}
 
 

@@ -8,7 +8,7 @@ class MarkKind(StrEnum):
 
     LINK = "link"  # body, points, closed: a bar through the points at which a body is attached, or a plate around them
     DISC = "disc"  # body, at, radius: a body without any other mark, as a disc with its radius of gyration
-    WHEEL = "wheel"  # body, at, radius, internal: the pitch circle of a gear or a pinion
+    WHEEL = "wheel"  # body, at, radius, internal, perhaps teeth: the pitch circle of a gear or a pinion, and its number of teeth
     OUTLINE = "outline"  # body, at, points: the profile of a cam; its points are relative to `at`
     RAIL = "rail"  # body, at, axis, span, slot: the line of a prismatic joint or a slot, over its used range (m along `axis`)
     RACK = "rack"  # body, at, axis, span: the pitch line of a rack
@@ -17,6 +17,7 @@ class MarkKind(StrEnum):
     SUPPORT = "support"  # body, at: fixes a pin to the ground
     PIN = "pin"  # body, at, name: a revolute joint or the end of a rod
     ROLLER = "roller"  # body, at: slides in a slot or follows a cam
+    TARGET = "target"  # body, at: a wanted place
     WELD = "weld"  # body, at: a joint without relative motion
     ROD = "rod"  # a, b: a distance joint between two anchors
     SPRING = "spring"  # a, b, damper, length: a spring between two anchors, and its typical length (m)

@@ -32,18 +32,24 @@ from udkjax.scene.joints import (
 )
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.mark_kinds import MarkKind
+from udkjax.show.player.mark_places import SAME_PLACE, body_points, corners_of, distinct, in_frame, to_ground
 
 Mark = JsonObject
 BodyPoints = Mapping[str, ArrayLike]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # number of points of a cam's outline
-SAME_PLACE = 1e-9  # attachments closer than this, relative to the largest coordinate, are one point
 TOUCHING = 0.02  # relative to their distance: wheels with a larger gap are joined by a belt
 ROD = 0.01  # relative difference from the inertia of a uniform rod up to which a body is drawn as a rod
 MARGIN = 0.08  # length of a rail beyond the used range, relative to the mechanism's length
 
 
-def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = None, gaps: Sequence[Gap] = ()) -> list[Mark]:
+def marks(
+    mechanism: Mechanism,
+    poses: ArrayLike,
+    shapes: BodyPoints | None = None,
+    gaps: Sequence[Gap] = (),
+    targets: ArrayLike | None = None,
+) -> list[Mark]:
     """Return the marks of a mechanism, from back to front.
 
     Args:
@@ -51,6 +57,7 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = No
         poses: all poses in which it will be drawn.
         shapes: further points (n, 2) of bodies by name, in the bodies' frames (m), that the drawn bodies pass through.
         gaps: conditions of contacts, whose lines are drawn.
+        targets: wanted places (n, 2) on the ground (m).
 
     Raises:
         ValueError: a name in `shapes` is not a body.
@@ -61,37 +68,14 @@ def marks(mechanism: Mechanism, poses: ArrayLike, shapes: BodyPoints | None = No
     drawing = _Drawing(mechanism, np.asarray(poses, float), shapes or {})
     for gap in gaps:
         drawing.add_floor(gap)
+    places = np.zeros((0, 2)) if targets is None else np.asarray(targets, float)
+    wanted = [{"kind": MarkKind.TARGET, "body": -1, "at": place} for place in places.tolist()]
     links = drawing.links()
     plates = [mark for mark in links if mark.get("closed")]
     bars = [mark for mark in links if not mark.get("closed")]
     rings = [mark for mark in drawing.wheels if mark.get("internal")]
     wheels = [mark for mark in drawing.wheels if not mark.get("internal")]
-    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins]
-
-
-def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:
-    """Return the distinct points of each body (m, in its frame): attachments of joints, drivers and springs, and free pins."""
-    attached: dict[str, list[tuple[float, float]]] = {body: [] for body in (*mechanism.bodies, GROUND)}
-    springs = [force for force in mechanism.forces.values() if isinstance(force, Spring)]
-    for element in (*mechanism.constraints.values(), *springs):
-        points = getattr(element, "points", None)
-        if points is None or getattr(element, "coordinate", "") == "angle":
-            continue
-        for body, (x, y) in zip(element.bodies, np.asarray(points, float).tolist()):
-            attached[body].append((x, y))
-    if mechanism.drawing is not None:
-        for body, point in mechanism.drawing.free_pins().values():
-            attached[body].append(tuple(np.asarray(point, float).tolist()))
-    return {body: _distinct(points) for body, points in attached.items()}
-
-
-def _distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"]:
-    found: list[tuple[float, float]] = []
-    size = max((abs(c) for point in points for c in point), default=0.0)
-    for point in points:
-        if all(np.hypot(point[0] - x, point[1] - y) > SAME_PLACE * size for x, y in found):
-            found.append(point)
-    return np.array(found).reshape(-1, 2)
+    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins, *wanted]
 
 
 class _Drawing:
@@ -105,7 +89,7 @@ class _Drawing:
         self.number = {GROUND: -1, **{body: k for k, body in enumerate(mechanism.bodies)}}
         self.points = body_points(mechanism)
         for body, points in {**drawn, **shapes}.items():
-            self.points[body] = _distinct(
+            self.points[body] = distinct(
                 [*map(tuple, self.points[body].tolist()), *map(tuple, np.asarray(points, float).tolist())]
             )
         self.size = _size(self)
@@ -156,7 +140,7 @@ class _Drawing:
                 for k, x, y in (a, b):
                     self._pin(name, {"body": int(k), "at": [x, y]})
             case Gear():
-                self._gear(joint)
+                self._gear(name, joint)
             case Rack():
                 self._rack(joint)
             case Cam():
@@ -235,7 +219,9 @@ class _Drawing:
         span = [float(near.min()) - margin, float(near.max()) + margin]
         self.rails.append({"kind": MarkKind.FLOOR, **self._at(on, gap.through), "axis": axis, "span": span})
 
-    def _gear(self, joint: Gear) -> None:
+    def _gear(self, name: str, joint: Gear) -> None:
+        drawn = None if self.mechanism.drawing is None else self.mechanism.drawing.groups.get("gear", {}).get(name)
+        teeth = None if drawn is None or drawn.teeth is None else np.asarray(drawn.teeth)
         largest, radii = int(np.argmax(np.asarray(joint.radii))), np.asarray(joint.radii, float)
         strands = self._belt(joint)
         self.elements.extend({"kind": MarkKind.ROD, "a": a, "b": b} for a, b in strands)
@@ -243,6 +229,8 @@ class _Drawing:
             place = self._held_by(body, joint.carrier)
             is_ring = joint.internal and k == largest and not strands
             wheel = {"kind": MarkKind.WHEEL, **place, "radius": radius, "internal": is_ring}
+            if teeth is not None and not strands:
+                wheel["teeth"] = round(float(teeth[k]))
             if wheel not in self.wheels:
                 self.wheels.append(wheel)
             self.shaped.add(body)
@@ -251,7 +239,7 @@ class _Drawing:
         """Return the two strands of the belt between wheels that do not touch, on their carrier; an open one is internal."""
         radii, carrier = np.asarray(joint.radii, float), self._frames(joint.carrier)[0]
         axles = [self._path(body, self._held_by(body, joint.carrier)["at"])[0] for body in joint.bodies]
-        centres = [_local(carrier, axle) for axle in axles]
+        centres = [in_frame(carrier, axle) for axle in axles]
         arm = centres[1] - centres[0]
         distance, reach = float(np.hypot(*arm)), radii[0] - radii[1] if joint.internal else radii[0] + radii[1]
         if abs(distance - abs(reach)) <= TOUCHING * distance or distance <= abs(reach):
@@ -269,7 +257,7 @@ class _Drawing:
         axis, radius = float(joint.axis), float(joint.radius)
         frame, pinion = self._frames(first)[0], self._frames(second)[0, :2]
         right = np.array([np.sin(axis), -np.cos(axis)])
-        origin = _local(frame, pinion) + radius * right
+        origin = in_frame(frame, pinion) + radius * right
         start, end = self._travel(first, origin, axis, second, (0.0, 0.0))
         self.rails.append(
             {"kind": MarkKind.RACK, **self._at(first, origin), "axis": axis, "span": [start - radius, end + radius]}
@@ -312,37 +300,6 @@ class _Drawing:
         """Return the point about which two bodies turn: their revolute joint, or else the second body's centre of mass."""
         first, second = bodies
         return self._held_by(first if second == GROUND else second, second if second == GROUND else first)
-
-
-def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
-    """Return a point of a body in ground coordinates (m) for each of its frames x, y, angle; or several points for one frame."""
-    x, y = np.asarray(point, float).T
-    cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
-    return frames[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
-
-
-def corners_of(
-    points: Float[np.ndarray, "points 2"], polygon: Float[np.ndarray, "corners 2"] | None = None
-) -> tuple[Float[np.ndarray, "corners 2"], bool]:
-    """If the points are in line, return them in order, and False (a bar); else the corners of a plate around them, and True.
-
-    The plate is `polygon` if it contains all corners of the convex hull of the points; else the convex hull.
-    """
-    from scipy.spatial import ConvexHull  # importing SciPy takes longer than the call
-
-    spread = points - points.mean(axis=0)
-    if np.linalg.matrix_rank(spread, tol=SAME_PLACE * np.abs(spread).max()) < 2:
-        return points[np.argsort(spread @ np.linalg.svd(spread, full_matrices=False)[2][0])], False
-    hull, near = points[ConvexHull(points).vertices], SAME_PLACE * np.abs(points).max()
-    if polygon is not None and all(np.abs(polygon - corner).max(axis=1).min() <= near for corner in hull):
-        return polygon, True
-    return hull, True
-
-
-def _local(frame: Float[np.ndarray, "3"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Return a place, given in ground coordinates, in a body's frame."""
-    cos, sin = np.cos(frame[2]), np.sin(frame[2])
-    return np.array([[cos, sin], [-sin, cos]]) @ (place - frame[:2])
 
 
 def _size(drawing: _Drawing) -> float:

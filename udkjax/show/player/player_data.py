@@ -35,7 +35,8 @@ from udkjax.integrate.solution import Result
 from udkjax.positions.channels import locate
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.mark_kinds import MarkKind
-from udkjax.show.player.marks import BodyPoints, body_points, marks, to_ground
+from udkjax.show.player.mark_places import body_points, to_ground
+from udkjax.show.player.marks import BodyPoints, marks
 from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
 from udkjax.show.player.packing import floats, pack, unpack
 from udkjax.show.player.sketch import POINT, ForceArrow, TracedPath, view_of
@@ -66,6 +67,7 @@ def run_record(
     traces: Traces | None,
     shapes: BodyPoints | None = None,
     gaps: Sequence[Gap] = (),
+    targets: ArrayLike | None = None,
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return a run as plain data, and its poses; a failed run is shown up to its failure."""
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
@@ -83,7 +85,7 @@ def run_record(
         "label": label,
         "note": failure_of(solution) or (getattr(solution, "cause", "") if count < len(ts) else ""),
         "bodies": list(mechanism.bodies),
-        "marks": marks(mechanism, poses, shapes, gaps),
+        "marks": marks(mechanism, poses, shapes, gaps, targets),
         "traces": trace_anchors(mechanism, poses, traces, length),
         "time": pack(ts[shown, None], TIME_PRECISION * max(np.ptp(ts), frame)),
         "q": pack(poses.reshape(len(shown), -1), steps),

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.show.player.marks import Mark, to_ground
+from udkjax.show.player.mark_places import to_ground
+from udkjax.show.player.marks import Mark
 from udkjax.show.player.symbols import Symbol, symbols_of
 
 THEMES: dict[str, dict[str, Any]] = {

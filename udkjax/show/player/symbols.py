@@ -20,6 +20,7 @@ from udkjax.show.player.marks import Mark
 Symbol = Mark
 ROUND = 48  # vertices of a circle drawn as a polyline
 COIL_LENGTH = 11.0  # units per coil of a spring of usual length
+MOST_TEETH = 400  # drawn teeth of a wheel
 STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # straight ends of a spring in units; their largest fraction of its length
 
 
@@ -86,7 +87,8 @@ def _disc(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 def _wheel(mark: Mark, unit: float) -> Iterator[Symbol]:
     radius, body = mark["radius"], mark["body"]
-    depth, teeth = min(4 * unit, 0.12 * radius), int(np.clip(round(2 * np.pi * radius / (9 * unit) / 4) * 4, 12, 96))
+    teeth = min(mark.get("teeth", 0), MOST_TEETH) or int(np.clip(round(2 * np.pi * radius / (9 * unit) / 4) * 4, 12, 96))
+    depth = min(np.pi * radius / teeth if "teeth" in mark else 4 * unit, 0.12 * radius)
     tooth = np.array([(0, -1), (0.25, -1), (0.35, 1), (0.65, 1), (0.75, -1)])
     turn = 2 * np.pi / teeth * (np.arange(teeth)[:, None] + tooth[:, 0]).ravel()
     rim = np.tile(radius + tooth[:, 1] * depth / 2, teeth)[:, None] * _round(turn)
@@ -156,6 +158,11 @@ def _roller(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 def _weld(mark: Mark, unit: float) -> Iterator[Symbol]:
     yield _line(_at(mark), _offsets([(-4.5, -4.5), (4.5, -4.5), (4.5, 4.5), (-4.5, 4.5)]), "", 0, "ink", True)
+
+
+def _target(mark: Mark, unit: float) -> Iterator[Symbol]:
+    for x, y in ((4.5, 4.5), (4.5, -4.5)):
+        yield _line(_at(mark), _offsets([(-x, -y), (x, y)]), "accent", 1.6)
 
 
 def _rod(mark: Mark, unit: float) -> Iterator[Symbol]:
@@ -246,6 +253,7 @@ SYMBOLS = {
     MarkKind.PIN: _pin,
     MarkKind.ROLLER: _roller,
     MarkKind.WELD: _weld,
+    MarkKind.TARGET: _target,
     MarkKind.ROD: _rod,
     MarkKind.SPRING: _spring,
     MarkKind.SPIRAL: _spiral,

@@ -5,6 +5,7 @@ import {PageEngine} from "./page_engine.js";
 import {loadEngine} from "./player/engine.js";
 
 const COMPILE_DELAY = 120;  // ms without a change before an engine is compiled, which takes the server half a second or more
+const MOST_ENGINES = 12;  // of former structures, so that undo need not wait for the server
 const DIAGNOSE_DELAY = 250;  // ms without a change before a drawing is diagnosed, which takes the server a second
 
 /** The part of a drawing that its engine is compiled for: everything but the places of pins, which are parameters. */
@@ -12,7 +13,7 @@ const structureOf = ({pins, ...rest}) => JSON.stringify([Object.keys(pins ?? {})
 
 export class Sync {
   constructor(studio) {
-    Object.assign(this, {studio, stamp: 0, structure: null, pending: Promise.resolve()});
+    Object.assign(this, {studio, stamp: 0, structure: null, engines: new Map(), pending: Promise.resolve()});
   }
 
   /** Update everything for the current state; `settled` waits for it. */
@@ -69,21 +70,27 @@ export class Sync {
   }
 
   async compile(text, document, isLate) {
-    const {studio} = this, hasWasm = typeof WebAssembly === "object";
+    const {studio, engines} = this, structure = structureOf(document);
     studio.motion.showWaiting();
-    await new Promise(done => { setTimeout(done, COMPILE_DELAY); });
+    const compiled = engines.get(structure) ?? await this.compiled(text, isLate);
     if (isLate()) return;
-    let compiled = await ask("compile", {text, engine: hasWasm ? "wasm" : "recorded"});
-    if (isLate()) return;
-    if (!compiled.problems.length && !compiled.engine && !compiled.motion) {  // machine code cannot express it
-      compiled = {...await ask("compile", {text, engine: "recorded"}), why: compiled.why};
-      if (isLate()) return;
-    }
     if (compiled.problems.length) return void studio.findings.showProblems(compiled.problems);
+    engines.delete(structure);
+    if (compiled.engine) engines.set(structure, compiled);  // the last one used is the last one dropped
+    if (engines.size > MOST_ENGINES) engines.delete(engines.keys().next().value);
     const pageEngine = await PageEngine.load(document, compiled, loadEngine);
     if (isLate()) return;
-    this.structure = structureOf(document);
+    this.structure = structure;
     await studio.motion.use(pageEngine, compiled.why ?? "");
+  }
+
+  /** The server's engine of a drawing, or its motion if machine code cannot express it; null if the drawing has changed meanwhile. */
+  async compiled(text, isLate) {
+    await new Promise(done => { setTimeout(done, COMPILE_DELAY); });
+    if (isLate()) return null;
+    const found = await ask("compile", {text, engine: typeof WebAssembly === "object" ? "wasm" : "recorded"});
+    if (isLate() || found.problems.length || found.engine || found.motion) return found;
+    return {...await ask("compile", {text, engine: "recorded"}), why: found.why};
   }
 
   /** Find out why the motion ends early. */

@@ -1,0 +1,43 @@
+"""A thousand random gestures on drawings with motors: the page always answers, and undo restores everything."""
+
+import json
+
+import pytest
+
+from tests.studio.gestures import RandomGestures
+
+TEMPLATES = ("crank_rocker", "quick_return", "toggle_press", "cam_follower", "six_bar", "jansen_leg")
+GESTURES = 170  # on each of them
+TOO_LONG = "504 (Gateway Timeout)"  # the server gives up a diagnosis that takes too long, and the page says so
+FRAME = 0.2  # s: the longest time for which the page may be busy
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_random_gestures_are_answered_and_undone(studio, template):
+    studio.js(f"studio.files.openTemplate({json.dumps(template)})")
+    studio.until("studio.motion.pageEngine !== null")
+    studio.settle()
+    studio.watch()
+    first, gestures = studio.js("studio.state"), RandomGestures(studio, TEMPLATES.index(template))
+    longest: list[tuple[float, str]] = []
+    moves = 0
+    for k in range(GESTURES):
+        studio.js("watched.longest = 0")
+        done = gestures()
+        studio.problems[:] = [said for said in studio.problems if TOO_LONG not in said]
+        assert studio.problems == [], (k, done, studio.problems)
+        moves += studio.js("Boolean(studio.motion.pageEngine) && studio.motion.run?.count > 1")
+        longest.append((studio.watched()[1], f"{k}: {done}"))
+    print(f"{template}: moved after {moves} of {GESTURES} gestures; longest tasks of the page (s):", sorted(longest)[-5:])
+    assert moves > 0
+    slow = [one for one in longest if one[0] > FRAME]
+    studio.page.keyboard.press("Escape")
+    studio.page.keyboard.press("Escape")
+    studio.js("(() => { while (studio.history.canRedo) studio.redo(); })()")
+    last = studio.document
+    studio.js("(() => { while (studio.history.canUndo) studio.undo(); })()")
+    assert studio.js("studio.state") == first
+    studio.js("(() => { while (studio.history.canRedo) studio.redo(); })()")
+    assert studio.document == last
+    assert not slow, slow
