@@ -25,7 +25,7 @@ class Deviation(NamedTuple):
         extent: length of the path, or range of the outputs (m, rad).
         angle: of a link through poses, the largest difference of its angle (rad); else None.
         unit: m or rad.
-        size: the extent of the targets in the plane, or the range of the outputs, by which a fit is told.
+        size: the extent of the targets in the plane, or the range of the outputs, of which a tenth is accepted.
     """
 
     largest: float
@@ -54,7 +54,8 @@ def deviation_of(design: FoundDesign, goal: Goal) -> Deviation:
     residuals = design.residuals
     targets = goal.targets
     if isinstance(goal, FunctionGoal):
-        extent, unit = float(np.ptp(targets)), element_of(design.mechanism, goal.output).unit
+        is_angle = element_of(design.mechanism, goal.output).coordinate == "angle"
+        extent, unit = float(np.ptp(targets)), "rad" if is_angle else "m"
         return Deviation(float(np.max(np.abs(residuals))), extent, None, unit, extent)
     places, angle = targets[:, :2], None
     if isinstance(goal, PoseGoal):

@@ -108,7 +108,14 @@ def test_a_run_that_begins_elsewhere_keeps_its_beginning():
 def test_ten_seconds_are_simulated_where_no_run_is_given():
     animation = udk.animate(udk.library.simple_pendulum(), live=["gravity[1]"])
     assert (animation.data["start"], animation.data["end"]) == (0.0, 10.0)
-    assert animation.data["runs"][0]["measures"][0]["name"] == "violation"
+    names = [m["name"] for m in animation.data["runs"][0]["measures"]]
+    assert "energy" in names[0] and names[-1] == "violation"
+
+
+def test_a_live_page_opens_with_the_effort_of_its_driver(slider_crank):
+    driven = udk.animate(slider_crank, udk.simulate(slider_crank, np.linspace(0.0, 0.1, 3)), live=["gravity[1]"])
+    names = [m["name"] for m in driven.data["runs"][0]["measures"]]
+    assert names[0] == "torque of motor" and names[-1] == "violation"
 
 
 @pytest.mark.slow

@@ -221,7 +221,8 @@ class _Drawing:
 
     def _gear(self, name: str, joint: Gear) -> None:
         drawn = None if self.mechanism.drawing is None else self.mechanism.drawing.groups.get("gear", {}).get(name)
-        teeth = None if drawn is None or drawn.teeth is None else np.asarray(drawn.teeth)
+        given = getattr(drawn, "teeth", None)
+        teeth = None if given is None else np.asarray(given)
         largest, radii = int(np.argmax(np.asarray(joint.radii))), np.asarray(joint.radii, float)
         strands = self._belt(joint)
         self.elements.extend({"kind": MarkKind.ROD, "a": a, "b": b} for a, b in strands)
