@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from experiments import atlas
 from experiments.common import PACKAGE_DATA, load
 from experiments.parts.atlas_problems import PROBLEMS
 from experiments.parts.atlas_reference import reference
@@ -75,6 +76,20 @@ def test_the_package_reads_the_table_of_the_committed_data():
 def test_chains_in_space_move_as_their_quadratic_rows_say(name):
     problem = PROBLEMS[name]._replace(end=1.0)
     assert problem.redundant and reference(problem, 2).apart.max() < 1e-11
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", atlas.SPATIAL)
+def test_small_rank_thresholds_cost_steps_in_space(name):
+    """Violations within a step count as rank: rows depend on others in closed positions only."""
+    problem = PROBLEMS[name]
+
+    def steps(threshold):
+        ts = [0.0, problem.end]
+        run = udk.simulate(problem.mechanism, ts, problem.states(1)[0], 1e-6, 1e-6, udk.SVD(threshold))
+        return int(run.stats["steps"])
+
+    assert steps(1e-8) > 4 * steps(1e-4) and steps(1e-4) < 1.3 * steps(1e-3)
 
 
 @pytest.mark.slow
