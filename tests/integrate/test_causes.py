@@ -176,3 +176,18 @@ def test_a_cause_belongs_to_its_solution_alone():
     moved = eqx.tree_at(lambda s: s.time, one, 0.1)
     assert "motor" in one.cause and "motor" not in moved.cause and "end time" in other.cause
     assert pickle.loads(pickle.dumps(one.found_cause)).text(int(one.code), float(one.time)) in one.cause
+
+
+@pytest.mark.parametrize("tol", [1e-9, *(pytest.param(x, marks=pytest.mark.slow) for x in (1e-4, 1e-6, 1e-8, 1e-11))])
+@pytest.mark.parametrize("end", [0.5, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_a_run_does_not_follow_the_positions_nearest_to_a_dead_point(tol, end):
+    """A five-link press whose crank a motor turns at 60 rpm: beyond its reach nearest positions are open, and go on."""
+    pins = {"A": (-10, 40), "B": (10, 80), "C": (75, 165), "D": (115, 85), "E": (140, 20), "F": (190, 165), "G": (220, 40)}
+    links = {"crank": "AB", "plate": "BCD", "rocker": "DE", "coupler": "CF", "output": "FG"}
+    bars = {name: udk.Link(list(ends), mass=0.1) for name, ends in links.items()}
+    motors = [{"pin": "A", "speed": "60 rpm"}]
+    press = udk.Drawing(pins, bars, ["A", "E", "G"], motors=motors, units={"length": "mm"}).mechanism()
+    solution = failed(press, np.linspace(0.0, end, 11), rtol=tol, atol=tol, max_steps=5000)
+    assert solution.result in (Result.drift, Result.step_too_small)
+    assert float(solution.time) == pytest.approx(0.12112, abs=1e-4 if tol < 1e-5 else 1e-2)
+    assert "dead point: pins B, D, E in line" in solution.cause

@@ -126,6 +126,25 @@ def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
+def test_ten_times_more_or_less_refuses_no_projected_run_across_singular_configurations(factor, monkeypatch):
+    """The bound of Psi after a projection, in tolerances."""
+    monkeypatch.setattr(controller, "CLOSED_TOL", controller.CLOSED_TOL * factor)
+    primitive.generate.cache_clear()
+    primitive.machine_code.cache_clear()
+    for mech in (swing(), swing(0.9), kite(), equal_crank(), udk.library.n_four_bar(2), udk.library.peaucellier(1.1, 2.0)):
+        for method in (udk.Auto(), udk.SVD(1e-4), udk.Elimination(1e-3)):
+
+            def code(tol, mech=mech, method=method):
+                return udk.simulate(mech, TS, method=method, rtol=tol, atol=tol, throw=False).code
+
+            codes = jax.vmap(code)(jnp.array([1e-3, 1e-5, 1e-7, 1e-9, 1e-11]))
+            assert codes.tolist() == [Result.successful] * 5, (mech.name, method)
+    primitive.generate.cache_clear()
+    primitive.machine_code.cache_clear()
+
+
+@pytest.mark.slow
 def test_each_member_of_a_batch_has_its_own_end_and_derivatives_as_other_failed_runs():
     angles, ts = jnp.array([SWING, 0.9]), np.linspace(0.0, 3.0, 4)
 

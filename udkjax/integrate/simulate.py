@@ -86,11 +86,12 @@ def simulate(
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. The result has derivatives of any order, forward and reverse; second and higher ones take as long as a hundred
     runs, and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there; machine
-    code also ends a run at a violation above 0.01 L or 0.01 rad after a projected step. Where rows become dependent, a run that
-    is not projected may lose its energy or change its branch: it ends as `singular` at a step whose violation of Psi exceeds
-    `drift_tol` times the square of the distance from such a configuration, relative to the largest distance of the run. Where
-    rows depend on others along the whole motion, a run whose method finds a larger rank ends as `spurious_rank`; machine code
-    looks after each step, other solvers at the end.
+    code also ends a run at a projected step that leaves more than `drift_tol`, a hundred tolerances and the threshold of pivots,
+    or more than 0.01 (relative to L, or rad). Where rows become dependent, a run that is not projected may lose its energy or
+    change its branch: it ends as `singular` at a step whose violation of Psi exceeds `drift_tol` times the square of the
+    distance from such a configuration, relative to the largest distance of the run. Where rows depend on others along the whole
+    motion, a run whose method finds a larger rank ends as `spurious_rank`; machine code looks after each step, other solvers at
+    the end.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.

@@ -141,7 +141,7 @@ def _explain_drift(run: FailedRun) -> str | None:
     anew = "analyse the mechanism with its present numbers, or use method=SVD()"
     if not text:
         return f"rows of {', '.join(left_out)} are left out as redundant, but are independent: {anew}"
-    reach = explain_reach(run, run.time)
+    reach = explain_reach(run, _shortly_after(run, run.time))
     if reach:
         return reach
     size = float(np.max(np.abs(run.psi(run.time, q)) / run.row_scales))
@@ -286,8 +286,13 @@ def _stiff(run: FailedRun) -> str:
 
 def _reach_at_end(run: FailedRun) -> str:
     """Describe the demands of drivers if the run ended where the mechanism cannot follow them."""
-    t, span = run.states[0][0], float(run.ts[-1] - run.ts[0])
-    return explain_reach(run, min(float(run.ts[-1]), t + NEAR_REACH * span)) if t < run.ts[-1] else ""
+    t = run.states[0][0]
+    return explain_reach(run, _shortly_after(run, t)) if t < run.ts[-1] else ""
+
+
+def _shortly_after(run: FailedRun, t: float) -> float:
+    """Return a time at which a demand that stopped the run at t is clearly out of reach."""
+    return min(float(run.ts[-1]), t + NEAR_REACH * float(run.ts[-1] - run.ts[0]))
 
 
 def _near_singular(run: FailedRun) -> str:

@@ -41,6 +41,7 @@ SETTINGS = (
     "method",
     "drift_tol",
     "most_rank",
+    "open_tol",
 )
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")

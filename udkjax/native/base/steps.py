@@ -91,9 +91,12 @@ class Status:
     RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, SINGULAR, SPURIOUS_RANK, CROSSED, UNRESOLVED = range(10)
 
 
-# Tolerance of Psi after the projection of a step, each row over its scale; projection usually leaves 1e-12. If it is exceeded, no
-# position nearby is closed, for instance because a driver exceeds the range of a linkage, and the motion cannot be continued.
-LOST_TOL = 1e-2
+# Bounds of Psi after the projection of a step, each row over its scale. Projection usually leaves 1e-12. Where rows become
+# dependent, it leaves a fraction of the error before it, which is some tolerances, and rows with small pivots are left out.
+# Beyond CLOSED_TOL tolerances, the threshold of pivots and `drift_tol`, or beyond LOST_TOL whatever these are, no position
+# nearby is closed, for instance because a driver exceeds the range of a linkage. The nearest positions change smoothly with
+# time: a run would follow them by thousands of steps.
+CLOSED_TOL, LOST_TOL = 100.0, 1e-2
 
 LOOK_AHEAD = 1e-6  # fraction of the span after the end of a stopped run that is searched for non-finite numbers
 

@@ -21,6 +21,7 @@ from udkjax.native.base.module import Module
 from udkjax.native.base.power import power
 from udkjax.native.base.steps import (
     CLEARLY,
+    CLOSED_TOL,
     CORRECTIONS,
     EXPECTED,
     FACTORS,
@@ -207,7 +208,8 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
         s.where(accept, distance2=s.distance)
         if module.m and module.plan.projected:
             module.invoke(f, "psi")
-            is_lost = accept & (largest_violation(module, f) > LOST_TOL)
+            bound = f.min(f.const(LOST_TOL, DOUBLE, f.width), f.max(s.open_tol, (s.rtol + s.atol) * CLOSED_TOL))
+            is_lost = accept & (largest_violation(module, f) > bound)
             lost.value = f.select(is_lost, f.const(Status.LOST, DOUBLE, f.width), 0.0)
         if module.measures_drift:
             lost.value = _judge_drift(module, f, s, accept)
