@@ -322,5 +322,9 @@ class Module(Running):
         """Compute the accelerations at the end of a step that is not projected, `result a`."""
         self.accelerate(f, "result a")
 
+    def rank(self, f: Function) -> Value | None:
+        """Return the rank of the rows that were factorized last; None if the method does not find one."""
+        return None
+
     def accelerate_end(self, f: Function):
         """Hook: called with `state q`, `result v` and their accelerations `result a` at the end of a step."""

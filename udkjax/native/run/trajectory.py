@@ -22,7 +22,7 @@ All functions of a module work on one block of memory (`Layout`): `run` loads me
 
 from collections.abc import Callable, Sequence
 
-from udkjax.native.base.ir import DOUBLE, Function
+from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
 from udkjax.native.base.samples import write_next_breakpoint
@@ -66,6 +66,9 @@ class Trajectory(Module):
         self.accelerate(f, "result a")
         if self.measures_drift:
             self.invoke(f, "drift")
+
+    def rank(self, f: Function) -> Value | None:
+        return self.dense.rank(f) if self.dense else None
 
     def accelerate_end(self, f: Function):
         if self.formulated:
