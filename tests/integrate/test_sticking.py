@@ -267,3 +267,22 @@ def test_constant_torque_sticks():
     stop = 0.5 * 3.0 / 0.2
     np.testing.assert_allclose(solution.q[:, 0, 2], [0.0, 3.0 - 0.2, 3.0 * stop / 2], atol=1e-11)
     assert solution.events.of("A sticks") == pytest.approx([stop], abs=1e-11)
+
+
+@pytest.mark.slow
+def test_a_driven_joint_begins_to_slide_with_its_driver():
+    """A crank that is driven from rest, without a jump of its acceleration, and a bob that sticks to it at first."""
+    mechanism = udk.Mechanism(
+        {"crank": udk.Body(1.0, 0.1, [0.25, 0.0]), "bob": udk.Body(1.0, 0.05, [0.5, -0.3])},
+        {
+            "A": udk.Revolute(["ground", "crank"], [[0.0, 0.0], [-0.25, 0.0]]),
+            "B": udk.Revolute(["crank", "bob"], [[0.25, 0.0], [0.0, 0.3]]),
+        },
+        {"motor": udk.Driver(["ground", "crank"], "angle", udk.Polynomial([0.0, 0.0, 0.0, 1.0, -0.4]))},
+        {name: udk.Friction(name, coefficient=0.3, radius=0.05, **STICKS) for name in "AB"},
+    )
+    solution = udk.simulate(mechanism, np.linspace(0.0, 2.5, 26), **TOL)
+    assert solution.events.of("A slips") == pytest.approx([0.0], abs=1e-9)
+    assert solution.events.of("A turns round") == pytest.approx([1.875], abs=1e-9)  # where the rate of the driver is zero
+    assert solution.events.of("B slips")[0] > 0.1
+    assert solution.settings["engine"] == "native"

@@ -171,9 +171,9 @@ class EventPlan:
         return (phase & ~self._switches_of_locks) | xp.any(locked[..., None] & pairs, axis=-2)
 
     def not_sliding(self, sides: Float[Any, "*m S"], xp: ModuleType) -> Bool[Any, "*m E"]:
-        """Return a mask of the directions of joints in which these do not slide."""
+        """Return a mask of the directions that do not count: joints do not slide in them, and do not wait for their drivers."""
         direction, at_rest = (sides[..., self.directions_of_sliding + k] for k in range(2))
-        either = [(direction * sign < 0.5) | (at_rest > 0.5) for sign in (1, -1)]
+        either = [((direction * sign < 0.5) | (at_rest > 0.5)) & (at_rest < 1.5) for sign in (1, -1)]
         position, own = np.zeros((2, self.count), int)
         position[self.forwards], position[self.forwards + 1] = np.arange(len(self.forwards)), np.arange(len(self.forwards))
         own[self.forwards + 1] = 1

@@ -66,7 +66,8 @@ def listing(
         after, first = (_stick(phases, x, y, xp) for x, y in ((found.event_phase, found.sides), _first(found)))
         i, of_joint = xp.clip((event - own) // 2, 0, F - 1), (event >= own) & (event < own + 2 * F)
         stays = after[k, i]
-        transition = xp.where(kind == 1, SLIPS, xp.where(stays, STICKS, TURNS))
+        began = xp.concatenate([first, after[:-1]])[k, i]
+        transition = xp.where((kind == 1) | (began & ~stays), SLIPS, xp.where(stays, STICKS, TURNS))
         index = xp.where(of_joint, 3 * own + len(TRANSITIONS) * i + transition, index)
         is_hidden = is_hidden | (is_event & of_joint & (kind == 1) & stays)  # another joint holds it now
         last = xp.searchsorted(found.event_time, ts, side="right") - 1

@@ -51,7 +51,7 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
     hits = (event >= 0) & (event < E) & xp.asarray(plan.impacts & ~plan.impacts.all())[event % E]
     if xp is not np or (unknown | hits).any():
-        begins, falling = event == BEGIN, plan.impacts | plan.kinks
+        begins, falling = event == BEGIN, plan.impacts | plan.kinks | plan.slides
         is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
         # Contacts are approached from the allowed side: an impact whose condition is zero at the start and falls happens at once.
         before = xp.where(begins[:, None], xp.where(falling & is_zero, 1, now), sides[:, :E])

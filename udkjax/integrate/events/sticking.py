@@ -44,6 +44,7 @@ class FrictionModes(NamedTuple):
     locked: Bool[Any, "*m F"]
     direction: Float[Any, "*m F"]  # of sliding, or of the limit that is reached; 0: within the limit
     at_rest: Bool[Any, "*m F"]  # joints that others keep at rest
+    driven: Bool[Any, "*m F"]  # joints at rest without a motion of their own, which wait for drivers
 
 
 class _JointsAtRest(NamedTuple):
@@ -68,14 +69,16 @@ def modes_of(system: System, members: MemberIndices, at: RunState) -> FrictionMo
     """Return the modes of the joints of members."""
     plan, sides = system.plan, system.sides(members, at.joints)
     direction, rest = (sides[..., plan.directions_of_sliding + k] for k in range(2))
-    return FrictionModes(plan.locked(at.phase), direction, rest > 0.5)
+    return FrictionModes(plan.locked(at.phase), direction, rest > 0.5, rest > 1.5)
 
 
 def with_modes(system: System, members: MemberIndices, at: RunState, modes: FrictionModes) -> RunState:
     """Return the states with other modes; NumPy arrays of sides change in place."""
     plan, xp = system.plan, system.xp
     sides = system.sides(members, at.joints)
-    values = xp.stack([xp.where(modes.locked, 0.0, modes.direction), xp.where(modes.locked, 0.0, 1.0 * modes.at_rest)], axis=-1)
+    values = xp.stack(
+        [xp.where(modes.locked, 0.0, modes.direction), xp.where(modes.locked, 0.0, 1.0 * modes.at_rest + modes.driven)], axis=-1
+    )
     sides = xp.concatenate([values.reshape(*values.shape[:-2], -1), sides[..., plan.first_kink_side :]], axis=-1)
     return at._replace(phase=plan.with_locks(at.phase, modes.locked, xp), joints=system.with_sides(members, at.joints, sides))
 
@@ -140,17 +143,18 @@ def _decide(
     moves = diagonal > BLOCKED * mobility
     size = xp.sqrt(xp.where(moves, diagonal, 1.0))
     if xp is np and not rest.any():
-        return FrictionModes(rest, xp.sign(speed), rest), xp.zeros(at.t.shape, bool)
+        return FrictionModes(rest, xp.sign(speed), rest, rest), xp.zeros(at.t.shape, bool)
     at = _with_locks(system, members, at, rest & ~before.locked)
     W = xp.where(moves[..., None, :] & moves[..., :, None], W / size[..., None, :] / size[..., :, None], 0.0)
     candidates = _JointsAtRest(rest, xp.sign(speed), W, before.locked, scale * rate)
 
     left = xp.where(leaves[0], 1.0, xp.where(leaves[1], -1.0, 0.0))
     kept = xp.where(before.at_rest & rest, before.direction, 0.0)
-    direction = xp.where(left != 0, left, kept)
+    started = before.driven & (is_stopped[0] | is_stopped[1])  # its speed, in one of both directions, has become negative
+    direction = xp.where(left != 0, left, xp.where(started, xp.where(is_stopped[0], -1.0, 1.0), kept))
     if len(forwards) > 1 and (xp is not np or (rest.sum(axis=-1) > 1).any()):
-        direction = xp.where(left != 0, left, _guess(system, members, at, candidates, size, direction))
-    start = _Pivot(rest & (direction == 0), rest & False, direction, xp.asarray(0), xp.zeros(at.t.shape, bool))
+        direction = xp.where((left != 0) | started, direction, _guess(system, members, at, candidates, size, direction))
+    start = _Pivot(rest & (direction == 0), started, direction, xp.asarray(0), xp.zeros(at.t.shape, bool))
     most = (BLOCK_STEPS + SINGLE_STEPS) * len(forwards) + 8
 
     def step(pivot: _Pivot) -> _Pivot:
@@ -200,7 +204,7 @@ def _guess(
 
     def improve(share: Any) -> Any:
         """Return the forces as shares of the limits, from those before."""
-        trial = with_modes(system, members, at, FrictionModes(none, xp.where(known.rest, share, known.sliding), known.rest))
+        trial = with_modes(system, members, at, FrictionModes(none, xp.where(known.rest, share, known.sliding), known.rest, none))
         found = system.look(members, trial, has_forces=True)
         a, limit = found.rate[..., plan.forwards] / size, size * found.forces[..., plan.forwards]
         force = share * limit
@@ -239,4 +243,6 @@ def _modes(known: _JointsAtRest, pivot: _Pivot, xp: ModuleType) -> FrictionModes
             locked = locked | (takes[..., None] & (np.arange(F) == i))
     moves = xp.diagonal(remainder, axis1=-2, axis2=-1) > CARRIED
     at_rest = known.rest & ~locked & ~moves & ~pivot.departs
-    return FrictionModes(locked, xp.where(known.rest, xp.where(pivot.within, 0.0, pivot.direction), known.sliding), at_rest)
+    driven = at_rest & (xp.diagonal(known.W, axis1=-2, axis2=-1) == 0)
+    direction = xp.where(known.rest, xp.where(pivot.within, 0.0, pivot.direction), known.sliding)
+    return FrictionModes(locked, direction, at_rest, driven)

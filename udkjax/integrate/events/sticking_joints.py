@@ -29,7 +29,7 @@ class DirectedFriction(Friction):
     """Set-valued friction of a joint that slides in a given direction, or sticks.
 
     Its `sides` are the direction of sliding, 1 or -1 (0: the friction has no force), and one if the joint is at rest although no
-    constraint of its own locks it, so that the coefficient is the static one.
+    constraint of its own locks it, so that the coefficient is the static one; two if it waits for its drivers.
     """
 
     sides: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))
