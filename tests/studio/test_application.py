@@ -9,7 +9,7 @@ import udkjax as udk
 from udkjax.studio.findings import pins_in_line
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import duration_of
-from udkjax.studio.tasks import DRAWN, TEMPLATES
+from udkjax.studio.tasks import DRAWN, TEMPLATES, template_text
 from udkjax.studio.worker import Worker, WorkerPool
 
 SIX_BAR = """format = 2
@@ -362,3 +362,13 @@ def test_a_task_is_given_to_a_free_worker():
     assert pool.call("compile_drawing", {}, 1.0)["worker"] is pool.workers[1]
     pool.workers[1] = Stub(True)  # pyright: ignore[reportArgumentType, reportCallIssue]
     assert pool.call("compile_drawing", {}, 1.0)["worker"] is pool.workers[0]
+
+
+def test_klann_s_foot_steps_along_a_line():
+    """Its foot is on the ground, within a tenth of its step, for nearly half of a turn."""
+    leg = udk.loads(template_text("klann_leg"))
+    foot = np.asarray(udk.motion_at(leg, list(range(361))).pins["G"])[:, 0]
+    step, lift = np.ptp(foot, axis=0)
+    assert 0.06 < step < 0.07 and 0.3 < lift / step < 0.6
+    low = foot[foot[:, 1] < foot[:, 1].min() + 0.05 * step]
+    assert len(low) > 0.45 * len(foot) and np.ptp(low[:, 0]) > 0.95 * step

@@ -120,6 +120,10 @@ class AbstractDrawing(PrintsTable):
         """Return the lengths of each body and of the ground as text; empty if numbers are traced."""
 
     @abstractmethod
+    def dimensions(self) -> Mapping[tuple[str, str], str]:
+        """Return the lengths of all links and of the ground as text, by pairs of pins, in the unit of the drawing."""
+
+    @abstractmethod
     def touching_pins(self) -> list[str]:
         """Return the pins whose places have no derivatives, as circles only touch there. Numbers are concrete."""
 

@@ -29,6 +29,7 @@ print(sol)
 udk.animate(mech, sol).save("motion.html")
 '''
 
+LABELLED = (".svg", ".png", ".dxf")  # pictures with the names of points and the lengths of links
 FORMULA = ("=", "+", "-", "@", "\t")  # a spreadsheet evaluates cells that begin like this, unless an apostrophe comes first
 
 
@@ -48,7 +49,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
         return table(mechanism, run).encode()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"drawing{suffix}"
-        shown(mechanism, run, suffix).save(path)
+        shown(mechanism, run, suffix).save(path, **({"labels": True} if suffix in LABELLED else {}))
         return path.read_bytes()
 
 

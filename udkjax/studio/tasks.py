@@ -32,6 +32,7 @@ DRAWN: Mapping[str, str] = {
     "cam_follower": "Cam and follower",
     "six_bar": "Six-bar",
     "jansen_leg": "Jansen's walking leg",
+    "klann_leg": "Klann's walking leg",
     "door_closer": "Door closer",
 }
 # Further templates: mechanisms of the library, as drawings.

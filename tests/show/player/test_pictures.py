@@ -14,6 +14,8 @@ from udkjax.integrate.events.conditions import Gap
 from udkjax.show.player import films
 from udkjax.show.player.marks import marks
 from udkjax.show.player.page import module
+from udkjax.show.player.picture_labels import Placing, labels_of
+from udkjax.show.player.pictures import sketches
 from udkjax.show.player.sketch import THEMES, Sketch, view_of
 from udkjax.show.player.symbols import SYMBOLS, symbols_of
 
@@ -123,6 +125,64 @@ def test_a_dxf_is_in_metres_in_layers(animation, closed_form, tmp_path):
     assert {"links", "joints", "ground", "motors", "blocks"} <= {layer.dxf.name for layer in drawing.layers}
     paths = space.query('LWPOLYLINE[layer=="paths"]')
     assert_paths_of_slider_crank([np.array([point[:2] for point in path.get_points()]) for path in paths], 1e-4)
+
+
+@pytest.fixture(scope="module")
+def four_bar():
+    pins = {"O": [0, 0], "A": udk.polar("O", 40, 60), "C": [100, 0], "B": udk.circles(["A", "C"], [120, 80], "left")}
+    links = {name: {"pins": [*ends], "mass": 1} for name, ends in {"crank": "OA", "coupler": "AB", "rocker": "CB"}.items()}
+    return udk.Drawing(pins, links, ["O", "C"], units={"length": "mm", "angle": "deg"}, name="a < b").mechanism()
+
+
+def test_names_and_lengths_are_written(four_bar, tmp_path):
+    shown = udk.animate(four_bar, measures=())
+    texts = re.findall(r"<text [^>]*>([^<]*)</text>", shown.save(tmp_path / "pose.svg", labels=True).read_text())
+    assert sorted(texts) == ["100 mm", "120 mm", "40 mm", "80 mm", "A", "B", "C", "O"]
+    assert "<text" not in shown.save(tmp_path / "plain.svg").read_text()
+    plain, labelled = (np.asarray(films.image(shown, labels=on), float) for on in (False, True))
+    assert (np.abs(plain - labelled).max(axis=2) > 100).sum() > 300
+
+
+def test_texts_of_a_picture_cover_no_pin_and_no_other_text(four_bar):
+    _, (sketch,) = sketches(udk.animate(four_bar, measures=()), None, 640, "light")
+    placing = Placing(labels_of(four_bar, []), sketch)
+    centres = np.array([middle for middle, *_ in placing.boxes])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2) + 99 * np.eye(len(centres))
+    assert apart.min() > 10 * placing.pt
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    assert (low > 0).all() and (high < [sketch.view.width, sketch.view.height]).all()
+
+
+def test_lengths_are_dimensions_of_a_dxf(four_bar, tmp_path):
+    ezdxf = pytest.importorskip("ezdxf", reason="ezdxf is not installed: pip install '.[dxf]'")
+    space = ezdxf.readfile(udk.animate(four_bar, measures=()).save(tmp_path / "pose.dxf")).modelspace()
+    lengths = {d.dxf.text: d.get_measurement() for d in space.query('DIMENSION[layer=="dimensions"]')}
+    expected = {"40 mm": 0.04, "80 mm": 0.08, "100 mm": 0.1, "120 mm": 0.12}
+    assert lengths == pytest.approx(expected, rel=2e-5)  # positions of a page are rounded to 1e-5
+    assert sorted(t.dxf.text for t in space.query('TEXT[layer=="names"]')) == ["A", "B", "C", "O"]
+
+
+def meshing(teeth, internal):
+    """A pair of drawn wheels: their marks, and the frames in which they are drawn."""
+    pins, wheels = {"O": [0, 0], "C": [60 if not internal else 20, 0]}, {"a": "O", "b": "C"}
+    links = {name: {"pins": [pin], "mass": 1, "width": 10} for name, pin in wheels.items()}
+    gears = [{"links": ["a", "b"], "teeth": teeth, "internal": internal}]
+    mech = udk.Drawing(pins, links, ["O", "C"], gears=gears, units={"length": "mm"}).mechanism()
+    return [mark for mark in marks(mech, mech.q0[None]) if mark["kind"] == "wheel"]
+
+
+@pytest.mark.parametrize(("teeth", "internal"), [([20, 40], False), ([17, 31], False), ([40, 20], True)])
+def test_wheels_have_their_teeth_which_mesh(teeth, internal):
+    """On the line of centres, a tooth of one wheel stands in a gap of the other one: tooth and gap are half a pitch apart."""
+    first, second = sorted(meshing(teeth, internal), key=lambda mark: mark["body"])
+    assert [first["teeth"], second["teeth"]] == teeth
+    for wheel in (first, second):
+        outlines = [s["points"] for s in symbols_of([wheel], 1e-3) if s.get("closed")]
+        assert len(outlines[-1]) == 5 * wheel["teeth"]
+    towards = 0.0 if internal else np.pi
+    shares = [(angle - w["phase"]) * w["teeth"] / (2 * np.pi) for w, angle in ((first, 0.0), (second, towards))]
+    apart = shares[0] - shares[1] if internal else shares[0] + shares[1] - 0.5
+    assert abs(apart - round(apart)) < 1e-9
 
 
 def painted_by_script(symbols, pose, view, folder):

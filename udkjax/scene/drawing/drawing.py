@@ -179,6 +179,11 @@ class Drawing(AbstractDrawing):
             for name, lengths in self.lengths().items()
         }
 
+    def dimensions(self) -> dict[tuple[str, str], str]:
+        """Return the lengths of all links and of the ground as text, by pairs of pins, in the unit of the drawing."""
+        units = Units(dict(self.units))
+        return {pair: units.text(float(x), "m") for lengths in self.lengths().values() for pair, x in lengths.items()}
+
     def touching_pins(self) -> list[str]:
         """Return the pins at which circles only touch: their places have no derivatives. Numbers are concrete."""
         places = places_of(self.groups["pin"])

@@ -24,6 +24,7 @@ from udkjax.show.player.live_parameters import Live
 from udkjax.show.player.marks import BodyPoints
 from udkjax.show.player.measure_curves import Measures, ShownMotion
 from udkjax.show.player.page import frame, page
+from udkjax.show.player.picture_labels import PictureLabels, labels_of
 from udkjax.show.player.player_data import (
     Traces,
     arrows_of,
@@ -59,8 +60,8 @@ class Animation:
         failures: causes of failed runs by label.
     """
 
-    def __init__(self, data: JsonObject, failures: Mapping[str, str] | None = None):
-        self.data, self.failures = data, dict(failures or {})
+    def __init__(self, data: JsonObject, failures: Mapping[str, str] | None = None, mechanisms: Sequence[Mechanism] = ()):
+        self.data, self.failures, self._mechanisms = data, dict(failures or {}), mechanisms
         self._motions = [motion_of(record) for record in data["runs"]]
         self._arrows = [arrows_of(record) for record in data["runs"]]
         self._paths: list[list[TracedPath]] | None = None
@@ -83,7 +84,8 @@ class Animation:
                 for a pose.
             t: time of the pose (s); by default the start of the motion.
             options: for .html `theme` and `autoplay`; for .gif and .mp4 `fps` (1/s), `width` (px), `theme` and `speed` (seconds
-                of motion per second, by default the player's speed); for .svg and .png `width` (px) and `theme`.
+                of motion per second, by default the player's speed); for .svg and .png `width` (px), `theme`, and `labels`: True
+                to write the names of points and the lengths of links; for .dxf `labels`, by default True.
 
         Returns:
             The path.
@@ -99,7 +101,7 @@ class Animation:
         elif kind == ".svg":
             path.write_text(pictures.svg(self, t, **options), encoding="utf-8")
         elif kind == ".dxf":
-            pictures.save_dxf(self, path, t)
+            pictures.save_dxf(self, path, t, **options)
         elif kind in (".gif", ".mp4", ".png"):
             from udkjax.show.player import films  # imported here because it needs an extra
 
@@ -128,6 +130,11 @@ class Animation:
         """Return the arrows of the reactions of each run at time t (s); empty if reactions are not shown."""
         t = float(self.data["start"] if t is None else t)
         return [arrows(t) for arrows in self._arrows]
+
+    def labels(self) -> list[PictureLabels]:
+        """Return the names of points and the lengths of links of each run."""
+        shown = zip(self._mechanisms, self.data["runs"], strict=True)
+        return [labels_of(mechanism, run["marks"]) for mechanism, run in shown]
 
     def _repr_html_(self) -> str:
         return frame(self.data, FRAME_HEIGHT)
@@ -215,7 +222,7 @@ def animate(
     if live:
         shown: Any = [(mech, run, record) for (mech, *_), run, record in zip(records, runs.values(), data["runs"], strict=True)]
         data["live"] = live_data(shown, live, events)
-    return Animation(data, failures)
+    return Animation(data, failures, [mech for mech, *_ in records])
 
 
 def _live_runs(
@@ -271,7 +278,7 @@ def animate_modes(
     for k, shape in enumerate(shapes):
         frequency = None if frequencies is None else float(frequencies[k])
         records.append((mechanism, *mode_record(mechanism, q, shape, frequency, labels[k] if labels else f"mode {k + 1}")))
-    return Animation(player_data(title or mechanism.name or "mechanism", records))
+    return Animation(player_data(title or mechanism.name or "mechanism", records), mechanisms=[mechanism] * len(records))
 
 
 class _Still:

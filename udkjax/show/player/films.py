@@ -8,10 +8,10 @@ from jaxtyping import UInt8
 
 from udkjax.extras import OptionalImport
 from udkjax.show.player.pictures import Posed, sketches
-from udkjax.show.player.sketch import THEMES, Circle, Line
+from udkjax.show.player.sketch import THEMES, Circle, Line, Text
 
 with OptionalImport():
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageDraw, ImageFont
 
 SMOOTH = 3  # factor by which pictures are drawn larger and then reduced, to smooth edges
 MOST_FRAMES = 1500  # largest number of frames of a film
@@ -19,15 +19,18 @@ SAME_COLOUR = 8  # largest difference (of 255) of colours that count as the back
 GIF_TICK = 0.01  # unit of a GIF's frame times (s)
 
 
-def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light") -> Image.Image:
+def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light", labels: bool = False) -> Image.Image:
     """Return one pose of each run, side by side, as a bitmap."""
-    view, sketches_at_t = sketches(animation, t, width, theme, SMOOTH)
+    view, sketches_at_t = sketches(animation, t, width, theme, SMOOTH, labels)
     large = Image.new("RGB", (view.width * len(sketches_at_t), view.height), THEMES[theme]["back"])
     for k, sketch in enumerate(sketches_at_t):
         panel = Image.new("RGB", (view.width, view.height), THEMES[theme]["back"])
         draw = ImageDraw.Draw(panel)
         for shape in sketch.shapes:
-            _paint(draw, shape)
+            if isinstance(shape, Text):
+                _write(panel, shape, THEMES[theme]["back"])
+            else:
+                _paint(draw, shape)
         large.paste(panel, (k * view.width, 0))
     small = large.width // SMOOTH // 2 * 2, large.height // SMOOTH // 2 * 2  # MP4 needs even sizes
     return large.resize(small, Image.Resampling.LANCZOS)
@@ -47,6 +50,19 @@ def _paint(draw: ImageDraw.ImageDraw, shape: Line | Circle) -> None:
         for x, y in points:  # round ends and corners
             r = width / 2 - 0.5
             draw.ellipse((x - r, y - r, x + r, y + r), shape.stroke)
+
+
+def _write(panel: Image.Image, text: Text, back: str) -> None:
+    """Write a text with a rim in the colour of the background, so that lines behind it do not disturb."""
+    font, rim = ImageFont.load_default(text.size), round(text.size / 8)
+    left, top, right, bottom = font.getbbox(text.words, anchor="mm", stroke_width=rim)
+    half = int(np.hypot(max(-left, right), max(-top, bottom))) + 1
+    for colour, width in ((back, rim), (text.colour, 0)):
+        mask = Image.new("L", (2 * half, 2 * half), 0)
+        ImageDraw.Draw(mask).text((half, half), text.words, 255, font, anchor="mm", stroke_width=width)
+        mask = mask.rotate(text.angle, Image.Resampling.BICUBIC)
+        x, y = (round(float(c)) - half for c in text.place)
+        panel.paste(Image.new("RGB", mask.size, colour), (x, y), mask)
 
 
 def film_times(animation: Posed, fps: float, speed: float | None) -> np.ndarray:

@@ -75,7 +75,7 @@ def marks(
     bars = [mark for mark in links if not mark.get("closed")]
     rings = [mark for mark in drawing.wheels if mark.get("internal")]
     wheels = [mark for mark in drawing.wheels if not mark.get("internal")]
-    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins, *wanted]
+    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins]
 
 
 class _Drawing:
@@ -86,6 +86,7 @@ class _Drawing:
         drawn = {} if mechanism.drawing is None else mechanism.drawing.shapes()
         polygons = () if mechanism.drawing is None else mechanism.drawing.polygons
         self.polygons = {body: np.asarray(drawn[body], float) for body in polygons if body not in shapes}
+        self._names = [*mechanism.bodies, GROUND]  # by index, -1 for the ground
         self.number = {GROUND: -1, **{body: k for k, body in enumerate(mechanism.bodies)}}
         self.points = body_points(mechanism)
         for body, points in {**drawn, **shapes}.items():
@@ -220,21 +221,40 @@ class _Drawing:
         self.rails.append({"kind": MarkKind.FLOOR, **self._at(on, gap.through), "axis": axis, "span": span})
 
     def _gear(self, name: str, joint: Gear) -> None:
-        drawn = None if self.mechanism.drawing is None else self.mechanism.drawing.groups.get("gear", {}).get(name)
-        given = getattr(drawn, "teeth", None)
-        teeth = None if given is None else np.asarray(given)
         largest, radii = int(np.argmax(np.asarray(joint.radii))), np.asarray(joint.radii, float)
-        strands = self._belt(joint)
+        strands, teeth, pair = self._belt(joint), self._teeth(name), []
         self.elements.extend({"kind": MarkKind.ROD, "a": a, "b": b} for a, b in strands)
         for k, (body, radius) in enumerate(zip(joint.bodies, radii.tolist(), strict=True)):
             place = self._held_by(body, joint.carrier)
             is_ring = joint.internal and k == largest and not strands
-            wheel = {"kind": MarkKind.WHEEL, **place, "radius": radius, "internal": is_ring}
-            if teeth is not None and not strands:
-                wheel["teeth"] = round(float(teeth[k]))
-            if wheel not in self.wheels:
-                self.wheels.append(wheel)
+            wheel = {"kind": MarkKind.WHEEL, **place, "radius": radius, "internal": is_ring, "teeth": teeth[k], "phase": None}
+            same = [other for other in self.wheels if wheel | {"phase": other.get("phase")} == other]
+            self.wheels += [] if same else [wheel]
+            pair.append((same or [wheel])[0])
             self.shaped.add(body)
+        if all(teeth) and not strands:
+            self._mesh(*(pair if pair[1]["phase"] is None else pair[::-1]))
+
+    def _teeth(self, name: str) -> list[int]:
+        """Return the numbers of teeth of a pair of wheels; zeros where they are not known."""
+        drawn = None if self.mechanism.drawing is None else self.mechanism.drawing.groups["gear"].get(name)
+        counts = getattr(drawn, "teeth", None)
+        return [0, 0] if counts is None else [round(count) for count in np.asarray(counts, float).tolist()]
+
+    def _mesh(self, held: Mark, wheel: Mark) -> None:
+        """Turn the teeth of a wheel into the gaps of another one, as the two are first drawn; a meshed wheel is left as it is."""
+        held["phase"] = held["phase"] or 0.0
+        if wheel["phase"] is not None:
+            return
+        frames = [self._frames(self._names[mark["body"]])[0] for mark in (held, wheel)]
+        centres = [to_ground(mark["at"], frame[None])[0] for mark, frame in zip((held, wheel), frames, strict=True)]
+        inner = held["internal"] or wheel["internal"]
+        x, y = (centres[1] - centres[0]) * (1 if held["radius"] > wheel["radius"] or not inner else -1)
+        contact = np.arctan2(y, x)  # from the centre of the first wheel
+        share = (contact - frames[0][2] - held["phase"]) * held["teeth"] / (2 * np.pi)  # 0 in a gap, 1/2 on a tooth
+        other = share if inner else 0.5 - share
+        towards = contact - frames[1][2] - (0.0 if inner else np.pi)
+        wheel["phase"] = float((towards - 2 * np.pi * other / wheel["teeth"]) % (2 * np.pi / wheel["teeth"]))
 
     def _belt(self, joint: Gear) -> list[tuple[list[float], ...]]:
         """Return the two strands of the belt between wheels that do not touch, on their carrier; an open one is internal."""
@@ -263,7 +283,8 @@ class _Drawing:
         self.rails.append(
             {"kind": MarkKind.RACK, **self._at(first, origin), "axis": axis, "span": [start - radius, end + radius]}
         )
-        self.wheels.append({"kind": MarkKind.WHEEL, **self._at(second, (0.0, 0.0)), "radius": radius, "internal": False})
+        wheel = {"radius": radius, "internal": False, "teeth": 0, "phase": 0.0}
+        self.wheels.append({"kind": MarkKind.WHEEL, **self._at(second, (0.0, 0.0)), **wheel})
         self.shaped.add(second)
 
     def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:

@@ -71,6 +71,17 @@ class Line(NamedTuple):
     closed: bool = False
 
 
+class Text(NamedTuple):
+    """A line of text about its middle (px), turned anticlockwise by an angle (deg)."""
+
+    layer: str
+    place: np.ndarray
+    words: str
+    size: float
+    colour: str
+    angle: float = 0.0
+
+
 class Circle(NamedTuple):
     """A circle."""
 
@@ -116,7 +127,7 @@ class Sketch:
     ):
         self.pose, self.view, self.theme = pose, view, THEMES[theme]
         symbols = symbols_of(marks, view.pt / view.scale)
-        self.shapes = [*map(self._path, paths), *map(self._shape, symbols)]
+        self.shapes: list[Line | Circle | Text] = [*map(self._path, paths), *map(self._shape, symbols)]
         for arrow in arrows:
             self.shapes += self._arrow(arrow)
 
@@ -132,7 +143,7 @@ class Sketch:
         length = ARROW * pt * min(size, LONGEST_ARROW)
         if length <= HEAD * pt:
             return []
-        direction, start = force / size * [1, -1], self._anchor(arrow.body, *arrow.at)
+        direction, start = force / size * [1, -1], self.anchor(arrow.body, *arrow.at)
         tip, side = start + length * direction, np.array([-direction[1], direction[0]])
         back = tip - HEAD * pt * np.cos(HEAD_ANGLE) * direction
         colour = mix(self.theme["force"], self.theme["back"], 0.0 if arrow.unique else NOT_UNIQUE_TINT)
@@ -154,15 +165,16 @@ class Sketch:
     def _frame(self, frame: list) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the origin of a frame (px), the cosine and sine of the angle of its x axis, and its unit of length (px)."""
         if len(frame) == 2:
-            start, end = (self._anchor(*anchor) for anchor in frame)
+            start, end = (self.anchor(*anchor) for anchor in frame)
             axis = (end - start) * [1, -1]
             length = float(np.hypot(*axis))
             return start, axis / (length or 1.0), length
         body, x, y, angle, turns = frame
         angle += self.pose[body][2] if turns and body >= 0 else 0.0
-        return self._anchor(body, x, y), np.array([np.cos(angle), np.sin(angle)]), self.view.scale
+        return self.anchor(body, x, y), np.array([np.cos(angle), np.sin(angle)]), self.view.scale
 
-    def _anchor(self, body: float, x: float, y: float) -> np.ndarray:
+    def anchor(self, body: float, x: float, y: float) -> np.ndarray:
+        """Return the place (px) of a point (m) of a body."""
         place = to_ground((x, y), (np.zeros(3) if body < 0 else self.pose[int(body)])[None])[0]
         return np.array([self.view.x, self.view.y]) + self.view.scale * place * [1, -1]
 

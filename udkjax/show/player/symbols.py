@@ -20,7 +20,7 @@ from udkjax.show.player.marks import Mark
 Symbol = Mark
 ROUND = 48  # vertices of a circle drawn as a polyline
 COIL_LENGTH = 11.0  # units per coil of a spring of usual length
-MOST_TEETH = 400  # drawn teeth of a wheel
+FEWEST_TEETH, MOST_TEETH = 4, 400  # of a wheel: others have as many as fit its size
 STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # straight ends of a spring in units; their largest fraction of its length
 
 
@@ -86,17 +86,18 @@ def _disc(mark: Mark, unit: float) -> Iterator[Symbol]:
 
 
 def _wheel(mark: Mark, unit: float) -> Iterator[Symbol]:
-    radius, body = mark["radius"], mark["body"]
-    teeth = min(mark.get("teeth", 0), MOST_TEETH) or int(np.clip(round(2 * np.pi * radius / (9 * unit) / 4) * 4, 12, 96))
-    depth = min(np.pi * radius / teeth if "teeth" in mark else 4 * unit, 0.12 * radius)
+    radius, body, frame = mark["radius"], mark["body"], _at(mark, mark["phase"] or 0.0)
+    by_size = int(np.clip(round(2 * np.pi * radius / (9 * unit) / 4) * 4, 12, 96))
+    teeth = min(mark["teeth"], MOST_TEETH) if mark["teeth"] >= FEWEST_TEETH else by_size
+    depth = min(np.pi * radius / teeth if mark["teeth"] else 4 * unit, 0.12 * radius)
     tooth = np.array([(0, -1), (0.25, -1), (0.35, 1), (0.65, 1), (0.75, -1)])
     turn = 2 * np.pi / teeth * (np.arange(teeth)[:, None] + tooth[:, 0]).ravel()
     rim = np.tile(radius + tooth[:, 1] * depth / 2, teeth)[:, None] * _round(turn)
     if mark["internal"]:
-        yield _circle(_at(mark), (radius + depth, 5), _tint(body), _edge(body))
-    yield _line(_at(mark), rim, _edge(body), 1.3, "back" if mark["internal"] else _tint(body), True)
+        yield _circle(frame, (radius + depth, 5), _tint(body), _edge(body))
+    yield _line(frame, rim, _edge(body), 1.3, "back" if mark["internal"] else _tint(body), True)
     for spoke in () if mark["internal"] else _round(2 * np.pi * np.arange(3) / 3):
-        yield _line(_at(mark), [min(9 * unit, 0.3 * radius) * spoke, 0.8 * radius * spoke], f"spoke:{body}", 2.2)
+        yield _line(frame, [min(9 * unit, 0.3 * radius) * spoke, 0.8 * radius * spoke], f"spoke:{body}", 2.2)
 
 
 def _outline(mark: Mark, unit: float) -> Iterator[Symbol]:

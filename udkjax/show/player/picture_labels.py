@@ -1,0 +1,171 @@
+"""Names of points and lengths of links, written into pictures where they cover least."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.scene.mechanism import Mechanism
+from udkjax.show.player.mark_kinds import MarkKind
+from udkjax.show.player.marks import Mark
+from udkjax.show.player.sketch import Line, Sketch, Text
+
+T = TypeVar("T")
+Anchor = tuple[int, float, float]  # a place of a body, by its index; -1 is the ground
+Pixels = Float[np.ndarray, "2"]
+Box = tuple[Pixels, Pixels, Pixels]  # middle, and half of two sides that are at right angles
+
+SIZE = 12.0  # height of letters; all lengths are in units of symbols
+WIDE = 0.58  # usual width of a letter, relative to its height
+PIN = 7.0  # around the centre of a pin that texts keep clear
+LEVELS = (17.0, 31.0, 45.0)  # from a link to its dimension line
+ABOVE = 8.0  # from a dimension line to the middle of its text
+ARROW, ARROW_WIDTH = 7.0, 2.0  # length and half of the width of an arrow
+GAP, BEYOND = 6.0, 4.0  # of an extension line: from the point, and beyond the dimension line
+AROUND = [[9, -12, 0], [9, 14, 0], [-9, -12, 1], [-9, 14, 1], [0, -20, 0.5], [0, 22, 0.5]]  # a pin: shift, and share to the left
+SAMPLES = 9  # places of a text that are tested
+OUTSIDE, ON_TEXT, ON_LINK = 4.0, 2.0, 1.0  # costs of a tested place outside the picture, on other texts, on links
+
+
+class LinkDimension(NamedTuple):
+    """A length between two points, and its text."""
+
+    words: str
+    start: Anchor
+    end: Anchor
+
+
+class PictureLabels(NamedTuple):
+    """Names of points by name, and lengths of links."""
+
+    names: dict[str, Anchor]
+    dimensions: list[LinkDimension]
+
+
+def labels_of(mechanism: Mechanism, marks: Sequence[Mark]) -> PictureLabels:
+    """Return the names of a mechanism's points, and the lengths of its links in the units of its drawing, if it has one."""
+    drawing = mechanism.drawing
+    if drawing is None:
+        pins = [mark for mark in marks if mark["kind"] == MarkKind.PIN]
+        return PictureLabels({mark["name"]: (mark["body"], *mark["at"]) for mark in pins}, [])
+    names: dict[str, Anchor] = {}
+    for name in drawing.groups["pin"]:
+        body, place = drawing.locate_pin(name)  # pyright: ignore[reportGeneralTypeIssues]
+        x, y = np.asarray(place, float).tolist()
+        names[name] = (mechanism.body_names.index(body) if body in mechanism.body_names else -1, x, y)
+    found: dict[frozenset[str], LinkDimension] = {}
+    for (a, b), words in drawing.dimensions().items():
+        found.setdefault(frozenset((a, b)), LinkDimension(words, names[a], names[b]))
+    return PictureLabels(names, list(found.values()))
+
+
+class PlacedDimension(NamedTuple):
+    """A dimension in a picture: its text, its two points (px), and the distance of its line to their left (px)."""
+
+    words: str
+    start: Pixels
+    end: Pixels
+    off: float
+
+
+class Placing:
+    """Places texts one after another in the picture of a pose, each where it covers least of the others and of the links."""
+
+    def __init__(self, labels: PictureLabels, sketch: Sketch):
+        self.sketch, self.pt = sketch, sketch.view.pt
+        self.size = SIZE * self.pt
+        self.points = {name: sketch.anchor(*anchor) for name, anchor in labels.names.items()}
+        ends = [(d.words, sketch.anchor(*d.start), sketch.anchor(*d.end)) for d in labels.dimensions]
+        self.bars = [(start, end) for _, start, end in ends]
+        self.boxes: list[Box] = [(place, *(PIN * self.pt * np.eye(2))) for place in self.points.values()]
+        self.dimensions = [self._dimension(*entry) for entry in ends if np.hypot(*(entry[2] - entry[1])) > 2 * PIN * self.pt]
+        self.names = [self._name(name, place) for name, place in self.points.items()]
+
+    def shapes(self) -> list[Line | Text]:
+        """Return the lines of dimensions, and the texts above them."""
+        found = [shape for dimension in self.dimensions for shape in self._lines(dimension)]
+        return [*(s for s in found if isinstance(s, Line)), *(s for s in found if isinstance(s, Text)), *self.names]
+
+    def _dimension(self, words: str, start: Pixels, end: Pixels) -> PlacedDimension:
+        along = (end - start) / np.hypot(*(end - start))
+        left = np.array([along[1], -along[0]])
+        middle, own = (start + end) / 2, (start, end)
+        inwards = np.mean([*self.points.values(), middle], axis=0) - middle
+        sides = (-1.0, 1.0) if inwards @ left > 0 else (1.0, -1.0)
+        half = (self._width(words) / 2 * along, self.size / 2 * left)
+
+        def box(off: float) -> Box:
+            return middle + (off + np.sign(off) * ABOVE * self.pt) * left, *half
+
+        offs = [side * level * self.pt for level in LEVELS for side in sides]
+        off = self._cheapest(offs, box, own, lambda off: [start + off * left, end + off * left])
+        self.boxes.append(box(off))
+        self.bars.append((start + off * left, end + off * left))
+        return PlacedDimension(words, start, end, off)
+
+    def _name(self, name: str, place: Pixels) -> Text:
+        wide = self._width(name)
+
+        def box(choice: Sequence[float]) -> Box:
+            dx, dy, share = choice
+            shift = np.array([(0.5 - share) * wide + dx * self.pt, dy * self.pt])
+            return place + shift, np.array([wide / 2, 0.0]), np.array([0.0, self.size / 2])
+
+        found = box(self._cheapest(AROUND, box))
+        self.boxes.append(found)
+        return Text("name", found[0], name, self.size, self.sketch.theme["ink"])
+
+    def _cheapest(
+        self,
+        choices: Sequence[T],
+        box: Callable[[T], Box],
+        own: tuple[Pixels, Pixels] | None = None,
+        more: Callable[[T], list[Pixels]] = lambda _: [],
+    ) -> T:
+        """Return the first choice whose text covers least; `more` are further places that should stay in the picture."""
+        costs = [self._cost(box(choice), own, more(choice)) for choice in choices]
+        return choices[int(np.argmin(costs))]
+
+    def _cost(self, box: Box, own: tuple[Pixels, Pixels] | None, more: list[Pixels]) -> float:
+        middle, u, v = box
+        places = middle + np.array([s * u + t * v for s in np.linspace(-1, 1, SAMPLES) for t in (-1, 0, 1)])
+        limits = np.array([self.sketch.view.width, self.sketch.view.height])
+        outside = np.any((places < 0) | (places > limits), axis=1).sum() + sum(np.any((p < 0) | (p > limits)) for p in more)
+        cost = OUTSIDE * float(outside)
+        for other, a, b in self.boxes:
+            d = places - other
+            cost += ON_TEXT * float(np.sum((np.abs(d @ a) <= a @ a) & (np.abs(d @ b) <= b @ b)))
+        for bar in self.bars:
+            if own is None or (bar is not own and not all(np.allclose(x, y) for x, y in zip(bar, own, strict=True))):
+                cost += ON_LINK * float(np.sum(_distance(places, *bar) < self.size / 2))
+        return cost
+
+    def _width(self, words: str) -> float:
+        return WIDE * self.size * len(words)
+
+    def _lines(self, dimension: PlacedDimension) -> list[Line | Text]:
+        words, start, end, off = dimension
+        pt, colour = self.pt, self.sketch.theme["soft"]
+        length = float(np.hypot(*(end - start)))
+        along, side = (end - start) / length, np.sign(off)
+        left = np.array([along[1], -along[0]])
+        a, b = start + off * left, end + off * left
+        found: list[Line | Text] = [Line("dimension", np.array([a, b]), 0.9 * pt, colour)]
+        for foot, tip, inwards in ((start, a, along), (end, b, -along)):
+            reach = np.array([foot + side * GAP * pt * left, tip + side * BEYOND * pt * left])
+            head = min(ARROW * pt, length / 4)
+            corners = [tip, *(tip + head * inwards + s * head * ARROW_WIDTH / ARROW * left for s in (1, -1))]
+            found += [Line("dimension", reach, 0.7 * pt, colour)]
+            found += [Line("dimension", np.array(corners), 0.0, "", colour, True)]
+        place = (a + b) / 2 + side * ABOVE * pt * left
+        angle = float(np.degrees(np.arctan2(-along[1], along[0])))
+        upright = angle if -90.0 < round(angle, 6) <= 90.0 else angle - 180.0 * np.sign(angle)
+        return [*found, Text("dimension", place, words, self.size, colour, upright)]
+
+
+def _distance(places: Float[np.ndarray, "n 2"], start: Pixels, end: Pixels) -> Float[np.ndarray, "n"]:
+    """Return the distances of places from a line between two points."""
+    way = end - start
+    share = np.clip((places - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+    return np.linalg.norm(places - start - share[:, None] * way, axis=1)
