@@ -69,6 +69,7 @@ from udkjax.positions.pin_motion import motion_at as motion_at
 from udkjax.positions.pin_motion import pin_motion as pin_motion
 from udkjax.positions.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.position_batch import PositionBatch as PositionBatch
+from udkjax.positions.pressure import pressure_angle as pressure_angle
 from udkjax.positions.scene_check import check as check
 from udkjax.positions.transmission import Workspace as Workspace
 from udkjax.positions.transmission import coupler_curve as coupler_curve

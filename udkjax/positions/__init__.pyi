@@ -81,6 +81,7 @@ from udkjax.positions.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.position_batch import PositionBatch as PositionBatch
 from udkjax.positions.position_batch import compile_programs as compile_programs
 from udkjax.positions.position_batch import position_code as position_code
+from udkjax.positions.pressure import pressure_angle as pressure_angle
 from udkjax.positions.scene_check import Check as Check
 from udkjax.positions.scene_check import check as check
 from udkjax.positions.scene_check import check_lines as check_lines

@@ -12,12 +12,15 @@ from udkjax.positions.coordinates import Coordinate, element_of
 from udkjax.positions.counting import Count, count_of
 from udkjax.positions.drive import Drive, only_driver
 from udkjax.positions.linkage_type import FourBarType, Mobility, Pins, four_bars, mobility, pins_with_bodies
+from udkjax.positions.pressure import pressure_angles
 from udkjax.positions.turning_points import Combination, Cycle, TurningPoint
 from udkjax.printing import PrintedTable, PrintsTable, format_number
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.joints import Gear, Prismatic, Revolute, Slot
+from udkjax.scene.joints import Cam, Gear, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
+
+REFINEMENTS, REFINED = 6, 21  # of the extremes of pressure angles: rounds, and values of each; a round divides the step by ten
 
 
 class Output(NamedTuple):
@@ -46,6 +49,7 @@ class Characteristics(PrintsTable):
         limits: the toggle positions of the driver; empty if it has none.
         outputs: the motions of the links on the ground, by name.
         transmission_angles: by pin, the least and the largest acute angle between coupler and output (rad).
+        pressure_angles: by cam, the least and the largest pressure angle (rad).
         ratios: by link, its angular velocity for one of the driver, in a gear train.
         count: the zero and the units in which values of the driver are shown.
     """
@@ -56,6 +60,7 @@ class Characteristics(PrintsTable):
     limits: tuple[float, ...]
     outputs: dict[str, Output]
     transmission_angles: dict[str, tuple[float, float]]
+    pressure_angles: dict[str, tuple[float, float]]
     ratios: dict[str, float]
     count: Count = eqx.field(static=True)
 
@@ -77,9 +82,10 @@ class Characteristics(PrintsTable):
                 )
             if output.time_ratio is not None:
                 lines[f"time ratio of {name}"] = f"{output.time_ratio:.6g}"
-        for pin, angles in self.transmission_angles.items():
-            least, most = (format_number(np.degrees(x), scale=90.0) for x in angles)
-            lines[f"transmission angle at {pin}"] = f"{least} to {most} deg"
+        angles = {f"transmission angle at {pin}": ends for pin, ends in self.transmission_angles.items()}
+        for title, ends in (angles | {f"pressure angle of {cam}": ends for cam, ends in self.pressure_angles.items()}).items():
+            least, most = (format_number(np.degrees(x), scale=90.0) for x in ends)
+            lines[title] = f"{least} to {most} deg"
         lines |= {f"ratio of {name}": f"{ratio:.9g}" for name, ratio in self.ratios.items()}
         return lines
 
@@ -116,9 +122,11 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
     outputs = {name: _output(cycle, kind, weights, turning[name]) for name, (kind, weights) in measured.items()}
     angles = _transmission_angles(mechanism, element, cycle, pins_with_bodies(mechanism)) if cycle.is_known else {}
     has_gears = any(isinstance(joint, Gear) for joint in mechanism.joints.values())
+    pressures = _pressure_angles(mechanism, driver, cycle) if cycle.is_known else {}
     ratios = _ratios(mechanism, cycle, element) if has_gears and cycle.is_known else {}
     bars = four_bars(mechanism, element)
-    return Characteristics(mobility(mechanism), bars, cycle.turns, limits, outputs, angles, ratios, count_of(mechanism, driver))
+    count = count_of(mechanism, driver)
+    return Characteristics(mobility(mechanism), bars, cycle.turns, limits, outputs, angles, pressures, ratios, count)
 
 
 def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, Combination]]:
@@ -184,6 +192,27 @@ def acute_range(low: float, high: float) -> tuple[float, float]:
     angles = np.array([low, high, *(quarters * np.pi / 2)])
     acute = np.abs(angles - np.pi * np.round(angles / np.pi))
     return float(acute.min()), float(acute.max())
+
+
+def _pressure_angles(mechanism: Mechanism, driver: str | Coordinate, cycle: Cycle) -> dict[str, tuple[float, float]]:
+    """Return the limits of the pressure angle of each cam with a moving follower: the grid's, refined around them."""
+    found = {}
+    for name, joint in mechanism.joints.items():
+        if not isinstance(joint, Cam) or joint.bodies[1] == GROUND:
+            continue
+        angles, ends = pressure_angles(mechanism, cycle.q, name, driver), []
+        for sign in (-1.0, 1.0):
+            k, values = int(np.nanargmax(sign * angles)), cycle.values
+            best, step = angles[k], float(np.max(np.diff(values)))
+            centre = values[k]
+            for _ in range(REFINEMENTS):
+                near = centre + step * np.linspace(-1.0, 1.0, REFINED)
+                around = pressure_angles(mechanism, np.asarray(cycle.at(near).q), name, driver)
+                k, step = int(np.nanargmax(sign * around)), 2 * step / REFINED
+                best, centre = sign * max(sign * best, sign * around[k]), near[k]
+            ends.append(float(best))
+        found[name] = (ends[0], ends[1])
+    return found
 
 
 def _ratios(mechanism: Mechanism, cycle: Cycle, driven: Coordinate) -> dict[str, float]:

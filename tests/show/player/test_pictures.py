@@ -16,7 +16,7 @@ from udkjax.show.player.marks import marks
 from udkjax.show.player.page import module
 from udkjax.show.player.picture_labels import Placing, labels_of
 from udkjax.show.player.pictures import sketches
-from udkjax.show.player.sketch import THEMES, Sketch, view_of
+from udkjax.show.player.sketch import THEMES, Sketch, Text, view_of
 from udkjax.show.player.symbols import SYMBOLS, symbols_of
 
 INK = np.array([int(THEMES["light"]["ink"][k : k + 2], 16) for k in (1, 3, 5)])
@@ -243,6 +243,7 @@ def test_every_kind_of_mark_is_drawn(tmp_path):
     assert all(np.isfinite(shape[1]).all() for shape in sketch.shapes)  # points or centre
     painted = painted_by_script(symbols_of(every, view.pt / view.scale), np.asarray(mech.q0), view, tmp_path)
     for shape, (points, radius, *look) in zip(sketch.shapes, painted, strict=True):
+        assert not isinstance(shape, Text)
         np.testing.assert_allclose(points, shape[1], atol=1e-6)
         assert look == [shape.stroke, shape.fill] and radius == pytest.approx(getattr(shape, "radius", 0.0))
 

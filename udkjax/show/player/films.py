@@ -53,7 +53,7 @@ def _paint(draw: ImageDraw.ImageDraw, shape: Line | Circle) -> None:
 
 
 def _write(panel: Image.Image, text: Text, back: str) -> None:
-    """Write a text with a rim in the colour of the background, so that lines behind it do not disturb."""
+    """Write a text with a rim in the colour of the background, so that it stands out from the lines that it covers."""
     font, rim = ImageFont.load_default(text.size), round(text.size / 8)
     left, top, right, bottom = font.getbbox(text.words, anchor="mm", stroke_width=rim)
     half = int(np.hypot(max(-left, right), max(-top, bottom))) + 1

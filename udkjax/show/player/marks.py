@@ -75,7 +75,7 @@ def marks(
     bars = [mark for mark in links if not mark.get("closed")]
     rings = [mark for mark in drawing.wheels if mark.get("internal")]
     wheels = [mark for mark in drawing.wheels if not mark.get("internal")]
-    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins]
+    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins, *wanted]
 
 
 class _Drawing:

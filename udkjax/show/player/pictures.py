@@ -13,7 +13,7 @@ from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.picture_labels import PictureLabels, Placing
 from udkjax.show.player.sketch import THEMES, Circle, ForceArrow, Line, Sketch, Text, TracedPath, View, view_of
 
-DXF_LAYERS = {
+DXF_LAYERS: dict[str, str] = {
     MarkKind.PIN: "joints",
     MarkKind.ROLLER: "joints",
     MarkKind.WELD: "joints",
