@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from udkjax.equations.front_substitution import FrontFactors, triangle
 from udkjax.equations.scene_layout import (
     BODIES,
     BODY_CONSTANTS,
@@ -20,7 +21,6 @@ from udkjax.equations.scene_layout import (
     ROW,
     SAFE_TOL,
     ConstraintGroup,
-    arrays_of_solve,
 )
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, dot
 from udkjax.expressions import Scalar
@@ -29,9 +29,7 @@ from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.elimination_order import Fronts, order_blocks
 
 
-def triangle(i: int, j: int) -> int:
-    """Return the index of entry (i, j) in a lower triangle that is stored row by row."""
-    return i * (i + 1) // 2 + j
+FACTORS = FrontFactors("factors", is_symmetric=True)
 
 
 class BlockElimination:
@@ -95,22 +93,7 @@ class BlockElimination:
 
     def substitute(self, solve: int, **names: str) -> ProgramParts:
         """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right; `names` are those of arrays that differ from the system's."""
-        names = arrays_of_solve(solve) | names
-        yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
-        for fronts in self.order:
-
-            def forward(w: KernelWriter, fronts: Fronts = fronts):
-                _substitute_forward(w, fronts.size, fronts.later_sizes)
-
-            kernel = self.terms.kernel(("forward", fronts.size, fronts.later_sizes), forward)
-            yield KernelLoop(kernel, self._front_table(fronts), names)
-        for fronts in reversed(self.order):
-
-            def backward(w: KernelWriter, fronts: Fronts = fronts):
-                _substitute_backward(w, fronts.size, fronts.later_sizes)
-
-            kernel = self.terms.kernel(("backward", fronts.size, fronts.later_sizes), backward)
-            yield KernelLoop(kernel, self._front_table(fronts)[::-1], names)
+        yield from FACTORS.substitute(self.terms, self.order, self._front_table, solve, **names)
 
     def safe(self) -> KernelLoop:
         """Write `safe`: one if all pivots exceed `safe_tol`, else zero."""
@@ -284,28 +267,3 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...], dropping: bool, 
                         offset = i * later[b] + j if a > b else later[a] + triangle(i, j)
                         w.write(-dot(w.graph, row, other), "gram", base, offset, ADD)
             base += 1
-
-
-def _substitute_forward(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
-    y = [w.read("right", 1, i) - w.read("sum", 1, i) for i in range(p)]
-    for i in range(p):
-        for j in range(i):
-            y[i] = y[i] - w.read("factors", 0, p + triangle(i, j)) * y[j]
-        w.write(y[i], "y", 1, i)
-    for a, size in enumerate(later):
-        for i in range(size):
-            row: list[Scalar] = [w.read("factors", 2 + 2 * a, i * p + j) for j in range(p)]
-            w.write(dot(w.graph, row, y), "sum", 3 + 2 * a, i, ADD)
-
-
-def _substitute_backward(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
-    x = [w.read("y", 1, i) * w.read("factors", 0, p + triangle(i, i)) for i in range(p)]
-    for a, size in enumerate(later):
-        for i in range(size):
-            s = w.read("x", 3 + 2 * a, i)
-            for j in range(p):
-                x[j] = x[j] - w.read("factors", 2 + 2 * a, i * p + j) * s
-    for j in reversed(range(p)):
-        for i in range(j + 1, p):
-            x[j] = x[j] - w.read("factors", 0, p + triangle(i, j)) * x[i]
-        w.write(x[j], "x", 1, j)

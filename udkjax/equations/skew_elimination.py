@@ -9,21 +9,24 @@ from functools import cached_property
 
 import numpy as np
 
-from udkjax.equations.block_elimination import BlockElimination, triangle
-from udkjax.equations.scene_layout import BODIES, BODY_CONSTANTS, ENTRIES, RIGHT, SLOPES, ConstraintGroup, arrays_of_solve
+from udkjax.equations.block_elimination import BlockElimination
+from udkjax.equations.front_substitution import FrontFactors, triangle
+from udkjax.equations.scene_layout import BODIES, BODY_CONSTANTS, ENTRIES, RIGHT, SLOPES, ConstraintGroup
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, dot
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.elimination_order import Fronts
 
+FACTORS = FrontFactors("skew_factors", is_symmetric=False)
+
 
 class SkewElimination:
     """Loops that form J C (J + S^T)^T from the entries in `psi_q` and `slopes`, factorize it and solve with the factors.
 
     Their arrays are added to the layout after those of J C J^T in `symmetric`. `base` is J C J^T in the layout of `gram`; `skew`
-    is the whole matrix: diagonal blocks, then for each pair of coupled blocks the lower and the upper one. `skew_factors` holds L
-    and U in the same layout, with the reciprocals of the pivots. Rows that `symmetric` leaves out are left out here.
+    is the whole matrix: diagonal blocks, then for each pair of coupled blocks the lower and the upper one. `skew_factors` holds L,
+    D and U in the same places. Rows that `symmetric` leaves out are left out here.
     """
 
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
@@ -49,22 +52,7 @@ class SkewElimination:
 
     def substitute(self, solve: int, **names: str) -> ProgramParts:
         """Compute x = (J C (J + S^T)^T)^(-1) right; `names` are those of arrays that differ from the system's."""
-        names = arrays_of_solve(solve) | names
-        yield Reset(names["sum"], 0, self.terms.layout.sizes[names["sum"]])
-        for fronts in self._symmetric.order:
-
-            def forward(w: KernelWriter, fronts: Fronts = fronts):
-                _substitute_forward(w, fronts.size, fronts.later_sizes)
-
-            kernel = self.terms.kernel(("forward skew", fronts.size, fronts.later_sizes), forward)
-            yield KernelLoop(kernel, self._front_table(fronts), names)
-        for fronts in reversed(self._symmetric.order):
-
-            def backward(w: KernelWriter, fronts: Fronts = fronts):
-                _substitute_backward(w, fronts.size, fronts.later_sizes)
-
-            kernel = self.terms.kernel(("backward skew", fronts.size, fronts.later_sizes), backward)
-            yield KernelLoop(kernel, self._front_table(fronts)[::-1], names)
+        yield from FACTORS.substitute(self.terms, self._symmetric.order, self._front_table, solve, **names)
 
     # --- the matrix
 
@@ -206,8 +194,8 @@ def _write_products(
 def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
     zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
     S = [[w.read("skew", 0, i * p + j) for j in range(p)] for i in range(p)]
-    below = [[[w.read("skew", 3 + 3 * a, i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)]
-    right = [[[w.read("skew", 4 + 3 * a, j * size + i) for i in range(size)] for j in range(p)] for a, size in enumerate(later)]
+    below = [[[w.read("skew", FACTORS.below(a), i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)]
+    right = [[[w.read("skew", FACTORS.beside(a), j * size + i) for i in range(size)] for j in range(p)] for a, size in enumerate(later)]
     for j in range(p):
         is_kept = greater(absolute(w.read("factors", 2, p + triangle(j, j))), zero)
         inverse = where(is_kept, one / S[j][j], zero)
@@ -227,12 +215,12 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
         S[j][j] = inverse
     for i in range(p):
         for j in range(p):
-            w.write(S[i][j], "skew_factors", 0, i * p + j)
+            w.write(S[i][j] * S[i][i] if j > i else S[i][j], "skew_factors", 0, FACTORS.inner(p, i, j))
     for a, size in enumerate(later):
         for i in range(size):
             for j in range(p):
-                w.write(below[a][i][j], "skew_factors", 3 + 3 * a, i * p + j)
-                w.write(right[a][j][i], "skew_factors", 4 + 3 * a, j * size + i)
+                w.write(below[a][i][j], "skew_factors", FACTORS.below(a), i * p + j)
+                w.write(right[a][j][i] * S[j][j], "skew_factors", FACTORS.beside(a), i * p + j)
     base = 3 + 3 * len(later)
     for a, size in enumerate(later):
         for b, other in enumerate(later):
@@ -241,29 +229,3 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
                     product = dot(w.graph, below[a][i], [right[b][k][j] for k in range(p)])
                     w.write(-product, "skew", base, i * other + j, ADD)
             base += 1
-
-
-def _substitute_forward(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
-    y = [w.read("right", 1, i) - w.read("sum", 1, i) for i in range(p)]
-    for i in range(p):
-        for j in range(i):
-            y[i] = y[i] - w.read("skew_factors", 0, i * p + j) * y[j]
-        w.write(y[i], "y", 1, i)
-    for a, size in enumerate(later):
-        for i in range(size):
-            row: list[Scalar] = [w.read("skew_factors", 3 + 3 * a, i * p + j) for j in range(p)]
-            w.write(dot(w.graph, row, y), "sum", 5 + 3 * a, i, ADD)
-
-
-def _substitute_backward(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
-    x = [w.read("y", 1, i) for i in range(p)]
-    for a, size in enumerate(later):
-        for i in range(size):
-            s = w.read("x", 5 + 3 * a, i)
-            for j in range(p):
-                x[j] = x[j] - w.read("skew_factors", 4 + 3 * a, j * size + i) * s
-    for j in reversed(range(p)):
-        for k in range(j + 1, p):
-            x[j] = x[j] - w.read("skew_factors", 0, j * p + k) * x[k]
-        x[j] = x[j] * w.read("skew_factors", 0, j * p + j)
-        w.write(x[j], "x", 1, j)
