@@ -73,6 +73,22 @@ def test_engines_agree_and_energy_falls(name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("build", "factor"), [(lambda: pendulum(coefficient=0.3, radius=0.1, speed=0.05), 15.3)])
+def test_strong_friction_takes_more_rounds(build, factor):
+    """Friction of 0.9 of that which jams the pin: machine code settles, and lanes with less friction stay as they are."""
+    mechanism, ts = build(), np.linspace(0.0, 0.2, 3)
+
+    def end(scale, engine="native"):
+        changed = mechanism.with_parameters({"force.rub.coefficient": 0.3 * scale})
+        return udk.simulate(changed, ts, engine=engine, **TOL).q[-1]
+
+    strong = end(factor)
+    np.testing.assert_allclose(strong, end(factor, "jax"), atol=2e-9)
+    np.testing.assert_array_equal(jax.vmap(end)(jnp.array([1.0, factor]))[0], jax.vmap(end)(jnp.array([1.0, 0.5]))[0])
+    np.testing.assert_allclose(jax.vmap(end)(jnp.array([1.0, factor]))[1], strong, atol=1e-11)
+
+
+@pytest.mark.slow
 def test_lanes_equal_single_runs():
     mechanism, ts = rubbing(udk.library.four_bar(), speed=0.05), np.linspace(0.0, 0.5, 3)
 

@@ -28,7 +28,6 @@ from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, KernelLoop, Kerne
 from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.elimination_order import Fronts, order_blocks
 
-
 FACTORS = FrontFactors("factors", is_symmetric=True)
 
 

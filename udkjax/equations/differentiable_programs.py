@@ -14,7 +14,7 @@ from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, LoopP
 
 # Arrays that are held fixed in derivatives. Kernels that read sines and cosines differentiate them as functions of q.
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
-NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "unsettled", "rubbing", "drag")  # of friction
+NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "misfit", "rubbing", "drag", "new_drag")  # of friction
 
 # Arrays of the second correction of a solution; their first-order changes vanish after the first correction.
 SETTLED = ("right2", "sum2", "y2", "x2")

@@ -10,9 +10,15 @@ joint alone, but is not symmetric:
 
     J C (J + S^T)^T x_new = b.
 
-The first slopes are those at x without friction. An error e in the direction of a load becomes e^2 times the share of friction,
-and loads with a fixed direction, such as those of slides, are exact once their signs are. If the loads do not settle, friction
-admits no motion (the mechanism jams), and the accelerations are NaN.
+After each step a correction follows with the same factors, from the loads at the new x. An error e of the directions of loads,
+relative to friction that is a share s of them, becomes s e^2 by a step and s^2 e^3 by both: a round takes one factorization and
+is of third order. The first slopes are those at x after a correction without slopes, where e is s^2. Loads with a fixed
+direction, such as those of slides, are exact once their signs are.
+
+One round leaves an error of s^8: it suffices where friction is less than about a thirtieth of that which jams the mechanism, as
+in most machines. Programs that a run evaluates often take one round, and say where the loads are not settled; machine code
+then takes as many more as are needed (`further`). Others take `ROUNDS`. If the loads do not settle, friction admits no motion
+(the mechanism jams), and the accelerations are NaN.
 """
 
 from collections.abc import Callable
@@ -26,11 +32,13 @@ from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import greater, where
 
-# With a correction before each step, an error c of the directions of loads that are friction by a share of c becomes c^17 / 8 by
-# two steps.
-NEWTON_STEPS = 3
+# Rounds of programs that cannot ask for more. Friction of 0.9 of that which jams pins needs three; the slopes of a fourth round
+# are those at the solution, as derivatives need them.
+ROUNDS = 4
 CORRECTION = SOLVES  # the number of the system of corrections
-SETTLED = 1e-10  # change of the loads of friction by the last step, relative to these loads
+# Change of the loads of friction by another correction, relative to these loads. The accelerations have this error times the
+# share of friction, which is below the least tolerance of runs; one more round would end at rounding errors.
+SETTLED = 1e-10
 
 
 class FrictionElimination:
@@ -39,24 +47,53 @@ class FrictionElimination:
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
         self.terms, self._symmetric, self._skew = terms, symmetric, SkewElimination(terms, symmetric)
         layout = terms.layout
-        layout.sizes |= {"unsettled": 1, "rubbing": 1, "drag": layout.coordinate_count}
+        layout.sizes |= {"misfit": 1, "rubbing": 1, "drag": layout.coordinate_count, "new_drag": layout.coordinate_count}
         layout.add_solve(CORRECTION)
+        layout.sizes["settled"] = layout.sizes[f"x{CORRECTION}"]
         self.substitute = self._skew.substitute
 
     # --- programs
 
-    def settle(self, solve: int, v: str = "v") -> ProgramParts:
-        """Replace x of a system, without friction, by x with friction, and jt_x by J^T x + G(x); NaN if x does not settle."""
+    def settle(self, solve: int, v: str = "v", reports: bool = False) -> ProgramParts:
+        """Replace x of a system, without friction, by x with friction, and jt_x by J^T x + G(x); NaN if x does not settle.
+
+        With `reports` there is one round, and `unsettled` is one if it does not suffice to settle x, which is `settled`.
+        """
         yield from self._skew.form_symmetric
         yield from self._correct(solve, v, self._symmetric.substitute, has_slopes=False)
-        for k in range(NEWTON_STEPS):
-            if k:
-                yield from self._correct(solve, v, self._skew.substitute)
-            yield from self._slopes(solve, v)
-            yield from self._skew.factorize()
-            yield from self._skew.substitute(solve)
+        for _ in range(1 if reports else ROUNDS):
+            yield from self._round(solve, v)
+        yield from self._finish(solve, v, reports)
+
+    def further(self, solve: int, v: str = "v") -> ProgramParts:
+        """Compute the results of `settle` by a round that begins at x = `settled`."""
+        yield from self._skew.form_symmetric
+        yield from self._copy_solution("settled", f"x{solve}")
+        yield from self._round(solve, v)
+        yield from self._finish(solve, v, reports=True)
+
+    def _round(self, solve: int, v: str) -> ProgramParts:
+        yield from self._slopes(solve, v)
+        yield from self._skew.factorize()
+        yield from self._skew.substitute(solve)
+        yield from self._correct(solve, v, self._skew.substitute)
+
+    def _finish(self, solve: int, v: str, reports: bool) -> ProgramParts:
         yield from self._measure(solve, v)
+        if reports:
+            yield self.terms.single_iteration("unsettled", lambda w: w.write(_unsettled(w), "unsettled", None))
+            yield from self._copy_solution(f"x{solve}", "settled")
         yield from self._jt(solve, checked=True)
+
+    def _copy_solution(self, source: str, to: str) -> ProgramParts:
+        for group in self.terms.layout.eliminated:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                for i in range(len(group.rows)):
+                    w.write(w.read("from", RIGHT, i), "to", RIGHT, i)
+
+            kernel = self.terms.kernel(("copy solution", len(group.rows)), write)
+            yield KernelLoop(kernel, group.table, {"from": source, "to": to})
 
     def solve(self, solve: int) -> ProgramParts:
         """Compute x = (J C (J + S^T)^T)^(-1) right with the last factors, and jt_x = (J + S^T)^T x."""
@@ -77,19 +114,9 @@ class FrictionElimination:
 
     def _correct(self, solve: int, v: str, substitute: Callable[..., ProgramParts], has_slopes: bool = True) -> ProgramParts:
         """Replace x by the solution with the last factors and the loads G(x) - S x, or G(x) where the factors have no slopes."""
-        terms, layout = self.terms, self.terms.layout
-        yield Reset("drag", 0, layout.coordinate_count)
-        for group in layout.rubbing:
-
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                slopes = [group.slopes(w, row) for row in group.rows] if has_slopes else []
-                for k, load in enumerate(_programs(group).outputs["loads"]):
-                    if not load.is_zero:
-                        known = dot(w.graph, _programs(group).x, [row[k] for row in slopes]) if slopes else w.graph.constant(0.0)
-                        w.write(load - known, "drag", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
-
-            yield terms.over_rubbing(("drag", has_slopes), group, write, x=f"x{solve}", v=v)
-        for group in layout.eliminated:
+        terms = self.terms
+        yield from self._drag(solve, v, "drag", has_slopes)
+        for group in terms.layout.eliminated:
 
             def rest(w: KernelWriter, group: ConstraintGroup = group):
                 drag = read_bodies(w, group, "drag")
@@ -101,6 +128,20 @@ class FrictionElimination:
             yield KernelLoop(terms.kernel(("rest of right", group), rest), group.table, names)
         yield from substitute(CORRECTION, x=f"x{solve}")
 
+    def _drag(self, solve: int, v: str, to: str, has_slopes: bool = True) -> ProgramParts:
+        """Compute G(x) - S x on each body, or G(x)."""
+        yield Reset(to, 0, self.terms.layout.coordinate_count)
+        for group in self.terms.layout.rubbing:
+
+            def write(w: KernelWriter, group: ConstraintGroup = group):
+                slopes = [group.slopes(w, row) for row in group.rows] if has_slopes else []
+                for k, load in enumerate(_programs(group).outputs["loads"]):
+                    if not load.is_zero:
+                        known = dot(w.graph, _programs(group).x, [row[k] for row in slopes]) if slopes else w.graph.constant(0.0)
+                        w.write(load - known, "drag", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
+
+            yield self.terms.over_rubbing(("drag", has_slopes), group, write, x=f"x{solve}", v=v, drag=to)
+
     def _slopes(self, solve: int, v: str) -> ProgramParts:
         for group in self.terms.layout.rubbing:
 
@@ -111,46 +152,57 @@ class FrictionElimination:
             yield self.terms.over_rubbing("slopes", group, write, x=f"x{solve}", v=v)
 
     def _measure(self, solve: int, v: str) -> ProgramParts:
-        """Compute `unsettled` and `rubbing`, squares of G(x) - S x and of G(x) in the metric of C."""
-        yield Reset("unsettled", 0, 1)
+        """Compute `misfit` and `rubbing`, squares of the change of G(x) by another correction and of G(x), in the metric of C."""
+        yield Reset("misfit", 0, 1)
         yield Reset("rubbing", 0, 1)
+        yield from self._drag(solve, v, "new_drag")
         for group in self.terms.layout.rubbing:
 
-            def write(w: KernelWriter, group: ConstraintGroup = group):
-                slopes = [group.slopes(w, row) for row in group.rows]
-                unsettled = size = w.graph.constant(0.0)
+            def measure_size(w: KernelWriter, group: ConstraintGroup = group):
+                size = w.graph.constant(0.0)
                 for k, load in enumerate(_programs(group).outputs["loads"]):
-                    if load.is_zero:
-                        continue
-                    change = load - dot(w.graph, _programs(group).x, [row[k] for row in slopes])
-                    share = compliance(w, k % 3, BODIES + 3 * (k // 3) + BODY_CONSTANTS)
-                    unsettled, size = unsettled + share * (change * change), size + share * (load * load)
-                w.write(unsettled, "unsettled", None, 0, ADD)
+                    size = size + compliance(w, k % 3, BODIES + 3 * (k // 3) + BODY_CONSTANTS) * (load * load)
                 w.write(size, "rubbing", None, 0, ADD)
 
-            yield self.terms.over_rubbing("measure", group, write, x=f"x{solve}", v=v)
+            yield self.terms.over_rubbing("size", group, measure_size, x=f"x{solve}", v=v)
+
+        def measure_change(w: KernelWriter):
+            changes = [w.read("new_drag", BODY_COORDINATES, k) - w.read("drag", BODY_COORDINATES, k) for k in range(3)]
+            squares = [compliance(w, k) * (change * change) for k, change in enumerate(changes)]
+            w.write(sum(squares, w.graph.constant(0.0)), "misfit", None, 0, ADD)
+
+        yield self.terms.over_bodies("misfit", measure_change)
 
     def _jt(self, solve: int, checked: bool) -> ProgramParts:
-        """Compute jt_x = (J + S^T)^T x; if `checked`, NaN unless G(x) has settled."""
+        """Compute jt_x = (J + S^T)^T x; if `checked`, with the rest of G(x), and NaN unless it has settled."""
         yield from self.terms.jt(solve)
         for group in self.terms.layout.rubbing:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 x = [w.read("x", RIGHT, i) for i in range(len(group.rows))]
-                slopes, failed = [group.slopes(w, row) for row in group.rows], None
-                if checked:
-                    limit = w.read("rubbing", None) * SETTLED**2
-                    failed = where(
-                        greater(w.read("unsettled", None), limit), w.graph.constant(float("nan")), w.graph.constant(0.0)
-                    )
+                slopes = [group.slopes(w, row) for row in group.rows]
                 for k in range(group.coordinates):
                     total = dot(w.graph, [row[k] for row in slopes], x)
                     if not total.is_zero:
-                        total = total if failed is None else total + failed
                         w.write(total, "jt_x", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
 
             names = {name: f"{name}{solve}" for name in ("x", "jt_x")}
-            yield KernelLoop(self.terms.kernel(("jt slopes", checked, group), write), group.table, names)
+            yield KernelLoop(self.terms.kernel(("jt slopes", group), write), group.table, names)
+        if not checked:
+            return
+
+        def complete(w: KernelWriter):
+            failed = where(greater(_unsettled(w), w.graph.constant(0.5)), w.graph.constant(float("nan")), w.graph.constant(0.0))
+            for k in range(3):
+                w.write(w.read("drag", BODY_COORDINATES, k) + failed, "jt_x", BODY_COORDINATES, k, ADD)
+
+        yield self.terms.over_bodies("jt drag", complete, jt_x=f"jt_x{solve}")
+
+
+def _unsettled(w: KernelWriter) -> Scalar:
+    """Return one if G(x) has not settled, else zero."""
+    limit = w.read("rubbing", None) * SETTLED**2
+    return where(greater(w.read("misfit", None), limit), w.graph.constant(1.0), w.graph.constant(0.0))
 
 
 def _programs(group: ConstraintGroup) -> RubbingPrograms:

@@ -1,11 +1,14 @@
 """The common base of the programs of a scene (scene_programs.py) and of a user-defined system (system_programs.py)."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from udkjax.pinv.rank_policy import RankPolicy
 
 # The arrays that programs return; all others are scratch.
-RESULTS = tuple("a q1 v1 dq1 dv1 psi psi_dot terms rank distance safe pieces root energy independent multipliers".split())
+RESULTS = (
+    *("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root", "energy"),
+    *("independent", "multipliers", "unsettled", "settled"),
+)
 
 
 class RunPrograms:
@@ -27,12 +30,21 @@ class RunPrograms:
     """The reason why the programs are too long for machine code; empty if they are not."""
     has_mobility: bool = False
     """True if there is a program `mobility`, v1 = M^(-1) dv: M is not an input."""
+    rubs: bool = False
+    """True if friction depends on the loads of joints: `accelerations` then report that these are `unsettled`."""
+    FURTHER: ClassVar[str] = "accelerations_further"
+    """The program that goes on from `settled`."""
     is_linear: bool = True
     """True if constraints on velocities are linear in them."""
 
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...  # the programs, by their names
+
+    @property
+    def settled_accelerations(self) -> Any:
+        """The program `accelerations` with friction that is settled, without reports."""
+        return self.accelerations
 
     @property
     def position_rows(self) -> int:

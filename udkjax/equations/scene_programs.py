@@ -109,12 +109,37 @@ class ScenePrograms(RunPrograms):
 
     # --- programs
 
+    @property
+    def rubs(self) -> bool:
+        """True if friction depends on the loads of joints: programs may then report that these are `unsettled`."""
+        return self._solver.friction is not None
+
     @cached_property
     def accelerations(self) -> LoopProgram:
+        """Compute a; set safe, and unsettled."""
+        return self._accelerations(reports=True)
+
+    @cached_property
+    def settled_accelerations(self) -> LoopProgram:
         """Compute a; set safe."""
-        solver = self._solver
-        solve = [*solver.factorize, *solver.accelerating_solve(0), self._terms.add("a", start="free", solution=0), solver.safe]
+        return self._accelerations(reports=False)
+
+    @cached_property
+    def accelerations_further(self) -> LoopProgram:
+        """Compute a by another round of Newton's method for the loads of joints with friction; set unsettled."""
+        solver, friction = self._solver, self._solver.friction
+        assert friction is not None
+        solve = [*solver.factorize, *friction.further(0), self._terms.add("a", start="free", solution=0)]
         return program(solver.acceleration_system, solve)
+
+    def _accelerations(self, reports: bool) -> LoopProgram:
+        solver = self._solver
+        solve = [
+            *solver.factorize,
+            *solver.accelerating_solve(0, reports=reports),
+            self._terms.add("a", start="free", solution=0),
+        ]
+        return program(solver.acceleration_system, solve, [solver.safe])
 
     @cached_property
     def accelerations_and_drift(self) -> LoopProgram:
@@ -131,7 +156,7 @@ class ScenePrograms(RunPrograms):
     @cached_property
     def multipliers(self) -> LoopProgram:
         """Compute multipliers, the lambda of all rows, and a; set safe."""
-        return program(self.accelerations.parts, self._terms.multipliers(0))
+        return program(self.settled_accelerations.parts, self._terms.multipliers(0))
 
     @cached_property
     def newton_q(self) -> LoopProgram:

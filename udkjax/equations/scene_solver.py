@@ -30,14 +30,15 @@ class SceneSolver:
         """The factorization for accelerations, under the policy."""
         return self.elimination.factorize(self.policy.drops)
 
-    def accelerating_solve(self, solve: int, v: str = "v", refined_by: int | None = None) -> ProgramParts:
+    def accelerating_solve(self, solve: int, v: str = "v", refined_by: int | None = None, reports: bool = False) -> ProgramParts:
         """Solve the system `solve` with the right-hand side b: x, and jt_x = Psi_q^T x with the friction that depends on x.
 
-        `refined_by` is the number of a system for the corrections of a refined solution.
+        `refined_by` is the number of a system for the corrections of a refined solution. `reports`: friction that is not settled
+        after one round is reported as `unsettled`.
         """
         yield from self.solve(solve) if refined_by is None else self.refined_solve(solve, refined_by)
         if self.friction is not None:
-            yield from self.friction.settle(solve, v)
+            yield from self.friction.settle(solve, v, reports)
 
     @property
     def free_with_friction(self) -> list[KernelLoop | Reset]:
@@ -102,7 +103,7 @@ class SceneSolver:
         """Compute v1 after a Newton step to Psi_dot = 0, and a at v1, from one factorization."""
         terms = self.terms
         system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
-        solve = [*self.accelerating_solve(1, "v1"), terms.add("a", start="free", solution=1), self.safe]
+        solve = [*self.accelerating_solve(1, "v1", reports=True), terms.add("a", start="free", solution=1), self.safe]
         return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
 
     def tangent_parts(self, solve: int) -> ProgramParts:

@@ -13,7 +13,6 @@ from udkjax.equations.block_elimination import BlockElimination
 from udkjax.equations.front_substitution import FrontFactors, triangle
 from udkjax.equations.scene_layout import BODIES, BODY_CONSTANTS, ENTRIES, RIGHT, SLOPES, ConstraintGroup
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, dot
-from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.elimination_order import Fronts
@@ -25,8 +24,8 @@ class SkewElimination:
     """Loops that form J C (J + S^T)^T from the entries in `psi_q` and `slopes`, factorize it and solve with the factors.
 
     Their arrays are added to the layout after those of J C J^T in `symmetric`. `base` is J C J^T in the layout of `gram`; `skew`
-    is the whole matrix: diagonal blocks, then for each pair of coupled blocks the lower and the upper one. `skew_factors` holds L,
-    D and U in the same places. Rows that `symmetric` leaves out are left out here.
+    is the whole matrix: diagonal blocks, then for each pair of coupled blocks the lower and the upper one. `skew_factors` holds
+    L, D and U in the same places. Rows that `symmetric` leaves out are left out here.
     """
 
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
@@ -194,8 +193,12 @@ def _write_products(
 def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
     zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
     S = [[w.read("skew", 0, i * p + j) for j in range(p)] for i in range(p)]
-    below = [[[w.read("skew", FACTORS.below(a), i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)]
-    right = [[[w.read("skew", FACTORS.beside(a), j * size + i) for i in range(size)] for j in range(p)] for a, size in enumerate(later)]
+    below = [
+        [[w.read("skew", FACTORS.below(a), i * p + j) for j in range(p)] for i in range(size)] for a, size in enumerate(later)
+    ]
+    right = [
+        [[w.read("skew", FACTORS.beside(a), j * size + i) for i in range(size)] for j in range(p)] for a, size in enumerate(later)
+    ]
     for j in range(p):
         is_kept = greater(absolute(w.read("factors", 2, p + triangle(j, j))), zero)
         inverse = where(is_kept, one / S[j][j], zero)

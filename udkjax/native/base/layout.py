@@ -124,6 +124,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "rate": "error of the previous step, divided by (length of the step)^order",
     "ok": "whether all pivots of the attempted step were safe",
     "safe": "whether all pivots of the latest program were safe",
+    "unsettled": "whether the loads of joints with friction need further rounds of Newton's method",
     "fallback": "whether this attempt is made by the fallback",
     "fallback_due": "whether the next attempt must be made by the fallback",
     "retries": "number of successive attempts that were shortened because of a pivot",

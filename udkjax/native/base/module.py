@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.expressions.loop_derivative import FORWARD
 from udkjax.native.base.ir import BOOL, POINTER, Function, Value
@@ -9,6 +10,7 @@ from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, 
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.running import Running
+from udkjax.native.base.settling import AT_END, SETTLING, write_settling
 from udkjax.native.base.steps import POINTS
 from udkjax.native.base.tableau import Method
 
@@ -29,6 +31,9 @@ COLD = (
     "newton_v_and_psi",
     "evaluation_slopes",
     "measure_speed",
+    RunPrograms.FURTHER,
+    "settle_state",
+    "settle_end",
 )
 
 
@@ -59,7 +64,9 @@ class Module(Running):
         self.takes_dense_rows = self.is_dense or self.is_formulated
         self.measures_drift = plan.steps and m > 0 and not plan.projected
         self.pieces = code.piece_count if plan.breaks else 0
-        self.programs = {name: getattr(code, name) for name in self.program_names()}
+        names = self.program_names()
+        self.settles = code.rubs and any(name in SETTLING for name in names)  # friction may need further rounds
+        self.programs = {name: getattr(code, name) for name in (*names, *((code.FURTHER,) if self.settles else ()))}
         self.unrolled = self._unroll(differentiated, active) if plan.unrolled else None
         self.constants = len(self.unrolled.constants if self.unrolled else code.constants)
         self.moving = range(self.constants if any(active) else 0) if self.unrolled is None else self.unrolled.moving
@@ -118,8 +125,10 @@ class Module(Running):
             self._add_arrays("", {"couplings": code.scratch["couplings"], "change": n})
         if self.takes_dense_rows and "root" not in p.places:
             self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.unrolled else {}))
-        if self.is_formulated:
+        if self.is_formulated or self.settles:
             p.add("saved v", n)
+        if self.settles:
+            self._add_arrays("", {"further a": n} | ({"settled": code.scratch["settled"]} if self.unrolled else {}))
         if self.falls_back:
             self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
             if self.unrolled:
@@ -178,7 +187,7 @@ class Module(Running):
             "a": "result a",
         }
         named |= {"dq1": "result dq", "dv1": "result dv"} | {
-            x: x for x in ("constants", "psi", "terms", "pieces", "safe", "distance", "rank")
+            x: x for x in ("constants", "psi", "terms", "pieces", "safe", "distance", "rank", "unsettled")
         }
         if not self.unrolled:
             named |= {x: x for x in self.code.scratch}
@@ -186,6 +195,8 @@ class Module(Running):
             named |= {x: x for x in ("psi_q", "psi_dot", "root")}
         if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}
+        if self.settles:
+            named["settled"] = "settled"
         if "couplings" in self.places.places:
             named["couplings"] = "couplings"
         return {x: ("work", self.places[place]) for x, place in named.items()}
@@ -195,6 +206,8 @@ class Module(Running):
             out = {"a": ("out", 0)} if name.startswith("accelerations") else {}
             self.write_program(name, self.arrays | out)
         self.write_prologue("prologue", self.unrolled)
+        if self.settles:
+            write_settling(self, any(name in AT_END for name in self.programs))
         if "couplings" in self.places.places:
             at = {"couplings": ("work", self.places["couplings"]), "change": ("out", 0)}
             self.loops.write(self.code.spread, "spread", ("work", "out"), at)
@@ -309,6 +322,12 @@ class Module(Running):
         if self.pieces:
             return f.const(True, BOOL, f.width)
         return s.written + 1.0 < self.field(f, "times") - 1
+
+    def invoke(self, f: Function, name: str, out: str | None = None):
+        super().invoke(f, name, out)
+        if name in SETTLING and self.settles:
+            with f.if_(f.any_of(Lane(f, self.places).unsettled > 0.5)):
+                f.call("settle_end" if name in AT_END else "settle_state", f.given["work"], self.address(f, out or "result a"))
 
     def accelerate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i at `state`."""

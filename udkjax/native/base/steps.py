@@ -36,6 +36,9 @@ ROUNDING_GROWTH = 3e-14
 # distance.
 SURE, EXPECTED = 0.85, 0.3
 
+# Further rounds of Newton's method for the loads of joints with friction. Friction of 0.99 of that which jams needs five.
+SETTLING_ROUNDS = 20
+
 # Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.
 # Breakpoints closer to one another than the smallest step count as one.
 SMALLEST_STEP = 100.0  # in units of rounding of the end time; time would not advance by shorter steps

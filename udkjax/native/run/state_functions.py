@@ -176,8 +176,9 @@ class Evaluation:
         loops = LoopWriter(1)
         at = {name: ("work", place) for name, place in self.places.items()}
         loops.write(self._code.prologue, "prologue", ("numbers", "work"), at | {"numbers": ("numbers", 0)})
-        for name in ("accelerations", "energy"):
-            loops.write(getattr(self._code, name), name, ("work", "out"), at)
+        programs = {"accelerations": self._code.settled_accelerations, "energy": self._code.energy}
+        for name, program in programs.items():
+            loops.write(program, name, ("work", "out"), at)
         return text_of_module([*self._further, *loops.functions], loops.globals)
 
 
