@@ -124,6 +124,24 @@ def test_drawer_jams_at_its_angle():
     assert not np.isfinite(udk.accelerations(drawer(0.26), 0.0, *at)).any()
 
 
+def test_no_loads_give_no_friction():
+    """A mechanism that jams has no multipliers, and then no accelerations: not those without friction."""
+    mechanism = pendulum(coefficient=0.3, radius=0.1).without_origin
+    at = jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])
+    assert jnp.isnan(rubbing_loads(mechanism, 0.0, *at, jnp.full(2, jnp.nan))[2])
+    assert rubbing_loads(mechanism, 0.0, *at, jnp.zeros(2))[2] == 0
+
+
+@pytest.mark.slow
+def test_pin_jams():
+    """Beyond the coefficient at which the pin's friction outweighs what turns it, there are no accelerations."""
+    mechanism = MECHANISMS["pendulum"]()
+    q, v = states(mechanism, 1)[0]
+    for factor, jams in ((15.0, False), (19.0, True)):
+        found = udk.accelerations(scaled(mechanism, factor), 0.0, q.reshape(-1, 3), v.reshape(-1, 3))
+        assert np.isnan(found).any() == jams
+
+
 def test_static_coefficient_is_reached_at_its_speed():
     """At s = speed, mu is the static coefficient up to 1 - tanh 4; far above it is the coefficient."""
     at = jnp.zeros((1, 3))

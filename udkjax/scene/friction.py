@@ -173,7 +173,7 @@ class Friction(ForceElement):
         if isinstance(joint, Revolute):
             x, y = multipliers
             square = x * x + y * y
-            return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+            return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))  # NaN stays: it is a jam
         if self.length is None:
             return jnp.abs(multipliers[0])
         half, couple = multipliers[0] / 2, multipliers[1] / self.length

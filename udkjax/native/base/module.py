@@ -10,7 +10,7 @@ from udkjax.native.base.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, 
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.running import Running
-from udkjax.native.base.settling import AT_END, SETTLING, write_settling
+from udkjax.native.base.settling import AT_END, SETTLING, write_settle_end, write_settle_state
 from udkjax.native.base.steps import POINTS
 from udkjax.native.base.tableau import Method
 
@@ -207,7 +207,10 @@ class Module(Running):
             self.write_program(name, self.arrays | out)
         self.write_prologue("prologue", self.unrolled)
         if self.settles:
-            write_settling(self, any(name in AT_END for name in self.programs))
+            arguments = [(POINTER, "work"), (POINTER, "out")]
+            write_settle_state(self, *self.function("settle_state", arguments))
+            if any(name in AT_END for name in self.programs):
+                write_settle_end(self, self.function("settle_end", arguments)[0])
         if "couplings" in self.places.places:
             at = {"couplings": ("work", self.places["couplings"]), "change": ("out", 0)}
             self.loops.write(self.code.spread, "spread", ("work", "out"), at)

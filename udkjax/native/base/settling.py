@@ -8,7 +8,8 @@ linear system as `settled`. Two functions then take as many more rounds as such 
 """
 
 from udkjax.equations.run_programs import RunPrograms
-from udkjax.native.base.ir import INT, POINTER
+from udkjax.native.base.ir import INT, Function
+from udkjax.native.base.layout import Lane
 from udkjax.native.base.memory import Memory
 from udkjax.native.base.steps import SETTLING_ROUNDS
 
@@ -17,9 +18,8 @@ AT_END = ("project_and_accelerate", "end_of_step")
 SETTLING = (*AT_STATE, *AT_END)
 
 
-def write_settling(module: Memory, at_end: bool):
-    """Write `settle_state`, and `settle_end` if a program of `AT_END` is among those of the module."""
-    f, s = module.function("settle_state", [(POINTER, "work"), (POINTER, "out")])
+def write_settle_state(module: Memory, f: Function, s: Lane):
+    """Write `settle_state`."""
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.unsettled > 0.5) & (k.value < SETTLING_ROUNDS)):
         open_ = s.unsettled > 0.5
@@ -27,9 +27,11 @@ def write_settling(module: Memory, at_end: bool):
         module.copy(f, "further a", "out", open_)
         s.where(~open_, unsettled=0.0)
         k.value = k.value + 1
-    if at_end:
-        f, _ = module.function("settle_end", [(POINTER, "work"), (POINTER, "out")])
-        module.copy(f, "state v", "saved v")
-        module.copy(f, "result v", "state v")
-        f.call("settle_state", f.given["work"], f.given["out"])
-        module.copy(f, "saved v", "state v")
+
+
+def write_settle_end(module: Memory, f: Function):
+    """Write `settle_end`."""
+    module.copy(f, "state v", "saved v")
+    module.copy(f, "result v", "state v")
+    f.call("settle_state", f.given["work"], f.given["out"])
+    module.copy(f, "saved v", "state v")
