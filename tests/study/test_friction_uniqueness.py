@@ -1,5 +1,7 @@
 """`diagnose` says where friction depends on loads that equilibrium does not determine."""
 
+from collections.abc import Mapping
+
 import pytest
 
 import udkjax as udk
@@ -8,14 +10,65 @@ from tests.friction import rubbing
 pytestmark = pytest.mark.slow
 
 
+def verdict(mechanism: udk.Mechanism) -> tuple[dict[str, tuple[bool, bool]], str]:
+    """Return the marks of each friction, of its load and of the accelerations that it causes, and the text of the diagnosis."""
+    diagnosis = udk.diagnose(mechanism, fixes=False, walk=False)
+    return {name: (x.load, x.accelerations) for name, x in diagnosis.friction.items()}, str(diagnosis)
+
+
+def slider(joints: Mapping[str, udk.Joint], friction: udk.Friction, **bodies: udk.Body) -> udk.Mechanism:
+    """Return a sliding body with further joints and bodies."""
+    guide = udk.Prismatic(["ground", "slider"], [[0, 0], [0, 0]], axis=0.0)
+    return udk.Mechanism({"slider": udk.Body(1.0, 0.1), **bodies}, {"S": guide, **joints}, forces={"rub": friction})
+
+
 def test_parallelogram_is_not_unique():
     """The loads in its pins are shared by redundant constraints, and with them its accelerations."""
-    diagnosis = udk.diagnose(rubbing(udk.library.parallelogram()), fixes=False, walk=False)
-    assert any(not x.accelerations for x in diagnosis.friction.values())
-    assert "not unique, nor are the accelerations" in str(diagnosis)
+    found, text = verdict(rubbing(udk.library.parallelogram()))
+    assert not any(x for marks in found.values() for x in marks)
+    assert "not unique, nor are the accelerations" in text
 
 
 def test_four_bar_is_unique():
-    diagnosis = udk.diagnose(rubbing(udk.library.four_bar()), fixes=False, walk=False)
-    assert all(x.load and x.accelerations for x in diagnosis.friction.values())
-    assert "all loads are unique" in str(diagnosis)
+    found, text = verdict(rubbing(udk.library.four_bar()))
+    assert all(x for marks in found.values() for x in marks)
+    assert "all loads are unique" in text
+
+
+def test_only_the_components_that_rub_count():
+    """A second joint shares the torque of a slide, whose friction depends on its normal force alone, unless it has edges."""
+    joints = {"held": udk.Angle(["ground", "slider"])}
+    assert verdict(slider(joints, udk.Friction("S", coefficient=0.1)))[0] == {"S": (True, True)}
+    assert verdict(slider(joints, udk.Friction("S", coefficient=0.1, length=0.2)))[0] == {"S": (False, False)}
+
+
+def test_loads_of_opposite_sides_count():
+    """Two guides share a normal force. Where both push to the same side, their sum is constant, but nothing keeps them there."""
+    second = udk.Prismatic(["ground", "slider"], [[0, 0], [0.1, 0]], axis=0.0)
+    plain = slider({"S2": second}, udk.Friction("S", coefficient=0.1))
+    both = udk.Mechanism(plain.bodies, plain.joints, forces={**plain.forces, "rub2": udk.Friction("S2", coefficient=0.1)})
+    assert verdict(both)[0] == {"S": (False, False), "S2": (False, False)}
+
+
+def test_loads_that_answer_to_loose_friction_are_loose():
+    """A pendulum on a slider whose friction is not unique: neither are its accelerations, nor the load in its pin."""
+    joints = {"held": udk.Angle(["ground", "slider"]), "A": udk.Revolute(["slider", "bob"], [[0, 0], [0, 0.3]])}
+    mechanism = slider(joints, udk.Friction("S", coefficient=0.1, length=0.2), bob=udk.Body(1.0, 0.1, [0, -0.3]))
+    more = {**mechanism.forces, "rub2": udk.Friction("A", coefficient=0.1, radius=0.01)}
+    found, text = verdict(udk.Mechanism(mechanism.bodies, mechanism.joints, forces=more))
+    assert found == {"S": (False, False), "A": (False, False)}
+    assert "the loads of S, A are not unique, nor are the accelerations" in text
+
+
+def test_a_joint_that_cannot_slide_moves_nothing():
+    """A frame with a brace of too much: its pins have loads that are not unique, and do not turn."""
+    pins = {"A": [0, 0], "B": [0, 1], "C": [1, 1], "D": [1, 0]}
+    bars = {"a": "AB", "b": "BC", "c": "CD", "d": "AC", "e": "BD"}
+    links = {name: {"pins": list(ends), "mass": 1.0} for name, ends in bars.items()}
+    rubs = {"A": ["ground", "a"], "D": ["ground", "c"]}
+    friction = [{"pin": pin, "of": of, "coefficient": 0.1, "radius": 0.01} for pin, of in rubs.items()]
+    mechanism = udk.Drawing(pins=pins, links=links, ground=["A", "D"], friction=friction).mechanism()
+    found, text = verdict(mechanism)
+    assert all(accelerations for _, accelerations in found.values())
+    assert not all(load for load, _ in found.values())
+    assert "but the accelerations are" in text

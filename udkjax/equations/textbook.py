@@ -11,6 +11,7 @@ from udkjax.equations import constraints, loads, rubbing
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.loose_friction import LooseFriction, loose_friction
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -54,20 +55,9 @@ class TextbookEquations(MechanismSystem):
         drags = rubbing.single_rubbing_loads(self.mechanism, t, q, v, multipliers)
         return {joint: v @ drag for joint, drag in drags.items()}
 
-    def loose_friction(self, t: Time, q: Vector, v: Vector, N: Float[Array, "m k"]) -> dict[str, Array]:
-        """Return the accelerations (n, k) that a change of the multipliers by each column of N causes by friction, by joint.
-
-        They are those of a small change, without the change of the multipliers that follows from it.
-        """
-        multipliers, root = self.multipliers(t, q, v), uk.inverse_sqrt_mass(self.mechanism)
-        plus = uk.pseudoinverse(self.method, D := uk.D(self.mechanism, t, q, self.scales.weights))
-        slopes = jax.jacfwd(lambda x: rubbing.single_rubbing_loads(self.mechanism, t, q, v, x))(multipliers)
-
-        def accelerate(load: Vector) -> Vector:
-            pull = root * load
-            return root * (pull - plus @ (D @ pull))
-
-        return {joint: jax.vmap(accelerate, 1, 1)(slope @ N) for joint, slope in slopes.items()}
+    def loose_friction(self, t: Time, q: Vector, v: Vector, N: Float[Array, "m k"]) -> LooseFriction:
+        """Return which joints with friction have a load that is not unique: see `loose_friction`."""
+        return loose_friction(self.mechanism, t, q, v, N, self.scales, self.method)
 
     @property
     def rubbing_joints(self) -> list[str]:

@@ -118,7 +118,7 @@ def diagnose(
         clearance=clearance(positions, current, generic_rank, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
         held=tuple(pin.name for pin in held),
-        friction=_friction(mechanism, current, owners),
+        friction=_friction(mechanism, current),
     )
 
 
@@ -160,7 +160,7 @@ def _cure(
     return ()
 
 
-def _friction(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointFriction]:
+def _friction(mechanism: Mechanism, here: Configuration) -> dict[str, JointFriction]:
     """Return for friction that depends on loads whether these, and the accelerations that it causes, are unique, by joint.
 
     Accelerations are those of a motion that slides in all joints that can.
@@ -170,16 +170,18 @@ def _friction(mechanism: Mechanism, here: Configuration, owners: list[str]) -> d
         return {}
     scales, q = equations.scales, jnp.asarray(here.q)
     unit = np.asarray(scales.coordinates(q.size))
-    any_motion = jnp.asarray(np.random.default_rng(0).normal(size=q.size) * unit * float(scales.rate))
+    rate = float(scales.rate) or 1.0  # without loads and velocities, there is no time
+    any_motion = jnp.asarray(np.random.default_rng(0).normal(size=q.size) * unit * rate)
     v = equations.tangent_part(here.t, q, q, q, any_motion).dv
-    loose = equations.loose_friction(here.t, q, v, jnp.asarray(here.left / np.asarray(scales.rows)[:, None]))
-    found = {}
-    for joint, a in loose.items():
-        share = np.linalg.norm(here.left[[k for k, owner in enumerate(owners) if owner == joint]])
-        size = np.abs(np.asarray(a) / unit[:, None]).max(initial=0.0) * float(scales.mass * scales.length)
-        load = bool(share <= determinacy.UNIQUE_TOL)
-        found[joint] = JointFriction(load, load or bool(size <= determinacy.UNIQUE_TOL))
-    return found
+    found = equations.loose_friction(here.t, q, v, jnp.asarray(here.left))
+    slides, loads = np.asarray(found.slides), np.asarray(found.loads)
+    sources = loose = np.asarray(found.loose)
+    while np.any(sources := sources & slides) and np.any(new := loads[sources].any(0) & ~loose):
+        loose, sources = loose | new, new
+    return {
+        joint: JointFriction(not is_loose, not is_loose or not does_slide)
+        for joint, is_loose, does_slide in zip(equations.rubbing_joints, loose, slides, strict=True)
+    }
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:

@@ -230,17 +230,13 @@ def _forces(result: Diagnosis) -> list[str]:
 
 def _friction(result: Diagnosis) -> list[str]:
     """Name the joints whose friction depends on a load that is not unique."""
-    loose = {True: [], False: []}
-    for joint, friction in result.friction.items():
-        if not friction.load:
-            loose[friction.accelerations].append(joint)
-    lines = [f"the loads of {', '.join(loose[True])} are not unique, but the accelerations are"] if loose[True] else []
-    if loose[False]:
-        lines.append(
-            f"the loads of {', '.join(loose[False])} are not unique, nor are the accelerations: "
-            "they are those of the loads of least norm"
-        )
-    return lines or (["all loads are unique, and so are the accelerations"] if result.friction else [])
+    loose = [joint for joint, friction in result.friction.items() if not friction.load]
+    if not loose:
+        return ["all loads are unique, and so are the accelerations"] if result.friction else []
+    text = f"the loads of {', '.join(loose)} are not unique"
+    if all(friction.accelerations for friction in result.friction.values()):
+        return [f"{text}, but the accelerations are"]
+    return [f"{text}, nor are the accelerations: they are those of the loads of least norm"]
 
 
 def _conditioning(result: Diagnosis) -> list[str]:

@@ -1,0 +1,80 @@
+"""Friction whose load equilibrium does not determine, and what follows from it.
+
+The multipliers that agree with equilibrium and with friction G are lambda = L(G(lambda)) + N y, for any y, with the null space N
+of Psi_q^T (determinacy.py). G of each joint is homogeneous: G(N y) = 0 for all y if and only if the load of the joint does not
+depend on y. In a joint that slides, the power of friction grows with its load, and the power of no other joint makes up for that:
+all are negative. So accelerations are unique if and only if no joint that slides has a load that is loose. Where they are not,
+the loads of all joints that respond to the friction of these are loose as well.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.annotations import Time, Vector
+from udkjax.equations import rubbing
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.determinacy import UNIQUE_TOL
+from udkjax.equations.scales import Scales
+from udkjax.pinv import Pseudoinverse
+from udkjax.programs.deferred import deferred
+from udkjax.scene.mechanism import Mechanism
+
+
+class LooseFriction(NamedTuple):
+    """Marks of joints with friction: of a load that is not unique, of sliding, and of the joints (rows) that load others."""
+
+    loose: Bool[Array, "j"]
+    slides: Bool[Array, "j"]
+    loads: Bool[Array, "j j"]
+
+
+@deferred
+def loose_friction(
+    mechanism: Mechanism, t: Time, q: Vector, v: Vector, N: Float[Array, "m k"], scales: Scales, method: Pseudoinverse
+) -> LooseFriction:
+    """Return which joints with friction have a load that equilibrium leaves open if the friction of all others is given.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,).
+        v: Velocities (m/s, rad/s), (n,), of a motion in which all joints slide that can.
+        N: Basis of the null space of Psi_q^T, for multipliers in units of one over their rows' scales.
+        scales: Scales of the scene.
+        method: The pseudoinverse.
+
+    Returns:
+        `LooseFriction`, in the order of `rubbing_names`.
+    """
+    random, unit = np.random.default_rng(0), jnp.asarray(scales.coordinates(q.size))
+    some_load, some_mix = (jnp.asarray(random.normal(size=size)) for size in N.shape)
+    rate = jnp.where(jnp.asarray(scales.rate) > 0, scales.rate, 1.0)
+    everywhere = jnp.asarray(random.normal(size=q.size)) * unit * rate  # all joints slide
+
+    def frictions(speeds: Array, multipliers: Array) -> Array:
+        """Return the loads of friction of each joint (j, n), as forces."""
+        found = rubbing.single_rubbing_loads(mechanism, t, q, speeds, multipliers / jnp.asarray(scales.rows))
+        return jnp.stack(list(found.values())) * unit
+
+    def sizes(speeds: Array, multipliers: Array) -> Array:
+        return jnp.linalg.norm(frictions(speeds, multipliers), axis=1)
+
+    usual = sizes(everywhere, some_load)
+    loose = sizes(everywhere, N @ some_mix) > UNIQUE_TOL * usual
+    drags = frictions(v, some_load)
+    slides = jnp.linalg.norm(drags, axis=1) > UNIQUE_TOL * usual
+
+    D, root = uk.D(mechanism, t, q, scales.weights), uk.inverse_sqrt_mass(mechanism)
+    plus = uk.pseudoinverse(method, D)
+
+    def response(drag: Array) -> Array:
+        """Return the friction that the multipliers in answer to a load cause, if all joints slide."""
+        multipliers = uk.weigh(scales.weights, plus.T @ (plus @ (D @ (root * (drag / unit)))))
+        return sizes(everywhere, multipliers * jnp.asarray(scales.rows))
+
+    answers = jax.vmap(response)(drags / jnp.where(slides, jnp.linalg.norm(drags, axis=1), jnp.inf)[:, None])
+    return LooseFriction(loose, slides, answers > UNIQUE_TOL * usual)
