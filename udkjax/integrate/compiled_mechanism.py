@@ -45,6 +45,7 @@ class RunPlan:
     evaluation: Accelerate | None  # the machine code that evaluates its equations for diffrax; None: `TextbookEquations` in JAX
     why_not_native: str  # the reason why machine code does not integrate; empty if it does
     independent_rows: int = 0  # the number of rows that the method uses
+    most_rank: int = 0  # the number of rows not known to be redundant: a larger rank is due to rounding or violated rows
     orders_by_diffrax: float = np.inf  # the highest order of derivatives that diffrax, which does not locate pieces, has right
 
     @cached_property
@@ -87,11 +88,6 @@ class CompiledMechanism:
         """The equations, without the formulation that may contain them."""
         return textbook_of(self.equations)
 
-    @property
-    def most_rank(self) -> int:
-        """The number of rows that are not known to be redundant: a larger rank is due to rounding or violated rows."""
-        return len(self.textbook.scales.rows) - len(self.textbook.redundant or ())
-
 
 def compile_mechanism(
     system: Any,
@@ -114,7 +110,7 @@ def compile_mechanism(
     equations = equations_of(system, method, baumgarte, formulation, analysis)
     projects = isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem)
     projected, breakpoints = equations.constrained and projects, system.breakpoints
-    operation, evaluation, rows = None, None, 0
+    operation, evaluation, rows, most_rank = None, None, 0, 0
     if engine in ("diffrax", "jax"):
         why = "it was asked for"
     elif isinstance(stabilization, Stabilization):
@@ -124,14 +120,15 @@ def compile_mechanism(
     if not why:
         operation = _run_operation(equations, solver, projected, breakpoints)
         textbook = textbook_of(equations)
-        rows = len(textbook.scales.rows) - len((textbook.redundant or ()) if eliminates(textbook.method) else ())
+        most_rank = len(textbook.scales.rows) - len(textbook.redundant or ())
+        rows = most_rank if eliminates(textbook.method) else len(textbook.scales.rows)
         why = _reason_for_programs(operation.code)
     elif engine != "jax":
         evaluation = evaluation_of(equations)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" uses diffrax instead')
     orders = _orders_by_diffrax(system, projected)
-    plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows, orders)
+    plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows, most_rank, orders)
     return CompiledMechanism(equations, breakpoints, plan)
 
 

@@ -66,7 +66,8 @@ def integrate_by_diffrax(
     equations = problem.equations
     if isinstance(equations, TextbookEquations) and equations.redundant and not eliminates(equations.method):
         # machine code looks after every step
-        is_held = equations.rank(t_end[0], jnp.split(end[0], 2)[0]) > problem.compiled.most_rank
+        most = len(equations.scales.rows) - len(equations.redundant)
+        is_held = equations.rank(t_end[0], jnp.split(end[0], 2)[0]) > most
         status = jnp.where(is_held, Status.SPURIOUS_RANK, status)
     controller_state: Any = run.controller_state
     if measures_drift:

@@ -200,7 +200,7 @@ def simulate(
         if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
-    sticks = isinstance(mechanism, Mechanism) and Friction.may_stick(mechanism._forces)
+    sticks = isinstance(mechanism, Mechanism) and _may_stick(mechanism)
     is_located, located = events is not None or sticks, None
     if isinstance(mechanism, Mechanism) and _may_have_kinks(mechanism):
         from udkjax.integrate.events.kinks import kinks_of
@@ -248,6 +248,11 @@ def _releases(events: Any) -> bool:
     """Return whether an event removes a constraint."""
     listed = () if events is None else events if isinstance(events, Sequence) else (events,)
     return any(getattr(getattr(event, "action", None), "removed", None) for event in listed)
+
+
+@cached_by_identity
+def _may_stick(mechanism: Mechanism) -> bool:
+    return Friction.may_stick(mechanism.forces.values())
 
 
 @cached_by_identity

@@ -58,10 +58,11 @@ class Animation:
     Attributes:
         data: data of the player, as JSON.
         failures: causes of failed runs by label.
+        mechanisms: the mechanism of each run, whose points and links pictures name.
     """
 
     def __init__(self, data: JsonObject, failures: Mapping[str, str] | None = None, mechanisms: Sequence[Mechanism] = ()):
-        self.data, self.failures, self._mechanisms = data, dict(failures or {}), mechanisms
+        self.data, self.failures, self.mechanisms = data, dict(failures or {}), mechanisms
         self._motions = [motion_of(record) for record in data["runs"]]
         self._arrows = [arrows_of(record) for record in data["runs"]]
         self._paths: list[list[TracedPath]] | None = None
@@ -133,7 +134,7 @@ class Animation:
 
     def labels(self) -> list[PictureLabels]:
         """Return the names of points and the lengths of links of each run."""
-        shown = zip(self._mechanisms, self.data["runs"], strict=True)
+        shown = zip(self.mechanisms, self.data["runs"], strict=True)
         return [labels_of(mechanism, run["marks"]) for mechanism, run in shown]
 
     def _repr_html_(self) -> str:
