@@ -15,7 +15,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -93,12 +93,14 @@ def described(data: xarray.Dataset, scene: Mechanism | str, settings: Mapping[st
     return data.assign_attrs(scene=text, settings=json.dumps(numbers), seed="none" if seed is None else seed)
 
 
-def tracked(items: Sequence[Item] | Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+def tracked(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
     """Iterate over the parts of a study; say on stderr the current one, of their number or `total`, and the time so far."""
-    items, start = items if total else list(items), time.perf_counter()
-    end, count = "\r" if sys.stderr.isatty() else "\n", total or len(items)
+    start, end = time.perf_counter(), "\r" if sys.stderr.isatty() else "\n"
+    if total is None:
+        items = list(items)
+        total = len(items)
     for number, item in enumerate(items, 1):
-        print(f"{what}: {number} of {count}, {time.perf_counter() - start:.0f} s   ", end=end, file=sys.stderr, flush=True)
+        print(f"{what}: {number} of {total}, {time.perf_counter() - start:.0f} s   ", end=end, file=sys.stderr, flush=True)
         yield item
 
 
