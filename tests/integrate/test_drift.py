@@ -67,6 +67,7 @@ def test_redundant_rows_that_count_as_independent_end_a_run(method, engine):
     assert alone.result == Result.spurious_rank and "rank_tol" in alone.cause
     if engine == "native":
         assert udk.simulate(swing(-0.6), 2 * TS, method=udk.SVD(1e-4), **run).result == Result.successful
+        assert udk.simulate(swing(-0.6), 2 * TS, method=method, drift_tol=np.inf, **run).result == Result.successful
 
 
 @pytest.mark.parametrize("method", [udk.SVD(1e-10), pytest.param(udk.Varga(1e-12), marks=pytest.mark.slow)])

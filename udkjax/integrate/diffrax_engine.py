@@ -68,7 +68,7 @@ def integrate_by_diffrax(
         # machine code looks after every step
         most = len(equations.scales.rows) - len(equations.redundant)
         is_held = equations.rank(t_end[0], jnp.split(end[0], 2)[0]) > most
-        status = jnp.where(is_held, Status.SPURIOUS_RANK, status)
+        status = jnp.where(is_held & jnp.isfinite(problem.drift_tol), Status.SPURIOUS_RANK, status)
     controller_state: Any = run.controller_state
     if measures_drift:
         controller_state, drifted = controller_state.inner, controller_state.status

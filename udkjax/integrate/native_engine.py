@@ -163,7 +163,7 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
         "omega": problem.rate,
         "max_steps": problem.max_steps,
         "drift_tol": problem.drift_tol,
-        "most_rank": float(compiled.plan.most_rank),
+        "most_rank": xp.where(xp.isinf(problem.drift_tol), np.inf, float(compiled.plan.most_rank)),
         "open_tol": xp.maximum(problem.drift_tol, scene.thresholds[1]),
     }
     numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]

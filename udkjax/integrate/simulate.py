@@ -91,7 +91,7 @@ def simulate(
     change its branch: it ends as `singular` at a step whose violation of Psi exceeds `drift_tol` times the square of the
     distance from such a configuration, relative to the largest distance of the run. Where rows depend on others along the whole
     motion, a run whose method finds a larger rank ends as `spurious_rank`; machine code looks after each step, other solvers at
-    the end.
+    the end. With an infinite `drift_tol` neither ends a run.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.
