@@ -16,8 +16,8 @@ from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, LoopP
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
 NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "misfit", "rubbing", "drag", "new_drag")  # of friction
 
-# Arrays of the second correction of a solution; their first-order changes vanish after the first correction.
-SETTLED = ("right2", "sum2", "y2", "x2")
+# Arrays of the second correction of a solution, whose first-order changes vanish after the first correction.
+SECOND_CORRECTION = ("right2", "sum2", "y2", "x2")
 
 
 class DifferentiableProgram(NamedTuple):
@@ -50,7 +50,7 @@ class DifferentiableProgram(NamedTuple):
         """Return the program of a mode of differentiation, with additional arrays fixed."""
         if mode == TWICE:
             twice = LoopDerivative(self.second_parts, {*NOT_DIFFERENTIATED, *fixed} - {"x0"})
-            return twice.second(SETTLED)
+            return twice.second(SECOND_CORRECTION)
         derivative = self.derivative(fixed)
         return derivative.reverse if mode == REVERSE else derivative.forward
 

@@ -32,8 +32,9 @@ from udkjax.integrate.events.system import System, condition_values
 from udkjax.integrate.solution import Result
 from udkjax.transforms.gradients import stop_gradients
 
-# Number of repetitions for the limits, with sweeps of a projected Gauss-Seidel method in each.
-REPETITIONS, SWEEPS = 10, 20
+# Number of repetitions for the limits, with sweeps of a projected Gauss-Seidel method in each, and the change of the shares of
+# the limits by the last. Pivots correct what these leave: they decide where pivots begin, and so their number.
+REPETITIONS, SWEEPS, SAME_SHARE = 10, 20, 1e-6
 # Number of pivots of all joints that violate their law, for each joint; then only the first such joint pivots, which ends.
 BLOCK_STEPS, SINGLE_STEPS = 2, 8
 
@@ -221,7 +222,7 @@ def _guess(
     if xp is np:
         for _ in range(REPETITIONS):
             before, share = share, improve(share)
-            if np.all(np.abs(share - before) < 1e-6):
+            if np.all(np.abs(share - before) < SAME_SHARE):
                 break
     else:
         share = jax.lax.fori_loop(0, REPETITIONS, lambda _, x: improve(x), share)
