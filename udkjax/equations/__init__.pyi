@@ -5,7 +5,6 @@ from udkjax.equations import determinacy as determinacy
 from udkjax.equations import loads as loads
 from udkjax.equations import udwadia_kalaba as udwadia_kalaba
 from udkjax.equations.abstract_system import AbstractSystem as AbstractSystem
-from udkjax.equations.abstract_system import MechanismSystem as MechanismSystem
 from udkjax.equations.abstract_system import TangentPart as TangentPart
 from udkjax.equations.analysis import Analysis as Analysis
 from udkjax.equations.analysis import analyse as analyse
@@ -41,7 +40,6 @@ from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations.loads import mass_of as mass_of
 from udkjax.equations.motion_measures import MotionModel as MotionModel
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
-from udkjax.equations.partitioning import PartitionedSystem as PartitionedSystem
 from udkjax.equations.position_closure import CLOSURE as CLOSURE
 from udkjax.equations.position_closure import Assembly as Assembly
 from udkjax.equations.position_closure import close_position as close_position

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from types import SimpleNamespace
-from typing import NamedTuple, Protocol, Self, TypeAlias
+from typing import ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -110,7 +110,9 @@ class AbstractSystem(eqx.Module):
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
         """Return whether all terms of the equations are finite."""
 
-    # The methods below are for formulations that integrate only some of the coordinates. By default all are integrated.
+    # The members below are for formulations that integrate only some of the coordinates. By default all are integrated.
+
+    solves_constraints: ClassVar[bool] = False  # True: dependent coordinates are solved for, so every state is projected
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
         """Return the time derivatives of q and v that are integrated."""

@@ -63,6 +63,7 @@ class PartitionedSystem(WrappedSystem):
     Unless a partition is fixed, it is chosen anew at each state.
     """
 
+    solves_constraints = True
     equations: MechanismSystem
     formulation: CoordinatePartitioning
     dependent: Bool[Array, "n"] | None = None  # the dependent coordinates, if the partition is fixed

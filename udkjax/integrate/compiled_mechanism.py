@@ -13,7 +13,6 @@ from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.elements import has_pieces
 from udkjax.equations.formulations import FormulatedSystem, Formulation, WrappedSystem
-from udkjax.equations.partitioning import PartitionedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.textbook import TextbookEquations
@@ -108,7 +107,7 @@ def compile_mechanism(
     """
     baumgarte = stabilization if isinstance(stabilization, Baumgarte) else None
     equations = equations_of(system, method, baumgarte, formulation, analysis)
-    projects = isinstance(stabilization, Projection) or isinstance(equations, PartitionedSystem)
+    projects = isinstance(stabilization, Projection) or equations.solves_constraints
     projected, breakpoints = equations.constrained and projects, system.breakpoints
     operation, evaluation, rows, most_rank = None, None, 0, 0
     if engine in ("diffrax", "jax"):

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.annotations import Number, Time
-from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, damped_step
 from udkjax.equations.scales import Scales
-from udkjax.equations.textbook import prepare
+from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.pinv import SVD
 from udkjax.positions import native_closing
 from udkjax.scene.drivers import Motion
@@ -47,7 +46,7 @@ def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
 class TracedRows(NamedTuple):
     """The `Rows` of a mechanism with traced numbers, by its equations of motion."""
 
-    equations: MechanismSystem
+    equations: TextbookEquations
 
     @property
     def scales(self) -> Scales:

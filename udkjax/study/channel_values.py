@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Numbers
-from udkjax.equations.abstract_system import MechanismSystem
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.textbook import prepare
@@ -148,7 +147,7 @@ class _Motion:
     @cached_property
     def dynamics(self) -> _Dynamics:
         """The solution of the equations of motion, computed only if a channel needs it."""
-        equations: MechanismSystem = prepare(self.mechanism, SVD(), None, self.analysis)
+        equations = prepare(self.mechanism, SVD(), None, self.analysis)
         mass = jnp.stack([jnp.stack([body.mass, body.mass, body.inertia]) for body in self.mechanism.bodies.values()])
 
         def at(t, q, v):
