@@ -34,28 +34,33 @@ def chain(lengths: Sequence[float], twists: Sequence[float], angles: Sequence[fl
 def closed_chain(
     lengths: Sequence[float], twists: Sequence[float], angles: Sequence[float], mass: float = 1.0, inertia: float = 0.05
 ) -> udk.ConstrainedSystem:
-    """A closed chain of links between joints: all points and axes between those of the fixed link, with its state at rest.
+    """A closed chain of links between joints with masses at its joints, with its state at rest; gravity is along -y."""
+    points, axes = chain(lengths, twists, angles)
+    masses = np.repeat([mass, inertia], 3 * (len(points) - 2))
+    return _system(points, axes, np.diag(masses), mass * G)
+
+
+def _system(points: np.ndarray, axes: np.ndarray, inertia: np.ndarray, weight: float) -> udk.ConstrainedSystem:
+    """The system of all points and axes between those of the fixed link, with a constant M and a weight at each point.
 
     Each link keeps its length, and its common normal and the angle with the axes at its ends; axes keep their length.
     """
-    points, axes = chain(lengths, twists, angles)
-    count = len(lengths) - 2
-    fixed = points[[0, -1]], axes[[0, -1]]
+    count, links = len(points) - 2, np.diff(points, axis=0)
+    sizes, cosines = np.sum(links**2, 1), np.sum(axes[1:] * axes[:-1], 1)
 
     def constraint(t, q):
         P, u = q.reshape(2, count, 3)
-        P = jnp.concatenate([fixed[0][:1], P, fixed[0][1:]])
-        u = jnp.concatenate([fixed[1][:1], u, fixed[1][1:]])
+        P = jnp.concatenate([points[:1], P, points[-1:]])
+        u = jnp.concatenate([axes[:1], u, axes[-1:]])
         links = P[1:] - P[:-1]
-        rows = [jnp.sum(links**2, 1) - np.square(lengths[:-1]), jnp.sum(links * u[:-1], 1), jnp.sum(links * u[1:], 1)]
-        rows += [jnp.sum(u[:-1] * u[1:], 1) - np.cos(twists[:-1]), jnp.sum(u[1:-1] ** 2, 1) - 1.0]
+        rows = [jnp.sum(links**2, 1) - sizes, jnp.sum(links * u[:-1], 1), jnp.sum(links * u[1:], 1)]
+        rows += [jnp.sum(u[:-1] * u[1:], 1) - cosines, jnp.sum(u[1:-1] ** 2, 1) - 1.0]
         return jnp.concatenate(rows)
 
-    masses = np.repeat([mass, inertia], 3 * count)
-    weight = np.concatenate([np.tile([0.0, mass * G, 0.0], count), np.zeros(3 * count)])
+    weights = np.concatenate([np.tile([0.0, weight, 0.0], count), np.zeros(3 * count)])
     q = np.concatenate([points[1:-1].ravel(), axes[1:-1].ravel()])
     return udk.ConstrainedSystem(
-        lambda q: jnp.diag(masses), constraint=constraint, potential=lambda t, q: weight @ q, q0=q, v0=np.zeros_like(q)
+        lambda q: jnp.asarray(inertia), constraint=constraint, potential=lambda t, q: weights @ q, q0=q, v0=np.zeros_like(q)
     )
 
 
@@ -75,3 +80,23 @@ def bricard(first: float = np.pi / 2) -> udk.ConstrainedSystem:
     """
     right, second = np.pi / 2, np.arccos(-np.cos(first) / (1 + np.cos(first)))
     return closed_chain([1.0] * 6, [right, -right] * 3, [first, second] * 3)
+
+
+A04_POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], float)  # P3 is the third
+A04_AXES = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]], float)
+A04_WIDTH = 0.1  # of the rods' square section (m)
+
+
+def a04() -> udk.ConstrainedSystem:
+    """The IFToMM benchmark A04: Bricard's chain of five rods of 1 kg and 1 m along the edges of a cube, let go from rest.
+
+    With links normal to their axes, the velocity of each point of a rod is linear in those of its ends and axes: M is constant.
+    """
+    count = len(A04_POINTS) - 2
+    ends = np.zeros((count + 2, count + 2))
+    for k in range(count + 1):
+        ends[k : k + 2, k : k + 2] += np.array([[2.0, 1.0], [1.0, 2.0]]) / 6
+    axes = 2 * A04_WIDTH**2 / 12 * np.eye(count)  # of the two rods that meet in a joint
+    blocks = [np.kron(part, np.eye(3)) for part in (ends[1:-1, 1:-1], axes)]
+    inertia = np.block([[blocks[0], np.zeros_like(blocks[0])], [np.zeros_like(blocks[0]), blocks[1]]])
+    return _system(A04_POINTS, A04_AXES, inertia, G)

@@ -98,6 +98,59 @@ def test_the_angles_of_bricards_chain():
     assert np.ptp(a) > 0.5
 
 
+def rods_of_a04(a, b):
+    """Points and axes of Bricard's chain by its angles, alternately a and b, in the axes of the benchmark."""
+    frame, frames = jnp.eye(4), []
+    for k in range(6):
+        frames.append(frame)
+        frame = frame @ turned((a, b)[k % 2], (1, -1)[k % 2])
+    return jnp.stack(frames)[:, :3, 3], jnp.stack(frames)[:, :3, 2]
+
+
+def turned(angle, twist):
+    """The frame of the next joint: turned about z by an angle, moved by 1 along x, twisted about x by 90 degrees."""
+    c, s, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
+    rows = [[c, zero, twist * s, c], [s, zero, -twist * c, s], [zero, twist + zero, zero, zero], [zero, zero, zero, 1 + zero]]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def path_of_a04(ts):
+    """P3 by one coordinate: the angles follow the curve f = cos a + cos b + cos a cos b = 0, at the rate w of (f_b, -f_a)."""
+    start = np.array(rods_of_a04(*[jnp.array(np.pi / 2)] * 2)[0])
+    to_scene = np.linalg.lstsq(start, closed_chains.A04_POINTS, rcond=None)[0]  # both begin in the first joint
+    assert_allclose(start @ to_scene, closed_chains.A04_POINTS, atol=1e-12)
+
+    def along(y):
+        a, b = y
+        return jnp.stack([-jnp.sin(b) * (1 + jnp.cos(a)), jnp.sin(a) * (1 + jnp.cos(b))])
+
+    def energies(y):
+        (P, _), (dP, du) = jax.jvp(lambda y: rods_of_a04(*y), (y,), (along(y),))
+        ends = dP[:-1], dP[1:]
+        rods = sum(jnp.sum(x * z) for x, z in (ends, (ends[0], ends[0]), (ends[1], ends[1]))) / 3
+        section = closed_chains.A04_WIDTH**2 / 12 * (jnp.sum(du[:-1] ** 2) + jnp.sum(du[1:] ** 2))
+        return rods + section, G * jnp.sum((P[:-1] + P[1:]) @ to_scene[:, 1]) / 2  # per w^2 / 2, and V
+
+    @jax.jit
+    def slope(y):
+        (inertia, _), (change, force) = jax.jvp(energies, (y[:2],), (along(y[:2]),))
+        return jnp.append(y[2] * along(y[:2]), -(change * y[2] ** 2 / 2 + force) / inertia)
+
+    y = by_scipy(lambda t, y: np.asarray(slope(y)), [np.pi / 2, np.pi / 2, 0.0], ts)
+    return np.stack([rods_of_a04(*map(jnp.asarray, angles))[0][2] @ to_scene for angles in y[:2].T])
+
+
+@pytest.mark.slow
+def test_the_benchmark_a04():
+    """The third point of the rods over the 10 s of the benchmark, by redundant coordinates and by one."""
+    system = closed_chains.a04()
+    solution = run(system, system.q0, system.v0)
+    assert_allclose(np.asarray(solution.q)[:, 3:6], path_of_a04(TS), rtol=0, atol=1e-9)
+    energy = udk.energy(system, solution)
+    assert np.ptp(energy.total) < 1e-9 * energy.kinetic.max()
+    assert udk.diagnose(system, udk.State(system.q0, system.v0)).degrees_of_freedom == 1
+
+
 @pytest.mark.slow
 def test_satellites_keep_a_formation():
     """The relative motion is prescribed; the other is that of both masses together. The multipliers are the thrust."""
