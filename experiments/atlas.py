@@ -51,7 +51,7 @@ SLOW_PARTS = ("multistep", "partitioning", "formulations", "Braun and Goldfarb",
 KEPT = HERE / "data" / ".atlas"  # finished chunks of an interrupted study
 CODES = ("problem", "part", "method", "stabilization", "solver", "formulation")
 NUMBERS = ("gain", "beta", "threshold")
-FIRST = ("squares", "four-bar", "hanging", "stiff", "crossing", "turning", "small", "large")  # begun first: they take longest
+FIRST = (*SPATIAL, "squares", "four-bar", "hanging", "stiff", "crossing", "turning", "small", "large")  # they take longest
 MEASURED = {
     "error": ("1", "largest error of a position, relative to the mechanism's length, or of an angle (rad); NaN: the run failed"),
     "closure": ("m, rad", "largest violation of a constraint"),

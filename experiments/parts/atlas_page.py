@@ -50,7 +50,7 @@ def html(data: xarray.Dataset) -> str:
         "curves": curves,
         "lines": lines,
         "failures": failures,
-        "peers": json.loads(data.peers),
+        "peers": [_shortened(row) for row in json.loads(data.peers)],
         "recommendations": [_shortened(row) for row in recommendations(runs)],
     }
     versions = ", ".join(f"{key[8:]} {data.attrs[key]}" for key in sorted(data.attrs) if key.startswith("version_"))

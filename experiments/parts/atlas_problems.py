@@ -40,6 +40,11 @@ class Problem(NamedTuple):
         return [udk.State(np.asarray(one.q0), np.asarray(one.v0)) for one in built]
 
     @property
+    def is_spatial(self) -> bool:
+        """True for chains in space, systems of their own: rows depend on others in closed positions only."""
+        return isinstance(self.mechanism, udk.ConstrainedSystem)
+
+    @property
     def redundant(self) -> bool:
         """True if rows of the Jacobian depend on others in every position."""
         model = self.mechanism

@@ -104,7 +104,8 @@ def parts(problem: Problem) -> dict[str, Part]:
         found["partitioning"] = Part([cell(formulation=f) for f in SLOW_FORMULATIONS], TOLERANCES[1:8:2], 2)
     if problem.crosses or problem.redundant:
         several = [(s, m, x) for s in ("projection", "none") for m in METHODS for x in THRESHOLDS]
-        found["thresholds"] = Part([cell(method=m, stabilization=s, threshold=x) for s, m, x in several], COARSE, 4)
+        starts = 1 if problem.is_spatial else 4  # violations that count as rank take thirty times as many steps there
+        found["thresholds"] = Part([cell(method=m, stabilization=s, threshold=x) for s, m, x in several], COARSE, starts)
     return found
 
 
