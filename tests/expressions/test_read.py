@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
+from tests.choices import fast
 from udkjax.programs.deferred import deferred
 
 
@@ -98,6 +99,7 @@ CHOICES = [
     "determinant of four rows",
 ]
 ELEMENTWISE = list(FUNCTIONS)[: list(FUNCTIONS).index("cond")]
+SLOW = "inverse", "determinants", "determinant of four rows", "large linear system"  # as "linear system"
 X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
 XS, YS = np.stack([X, -X, X[::-1]]), np.stack([Y, Y + 0.2, -Y])
 
@@ -110,7 +112,7 @@ def close(found, expected):
         np.testing.assert_allclose(f, e, rtol=1e-12, atol=1e-13)
 
 
-@pytest.fixture(params=FUNCTIONS, scope="module")
+@pytest.fixture(params=fast([name for name in FUNCTIONS if name not in SLOW], FUNCTIONS), scope="module")
 def function(request):
     return request.param, FUNCTIONS[request.param]
 

@@ -92,6 +92,7 @@ def loss():
     return jax.jit(lambda torque, force: _loss(mechanism, torque, force))
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_samples_forward_and_in_reverse(loss):
     gradient = deferred(jax.grad(loss, (0, 1)))
     _check_gradient(loss, gradient, 1e-4)

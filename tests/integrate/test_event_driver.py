@@ -63,7 +63,7 @@ STOPS = [udk.JointLimit(next(iter(FIVE_BAR.joints)), lower=-2.0, restitution=0.6
 @pytest.mark.parametrize(
     ("mechanism", "events", "end"),
     [
-        pytest.param(PENDULUM, LIMITS, 2.0, id="limits"),
+        pytest.param(PENDULUM, LIMITS, 2.0, id="limits", marks=pytest.mark.slow),
         pytest.param(CATCH, CAUGHT, 0.8, id="catch", marks=pytest.mark.slow),
         pytest.param(BOX, FEET, 0.41, id="box", marks=pytest.mark.slow),
         pytest.param(PENDULUM, [*CHANGE, *LIMITS[1:]], 0.8, id="change"),
@@ -137,6 +137,7 @@ def phase_codes(mechanism, events):
     return codes, inverse_mass
 
 
+@pytest.mark.slow
 def test_machine_code_knows_of_states_what_the_textbook_does():
     """Accelerations, conditions with their rates and derivatives, and the effect of impulses, at several states."""
     mechanism, events = FIVE_BAR, [*STOPS, udk.Event(lambda t, at: at[FIVE_BAR.body_names[1]].omega * t, udk.Log(), name="turn")]

@@ -91,9 +91,9 @@ SLOPES = {
 }
 
 
-@pytest.mark.parametrize("run", SLOPES.values(), ids=SLOPES)
-def test_every_way_gives_the_same_slopes(run, slopes):
-    assert_allclose(jax.jit(run)(INERTIAS), slopes, rtol=1e-7)
+@pytest.mark.parametrize("way", fast(["jvp", "jacrev", "grad of scan", "grad of checkpoint"], SLOPES))
+def test_every_way_gives_the_same_slopes(way, slopes):
+    assert_allclose(jax.jit(SLOPES[way])(INERTIAS), slopes, rtol=1e-7)
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ IN_A_BATCH = {
 }
 
 
-@pytest.mark.parametrize("way", fast(["vmap of grad", "grad of vmap"], IN_A_BATCH))
+@pytest.mark.parametrize("way", fast(["vmap of grad"], IN_A_BATCH))
 def test_a_large_batch_stores_no_records(way, monkeypatch):
     """Its members are integrated again: all bits are those of a batch with records."""
     slope, rtols = IN_A_BATCH[way], jnp.array([1e-4, 1e-6, 1e-8, 1e-10])

@@ -53,6 +53,7 @@ def test_members_of_a_batch_are_single_runs(method):
 
 
 @pytest.mark.parametrize("method", [METHODS[1], pytest.param(METHODS[4], marks=pytest.mark.slow)], ids=["Varga", "Greville"])
+@pytest.mark.slow
 def test_derivatives_are_those_of_elimination(method):
     linkage = udk.library.parallelogram()
 

@@ -234,6 +234,7 @@ def traced(mechanism, **choices):
     jax.eval_shape(lambda start: udk.simulate(mechanism, [0.0, 0.1], start, **choices).q, udk.State(mechanism.q0, mechanism.v0))
 
 
+@pytest.mark.slow
 def test_what_has_no_machine_code_is_integrated_by_another_engine(served):
     scene = udk.library.compound_pendulum()
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.pinv.methods import entries
 from udkjax.pinv import SVD, GramSchmidt, Greville, Varga
 
 
@@ -22,6 +23,7 @@ def test_absolute_and_relative_thresholds():
         SVD(relative=False)
 
 
+@pytest.mark.parametrize("entry", entries("SVD", "Greville", "Elimination"), indirect=True)
 def test_absolute_threshold_is_in_the_units_of_the_matrix(entry):
     a, scales = np.diag([1.0, 1e-3]), np.array([1.0, 1e-2, 1e-4, 1e-7])
     ranks = jax.jit(jax.vmap(lambda scale: entry.make(1e-6, relative=False).rank(scale * a)))(scales)
@@ -43,6 +45,7 @@ def test_rank_tol_is_a_leaf():
     assert jax.grad(lambda tol: SVD(tol)(a).sum())(1e-4) == 0
 
 
+@pytest.mark.parametrize("entry", entries("SVD", "Greville", "Elimination"), indirect=True)
 def test_an_invalid_matrix_gives_nan_not_a_plausible_answer(entry):
     a = np.eye(3)
     a[1, 2] = np.nan

@@ -138,6 +138,7 @@ def test_a_spring_holds_the_slider_of_a_slider_crank(at):
     assert_allclose(spring.loads(0.0, ground, slider)[1], (-0.6, 0.0, 0.0), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_the_excavator_is_in_equilibrium_on_its_cylinders(at):
     """With the free lengths of its springs, a rotation of boom, stick or bucket does not change the energy to first order."""
     start = library.excavator()

@@ -15,7 +15,6 @@ from jax.interpreters import mlir
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
-from tests.choices import fast
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import primitive, records
@@ -76,10 +75,8 @@ RUNS = {
 }
 
 
-FAST = ("SVD",)
-
-
-@pytest.mark.parametrize("name", [x if x in FAST else pytest.param(x, marks=pytest.mark.slow) for x in RUNS])
+@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.slow
 def test_threads_compute_what_the_engine_computes(name):
     calls = emulation.calls_of(jax.vmap(RUNS[name]), MASSES)
     assert calls
@@ -296,6 +293,7 @@ def test_a_card_without_memory_for_a_single_record_is_an_error(card):
     assert card.names[-1] == "cuCtxPopCurrent_v2"
 
 
+@pytest.mark.slow
 def test_an_error_of_the_launch_is_that_of_the_program(card):
     card.failing["cuLaunchKernel"] = 1
     with pytest.raises(Exception, match="launching a kernel for a batch failed: an illegal memory access was"):
@@ -320,7 +318,8 @@ def test_small_batches_stay_with_the_host(monkeypatch):
         target_of(7)
 
 
-@pytest.mark.parametrize("name", fast(["tangent"], ["redundant", "tangent", "gradient"]))
+@pytest.mark.parametrize("name", ["redundant", "tangent", "gradient"])
+@pytest.mark.slow
 def test_kernels_are_assembled(name):
     assembler = target.ptxas()
     if assembler is None:

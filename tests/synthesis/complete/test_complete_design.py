@@ -41,6 +41,7 @@ def published():
     return udk.design_all(FOUR_BAR, udk.PathGoal("P", DATA["points"]))
 
 
+@pytest.mark.slow
 def test_the_published_problem_has_its_64_real_classes(published):
     assert published.paths == {"tracked": DATA["classes"], "regular": DATA["classes"]}
     assert published.classes == DATA["real_classes"] == len({*published.numbers})
