@@ -77,6 +77,18 @@ def test_friction_settles_up_to_jams(name, jam):
 
 
 @pytest.mark.slow
+def test_both_forms_settle_loads_that_change_their_signs():
+    """At 0.6 of the friction that jams, Newton's method alone goes back and forth between the signs of two loads."""
+    mechanism = scaled(rubbing(udk.library.slider_crank(), speed=0.05), 0.6 * 47.3)
+    programs, ts = prepare(mechanism).programs, [0.0, 0.02, 0.03, 0.0325, 0.04]
+    solution = udk.simulate(mechanism, ts)
+    for q, v in zip(solution.q[1:], solution.v[1:], strict=True):
+        found = evaluated(mechanism, programs, "multipliers", jnp.ravel(q), jnp.ravel(v))["a"]
+        expected = np.asarray(udk.accelerations(mechanism, 0.0, q, v)).ravel()
+        np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("settled", [1e-11, 1e-10, 1e-9])
 def test_accelerations_hardly_depend_on_what_counts_as_settled(settled, monkeypatch):
     monkeypatch.setattr(friction_elimination, "SETTLED", settled)

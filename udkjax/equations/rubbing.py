@@ -5,8 +5,10 @@ With friction G(q, v, lambda) on the right-hand side, M a + Psi_q^T lambda = F +
     lambda = L(G(lambda)),        L(g) = -w (D^+)^T D^+ (b - D M^(-1/2) g),
 
 with D, b, weights w and D^+ as in udwadia_kalaba.py: with redundant rows they are those of least norm, or with compliances those
-of least elastic energy. Newton's method solves this from lambda = L(0). The implicit function theorem gives derivatives of any
-order. Where friction admits no motion (the mechanism jams), Newton's method does not end, and the multipliers are NaN.
+of least elastic energy. Newton's method solves this from lambda = L(0). Loads have kinks where they change their signs, and with
+strong friction its steps may go back and forth between two sets of signs. Then the solution is followed from L(0) on, in `STAGES`
+of growing friction: lambda = L(s G(lambda)). The implicit function theorem gives derivatives of any order. Where friction admits
+no motion (the mechanism jams), Newton's method does not end, and the multipliers are NaN.
 """
 
 from collections.abc import Callable
@@ -27,6 +29,7 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.mechanism import Mechanism
 
 MOST_STEPS = 50  # of Newton's method, which needs three to five
+STAGES = 8  # of equal shares; fewer may do, but most mechanisms need none
 SETTLED = 1e-13  # change of the loads of friction by a step, relative to these loads
 
 
@@ -157,21 +160,33 @@ def settle(
     """
     friction, root = partial(rubbing_loads, mechanism, t, q, v), jax.lax.stop_gradient(uk.inverse_sqrt_mass(mechanism))
 
-    def remainder(x: Array) -> Array:
-        return x - multipliers(friction(x))
+    def remainder(x: Array, share: Array | float = 1.0) -> Array:
+        return x - multipliers(share * friction(x))
 
-    def solve(remainder: Callable[[Array], Array], start: Array) -> Array:
+    def newton(start: Array, share: Array | float, begins: Array) -> tuple[Array, Array]:
+        """Return the solution with a share of friction, and whether it is not found; the start itself unless this `begins`."""
+
         def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             x, _, count = state
-            new = x - jnp.linalg.solve(jax.jacfwd(remainder)(x), remainder(x))
+            new = x - jnp.linalg.solve(jax.jacfwd(remainder)(x, share), remainder(x, share))
             before, after = root * friction(x), root * friction(new)
             return new, jnp.linalg.norm(after - before) > SETTLED * jnp.linalg.norm(after), count + 1
 
         def goes_on(state: tuple[Array, Array, Array]) -> Array:
             return state[1] & (state[2] < MOST_STEPS)
 
-        x, open_, _ = jax.lax.while_loop(goes_on, step, (start, jnp.asarray(True), jnp.asarray(0)))
-        return jnp.where(open_, jnp.nan, x)
+        x, is_open, _ = jax.lax.while_loop(goes_on, step, (start, begins, jnp.asarray(0)))
+        return x, is_open
+
+    def solve(_: Callable[[Array], Array], start: Array) -> Array:
+        x, fails = newton(start, 1.0, jnp.asarray(True))
+
+        def stage(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            found, is_open = newton(state[0], (k + 1) / STAGES, fails & ~state[1])
+            return found, is_open | state[1]
+
+        followed, is_open = jax.lax.fori_loop(0, STAGES, stage, (start, jnp.asarray(False)))
+        return jnp.where(fails, jnp.where(is_open, jnp.nan, followed), x)
 
     def solve_for_tangent(linear: Callable[[Array], Array], y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(y), y)
