@@ -1,5 +1,7 @@
 """Pressure angles of cams against formulas of textbooks: followers that slide in line and offset, that swing, and flat ones."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -61,6 +63,15 @@ def test_of_an_offset_follower():
 
 
 @pytest.mark.slow
+def test_of_an_offset_follower_by_laws():
+    """The angle has the tangent (s' - e) / (y0 + s)."""
+    rise, slope = cycloidal_rise()
+    height = np.sqrt(BASE**2 - OFFSET**2)
+    mech = cam({"O": [0, 0], "P": [OFFSET, height]}, ["P"], ["O"], slides=UPWARDS, cam={"profile": LAW})
+    np.testing.assert_allclose(pressure(mech), np.arctan2(np.abs(slope - OFFSET), height + rise), atol=1e-9)
+
+
+@pytest.mark.slow
 def test_of_a_swinging_follower():
     """The arm turns about Q: the angle is that between the normal and the perpendicular of the arm."""
     mech = cam({"O": [0, 0], "P": [50.0, 0], "Q": [50, 60]}, ["Q", "P"], ["O", "Q"], cam={"profile": eccentric()})
@@ -92,6 +103,21 @@ def test_limits_are_printed_with_the_characteristics():
     returning = np.arctan2(LIFT / 2 * np.pi / np.deg2rad(120) * np.sin(np.pi * x), BASE + LIFT * (1 + np.cos(np.pi * x)) / 2)
     np.testing.assert_allclose(found.pressure_angles["cam"], [0, max(angles.max(), returning.max())], atol=1e-9)
     assert "pressure angle of cam" in repr(found)
+
+
+@pytest.mark.slow
+def test_places_that_are_not_reached_have_no_angle():
+    mech = cam({"O": [0, 0], "P": [0, BASE]}, ["P"], ["O"], slides=UPWARDS, cam={"profile": LAW})
+    motion = udk.kinematics(mech, "motor", np.deg2rad(AT))
+    q = np.array(motion.q)
+    q[2] = np.nan
+    assert np.isnan(udk.pressure_angle(mech, SimpleNamespace(ts=motion.values, q=q, v=motion.v), "cam")).tolist() == [
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_mistakes():

@@ -3,14 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from udkjax.arrays import ROUNDING
-from udkjax.equations import constraints
-from udkjax.equations.analysis import analyse
+from udkjax.equations.redundancy import kinematic_rows
 from udkjax.positions.channels import StateHistory
-from udkjax.positions.coordinates import value_of
+from udkjax.positions.coordinates import Coordinate, value_of
 from udkjax.positions.drive import Drive, only_driver
+from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import SceneError
@@ -54,16 +54,16 @@ def pressure_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], ca
     follower = joint.bodies[1]
     if follower == GROUND:
         raise SceneError([f"{quote(cam)}: its second body, the follower, is the ground: exchange the two"], mechanism.name)
-    k, rows = mechanism.body_names.index(follower), _rows(mechanism, q, driver)
-    names = [name for name, _ in constraints.row_names(mechanism)]
-    own = np.array([name == cam for name in names] + [False] * (rows.shape[1] - len(names)))
-    length = float(analyse(mechanism).length)
-    scales = np.tile([1.0, 1.0, 1.0 / length], len(mechanism.bodies))
-    ways = _ways(rows[:, ~own] * scales) * scales
+    rows = kinematic_rows(mechanism)
+    own = [name == cam for name, _ in rows.names]
+    D = np.stack([rows.dense(rows.at(0.0, x.ravel())[2]) for x in q])
+    held = _slopes(mechanism, driver, q) * rows.metric
+    ways = _ways(np.concatenate([D[:, ~np.array(own)], held], 1)) * rows.metric
     if np.isnan(ways).all():
         problem = f"{quote(cam)}: without it and with its driver held, the follower has not one way to move"
         raise SceneError([problem], mechanism.name)
-    force, way = (x.reshape(len(q), -1, 3)[:, k] for x in (rows[:, own][:, 0], ways))
+    k = mechanism.body_names.index(follower)
+    force, way = (x.reshape(len(q), -1, 3)[:, k] for x in (D[:, own][:, 0] / rows.metric, ways))
     c, s = np.cos(q[:, k, 2]), np.sin(q[:, k, 2])
     x, y = np.asarray(joint.points, float)[1]
     arm = np.stack([c * x - s * y, s * x + c * y], 1)
@@ -73,18 +73,21 @@ def pressure_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], ca
     return np.arctan2(np.abs(across), np.abs(along))
 
 
-def _rows(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], driver: Drive) -> Float[np.ndarray, "T rows n"]:
-    """Return the Jacobians of all constraints, and of the driver if it is a coordinate without a motion."""
+def _slopes(mechanism: Mechanism, driver: Drive, q: Float[np.ndarray, "T bodies 3"]) -> Float[np.ndarray, "T k n"]:
+    """Return the slopes of the driver by q if it is a coordinate without a motion, which no constraint holds; else none."""
     driver = only_driver(mechanism) if driver is None else driver
-    found = jax.vmap(lambda q: constraints.psi_q(mechanism, 0.0, q))(jnp.asarray(q))
-    if not (isinstance(driver, str) and driver in mechanism.drivers):
-        held = jax.vmap(jax.grad(value_of(mechanism, driver)))(jnp.asarray(q))
-        found = jnp.concatenate([found, held.reshape(len(q), 1, -1)], 1)
-    return np.asarray(found)
+    if isinstance(driver, str) and driver in mechanism.drivers:
+        return np.zeros((len(q), 0, q[0].size))
+    return np.stack([np.asarray(_slope(mechanism, driver, jnp.asarray(x))).reshape(1, -1) for x in q])
+
+
+@deferred
+def _slope(mechanism: Mechanism, driver: str | Coordinate, q: Float[Array, "bodies 3"]) -> Float[Array, "bodies 3"]:
+    return jax.grad(value_of(mechanism, driver))(q)
 
 
 def _ways(rows: Float[np.ndarray, "T rows n"]) -> Float[np.ndarray, "T n"]:
     """Return the one motion that each of several Jacobians leaves free; NaN if there is none, or several."""
-    values, vectors = np.linalg.svd(rows)[1:]
+    values, vectors = np.linalg.svd(np.where(np.isfinite(rows).all((1, 2), keepdims=True), rows, 0.0))[1:]
     free = rows.shape[2] - np.sum(values > RANK * values[:, :1], axis=1)
     return np.where(free[:, None] == 1, vectors[:, -1], np.nan)
