@@ -165,8 +165,23 @@ test("the follower of a new cam stands on its profile", () => {
   found = actions.drawLink(found, at(0.12, 0.09), at(0.12, 0.15), context).document;
   found = actions.drawCam(found, at(0.1, 0.06, "A"), at(0.12, 0.09, "B")).document;
   const outline = shapes.camOutline(found, found.cam[0]), away = Math.hypot(0.02, 0.03);
-  assert.ok(Math.abs(outline.radius(Math.atan2(0.03, 0.02)) - away) < 1e-12);
+  assert.ok(Math.min(...outline.points.map(([x, y]) => Math.hypot(x - 0.12, y - 0.09))) < 0.03 * away);
   assert.ok(Math.abs(Math.max(...outline.points.map(([x, y]) => Math.hypot(x - 0.1, y - 0.06))) - 1.4 * away) < 1e-3 * away);
+});
+
+test("the outline of a cam by laws touches its follower as drawn, whether that slides past the centre, swings, or is flat", () => {
+  const law = ["harmonic", "dwell", "harmonic"], units = {length: "mm", angle: "deg"}, angles = [120, 120, 120];
+  const drawn = (pins, follower, profile, more = {}) => ({
+    format: 2, units, ground: ["O", "Q"], pins: {O: [0, 0], Q: [90, 0], ...pins}, link: [{name: "cam", pins: ["O"]}, {name: "follower", pins: follower}],
+    slide: follower.length > 1 ? [] : [{link: "follower", direction: [0, 1]}], cam: [{pins: ["O", "P"], profile: {base: 40, law, angle: angles, ...profile}, ...more}]});
+  const touches = (document, [x, y]) => Math.min(...shapes.camOutline(document, document.cam[0], 720).points.map(p => Math.hypot(p[0] - x, p[1] - y)));
+  const lift = {lift: [20, 0, -20]}, swing = {swing: [25, 0, -25]}, height = Math.sqrt(40 ** 2 - 12 ** 2), psi = Math.acos((90 ** 2 + 70 ** 2 - 40 ** 2) / (2 * 90 * 70));
+  assert.ok(touches(drawn({P: [12, height]}, ["P"], lift), [0.012, height / 1e3]) < 1e-12);
+  const place = [90 - 70 * Math.cos(psi), 70 * Math.sin(psi)];
+  assert.ok(touches(drawn({P: place}, ["Q", "P"], swing), place.map(x => x / 1e3)) < 1e-12);
+  assert.ok(touches(drawn({P: [0, 40]}, ["P"], lift, {face: [0, 1]}), [0, 0.04]) < 1e-6);
+  assert.ok(Math.abs(Math.max(...shapes.camOutline(drawn({P: [12, height]}, ["P"], lift), drawn({}, ["P"], lift).cam[0]).points.map(p => Math.hypot(...p))) - Math.hypot(12, height + 20) / 1e3) < 1e-9);
+  assert.equal(shapes.camOutline(drawn({P: [0, 30]}, ["P"], swing), {pins: ["O", "P"], profile: {base: 40, law, angle: angles, ...swing}}), null);
 });
 
 test("a periodic spline goes through its values and has no corner where it closes", () => {

@@ -30,6 +30,6 @@ function entryProblem(section, entry) {
   if (names) return `${names}: must be a list of names, such as A, B`;
   if (numbers) return `${numbers}: must be a list, such as [1, 2]`;
   if (!("profile" in entry)) return "";
-  const isProfile = isTable(entry.profile) && ["angle", "radius", "law", "lift"].every(key => !(key in entry.profile) || Array.isArray(entry.profile[key]));
-  return isProfile ? "" : "profile: angle, radius, law and lift must be lists";
+  const isProfile = isTable(entry.profile) && ["angle", "radius", "law", "lift", "swing"].every(key => !(key in entry.profile) || Array.isArray(entry.profile[key]));
+  return isProfile ? "" : "profile: angle, radius, law, lift and swing must be lists";
 }

@@ -48,6 +48,7 @@ export class Gestures {
     this.element.focus({preventScroll: true, focusVisible: false});  // now, so that a field commits its text before the gesture begins
     if (this.studio.source.timer) return this.studio.say("the edited text is still being read: try again");
     this.studio.draw();
+    this.studio.isFresh = false;  // the view stays as it is under the hand, whatever the motion shows
     this.pointers.set(event.pointerId, pixel);
     if (this.pointers.size > 1) return this.cancel();
     this.moved = false;

@@ -71,7 +71,7 @@ export class Motion {
     const {studio} = this;
     Object.assign(this, {run, energies: run.energies});
     studio.paths = run.paths;
-    if (studio.isFresh) studio.fit();  // with the paths of its pins
+    if (studio.isFresh && studio.isFitted) studio.fit();  // with the paths of its pins
     studio.isFresh = false;
     this.showLoops();
     studio.curves.list();

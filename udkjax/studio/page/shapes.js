@@ -4,6 +4,11 @@ import {groundOf, list, members, placeOf, pinsOf} from "./document.js";
 import {angle, direction, length, point} from "./units.js";
 
 const THIN = 0.02;  // area of a plate over its length squared: a thinner one is meant as a bar
+const STEP = 1e-5;  // rad: of the differences that give the envelope of a flat face
+const LAWS = {  // share of the lift over the share of the angle
+  dwell: () => 0, cycloidal: x => x - Math.sin(2 * Math.PI * x) / (2 * Math.PI), harmonic: x => (1 - Math.cos(Math.PI * x)) / 2,
+  "3-4-5": x => x ** 3 * (10 - 15 * x + 6 * x * x), "4-5-6-7": x => x ** 4 * (35 - 84 * x + 70 * x * x - 20 * x ** 3),
+};
 const IN_LINE = 1e-9;  // fraction of the size squared: points whose hull has a smaller area are in line
 
 /** The corners of a link through points, and whether they enclose an area: the hull of a plate, or the ends of a bar. */
@@ -120,20 +125,70 @@ export function lineAngle(document, entry) {
 
 /** The outline of a cam: its corners in world coordinates (m), and the name of its link; null if they are not determined. */
 export function camOutline(document, cam, count = 144) {
-  const [centre, follower] = cam.pins ?? [], at = placeOf(document, centre);
-  const moving = pin => members(document, pin).filter(name => name !== "ground");
+  const [centre, follower] = cam.pins ?? [], at = placeOf(document, centre), moving = pin => members(document, pin).filter(name => name !== "ground");
   const link = cam.links?.[0] ?? moving(centre)[0], other = cam.links?.[1] ?? moving(follower)[0];
-  const angles = (cam.profile?.angle ?? []).map(x => angle(x, document)), radii = (cam.profile?.radius ?? []).map(x => length(x, document));
-  if (!at || !link || angles.length < 3 || angles.length !== radii.length || ![...angles, ...radii].every(Number.isFinite)) return null;
-  const pins = list(document, "link").find(entry => entry.name === link)?.pins ?? [];
-  const [a, b] = pins.map(pin => placeOf(document, pin)), turned = a && b ? Math.atan2(b[1] - a[1], b[0] - a[0]) : 0;
-  const radius = periodicSpline(angles, radii);
+  if (!at || !link) return null;
+  const pins = list(document, "link").find(entry => entry.name === link)?.pins ?? [], [a, b] = pins.map(pin => placeOf(document, pin));
+  const turned = a && b ? Math.atan2(b[1] - a[1], b[0] - a[0]) : 0, isFlat = cam.face !== undefined;
+  const contact = cam.profile?.law ? contactByLaws(document, cam, link, other, turned) : contactByPoints(document, cam, turned);
+  if (!contact) return null;
   const points = Array.from({length: count}, (_, k) => {
-    const phi = 2 * Math.PI * k / count, r = radius(phi);
-    return [at[0] + r * Math.cos(phi + turned), at[1] + r * Math.sin(phi + turned)];
+    const turn = 2 * Math.PI * k / count, [r, phi] = contact(turn), [c, s] = [Math.cos(phi), Math.sin(phi)];
+    const [before, after] = isFlat ? [contact(turn - STEP), contact(turn + STEP)] : [[0, 0], [0, 1]];
+    const across = (after[0] - before[0]) / (after[1] - before[1]);  // the envelope of the positions of a flat face
+    return [at[0] + r * c - across * s, at[1] + r * s + across * c];
   });
-  return {points, link, follower, other, turned, radius};
+  return points.flat().every(Number.isFinite) ? {points, link, follower, other} : null;
 }
+
+/** The distance of a follower from the centre of a cam by points, and its direction in world coordinates, over the turn. */
+function contactByPoints(document, {profile}, turned) {
+  const angles = (profile?.angle ?? []).map(x => angle(x, document)), radii = (profile?.radius ?? []).map(x => length(x, document));
+  if (angles.length < 3 || angles.length !== radii.length || ![...angles, ...radii].every(Number.isFinite)) return null;
+  const radius = periodicSpline(angles, radii);
+  return turn => [radius(turn), turn + turned];
+}
+
+/** The same for a cam by laws, which has turned as far: its follower moves along its slide, or about its pivot, by the laws. */
+function contactByLaws(document, cam, link, other, turned) {
+  const {law, clockwise, start, angle: turns = [], swing} = cam.profile, sense = clockwise ? 1 : -1;
+  const angles = turns.map(x => angle(x, document)), steps = swing ? swing.map(x => angle(x, document)) : (cam.profile.lift ?? []).map(x => length(x, document));
+  const guide = guideOf(document, cam, link, other);
+  if (!guide || angles.length !== law.length || steps.length !== law.length || !law.every(name => name in LAWS)) return null;
+  const toward = start === undefined ? guide.toward : angle(start, document) + turned;
+  return turn => {
+    let left = ((turn % (2 * Math.PI)) + 2 * Math.PI) % (2 * Math.PI), travel = 0, k = 0;
+    for (; k < law.length - 1 && left >= angles[k]; k++) { left -= angles[k]; travel += steps[k]; }
+    const r = guide.distance(travel + steps[k] * LAWS[law[k]](left / angles[k]));
+    return [r, toward + guide.sight(r) + sense * turn];
+  };
+}
+
+/** The guide of the follower of a cam by laws: its distance at a travel, and its angle at a distance from the direction of its slide or pivot. */
+function guideOf(document, {profile, face, pins}, link, other) {
+  const [centre, point] = pins.map(pin => placeOf(document, pin)), base = length(profile.base, document);
+  const given = key => (profile[key] === undefined ? undefined : length(profile[key], document));
+  if (!point) return null;
+  const arm = minus(point, centre), isFlat = face !== undefined, seen = isFlat ? direction(face, document) : Math.atan2(arm[1], arm[0]);
+  const carriers = members(document, pins[0]).filter(name => name !== link);
+  if (profile.swing) {
+    const found = carriers.map(carrier => centrePin(document, other, carrier)), pivot = found.length === 1 && found[0] && placeOf(document, found[0]);
+    if (!pivot) return null;
+    const line = minus(pivot, centre), held = minus(point, pivot), toward = Math.atan2(line[1], line[0]);
+    const signed = given("pivot") ?? Math.hypot(...line) * (Math.sin(seen - toward) >= 0 ? 1 : -1), c = Math.abs(signed), side = Math.sign(signed);
+    const l = given("arm") ?? (isFlat ? held[0] * Math.cos(seen) + held[1] * Math.sin(seen) : Math.hypot(...held));
+    const rest = Math.acos(isFlat ? (base - l) / c : (c * c + l * l - base * base) / (2 * c * l));
+    return isFlat ? {toward, distance: s => l + c * Math.cos(rest - s), sight: r => side * Math.acos((r - l) / c)}
+      : {toward, distance: s => Math.sqrt(c * c + l * l - 2 * c * l * Math.cos(rest + s)), sight: r => side * Math.acos((c * c + r * r - l * l) / (2 * c * r))};
+  }
+  const slide = list(document, "slide").find(({link: one, on = "ground"}) => (one === other && carriers.includes(on)) || (on === other && carriers.includes(one)));
+  if (isFlat || !slide) return {toward: seen, distance: s => base + s, sight: () => 0};
+  const line = lineAngle(document, slide), toward = Math.cos(line - seen) < 0 ? line + Math.PI : line;
+  const e = given("eccentricity") ?? arm[1] * Math.cos(toward) - arm[0] * Math.sin(toward), way = Math.sqrt(base * base - e * e);
+  return {toward, distance: s => Math.hypot(e, way + s), sight: r => Math.atan2(e, Math.sqrt(Math.max(r * r - e * e, 0)))};
+}
+
+const minus = ([x, y], [u, v]) => [x - u, y - v];
 
 /** The periodic cubic spline through values at increasing angles within one turn. */
 export function periodicSpline(angles, values) {
