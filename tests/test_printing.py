@@ -60,6 +60,7 @@ def objects() -> dict[str, object]:
         *(motion, udk.travel(linkage, "joint.C.angle"), rest, udk.modes(free, rest.state), driven, udk.power_balance(free, run)),
         udk.motion_ranges(free, motion),
         udk.LiftProfile(0.04, ["cycloidal", "3-4-5"], [np.pi, np.pi], [0.02, -0.02]),
+        udk.SwingProfile(0.04, ["cycloidal", "3-4-5"], [np.pi, np.pi], [0.4, -0.4], 0.09, 0.07),
         udk.motion_at(free, 0.3, coordinate),
         udk.characteristics(free, coordinate),
         *(udk.diagnose(free), udk.explain(free), udk.Workspace(jnp.ones((2, 2, 2)), jnp.ones((2, 2), bool))),

@@ -106,6 +106,7 @@ from udkjax.scene import Sine as Sine
 from udkjax.scene import Slot as Slot
 from udkjax.scene import Spline as Spline
 from udkjax.scene import Spring as Spring
+from udkjax.scene import SwingProfile as SwingProfile
 from udkjax.scene import Torque as Torque
 from udkjax.scene import TorsionSpring as TorsionSpring
 from udkjax.scene import Weld as Weld

@@ -79,6 +79,7 @@ from udkjax.scene.number_fields import split_index as split_index
 from udkjax.scene.origin import Origin as Origin
 from udkjax.scene.profiles import LiftProfile as LiftProfile
 from udkjax.scene.profiles import Profile as Profile
+from udkjax.scene.profiles import SwingProfile as SwingProfile
 from udkjax.scene.reshaping import length_of as length_of
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length

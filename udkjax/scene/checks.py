@@ -19,8 +19,8 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import FieldMetadata, StaticValue
 from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
-from udkjax.scene.joints import Prismatic, Revolute, Slot
-from udkjax.scene.profiles import AbstractProfile, profile_class
+from udkjax.scene.joints import Cam, Prismatic, Revolute, Slot
+from udkjax.scene.profiles import AbstractProfile, LawProfile, profile_class
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
@@ -166,6 +166,8 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
         joint = table.get("joint")
         joint_class = known.get("rubbing", {}).get(joint) if isinstance(joint, str) else None
         yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table, joint_class))
+    if issubclass(cls, Cam | LawProfile):
+        yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table))
 
 
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:

@@ -139,8 +139,11 @@ _WHOLE_TURN = Requirement(
     "the angles must add up to a whole turn",
     lambda v: abs(v.sum() - 2 * np.pi) * array_namespace(v).ones_like(v) <= CLOSES * 2 * np.pi,
 )
-_RETURNS = Requirement(
-    "the lifts must add up to zero", lambda v: abs(v.sum()) * array_namespace(v).ones_like(v) <= CLOSES * abs(v).sum()
+_LIFTS_RETURN, _SWINGS_RETURN = (
+    Requirement(
+        f"the {steps} must add up to zero", lambda v: abs(v.sum()) * array_namespace(v).ones_like(v) <= CLOSES * abs(v).sum()
+    )
+    for steps in ("lifts", "swings")
 )
 
 POSITIVE: FieldMetadata = {"require": (_POSITIVE,)}
@@ -148,7 +151,8 @@ NOT_NEGATIVE: FieldMetadata = {"require": (_NOT_NEGATIVE,)}
 KNOTS: FieldMetadata = {"require": (_INCREASING,), "at_least": 2}
 PROFILE_ANGLES: FieldMetadata = {"require": (_INCREASING, _ONE_TURN), "at_least": 3}
 LAW_ANGLES: FieldMetadata = {"require": (_POSITIVE, _WHOLE_TURN), "at_least": 1}
-LIFTS: FieldMetadata = {"require": (_RETURNS,), "at_least": 1}
+LIFTS: FieldMetadata = {"require": (_LIFTS_RETURN,), "at_least": 1}
+SWINGS: FieldMetadata = {"require": (_SWINGS_RETURN,), "at_least": 1}
 PROFILE_RADII: FieldMetadata = {"require": (_POSITIVE,), "at_least": 3}
 CALLED: FieldMetadata = {"called": True}
 NOT_EMPTY: FieldMetadata = {"at_least": 1}

@@ -8,7 +8,7 @@ anticlockwise positive, and not wrapped; rows are in the order in which `residua
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import ClassVar, Self, TypeVar
 
 import equinox as eqx
@@ -20,7 +20,7 @@ from udkjax.arrays import ROUNDING, array_namespace, number
 from udkjax.printing import PrintsLine
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.fields import BODY, POSITIVE, given_direction, given_names, given_number, given_or_guess
-from udkjax.scene.profiles import AbstractProfile, as_profile
+from udkjax.scene.profiles import AbstractProfile, SwingProfile, as_profile
 
 
 class Constraint(PrintsLine):
@@ -280,14 +280,15 @@ class Rack(Joint):
 class Cam(Joint):
     """A point of a follower, body 2, stays on the closed `profile` of a cam, body 1; or a flat face of the follower touches it.
 
-    1 row (m): |d| - radius(phi), positive outside the profile, with d the vector from point 1 to point 2 in body 1's frame, and
-    phi its polar angle. With a `face`, n . d - radius(phi) with phi the angle of its outward normal n in body 1's frame: radius
-    is then the distance of the tangent across n. The constraint acts in both directions: the follower cannot lift off.
+    1 row (m): |d| - radius, positive outside the profile, with d the vector from point 1 to point 2 in body 1's frame, and the
+    profile's radius at its polar angle. With a `face`, n . d - radius, at the angle of its outward normal n in body 1's frame:
+    radius is then the distance of the tangent across n. A profile by laws finds its radius at the turn of the cam that belongs
+    to |d|, or n . d, and to the angle. The constraint acts in both directions: the follower cannot lift off.
 
     Args:
         bodies: the names of the cam and of the follower.
         points: the centre of the profile on body 1, and the point of body 2 that stays on it, each in the frame of its body (m).
-        profile: a `Profile` or a `LiftProfile`, or the table of one.
+        profile: a `Profile`, a `LiftProfile` or a `SwingProfile`, or the table of one.
         face: the direction of the normal of a flat face, away from the cam, in body 2's frame, as an angle (rad) or a vector.
     """
 
@@ -296,19 +297,29 @@ class Cam(Joint):
     face: Float[Array, ""] | None = eqx.field(converter=given_direction, default=None)
 
     def residual(self, t, *frames):
-        d, angle = self._arm(*frames), self._angle(*frames)
-        out = d.norm() if self.face is None else d.x * jnp.cos(angle) + d.y * jnp.sin(angle)
-        return [out - self.profile(angle)]
+        distance, turn = self._contact(*frames)
+        return [distance - self.profile(turn, self.face is not None)]
 
     def piece(self, t, *frames):
-        return self.profile.piece(self._angle(*frames))
+        return self.profile.piece(self._contact(*frames)[1])
 
-    def _angle(self, frame1: Frame, frame2: Frame) -> Number:
-        """Return the polar angle of the point, or the angle of the normal of the face, in body 1's frame (rad)."""
-        if self.face is not None:
-            return self.face + frame2.angle - frame1.angle
+    @staticmethod
+    def mistakes(table: Mapping[str, object]) -> Iterator[str]:
+        """Iterate over the numbers that a joint's profile lacks, and a drawing would find, each with its key."""
+        profile = table.get("profile")
+        if isinstance(profile, SwingProfile) or (isinstance(profile, Mapping) and "swing" in profile):
+            given = profile if isinstance(profile, Mapping) else vars(profile)
+            yield from (f"profile.{key}: missing" for key in ("pivot", "arm") if given.get(key) is None)
+
+    def _contact(self, frame1: Frame, frame2: Frame) -> tuple[Number, Number]:
+        """Return the distance (m) of the point or the face from the centre, and the turn of the profile there (rad)."""
         d = self._arm(frame1, frame2)
-        return jnp.arctan2(d.y, d.x)
+        if self.face is None:
+            distance, angle = d.norm(), jnp.arctan2(d.y, d.x)
+        else:
+            angle = self.face + frame2.angle - frame1.angle
+            distance = d.x * jnp.cos(angle) + d.y * jnp.sin(angle)
+        return distance, self.profile.turn(distance, angle, self.face is not None)
 
     def _arm(self, frame1: Frame, frame2: Frame) -> Point:
         """Return the vector from point 1 to point 2 in body 1's frame."""

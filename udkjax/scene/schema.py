@@ -17,7 +17,7 @@ from udkjax.scene import drivers, forces, friction, joints
 from udkjax.scene.bodies import Body
 from udkjax.scene.fields import FieldMetadata
 from udkjax.scene.held import Held
-from udkjax.scene.profiles import AbstractProfile, LiftProfile, Profile, profile_class
+from udkjax.scene.profiles import AbstractProfile, LiftProfile, Profile, SwingProfile, profile_class
 
 SECTIONS = ("body", "joint", "driver", "force")
 
@@ -48,6 +48,7 @@ CLASSES_WITHOUT_TYPE: dict[str, type] = {
     "driver": drivers.Driver,
     "profile": Profile,
     "lift_profile": LiftProfile,
+    "swing_profile": SwingProfile,
     "held": Held,
 }
 

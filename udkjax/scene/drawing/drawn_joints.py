@@ -10,10 +10,11 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, line_mistakes
+from udkjax.scene.drawing.pin_forms import norm
+from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, SlidingLink, line_mistakes
 from udkjax.scene.fields import LINK, PIN, POSITIVE, given_direction, given_names, given_or_none
 from udkjax.scene.joints import Cam, Gear, Prismatic, Slot
-from udkjax.scene.profiles import AbstractProfile, LiftProfile, as_profile
+from udkjax.scene.profiles import AbstractProfile, LawProfile, SwingProfile, as_profile
 from udkjax.wording import quote
 
 
@@ -136,8 +137,9 @@ class CamPair(DrawnElement):
     """A follower, the second pin, stays on the `profile` of a cam around the first pin.
 
     The polar angle of the profile is measured from the cam's x axis: from its first pin towards its second, or the world's x axis
-    for a cam with one pin. A `LiftProfile` begins at the follower as drawn. `face` is the direction of the normal of a flat face,
-    away from the cam.
+    for a cam with one pin. Laws begin as drawn: those of a `LiftProfile` move a follower along its slide, if it slides on the
+    link that carries the cam; those of a `SwingProfile` turn it about its pin there. `face` is the direction of the normal of a
+    flat face, away from the cam.
     """
 
     pins: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=PIN)
@@ -149,23 +151,64 @@ class CamPair(DrawnElement):
         if len(self.pins) != 2:
             yield "pins: must name two pins, the centre of the cam and the follower"
             return
-        counts = {len(self.profile.law), *self.profile.angle.shape} if isinstance(self.profile, LiftProfile) else {0}
-        if len(counts) > 1:
-            yield "profile.law: must have as many entries as angle and lift"
         pair = self._pair(layout)
         if len(pair) != 2 or any(p not in layout.members(pin) for p, pin in zip(pair, self.pins, strict=False)):
             yield "links: name two, the cam with the first pin and the follower with the second"
+        elif isinstance(self.profile, SwingProfile) and self._pivot(layout) is None:
+            carrier = f"the link, or the ground, that carries the cam at {quote(self.pins[0])}"
+            yield f"profile.swing: {quote(pair[1])} must turn about one pin of {carrier}; or give lift"
 
     def parts(self, placement):
         pair, places = self._pair(placement), [placement.places[pin] for pin in self.pins]
         face = None if self.face is None else by_numpy(self.face)
         profile = self.profile
-        if isinstance(profile, LiftProfile) and profile.start is None:
-            d = places[1] - places[0]
-            at = array_namespace(d).arctan2(d[1], d[0]) if face is None else face
-            profile = replace(profile, start=at - placement.angle(pair[0]))
+        if isinstance(profile, LawProfile):
+            profile = self._guided(profile, placement)
         face = None if face is None else face - placement.angle(pair[1])
         return Parts(joint=Cam(pair, placement.points(pair, places), profile, face))
+
+    def unreachable(self, placement: Placement) -> str:
+        """Return why the follower cannot follow the laws as it is guided, with the key; empty if it can."""
+        profile = self.profile
+        return self._guided(profile, placement).unreachable(self.face is not None) if isinstance(profile, LawProfile) else ""
+
+    def _guided(self, profile: LawProfile, placement: Placement) -> LawProfile:
+        """Return the laws with the follower's slide or pivot as drawn, in numbers that are not given."""
+        cam = self._pair(placement)[0]
+        centre, point = (placement.places[pin] for pin in self.pins)
+        arm, numbers = point - centre, {}
+        xp = array_namespace(arm)
+        toward = xp.arctan2(arm[1], arm[0]) if self.face is None else by_numpy(self.face)
+        if isinstance(profile, SwingProfile):
+            place = placement.places[self._pivot(placement) or ""]
+            line, x, y = place - centre, xp.cos(toward), xp.sin(toward)
+            left = line[0] * y - line[1] * x >= 0
+            distance = norm(line)
+            numbers["pivot"] = xp.where(left, distance, -distance)
+            held = point - place
+            numbers["arm"] = norm(held) if self.face is None else held[0] * x + held[1] * y
+            toward = xp.arctan2(line[1], line[0])
+        elif self.face is None and (slide := self._slide(placement)):
+            axis = placement.direction(slide.on, slide.along, slide.direction) + placement.angle(slide.on)
+            axis = axis + xp.where(xp.cos(axis - toward) < 0, np.pi, 0.0)  # away from the cam
+            numbers["eccentricity"] = arm[1] * xp.cos(axis) - arm[0] * xp.sin(axis)
+            toward = axis
+        numbers["start"] = toward - placement.angle(cam)
+        return replace(profile, **{key: x for key, x in numbers.items() if getattr(profile, key) is None})
+
+    def _carriers(self, layout: PinLayout) -> list[str]:
+        """Return the links, or the ground, that meet the cam at its centre."""
+        return [member for member in layout.members(self.pins[0]) if member != self._pair(layout)[0]]
+
+    def _slide(self, layout: PinLayout) -> SlidingLink | None:
+        """Return the slide of the follower on the link that carries the cam, if there is one."""
+        pairs = [{carrier, self._pair(layout)[1]} for carrier in self._carriers(layout)]
+        return next((slide for slide in layout.slides.values() if {slide.link, slide.on} in pairs), None)
+
+    def _pivot(self, layout: PinLayout) -> str | None:
+        """Return the pin about which the follower turns on the link that carries the cam; None unless there is exactly one."""
+        found = [layout.centre(self._pair(layout)[1], carrier) for carrier in self._carriers(layout)]
+        return found[0] if len(found) == 1 else None
 
     def _pair(self, layout: PinLayout) -> tuple[str, ...]:
         """Return the links, by default the only moving link of each pin."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.drawing.drawn_joints import GearPair, PinInSlot
+from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, twice_area, with_concrete_numbers
 from udkjax.scene.drawing.pin_forms import AbstractPin, PointArray, in_order, reference_mistakes
@@ -230,7 +230,7 @@ def _reaches(corners: np.ndarray, point: PointArray) -> bool:
 
 
 def gap_mistakes(placement: Placement, groups: DrawnGroups) -> Iterator[str]:
-    """Iterate over slots and gears that do not fit as drawn; all numbers are concrete."""
+    """Iterate over slots, gears and cams that do not fit as drawn; all numbers are concrete."""
     size = extent(list(placement.places.values()))
     for k, (name, slot) in enumerate(groups["slot"].items()):
         distance = _off_line(placement, slot) if slot.along else 0.0
@@ -245,6 +245,10 @@ def gap_mistakes(placement: Placement, groups: DrawnGroups) -> Iterator[str]:
                 f"{where('gear', k, name)}.radii: wheels of these radii are {misfit[1]:.4g} m apart, and their centres "
                 f"{misfit[0]:.4g} m: give teeth, or move a pin"
             )
+    for k, (name, cam) in enumerate(groups["cam"].items()):
+        assert isinstance(cam, CamPair)
+        if problem := cam.unreachable(placement):
+            yield f"{where('cam', k, name)}.profile.{problem}"
 
 
 def _off_line(placement: Placement, slot: PinInSlot) -> float:

@@ -7,7 +7,6 @@ which is given by its index in the mechanism, or -1 for the ground; an `anchor` 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -145,14 +144,7 @@ class _Drawing:
             case Rack():
                 self._rack(joint)
             case Cam():
-                angle = np.linspace(0.0, 2 * np.pi, PROFILE_POINTS, endpoint=False)
-                radius, slope = (
-                    np.asarray(x)[:, None] for x in jax.vmap(jax.value_and_grad(joint.profile))(jax.numpy.asarray(angle))
-                )
-                along = np.column_stack([np.cos(angle), np.sin(angle)])
-                rim = radius * along
-                if joint.face is not None:  # the envelope of the positions of the face
-                    rim = rim + slope * np.column_stack([-np.sin(angle), np.cos(angle)])
+                rim = joint.profile.rim(PROFILE_POINTS, joint.face is not None)
                 place = self._at(joint.bodies[0], joint.points[0])
                 self.wheels.append({"kind": MarkKind.OUTLINE, **place, "points": rim.tolist()})
                 self.elements.append({"kind": MarkKind.ROLLER, **self._at(joint.bodies[1], joint.points[1])})
