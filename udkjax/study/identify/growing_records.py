@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
-from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, CostHistory, Fit
+from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, CostHistory, Fit, reduce_rows
 from udkjax.study.identify.optimizer import Minimizer, huber, robust
 from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.identify.unknowns import Unknowns
@@ -142,7 +142,7 @@ def _predictable_time(regularized: RegularizedProblem, z: np.ndarray, tol: Toler
     square = size**2 if enough and np.isfinite(size) else 1.0
     prior_rows = J[R:][usable[R:]]
     root = np.concatenate([data[in_part] / np.sqrt(max(square, np.finfo(float).eps)), prior_rows])  # C^-1 = root^T root
-    _, s, vt = np.linalg.svd(root, full_matrices=False)  # C = V S^-2 V^T
+    _, s, vt = np.linalg.svd(reduce_rows(root[:, 0], root)[1], full_matrices=False)  # C = V S^-2 V^T
     with np.errstate(invalid="ignore", over="ignore"):
         deviation = np.linalg.norm(data @ (vt.T / s), axis=1)
     scale = problem.channel_scale[problem.index[:, 2]] / (regularized.noise * problem.sigma)

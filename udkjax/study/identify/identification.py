@@ -190,7 +190,7 @@ def _estimate_of(
         (*unknowns.kinds, *["free"] * (problem.K - P)),
     )
     J, r = weighted.J[0][inliers], weighted.r[0][inliers]
-    if (stuck := unknowns.stuck_at_bounds(z, r, J)).any():
+    if (stuck := unknowns.stuck_at_bounds(z, r, J, len(r))).any():
         # dr/dz vanishes at a bound; dr/dx, from within, does not.
         scale = np.append(unknowns.range_scale, problem.state_sizes)
         J = J * np.where(stuck, scale / values.dx_dz, 1.0)

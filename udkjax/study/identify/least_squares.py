@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.linalg import lstsq
 
 from udkjax.study.identify.fit_problem import Residuals
@@ -28,10 +28,11 @@ FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
 # number of residuals, it is the Gauss-Newton step in standard errors, of which a thousandth is negligible.
 ORTHOGONAL_COSINE = 1e-5
 MOST_REFUSED_STEPS = 8  # number of successive rejected steps after which a fit is given up
+BLOCK_NUMBERS = 4096  # size of a block of rows, of which BLAS computes products without threads
 ROUNDING = 4 * float(np.finfo(float).eps)  # steps below this, relative to the unknowns, are rounding errors
 
 Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
-Stuck: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # `Unknowns.stuck_at_bounds`
+Stuck: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]  # `Unknowns.stuck_at_bounds`
 ReportStep: TypeAlias = Callable[[str], None]  # called with a message after each step
 CostHistory: TypeAlias = list[tuple[float, float]]  # cost after each step, and largest change of an unknown in the next step
 
@@ -43,6 +44,7 @@ class Fit(NamedTuple):
     cost: float  # r.r / 2
     converged: bool
     history: CostHistory
+    stuck: Bool[np.ndarray, "K"] | None = None  # unknowns at a bound, whose values mean nothing; None: unknown
 
 
 def minimize_squares(
@@ -97,33 +99,57 @@ class _TrustRegionFit(Descent):
     """
 
     stuck: Stuck | None = None
+    count = 0  # number of residuals before they are reduced
     refused = 0  # number of trials since the last improvement
 
-    def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R"]:
-        """Return the residuals; infinite if they cannot be computed."""
+    def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "2K+1"]:
+        """Return the residuals, reduced by `reduce_rows`; infinite if they cannot be computed."""
         z = self.guess + change
-        self.found = self.evaluate(z[None])
-        r, ok = self.found.r[0], self.found.ok[0] and np.abs(z).max(initial=0.0) < FARTHEST_UNKNOWN
-        cost = float(0.5 * r @ r) if ok else np.inf
+        found = self.evaluate(z[None])
+        ok = found.ok[0] and np.abs(z).max(initial=0.0) < FARTHEST_UNKNOWN
+        self.count, size = found.r.shape[1], min(found.r.shape[1], len(z) + 1)
+        self.r, self.J = reduce_rows(found.r[0], found.J[0]) if ok else (np.full(size, np.inf), found.J[0, :size])
+        cost = float(0.5 * self.r @ self.r)
         if cost < self.end.cost:
             self.end, self.refused = self.end._replace(z=z, cost=cost), 0
-            return np.append(r, np.zeros(len(z)))
+            return np.append(self.r, np.zeros(len(z)))
         self.refused += 1
         is_finest = self.size <= FINE_STEP and self.refused >= 2  # further improvements are rounding errors
         if not self.end.history or is_finest or self.refused >= MOST_REFUSED_STEPS:
             self.stop(is_finest)
-        return np.append(r if ok else np.full_like(r, np.inf), np.zeros(len(z)))
+        return np.append(self.r, np.zeros(len(z)))
 
-    def jacobian(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "R K"]:
+    def jacobian(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "2K+1 K"]:
         """Return the Jacobian of the latest residuals."""
-        J, held = self.found.J[0], np.zeros(len(change))
-        if self.stuck is not None and (stuck := self.stuck(self.guess + change, self.found.r[0], J)).any():
+        J, held = self.J, np.zeros(len(change))
+        if self.stuck is not None:
+            stuck = self.stuck(self.guess + change, self.r, J, self.count)
+            self.end = self.end._replace(stuck=stuck)
+        if self.end.stuck is not None and self.end.stuck.any():
+            stuck = self.end.stuck
             J, held = np.where(stuck, 0.0, J), np.where(stuck, np.linalg.norm(J, axis=0).max() or 1.0, 0.0)
-        size, cosine = gauss_newton(self.found.r[0], J)
+        size, cosine = gauss_newton(self.r, J)
         self.record(size)
         if cosine <= ORTHOGONAL_COSINE:
             self.stop(True)
         return np.concatenate([J, np.diag(held)])
+
+
+def reduce_rows(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most K + 1 residuals and their Jacobian with the same r.r, J^T r and J^T J, all that least squares depend on.
+
+    They are the triangular factor of [J r] = Q R, which loses no accuracy, as J^T J would. It is computed from the factors of
+    blocks of rows, since BLAS would start threads for tall matrices, in which they wait for each other most of the time.
+    """
+    table = np.column_stack([J, r])
+    columns = table.shape[1]
+    block = max(2 * columns, BLOCK_NUMBERS // columns)
+    while len(table) > 2 * block:
+        blocks = np.zeros((-(-len(table) // block), block, columns))
+        blocks.reshape(-1, columns)[: len(table)] = table
+        table = np.linalg.qr(blocks, mode="r").reshape(-1, columns)
+    factor = np.linalg.qr(table, mode="r")
+    return factor[:, -1], factor[:, :-1]
 
 
 def gauss_newton(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[float, float]:

@@ -30,7 +30,9 @@ CHAOTIC_GROWTH = 100.0  # growth of derivatives from the first half of a record 
 EXPLAINED_PART = 1e-3  # residuals up to which records with unknown noise are explained, relative to the channels' scales
 LIKELY_SQUARE = 2.0  # mean square of residuals up to which records with known noise are explained
 WHITE_CORRELATION = 4.0  # correlation of neighbours, in standard deviations, up to which residuals are noise
-SAME_MINIMUM_DISTANCE = 1e-4  # fits whose unknowns differ by less are at the same minimum
+# Fits are at the same minimum if their unknowns differ by less than the first number, or predictions by less than the second, in
+# standard deviations of the residuals; unknowns at a bound, where z is as good as infinite, do not count.
+SAME_MINIMUM_DISTANCE, SAME_PREDICTION = 1e-4, 0.1
 
 
 class SearchResult(NamedTuple):
@@ -86,10 +88,10 @@ def search(
             if (
                 explains(problem, _best(fits), loose)
                 or len(earlier) >= len(z) + more
-                or (_count_agreeing(fits) >= ENOUGH_AGREEING and _shows_most(problem, _best(fits)))
+                or (count_agreeing(problem, fits, loose) >= ENOUGH_AGREEING and _shows_most(problem, _best(fits)))
             ):
                 break
-    best, agreeing = _best(fits), _count_agreeing(fits)
+    best, agreeing = _best(fits), count_agreeing(problem, fits, loose)
     if more and not explains(problem, best, loose):
         # If half of the guesses agree, the model itself cannot reproduce the records.
         chaotic = is_chaotic(problem, best.z, loose)
@@ -104,11 +106,22 @@ def _best(fits: Sequence[Fit]) -> Fit:
     return min(fits, key=lambda fit: fit.cost)
 
 
-def _count_agreeing(fits: Sequence[Fit]) -> int:
+def count_agreeing(problem: FitProblem, fits: Sequence[Fit], tol: TolerancePair) -> int:
     """Return the number of fits at the best minimum."""
-    best = _best(fits).z
-    near = SAME_MINIMUM_DISTANCE * (1.0 + np.abs(best).max())
-    return sum(bool(np.isfinite(fit.cost)) and bool(np.abs(fit.z - best).max() <= near) for fit in fits)
+    best, count = _best(fits), 0
+    if not np.isfinite(best.cost):
+        return count
+    J = problem.evaluate(best.z[None], tol).J[0]
+    noise = np.sqrt(2.0 * best.cost / len(J))
+    for fit in fits:
+        seen = np.ones(len(best.z), bool)
+        for at_bound in (best.stuck, fit.stuck):
+            seen &= True if at_bound is None else ~at_bound
+        change = np.where(seen, fit.z - best.z, 0.0)
+        near = SAME_MINIMUM_DISTANCE * (1.0 + np.abs(best.z[seen]).max(initial=0.0))
+        alike = np.abs(change).max(initial=0.0) <= near or np.linalg.norm(J @ change) <= SAME_PREDICTION * noise
+        count += bool(np.isfinite(fit.cost)) and bool(alike)
+    return count
 
 
 def _shows_most(problem: FitProblem, fit: Fit) -> bool:

@@ -110,16 +110,18 @@ class Unknowns:
         return np.select([kinds == "positive", kinds == "bounded"], [positive, bounded], free)
 
     def stuck_at_bounds(
-        self, z: Float[np.ndarray, "K"], r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]
+        self, z: Float[np.ndarray, "K"], r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"], count: int
     ) -> Bool[np.ndarray, "K"]:
         """Return which unknowns a fit pushes towards a bound, zero for positive parameters, without a visible effect.
+
+        The residuals, `count` in number, may be reduced to fewer (`reduce_rows`).
 
         dr/dz vanishes at a bound, where z is infinite. The rest of the way to the bound changes the residuals by about dr/dz: if
         this is at most `BOUND_EFFECT` of the noise, or not visible at all, the parameter is as good as at the bound.
         """
         P = len(self.names)
         size, slope = np.linalg.norm(J, axis=0), (J.T @ r)[:P]
-        kinds, noise = np.array(self.kinds), np.linalg.norm(r) / np.sqrt(max(len(r), 1))
+        kinds, noise = np.array(self.kinds), np.linalg.norm(r) / np.sqrt(max(count, 1))
         outwards = np.select([kinds == "positive", kinds == "bounded"], [-1.0, np.sign(z[:P])], 0.0)
         is_near = (size[:P] <= BOUND_EFFECT * noise) & (slope * outwards < 0.0) | (
             size[:P] <= INVISIBLE_RATIO * size.max(initial=0.0)
