@@ -14,6 +14,7 @@ from udkjax.equations import accelerations as accelerations
 from udkjax.equations import analyse as analyse
 from udkjax.equations import efforts as efforts
 from udkjax.equations import energy as energy
+from udkjax.equations import friction_loads as friction_loads
 from udkjax.equations import reactions as reactions
 from udkjax.equations import singular_values as singular_values
 from udkjax.equations import unique_reactions as unique_reactions

@@ -99,6 +99,18 @@ def test_mistakes():
             )
 
 
+def test_a_joint_that_sticks_has_one_friction():
+    """Two would have one force between them, which the law does not share."""
+    torque, more = udk.Friction("A", torque=1.0, **STICKS), udk.Friction("A", coefficient=0.1, radius=0.1, **STICKS)
+    for second in (more, torque, udk.Friction("A", torque=1.0, velocity=0.1)):
+        with pytest.raises(ValueError, match='joint: "A" has friction already, by force "one"'):
+            udk.Mechanism(
+                {"a": udk.Body(1.0, 1.0)},
+                {"A": udk.Revolute(["ground", "a"], [[0.0, 0.0], [0.0, 0.0]])},
+                forces={"one": torque, "two": second},
+            )
+
+
 @pytest.mark.slow
 def test_block_turns_round():
     """With mu < tan it comes back with g (sin - mu cos)."""

@@ -15,6 +15,8 @@ from udkjax.equations.dense_rows import KinematicRows as KinematicRows
 from udkjax.equations.dense_rows import TruncatedPseudoinverse as TruncatedPseudoinverse
 from udkjax.equations.determinacy import Uniqueness as Uniqueness
 from udkjax.equations.differentiable_programs import DifferentiableProgram as DifferentiableProgram
+from udkjax.equations.directed_friction import SIDES as SIDES
+from udkjax.equations.directed_friction import with_directed_friction as with_directed_friction
 from udkjax.equations.effort_arrays import efforts_by_numpy as efforts_by_numpy
 from udkjax.equations.element_programs import has_rheonomic_joints as has_rheonomic_joints
 from udkjax.equations.elements import has_pieces as has_pieces
@@ -54,6 +56,7 @@ from udkjax.equations.quantities import accelerations as accelerations
 from udkjax.equations.quantities import efforts as efforts
 from udkjax.equations.quantities import energy as energy
 from udkjax.equations.quantities import equations_of as equations_of
+from udkjax.equations.quantities import friction_loads as friction_loads
 from udkjax.equations.quantities import violation as violation
 from udkjax.equations.reactions import reactions as reactions
 from udkjax.equations.reactions import unique_reactions as unique_reactions
@@ -67,6 +70,10 @@ from udkjax.equations.scales import Scales as Scales
 from udkjax.equations.scales import scales_p as scales_p
 from udkjax.equations.scene_programs import scene_programs as scene_programs
 from udkjax.equations.sparse_rows import SparseRows as SparseRows
+from udkjax.equations.stick_or_slip import AT_REST as AT_REST
+from udkjax.equations.stick_or_slip import FrictionModes as FrictionModes
+from udkjax.equations.stick_or_slip import JointsAtRest as JointsAtRest
+from udkjax.equations.sticking_state import known_sticking as known_sticking
 from udkjax.equations.structure import numbers_as_vector as numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations as TextbookEquations
 from udkjax.equations.textbook import prepare as prepare

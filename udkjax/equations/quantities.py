@@ -14,13 +14,16 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem, GeneralEquations, prepare_general
 from udkjax.equations.state_arrays import by_numpy, history_of, state_arrays
-from udkjax.equations.textbook import prepare
+from udkjax.equations.sticking_state import known_sticking
+from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.equations.traced_system import TracedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
+from udkjax.scene.bodies import GROUND
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
 Result = TypeVar("Result")
@@ -109,6 +112,9 @@ def accelerations(
 ) -> Float[Array, "bodies 3"] | tuple[Float[Array, "bodies 3"], Float[Array, "m"]]:
     """Return a = a_F + M^(-1/2) D^+ b, and on request lambda = -(D^+)^T D^+ b. The state need not be closed.
 
+    A joint with set-valued friction whose speed is zero, up to 1e-9 of the scene's own speeds, sticks if the law allows it: its
+    friction is the force that holds it. Else it begins to slide.
+
     Args:
         mechanism: The mechanism, or a `ConstrainedSystem`.
         t: Time (s).
@@ -195,9 +201,40 @@ def efforts(
         multipliers = jax.device_put(np.concatenate([piece.multipliers for piece in pieces]))
     else:
         ts, q, v = (jnp.asarray(x) for x in (solution.ts, solution.q, solution.v))
-        multipliers = _multipliers(mechanism.without_origin, analysis, ts, q, v, method, stabilization)
+        sticking = known_sticking(mechanism, solution)
+        multipliers = _multipliers(mechanism.without_origin, analysis, ts, q, v, sticking, method, stabilization)
     rows = {owner: k for k, (owner, _) in enumerate(analysis.row_names)}
     return {name: -multipliers[:, rows[name]] for name in mechanism.driver_names}
+
+
+@checked
+def friction_loads(
+    mechanism: Mechanism, solution: HistoryLike, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+    """Return the load of each friction on the bodies of its joint: `friction_loads(mech, sol)["rub"]["link1"]`.
+
+    A joint that sticks carries the force that keeps it at rest. With gravity, all other force elements and `reactions`, these
+    loads are the mass times the accelerations of a body.
+
+    Args:
+        mechanism: The scene.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3). A `Solution` tells which joints stick; else
+            those do that are at rest, as the law says.
+        method: The pseudoinverse; by default `SVD`.
+        stabilization: The run's `Baumgarte`, to include its terms.
+
+    Returns:
+        For each friction and each body of its joint the load (T, 3) about the centre of mass: force x, force y (N) and torque
+        (N m).
+    """
+    frictions = {name: force for name, force in mechanism.forces.items() if isinstance(force, Friction)}
+    if not frictions:
+        return {}
+    ts, q, v = (jnp.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
+    given = analyse(mechanism), ts, q, v, known_sticking(mechanism, solution), SVD() if method is None else method
+    by_name, names = _friction_loads(mechanism.without_origin, *given, stabilization), mechanism.body_names
+    bodies = {name: [b for b in dict.fromkeys(mechanism.frames_of(force)) if b != GROUND] for name, force in frictions.items()}
+    return {name: {b: by_name[name][:, names.index(b)] for b in bodies[name]} for name in frictions}
 
 
 # Top-level functions, so that compiled programs are reused by later calls.
@@ -206,17 +243,32 @@ def efforts(
 @deferred
 def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation, multipliers):
     equations, flat = equations_of(mechanism, method, baumgarte, formulation, analysis), (q.ravel(), v.ravel())
+    if multipliers and isinstance(equations, TextbookEquations):
+        a, found = equations.motion(t, *flat)
+        return a.reshape(q.shape), found
     a = equations.accelerations(t, *flat).reshape(q.shape)
     return (a, equations.multipliers(t, *flat)) if multipliers else a
 
 
 @deferred
-def _multipliers(mechanism, analysis, ts, q, v, method, baumgarte):
-    equations, finite = equations_of(mechanism, method, baumgarte, analysis=analysis), jnp.isfinite(q) & jnp.isfinite(v)
+def _multipliers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
+    equations, finite = prepare(mechanism, method, baumgarte, analysis), jnp.isfinite(q) & jnp.isfinite(v)
     reached = jnp.all(finite, axis=(1, 2))
     # States after a failure are replaced by the guess, because NaN would also make the derivatives of the other states NaN.
     q, v = (jnp.where(reached[:, None, None], x, x0).reshape(len(ts), -1) for x, x0 in ((q, mechanism.q0), (v, mechanism.v0)))
-    return jnp.where(reached[:, None], jax.vmap(equations.multipliers)(ts, q, v), jnp.nan)
+    of_state = lambda t, q, v, sticking: equations.known_to_stick(sticking).multipliers(t, q, v)  # noqa: E731
+    return jnp.where(reached[:, None], jax.vmap(of_state)(ts, q, v, sticking), jnp.nan)
+
+
+@deferred
+def _friction_loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
+    equations = prepare(mechanism, method, baumgarte, analysis)
+
+    def of_state(t, q, v, sticking):
+        found = equations.known_to_stick(sticking).friction_loads(t, q.ravel(), v.ravel())
+        return {name: load.reshape(q.shape) for name, load in found.items()}
+
+    return jax.vmap(of_state)(ts, q, v, sticking)
 
 
 def _psi(equations: AbstractSystem, t: Array, q: Vector, v: Vector) -> Array:

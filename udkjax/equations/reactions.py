@@ -1,14 +1,7 @@
 """Loads of joints on their bodies, -Psi_q^T lambda: in chosen axes, about a chosen point, with a chosen rule for sharing.
 
 With redundant constraints, equilibrium determines only some components (determinacy.py). The others require an assumption: by
-default the least norm, each row in units of its scale; or, with the compliances c of joints (m/N, rad/(N m)), the least elastic
-energy,
-
-    minimize sum(c_i lambda_i^2) / 2  over all lambda with M a + Psi_q^T lambda = F,
-
-which holds for bodies that are stiff compared with their joints. With mu = lambda / w in units of the rows, P = I - D D^+ the
-projector on the null space of D^T, and K = diag(w c w), the minimum over mu + P z is at z = -(P K P)^+ P K mu. Among joints
-without compliance, loads that remain undetermined are those of least norm.
+default the least norm, each row in units of its scale; or the least elastic energy (compliance.py).
 """
 
 from collections.abc import Callable, Mapping
@@ -18,18 +11,18 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from udkjax.annotations import Number, NumberLike, Time
+from udkjax.annotations import Number, NumberLike
 from udkjax.arrays import ArrayLibrary, array_namespace
-from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.abstract_system import HistoryLike
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.compliance import compliance_rows
 from udkjax.equations.constraints import psi_q
 from udkjax.equations.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
 from udkjax.equations.general import ConstrainedSystem, prepare_general
 from udkjax.equations.state_arrays import StateArrays, StateArraysOverTime, by_numpy, history_of, state_arrays
+from udkjax.equations.sticking_state import known_sticking
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -37,16 +30,12 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
 from udkjax.scene.drivers import Driver
-from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Revolute, Slot
+from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Slot
 from udkjax.scene.mechanism import Mechanism
-from udkjax.wording import quote, suggestion
 
 Axes = Literal["ground", "body", "joint"]
 About = Literal["centre", "joint"]
 ByBody = dict[str, dict[str, Array]]  # by joint or driver, then by body
-
-# Threshold for eigenvalues of P K P, relative to the largest: joints with a smaller relative compliance count as rigid.
-COMPLIANCE_TOL = 1e-10
 
 
 @checked
@@ -73,12 +62,13 @@ def reactions(
             or prismatic joint the point of body 2), each body's own point for a distance; without points the centre of mass.
         compliances: compliances by joint name, one for each row (m/N for rows in metres, rad/(N m) for rows in radians), or one
             for both rows of a revolute. Redundant forces are shared with the least elastic energy; all other joints are rigid.
+            Friction follows the shared loads, also if it then gives other accelerations than a run, which shares by least norm.
 
     Returns:
         The load (T, 3): force x, force y (N) and torque (N m), -Psi_q^T lambda of the constraint's rows. With redundant
-        constraints only the components marked by `unique_reactions` are determined; the accelerations are always unique.
-        Of a `ConstrainedSystem`: for "constraint" and "velocity_constraint" the "load" -A^T lambda on its coordinates (T, n), and
-        the "multipliers" lambda (T, m) of its rows A.
+        constraints only the components marked by `unique_reactions` are determined. The force of friction is not included: see
+        `friction_loads`. Of a `ConstrainedSystem`: for "constraint" and "velocity_constraint" the "load" -A^T lambda on its
+        coordinates (T, n), and the "multipliers" lambda (T, m) of its rows A.
 
     Raises:
         ValueError: a compliance is negative or belongs to an unknown joint, or a joint has the wrong number of compliances.
@@ -88,14 +78,15 @@ def reactions(
             raise ValueError("the coordinates of a ConstrainedSystem have no frame: leave out frame, about and compliances")
         states = _states(solution)
         return _of_system(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
-    soft = None if compliances is None else _compliance_rows(mechanism, compliances)
+    soft = None if compliances is None else compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
     if soft is None and by_numpy(mechanism, (states, analysis, stabilization), method):
         loads = _loads_by_numpy(
             mechanism.without_origin, analysis, history_of(solution), method, stabilization, frame=frame, about=about
         )
     else:
-        loads = _loads(mechanism.without_origin, analysis, *states, method, stabilization, soft, frame, about)
+        sticking = known_sticking(mechanism, solution)
+        loads = _loads(mechanism.without_origin, analysis, *states, sticking, method, stabilization, soft, frame, about)
     return _name_by_body(mechanism, loads)
 
 
@@ -224,53 +215,21 @@ def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | No
     return frames[holder].point(points[holder])
 
 
-def _compliance_rows(mechanism: Mechanism, compliances: Mapping[str, NumberLike]) -> Float[Array, "m"]:
-    constraints, counts = mechanism.constraints, {}
-    for name, _ in analyse(mechanism).row_names:
-        counts[name] = counts.get(name, 0) + 1
-    for name, compliance in compliances.items():
-        if name not in constraints:
-            raise ValueError(f"compliances: no joint named {quote(name)}{suggestion(name, constraints)}")
-        shape, single_number = np.shape(compliance), isinstance(constraints[name], Revolute) or counts[name] == 1
-        if shape != (counts[name],) and not (shape == () and single_number):
-            raise ValueError(f"compliances: {quote(name)} takes {counts[name]} numbers, one for each row, not {compliance!r}")
-        if not isinstance(compliance, Tracer) and not np.all(np.asarray(compliance) >= 0):
-            raise ValueError(f"compliances: {quote(name)} has a negative compliance: {compliance!r}")
-    rows = [jnp.broadcast_to(jnp.asarray(compliances.get(name, 0.0), float), (count,)) for name, count in counts.items()]
-    return jnp.concatenate(rows) if rows else jnp.zeros(0)
-
-
 def _states(solution: HistoryLike) -> tuple[Array, Array, Array]:
     ts = jnp.asarray(solution.ts)
     return ts, jnp.asarray(solution.q).reshape(len(ts), -1), jnp.asarray(solution.v).reshape(len(ts), -1)
 
 
-def split_by_compliance(
-    mechanism: Mechanism, t: Time, q: Array, multipliers: Float[Array, "m"], soft: Float[Array, "m"], w: Float[Array, "m"]
-) -> Float[Array, "m"]:
-    """Return the equivalent multipliers of least elastic energy; `w` are the weights of the rows."""
-    if not len(soft):
-        return multipliers
-    D = uk.D(mechanism, t, q, w)
-    P = jnp.eye(len(soft)) - D @ SVD(rank_tol=STATIC_RANK_TOL)(D)
-    K = soft * w**2
-    K, mu = K / jnp.maximum(jnp.max(jax.lax.stop_gradient(K)), jnp.finfo(float).tiny), multipliers / w
-    z = SVD(rank_tol=COMPLIANCE_TOL)(P @ (K[:, None] * P)) @ (P @ (K * mu))
-    return w * (mu - P @ z)
-
-
 @deferred
-def _loads(mechanism, analysis, ts, q, v, method, baumgarte, soft, frame, about):
+def _loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte, soft, frame, about):
     """Compute -Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
-    equations = prepare(mechanism, method, baumgarte, analysis)
+    equations = prepare(mechanism, method, baumgarte, analysis).with_compliances(soft)
 
-    def row_loads(t, q, v):
-        multipliers = equations.multipliers(t, q, v)
-        if soft is not None:
-            multipliers = split_by_compliance(mechanism, t, q, multipliers, soft, analysis.scales.weights)
+    def row_loads(t, q, v, sticking):
+        multipliers = equations.known_to_stick(sticking).multipliers(t, q, v)
         return -equations.jacobian(t, q) * multipliers[:, None]
 
-    by_row, rows = jax.vmap(row_loads)(ts, q, v), [name for name, _ in analysis.row_names]
+    by_row, rows = jax.vmap(row_loads)(ts, q, v, sticking), [name for name, _ in analysis.row_names]
     by_body = _split_by_body(mechanism, rows, q, by_row, lambda load: load.sum(0), frame, about)
     return [list(loads.values()) for loads in by_body.values()]
 

@@ -11,7 +11,7 @@ of growing friction: lambda = L(s G(lambda)). The implicit function theorem give
 no motion (the mechanism jams), Newton's method does not end, and the multipliers are NaN.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import jax
@@ -21,11 +21,14 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.annotations import Time, Vector
 from udkjax.equations import constraints
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.compliance import sharing
 from udkjax.equations.constraints import BodyArray, bodies
 from udkjax.equations.structure import rubbing_joints
 from udkjax.equations.udwadia_kalaba import Baumgarte, Weights
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
+from udkjax.scene.forces import Wrench
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
 MOST_STEPS = 50  # of Newton's method, which needs three to five
@@ -67,23 +70,52 @@ def single_rubbing_loads(
     mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
 ) -> dict[str, Float[Array, "n"]]:
     """Return the loads of each friction that depends on the load of a joint, by the name of the joint; see `rubbing_loads`."""
-    time, places, speeds = jnp.asarray(t, jnp.result_type(float)), bodies(q), bodies(v)
-    index = {name: k for k, name in enumerate(mechanism.body_names)}
+    time, places = jnp.asarray(t, jnp.result_type(float)), frames(mechanism, q, v)
     rows: dict[str, list[int]] = {}
     for k, (owner, _) in enumerate(constraints.row_names(mechanism)):
         rows.setdefault(owner, []).append(k)
     found: dict[str, Array] = {}
     for name, joint in zip(mechanism.constraints, rubbing_joints(mechanism), strict=True):
-        if joint is None:
-            continue
-        frames = [GROUND_FRAME_AT_REST if b == GROUND else _frame(places[index[b]], speeds[index[b]]) for b in joint.bodies]
-        total = jnp.zeros((len(index), 3))
-        wrenches = joint.loads([multipliers[k] for k in rows[name]], time, *frames)
-        for body, wrench in zip(joint.bodies, wrenches, strict=True):
-            if body != GROUND:
-                total = total.at[index[body]].add(constraints.vector(list(wrench)))
-        found[name] = total.ravel()
+        if joint is not None:
+            wrenches = joint.loads([multipliers[k] for k in rows[name]], time, *(places[b] for b in joint.bodies))
+            found[name] = _on_bodies(mechanism, joint.bodies, wrenches)
     return found
+
+
+def loads_of_friction(
+    mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
+) -> dict[str, Float[Array, "n"]]:
+    """Return the loads of each friction, constant torques included, by its own name; see `rubbing_loads`."""
+    time, places = jnp.asarray(t, jnp.result_type(float)), frames(mechanism, q, v)
+    by_joint, found = single_rubbing_loads(mechanism, t, q, v, multipliers), {}
+    for name, force in mechanism.forces.items():
+        if isinstance(force, Friction):
+            attached = mechanism.joints[force.joint].frame_names
+            constant = force.loads(time, *(places[b] for b in attached))
+            total = jnp.zeros(3 * len(mechanism.body_names)) if constant is None else _on_bodies(mechanism, attached, constant)
+            found[name] = total + by_joint[force.joint] if force.rubs else total
+    return found
+
+
+def _on_bodies(mechanism: Mechanism, attached: Sequence[str], wrenches: Sequence[Wrench]) -> Float[Array, "n"]:
+    """Return loads on bodies or the ground as loads on all coordinates."""
+    names, total = mechanism.body_names, jnp.zeros((len(mechanism.body_names), 3))
+    for body, wrench in zip(attached, wrenches, strict=True):
+        if body != GROUND:
+            total = total.at[names.index(body)].add(constraints.vector(list(wrench)))
+    return total.ravel()
+
+
+def frames(mechanism: Mechanism, q: BodyArray, v: BodyArray) -> dict[str, Frame]:
+    """Return the moving frames of all bodies and of the ground, by name.
+
+    Args:
+        mechanism: The scene.
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+    """
+    places, speeds = bodies(q), bodies(v)
+    return {GROUND: GROUND_FRAME_AT_REST} | {name: _frame(places[k], speeds[k]) for k, name in enumerate(mechanism.body_names)}
 
 
 def _frame(place: Array, speed: Array) -> Frame:
@@ -99,6 +131,7 @@ def settled_multipliers(
     method: Pseudoinverse,
     baumgarte: Baumgarte | None = None,
     w: Weights = None,
+    soft: Float[Array, "m"] | None = None,
 ) -> Float[Array, "m"]:
     """Return lambda = L(G(lambda)); NaN if friction admits none.
 
@@ -110,17 +143,19 @@ def settled_multipliers(
         method: The pseudoinverse.
         baumgarte: Gains of Baumgarte stabilization; None: no stabilization.
         w: Weights of the rows (m,); None: all are one.
+        soft: Compliances of the rows (m/N, rad/(N m)); None: loads of least norm.
 
     Returns:
         lambda (m,), in N and N m.
     """
     D, root = uk.D(mechanism, t, q, w), uk.inverse_sqrt_mass(mechanism)
     plus, b = uk.pseudoinverse(method, D), uk.b(mechanism, t, q, v, baumgarte, w)
+    share = sharing(D, soft, jnp.ones(len(D)) if w is None else jnp.asarray(w))
 
     def multipliers(friction: Array) -> Array:
-        return uk.weigh(w, -(plus.T @ (plus @ (b - D @ (root * friction)))))
+        return share(uk.weigh(w, -(plus.T @ (plus @ (b - D @ (root * friction))))))
 
-    return settle(multipliers, mechanism, t, q, v)
+    return settle(multipliers, mechanism, t, q, v) if rubbing_names(mechanism) else multipliers(jnp.zeros_like(q))
 
 
 def settled_loads(

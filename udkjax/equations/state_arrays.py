@@ -22,6 +22,7 @@ from udkjax.equations.structure import rubbing_joints
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Auto, Pseudoinverse
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
 PIECE = 2**24  # bytes of a piece's largest arrays
@@ -32,7 +33,7 @@ def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = Non
     """Return whether `StateArrays` has the quantities of a mechanism: its numbers and the given ones are concrete.
 
     `method` must be the SVD, or what stands for it; numbers of the mechanism must not be samples over time, and its friction must
-    not depend on the loads of joints.
+    neither depend on the loads of joints nor be set-valued.
     """
     config = jax.config
     return (
@@ -43,6 +44,7 @@ def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = Non
         and config.jax_enable_x64
         and not (config.jax_disable_jit or config.jax_debug_nans)
         and not any(joint is not None for joint in rubbing_joints(mechanism))
+        and not Friction.may_stick(mechanism._forces)
     )
 
 

@@ -1,5 +1,7 @@
 """The equations of motion of a mechanism in textbook form (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,9 +16,11 @@ from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.loose_friction import LooseFriction, loose_friction
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
+from udkjax.equations.sticking_state import StickingState
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -33,22 +37,66 @@ class TextbookEquations(MechanismSystem):
     scales: Scales
     redundant: tuple[int, ...] | None = eqx.field(static=True)  # rows that elimination leaves out; None: unknown
     only_switched: bool = eqx.field(static=True, default=False)  # whether unknown ones are those that are switched off
+    soft: Float[Array, "m"] | None = None  # compliances of the rows, by which they share redundant forces; None: by least norm
+    sticking: Bool[Array, "F"] | None = None  # the joints that are known to stick; None: the law decides
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """Return a = a_F + M^(-1/2) D^+ b."""
-        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights, self._friction(t, q, v))
+        return self._accelerations(t, q, v, self._friction(t, q, v))
 
     def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         """Return lambda = -(D^+)^T D^+ b."""
-        if self.rubs:
-            return rubbing.settled_multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
-        return uk.multipliers(self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights)
+        if self.sticks:
+            return self._sticking_state.loads(t, q, v).multipliers
+        given = self.mechanism, t, q, v, self.method, self.baumgarte, self.scales.weights
+        if self.rubs or self.soft is not None:
+            return rubbing.settled_multipliers(*given, self.soft)
+        return uk.multipliers(*given)
+
+    def motion(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Float[Array, "m"]]:
+        """Return a and lambda."""
+        if self.sticks:
+            multipliers, friction, _ = self._sticking_state.loads(t, q, v)
+        else:
+            multipliers = self.multipliers(t, q, v)
+            friction = rubbing.rubbing_loads(self.mechanism, t, q, v, multipliers) if self.rubs else None
+        return self._accelerations(t, q, v, friction), multipliers
+
+    def _accelerations(self, t: Time, q: Vector, v: Vector, friction: Vector | None) -> Vector:
+        return uk.accelerations(self.mechanism, t, q, v, self.method, self.baumgarte, self.weights, friction)
 
     def _friction(self, t: Time, q: Vector, v: Vector) -> Vector | None:
         """Return the loads of friction that depends on the loads of joints; None if there is none."""
+        if self.sticks:
+            return self._sticking_state.loads(t, q, v).friction
         if not self.rubs:
             return None
         return rubbing.rubbing_loads(self.mechanism, t, q, v, self.multipliers(t, q, v))
+
+    def friction_loads(self, t: Time, q: Vector, v: Vector) -> dict[str, Vector]:
+        """Return the loads of each friction (n,), by its name."""
+        if self.sticks:
+            return self._sticking_state.loads(t, q, v).by_name
+        return rubbing.loads_of_friction(self.mechanism, t, q, v, self.multipliers(t, q, v))
+
+    @property
+    def _sticking_state(self) -> StickingState:
+        return StickingState(
+            self.mechanism, self.method, self.baumgarte, self.scales.weights, self.scales, self.soft, self.sticking
+        )
+
+    @property
+    def sticks(self) -> bool:
+        """True if friction is set-valued."""
+        return Friction.may_stick(self.mechanism._forces)
+
+    def with_compliances(self, soft: Float[Array, "m"] | None) -> "TextbookEquations":
+        """Return the equations whose redundant forces are shared by the compliances of the rows."""
+        return replace(self, soft=soft)
+
+    def known_to_stick(self, sticking: Bool[Array, "F"] | None) -> "TextbookEquations":
+        """Return the equations at states at which these joints are known to stick, in the order of `sticking_joints`."""
+        return replace(self, sticking=sticking)
 
     def rubbing_powers(self, t: Time, q: Vector, v: Vector, multipliers: Float[Array, "m"]) -> dict[str, Array]:
         """Return the power (W) of the friction that depends on the loads of joints, by joint."""

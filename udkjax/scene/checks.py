@@ -95,17 +95,23 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
             problems.extend(_check_references(f"{entry.where}.bodies", "body", entry.table.get("bodies"), known))
         else:
             problems.extend(check_table(entry.where, entry.cls, entry.table, known))
-    return [*problems, *_repeated_coefficients(entries)]
+    return [*problems, *_repeated_friction(entries)]
 
 
-def _repeated_coefficients(entries: Sequence[SceneEntry]) -> Iterator[str]:
-    """Iterate over force elements that give a joint a second coefficient of friction."""
-    first: dict[object, SceneEntry] = {}
+def _repeated_friction(entries: Sequence[SceneEntry]) -> Iterator[str]:
+    """Iterate over friction of a joint that has a coefficient already, or that is not alone although one of them sticks."""
+    by_joint: dict[object, list[SceneEntry]] = {}
     for entry in entries:
-        if entry.cls is not None and issubclass(entry.cls, Friction) and "coefficient" in entry.table:
-            joint = abbreviate(entry.table.get("joint"))
-            if first.setdefault(joint, entry) is not entry:
-                yield f"{entry.where}.joint: {joint} has a coefficient of friction already, by {first[joint].where}"
+        if entry.cls is None or not issubclass(entry.cls, Friction):
+            continue
+        joint, table = abbreviate(entry.table.get("joint")), entry.table
+        for other in by_joint.setdefault(joint, []):
+            if "coefficient" in table and "coefficient" in other.table:
+                yield f"{entry.where}.joint: {joint} has a coefficient of friction already, by {other.where}"
+            elif "set-valued" in (table.get("law"), other.table.get("law")):
+                cure = "give the torque and the coefficient to one friction, as the set-valued law needs"
+                yield f"{entry.where}.joint: {joint} has friction already, by {other.where}; {cure}"
+        by_joint[joint].append(entry)
 
 
 def name_mistake(name: object) -> str:

@@ -37,7 +37,8 @@ class Friction(ForceElement):
         mu(s) = coefficient sign(s) + viscous s
 
     while the joint slides. At rest the joint sticks: a run holds it, as a constraint, while its force is at most `torque` +
-    `static_coefficient` times the load. Outside of runs the force of a joint at rest is zero.
+    `static_coefficient` times the load. At a single state the same law
+    decides for joints whose speed is zero, as in `udkjax.accelerations`.
 
     Args:
         joint: the name of a revolute joint; with a coefficient also of a slot or a prismatic joint.
@@ -117,11 +118,7 @@ class Friction(ForceElement):
         if self.torque is None:
             return None
         frame1, frame2 = frames
-        rate = frame2.omega - frame1.omega
-        if self.sticks:
-            return couple(-self.torque * self._direction(rate))
-        assert self.velocity is not None  # a mistake
-        return couple(-self.torque * jnp.tanh(rate / self.velocity))
+        return couple(-self._torque_at(frame2.omega - frame1.omega))
 
     def rubbing_loads(self, joint: Joint, multipliers: Sequence[Number], t: Number, *frames: Frame) -> Sequence[Wrench]:
         """Return the loads that depend on the load of the joint, as `loads` does.
@@ -182,6 +179,14 @@ class Friction(ForceElement):
     def _direction(self, speed: Number) -> Number:
         """Return the sign of a speed, 0 at rest."""
         return jnp.where(speed > 0, 1.0, jnp.where(speed < 0, -1.0, 0.0))
+
+    def _torque_at(self, rate: Number) -> Number:
+        """Return the constant torque at a relative angular velocity."""
+        assert self.torque is not None
+        if self.sticks:
+            return self.torque * self._direction(rate)
+        assert self.velocity is not None  # a mistake
+        return self.torque * jnp.tanh(rate / self.velocity)
 
     def _coefficient_at(self, speed: Number) -> Number:
         """Return mu(s)."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.annotations import Numbers
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.sticking_state import known_sticking
 from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
 from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, LocalPoint, Quantity, StateHistory, locate, point_of_pin
@@ -46,7 +47,7 @@ def measure(
     """
     if isinstance(mechanism, ConstrainedSystem):
         return _measure_system(mechanism, solution, channels)
-    motion, placed, reached = _fill(mechanism, solution)
+    motion, placed, reached = _fill(mechanism, solution, known_sticking(mechanism, solution))
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
     if not columns:
@@ -95,17 +96,18 @@ def path(
     accelerations = getattr(solution, "a", None)
     analysis = analyse(mechanism) if derivative == 2 and accelerations is None else None
     motion = jnp.asarray(solution.ts), jnp.asarray(solution.q), jnp.asarray(solution.v)
-    return _path(mechanism.without_origin, analysis, *motion, accelerations if derivative == 2 else None, local, body, derivative)
+    given = accelerations if derivative == 2 else None, known_sticking(mechanism, solution)
+    return _path(mechanism.without_origin, analysis, *motion, *given, local, body, derivative)
 
 
 @deferred
-def _path(mechanism, analysis, ts, q, v, a, local, body, derivative):
-    motion, placed, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), analysis)
+def _path(mechanism, analysis, ts, q, v, a, sticking, local, body, derivative):
+    motion, placed, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), sticking, analysis)
     return jnp.where((reached if derivative else placed)[:, None], jnp.stack(motion.point(body, local, derivative), -1), jnp.nan)
 
 
 def _fill(
-    mechanism: Mechanism, solution: StateHistory | SimpleNamespace, analysis: Analysis | None = None
+    mechanism: Mechanism, solution: StateHistory | SimpleNamespace, sticking: Any, analysis: Analysis | None = None
 ) -> tuple["_Motion", Bool[Array, "T"], Bool[Array, "T"]]:
     """Return a motion whose NaN states are replaced by the scene's guess, to keep all derivatives finite, and two masks.
 
@@ -117,7 +119,7 @@ def _fill(
     q, v = (jnp.where(valid[:, None, None], x, jax.lax.stop_gradient(x0)) for valid, x, x0 in filled)
     a = getattr(solution, "a", None)
     a = None if a is None else jnp.where(reached[:, None, None], a, 0.0)
-    return _Motion(mechanism, solution.ts, q, v, a, analysis), placed, reached
+    return _Motion(mechanism, solution.ts, q, v, a, analysis, sticking), placed, reached
 
 
 POSITIONS = ("x", "y", "angle", "distance")  # quantities that do not depend on velocities
@@ -143,19 +145,18 @@ class _Motion:
     v: Float[Array, "T bodies 3"]
     a: Float[Array, "T bodies 3"] | None  # accelerations of the motion, if it has them
     analysis: Analysis | None
+    sticking: Bool[Array, "T F"] | None  # the joints that are known to stick
 
     @cached_property
     def dynamics(self) -> _Dynamics:
         """The solution of the equations of motion, computed only if a channel needs it."""
         equations = prepare(self.mechanism, SVD(), None, self.analysis)
-        mass = jnp.stack([jnp.stack([body.mass, body.mass, body.inertia]) for body in self.mechanism.bodies.values()])
 
-        def at(t, q, v):
-            _, F, psi_q, _ = equations.matrices(t, q.ravel(), v.ravel())
-            multipliers = equations.multipliers(t, q.ravel(), v.ravel())
-            return psi_q.reshape(-1, *q.shape), multipliers, (F - psi_q.T @ multipliers).reshape(q.shape) / mass
+        def at(t, q, v, sticking):
+            a, multipliers = equations.known_to_stick(sticking).motion(t, q.ravel(), v.ravel())
+            return equations.jacobian(t, q.ravel()).reshape(-1, *q.shape), multipliers, a.reshape(q.shape)
 
-        psi_q, multipliers, a = jax.vmap(at)(self.ts, self.q, self.v)
+        psi_q, multipliers, a = jax.vmap(at)(self.ts, self.q, self.v, self.sticking)
         return _Dynamics(psi_q, multipliers, [name for name, _ in equations.row_names], a)
 
     @cached_property

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import analyse
+from udkjax.equations.sticking_state import known_sticking
 from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
@@ -97,7 +98,8 @@ def power_balance(
     ts, flat = jnp.asarray(solution.ts), (len(solution.ts), -1)
     q, v = (jnp.asarray(x).reshape(flat) for x in (solution.q, solution.v))
     analysis, method = analyse(mechanism), SVD() if method is None else method
-    by_row, by_force, by_joint, kinetic, potential = _powers(mechanism.without_origin, analysis, ts, q, v, method, stabilization)
+    given = analysis, ts, q, v, known_sticking(mechanism, solution), method, stabilization
+    by_row, by_force, by_joint, kinetic, potential = _powers(mechanism.without_origin, *given)
     owners = [name for name, _ in analysis.row_names]
 
     def total(values: Array, name: str) -> Array:
@@ -114,11 +116,11 @@ def power_balance(
 
 
 @deferred
-def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
+def _powers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
     equations = prepare(mechanism, method, baumgarte, analysis)
 
-    def one(t, q, v):
-        a, multipliers = equations.accelerations(t, q, v), equations.multipliers(t, q, v)
+    def one(t, q, v, sticking):
+        a, multipliers = equations.known_to_stick(sticking).motion(t, q, v)
         psi_t = jax.jvp(lambda t: constraints.psi(mechanism, t, q), (t,), (jnp.ones_like(t),))[1]
         kinetic = jax.jvp(lambda v: loads.kinetic_energy(mechanism, v), (v,), (a,))[1]
         potential = jax.jvp(lambda t, q: loads.potential_energy(mechanism, t, q, v), (t, q), (jnp.ones_like(t), v))[1]
@@ -126,7 +128,7 @@ def _powers(mechanism, analysis, ts, q, v, method, baumgarte):
         drags = equations.rubbing_powers(t, q, v, multipliers)
         return multipliers * psi_t, _force_powers(mechanism, t, q, v, drags), by_joint, kinetic, potential
 
-    return jax.vmap(one)(ts, q, v)
+    return jax.vmap(one)(ts, q, v, sticking)
 
 
 def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array, drags: dict[str, Array]) -> Float[Array, "forces"]:

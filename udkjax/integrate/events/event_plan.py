@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udkjax.equations.directed_friction import SIDES
 from udkjax.integrate.events.actions import Action
 from udkjax.integrate.events.conditions import sees_velocity
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import MOST_KINKS
 from udkjax.integrate.events.phases import Phases, Switches
-from udkjax.integrate.events.sticking_joints import SIDES, StickingJoint
+from udkjax.integrate.events.sticking_joints import StickingJoint
 from udkjax.scene.mechanism import Mechanism
 
 

@@ -37,23 +37,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.stick_or_slip import AT_REST
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.integrate.events.complementarity import diagonal, solve_complementarity, solve_rows, times
 from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2, ConditionValues
 from udkjax.transforms.gradients import stop_gradients
 
-# Bound on (u . u) / (n M^(-1) n), the square of the sine of the angle between a contact's row and those of the constraints, in
-# the metric of M. At a sine of 1e-8, half of the digits, u is merely the rounding error of a difference of two rows, and no
-# impulse follows from it.
-BLOCKED = 1e-16
-BLOCKED_IN_SYSTEM = 1e-13  # the same where u . u is a difference of products, with their rounding errors
-# CLOSED, relative to a condition's scale: contacts this close to zero are hit together with another one. This bound exceeds the
-# errors of a symmetric mechanism at usual tolerances, and advances a hit by 1e-9 T at most. STILL, relative to the fastest
-# approach in an impact, or to the strongest pull: smaller values of other contacts are zero, to the accuracy of their rows.
-CLOSED = STILL = 1e-9
-# Bound on the squared sine of the angle between the row of a contact and those of held contacts: below it, they hold this
-# contact, too. A dependent row has a sine of about CLOSED over the distance of the contacts, here down to a thousandth of L.
-CARRIED = (1e3 * CLOSED) ** 2
+BLOCKED, CLOSED, STILL, CARRIED = AT_REST.blocked, AT_REST.closed, AT_REST.still, AT_REST.carried
+BLOCKED_IN_SYSTEM = 1e-13  # as BLOCKED, where u . u is a difference of products, with their rounding errors
 # Speed before or after an impact, relative to a condition's scale per T: a pressed contact that is slower is at rest. Its rebound
 # would rise by 1e-10 of that scale, a hundredth of the accuracy at usual tolerances.
 REST = 1e-5

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
+from udkjax.equations.stick_or_slip import FrictionModes
 from udkjax.integrate.events.crossings import NO_EVENT, ConditionValues
 from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions, rows_of_system
 from udkjax.integrate.events.runs import MemberIndices, RunState, take
-from udkjax.integrate.events.sticking import FrictionModes, settle_friction
+from udkjax.integrate.events.sticking import settle_friction
 from udkjax.integrate.events.system import StateValues, System
 from udkjax.transforms.gradients import stop_gradients
 

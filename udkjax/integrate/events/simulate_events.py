@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from udkjax.arrays import is_traced, is_within_jit, number, put_arrays
 from udkjax.devices import computing_on_host, on_host
 from udkjax.equations.analysis import Analysis
+from udkjax.equations.directed_friction import SIDES
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
 from udkjax.integrate.events.condition_program import (
@@ -33,7 +34,7 @@ from udkjax.integrate.events.listing import Listing, listing, names_of_events
 from udkjax.integrate.events.phases import SCENE, Phases, phases_of
 from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.events.runs import EventRun
-from udkjax.integrate.events.sticking_joints import SIDES, with_sticking_joints
+from udkjax.integrate.events.sticking_joints import with_sticking_joints
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation

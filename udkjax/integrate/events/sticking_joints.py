@@ -6,7 +6,7 @@ speed falls to zero while the joint slides in that direction; its force reaches 
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,38 +14,13 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
 from udkjax.arrays import make_module, number
+from udkjax.equations.directed_friction import SIDES, with_directed_friction
 from udkjax.integrate.events.actions import Action, Displacement
 from udkjax.integrate.events.conditions import BodyCondition, Frames
 from udkjax.integrate.events.event import Event
-from udkjax.scene.fields import given_number
 from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Angle, Joint, Revolute
 from udkjax.scene.mechanism import Mechanism
-
-SIDES = 2  # numbers of a `DirectedFriction` among all sides
-
-
-class DirectedFriction(Friction):
-    """Set-valued friction of a joint that slides in a given direction, or sticks.
-
-    Its `sides` are the direction of sliding, 1 or -1 (0: the friction has no force), and one if the joint is at rest although no
-    constraint of its own locks it, so that the coefficient is the static one; two if it waits for its drivers.
-    """
-
-    sides: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))
-
-    @property
-    def may_have_kinks(self):
-        return False
-
-    def _direction(self, speed):
-        return self.sides[0]
-
-    def _coefficient_at(self, speed):
-        assert self.coefficient is not None
-        static = self.coefficient if self.static_coefficient is None else self.static_coefficient
-        total = self.sides[0] * jnp.where(self.sides[1] > 0.5, static, self.coefficient)
-        return total if self.viscous is None else total + self.viscous * speed
 
 
 class SlidingSpeed(BodyCondition):
@@ -110,19 +85,14 @@ def with_sticking_joints(mechanism: Any, first_event: int) -> Sticking:
     """
     if not isinstance(mechanism, Mechanism) or not Friction.may_stick(mechanism._forces):
         return Sticking(mechanism, (), ())
-    mechanism = mechanism.without_origin
-    forces, joints, events = list(mechanism._forces), [], []
-    for k, force in enumerate(forces):
-        if not isinstance(force, Friction) or not force.sticks:
-            continue
-        joint, name = mechanism.joints[force.joint], force.joint
-        forces[k] = make_module(DirectedFriction, **vars(force), sides=jnp.zeros(SIDES))
+    directed, joints, events = with_directed_friction(mechanism), [], []
+    for name, k in directed.joints:
+        joint, friction = mechanism.joints[name], cast(Friction, mechanism._forces[k])
         joints.append(StickingJoint(name, k, first_event + len(events), SIDES * len(joints)))
         for sign, text in ((1.0, "forwards"), (-1.0, "backwards")):
-            condition = SlidingSpeed(joint.bodies, joint, force, number(sign))
+            condition = SlidingSpeed(joint.bodies, joint, friction, number(sign))
             events.append(Event(condition, StickOrSlip(), -1, f"{name} slides {text}"))
-    mechanism = eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces))
-    return Sticking(mechanism, tuple(joints), tuple(events))
+    return Sticking(directed.mechanism, tuple(joints), tuple(events))
 
 
 def lock_of(joint: Any) -> Joint:

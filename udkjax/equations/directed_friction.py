@@ -1,0 +1,78 @@
+"""Set-valued friction in given modes: the direction of sliding is a number, with which its loads are smooth."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udkjax.arrays import make_module
+from udkjax.scene.fields import given_number
+from udkjax.scene.friction import Friction
+from udkjax.scene.mechanism import Mechanism
+
+SIDES = 2  # numbers of a `DirectedFriction` among all sides
+
+
+class DirectedFriction(Friction):
+    """Set-valued friction of a joint that slides in a given direction, or sticks.
+
+    Its `sides` are the direction of sliding, 1 or -1 (0: the friction has no force), and one if the joint is at rest although no
+    constraint of its own locks it, so that the coefficient is the static one; two if it waits for its drivers.
+    """
+
+    sides: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))
+
+    @property
+    def may_have_kinks(self):
+        return False
+
+    @property
+    def sticks(self):
+        return False
+
+    def _torque_at(self, speed):
+        assert self.torque is not None
+        return self.torque * self.sides[0]
+
+    def _coefficient_at(self, speed):
+        assert self.coefficient is not None
+        static = self.coefficient if self.static_coefficient is None else self.static_coefficient
+        total = self.sides[0] * jnp.where(self.sides[1] > 0.5, static, self.coefficient)
+        return total if self.viscous is None else total + self.viscous * speed
+
+
+class StickingFriction(NamedTuple):
+    """A joint with set-valued friction; hashable."""
+
+    joint: str
+    force: int  # index of the friction among the forces
+
+
+class DirectedMechanism(NamedTuple):
+    """A mechanism whose set-valued friction is directed, and its joints with such friction, F."""
+
+    mechanism: Any
+    joints: tuple[StickingFriction, ...]
+
+    def with_sides(self, sides: Float[Array, "F 2"]) -> Mechanism:
+        """Return the mechanism with the sides of all directed friction."""
+        return eqx.tree_at(lambda m: [m._forces[x.force].sides for x in self.joints], self.mechanism, list(sides))
+
+
+def with_directed_friction(mechanism: Mechanism) -> DirectedMechanism:
+    """Return a mechanism with directed friction in place of set-valued friction.
+
+    Args:
+        mechanism: The scene.
+
+    Returns:
+        The mechanism, and the joints whose friction is set-valued, in the order of the forces.
+    """
+    mechanism = mechanism.without_origin
+    forces, joints = list(mechanism._forces), []
+    for k, force in enumerate(forces):
+        if isinstance(force, Friction) and force.sticks:
+            forces[k] = make_module(DirectedFriction, **vars(force), sides=jnp.zeros(SIDES))
+            joints.append(StickingFriction(force.joint, k))
+    return DirectedMechanism(eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces)) if joints else mechanism, tuple(joints))
