@@ -130,6 +130,8 @@ from udkjax.show.player import animate_modes as animate_modes
 from udkjax.statics.equilibrium import Equilibrium as Equilibrium
 from udkjax.statics.equilibrium import equilibria as equilibria
 from udkjax.statics.equilibrium import equilibrium as equilibrium
+from udkjax.statics.holding import HoldingEfforts as HoldingEfforts
+from udkjax.statics.holding import holding_efforts as holding_efforts
 from udkjax.statics.modes import Modes as Modes
 from udkjax.statics.modes import modes as modes
 from udkjax.statics.reaction_peaks import envelope as envelope

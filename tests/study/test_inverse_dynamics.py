@@ -114,3 +114,28 @@ def test_derivatives_of_a_torque_are_those_of_its_closed_form():
 def test_nothing_drives():
     with pytest.raises(udk.SceneError, match="the scene has none"):
         udk.inverse_dynamics(udk.library.four_bar(), [0.0], udk.kinematics(udk.library.four_bar(), "body.crank.angle", [1.0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["smooth", "set-valued"])
+def test_friction_of_both_laws_is_driven(law):
+    """A pendulum on a thick pin: I alpha + m g l cos + mu r |R| sign(omega), without friction where the driver rests."""
+    m, length, inertia, radius, mu = 2.0, 0.5, 0.03, 0.1, 0.4
+    smoothing = {"speed": 1e-9} if law == "smooth" else {}
+    mech = udk.Mechanism(
+        {"bob": udk.Body(m, inertia, [length, 0.0])},
+        {"A": udk.Revolute(["ground", "bob"], [[0.0, 0.0], [-length, 0.0]])},
+        {"motor": udk.Driver(["ground", "bob"], "angle", udk.Polynomial([0.0, 0.0, 1.5, -1.0]))},
+        {"rub": udk.Friction("A", coefficient=mu, radius=radius, law=law, **smoothing)},
+    )
+    ts = np.array([0.0, 0.3, 0.8, 1.2])
+    angle, omega, alpha = 1.5 * ts**2 - ts**3, 3 * ts - 3 * ts**2, 3 - 6 * ts
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    force = m * (length * alpha * across - length * omega**2 * along + np.array([[0.0], [9.81]]))
+    sign = np.array([0.0, 1.0, 1.0, -1.0])
+    exact = (inertia + m * length**2) * alpha + m * 9.81 * length * np.cos(angle) + sign * mu * radius * np.hypot(*force)
+    np.testing.assert_allclose(udk.inverse_dynamics(mech, ts).efforts["motor"], exact, rtol=1e-10)
+    if law == "smooth":
+        return
+    solution = udk.simulate(mech, ts, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(udk.efforts(mech, solution)["motor"][1:], exact[1:], rtol=1e-8)

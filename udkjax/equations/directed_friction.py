@@ -4,11 +4,15 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.annotations import NumberLike, Vector
 from udkjax.arrays import make_module
+from udkjax.equations import rubbing
 from udkjax.scene.fields import given_number
 from udkjax.scene.friction import Friction
+from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
 SIDES = 2  # numbers of a `DirectedFriction` among all sides
@@ -42,29 +46,38 @@ class DirectedFriction(Friction):
         return total if self.viscous is None else total + self.viscous * speed
 
 
-class StickingFriction(NamedTuple):
-    """A joint with set-valued friction; hashable."""
-
-    joint: str
-    force: int  # index of the friction among the forces
-
-
 class DirectedMechanism(NamedTuple):
     """A mechanism whose set-valued friction is directed, and its joints with such friction, F."""
 
     mechanism: Any
-    joints: tuple[StickingFriction, ...]
+    joints: tuple[tuple[str, int], ...]  # the names of the joints, and the indices of their friction among the forces
 
     def with_sides(self, sides: Float[Array, "F 2"]) -> Mechanism:
         """Return the mechanism with the sides of all directed friction."""
-        return eqx.tree_at(lambda m: [m._forces[x.force].sides for x in self.joints], self.mechanism, list(sides))
+        if not self.joints:
+            return self.mechanism
+        return eqx.tree_at(lambda m: [m._forces[k].sides for _, k in self.joints], self.mechanism, list(sides))
+
+    def sliding_speeds(self, q: Vector, v: Vector) -> Float[Array, "F"]:
+        """Return the speeds of the joints (rad/s, m/s)."""
+        frames, found = rubbing.frames(self.mechanism, q, v), []
+        for name, k in self.joints:
+            joint = self.mechanism.joints[name]
+            found.append(self.mechanism._forces[k].sliding_speed(joint, *(frames[body] for body in joint.frame_names)))
+        return jnp.stack(found) if found else jnp.zeros(0)
+
+    def units(self, length: NumberLike) -> Float[Array, "F"]:
+        """Return the units of displacements of the joints: one radian, or a length."""
+        turns = np.array([isinstance(self.mechanism.joints[name], Revolute) for name, _ in self.joints], bool)
+        return jnp.where(turns, 1.0, length)
 
 
-def with_directed_friction(mechanism: Mechanism) -> DirectedMechanism:
+def with_directed_friction(mechanism: Mechanism, every: bool = False) -> DirectedMechanism:
     """Return a mechanism with directed friction in place of set-valued friction.
 
     Args:
         mechanism: The scene.
+        every: Whether smooth friction becomes directed, too.
 
     Returns:
         The mechanism, and the joints whose friction is set-valued, in the order of the forces.
@@ -72,7 +85,7 @@ def with_directed_friction(mechanism: Mechanism) -> DirectedMechanism:
     mechanism = mechanism.without_origin
     forces, joints = list(mechanism._forces), []
     for k, force in enumerate(forces):
-        if isinstance(force, Friction) and force.sticks:
+        if isinstance(force, Friction) and (force.sticks or every):
             forces[k] = make_module(DirectedFriction, **vars(force), sides=jnp.zeros(SIDES))
-            joints.append(StickingFriction(force.joint, k))
+            joints.append((force.joint, k))
     return DirectedMechanism(eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces)) if joints else mechanism, tuple(joints))

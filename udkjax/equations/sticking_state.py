@@ -10,13 +10,11 @@ rounding errors in units of the scene; which of the joints at rest stick follows
 a run. Where joints lock each other, the forces of least norm among those that the law allows count.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
@@ -28,7 +26,6 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.stick_or_slip import AT_REST, FrictionModes, JointsAtRest, Response
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Pseudoinverse
-from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -74,7 +71,7 @@ class StickingState(eqx.Module):
 
     def _decide(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
         directed = with_directed_friction(self.mechanism)
-        unit, (speed, A, _) = self._units(directed), self._rows(directed, q, v)
+        unit, (speed, A, _) = directed.units(self.scales.length), self._rows(directed, q, v)
         sticking = jnp.zeros(len(unit), bool) if self.sticking is None else self.sticking
         rest = sticking | (jnp.abs(speed) <= AT_REST.closed * unit * self.scales.rate)
         D, root = uk.D(self.mechanism, t, q, self.w), uk.inverse_sqrt_mass(self.mechanism)
@@ -97,7 +94,8 @@ class StickingState(eqx.Module):
         """Return the loads in given modes, and the motion of the joints."""
         mechanism = directed.with_sides(modes.sides(jnp))
         _, A, rate = self._rows(directed, q, v)
-        held = jnp.where(modes.locked, self.scales.length / self._units(directed), 0.0)  # weights as those of `Scales`
+        length = self.scales.length
+        held = jnp.where(modes.locked, length / directed.units(length), 0.0)  # weights as those of `Scales`
         root, rows, w = uk.inverse_sqrt_mass(mechanism), len(self.w), jnp.concatenate([self.w, held])
         D = w[:, None] * jnp.concatenate([constraints.psi_q(mechanism, t, q), A]) * root
         plus, share = uk.pseudoinverse(self.method, D), sharing(D, self.soft, w)
@@ -130,27 +128,13 @@ class StickingState(eqx.Module):
             found.append(friction.largest_force(self.mechanism.joints[name], own))
         return jnp.stack([jnp.asarray(x, float) for x in found])
 
-    def _units(self, directed: DirectedMechanism) -> Float[Array, "F"]:
-        """Return the units of displacements of the joints: one radian, or L."""
-        turns = np.array([isinstance(self.mechanism.joints[name], Revolute) for name, _ in directed.joints])
-        return jnp.where(turns, 1.0, self.scales.length)
-
     def _rows(
         self, directed: DirectedMechanism, q: Vector, v: Vector
     ) -> tuple[Float[Array, "F"], Float[Array, "F n"], Float[Array, "F"]]:
         """Return the speeds of the joints, A, and (d A / dt) v."""
-        speeds = partial(_sliding_speeds, self.mechanism, directed)
+        speeds = directed.sliding_speeds
         s, rate = jax.jvp(lambda q: speeds(q, v), (q,), (v,))
         return s, jax.jacfwd(speeds, 1)(q, v), rate
-
-
-def _sliding_speeds(mechanism: Mechanism, directed: DirectedMechanism, q: Vector, v: Vector) -> Float[Array, "F"]:
-    frames, found = rubbing.frames(mechanism, q, v), []
-    for name, k in directed.joints:
-        friction: Any = mechanism._forces[k]
-        joint = mechanism.joints[name]
-        found.append(friction.sliding_speed(joint, *(frames[body] for body in joint.frame_names)))
-    return jnp.stack(found)
 
 
 def sticking_joints(mechanism: Mechanism) -> tuple[str, ...]:

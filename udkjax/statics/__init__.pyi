@@ -3,6 +3,8 @@
 from udkjax.statics.equilibrium import Equilibrium as Equilibrium
 from udkjax.statics.equilibrium import equilibria as equilibria
 from udkjax.statics.equilibrium import equilibrium as equilibrium
+from udkjax.statics.holding import HoldingEfforts as HoldingEfforts
+from udkjax.statics.holding import holding_efforts as holding_efforts
 from udkjax.statics.load_scale import load_sizes as load_sizes
 from udkjax.statics.modes import Modes as Modes
 from udkjax.statics.modes import modes as modes

@@ -109,6 +109,8 @@ def equilibrium(
 ) -> Equilibrium:
     """Return a position of rest near a given position: N^T F = 0 on Psi = 0, where N spans the free directions.
 
+    Friction is left out: it holds the mechanism in all positions around, which `holding_efforts` finds.
+
     Newton's method with K = -F_q + (lambda^T Psi)_qq; steps are limited in length, and halved until the unbalanced loads
     decrease. Pure, jittable and batched by `vmap` (`balanced` marks the members at rest); differentiable with respect to
     every number of the mechanism, where the stiffness is not singular.

@@ -1,6 +1,7 @@
 """Vibration about a position of rest: frequencies, damping and mode shapes of the linearized mechanism."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.programs.control_flow import ControlFlow, solve
 from udkjax.scene.arguments import checked
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.equilibrium import degrees_of_freedom, equilibrium
 from udkjax.statics.linearization import linearizer, solver_of_mass, with_unit_mass
@@ -26,6 +28,7 @@ class Modes(PrintsTable):
     Attributes:
         q: the position about which the mechanism vibrates (bodies, 3).
         bodies: the names of the bodies, in the order of q.
+        left_out: the names of friction that has no linearization at rest: it depends on loads, or sticks.
     """
 
     omega2: Float[Array, "f"]  # (rad/s)^2 without damping, ascending; negative: grows as exp(sqrt(-omega2) t)
@@ -35,6 +38,7 @@ class Modes(PrintsTable):
     q: Float[Array, "bodies 3"]
     residual: Float[Array, ""]  # N/sqrt(kg): remaining loads along free directions, zero at rest
     bodies: tuple[str, ...] = eqx.field(static=True, default=())
+    left_out: tuple[str, ...] = eqx.field(static=True, default=())
 
     _units = units(omega2="(rad/s)²", s="1/s", q="m, m, rad", residual="N/sqrt(kg)")
 
@@ -47,6 +51,8 @@ class Modes(PrintsTable):
             kind = f"{omega:.6g} rad/s, {omega / (2 * math.pi):.6g} Hz" if x >= 0 else f"grows as exp({omega:.6g} t)"
             largest = int(np.argmax(turns))
             rows.append((f"mode {k + 1}", f"{kind}; mostly {self.bodies[largest] if self.bodies else f'body {largest}'}"))
+        if self.left_out:
+            rows.append(("left out", f"friction {', '.join(self.left_out)}: it would hold small motions"))
         rows += [("s, damped", format_numbers(self.s, "1/s")), ("damping", format_numbers(self.damping))]
         return PrintedTable("modes about a position of rest", rows)
 
@@ -78,6 +84,8 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
     mechanism, where they are simple (those of `equilibrium` include the change of position); `damped_shapes` have no
     derivatives.
 
+    Friction that depends on loads, or sticks, has no linearization at rest: it is left out, and named in `left_out`.
+
     Args:
         mechanism: its drivers hold the values of time t.
         state: state at rest; by default the equilibrium near the initial guess.
@@ -90,7 +98,9 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
     analysis = analyse(mechanism) if analysis is None else analysis
     free, t = degrees_of_freedom(analysis), number(t)
     state = equilibrium(mechanism, None, t, analysis=analysis).state if state is None else state
-    return solve(_modes, mechanism.without_origin, analysis, t, number(library_for(state.q).ravel(state.q)), free)
+    found = solve(_modes, mechanism.without_origin, analysis, t, number(library_for(state.q).ravel(state.q)), free)
+    rubbing = [name for name, x in mechanism.forces.items() if isinstance(x, Friction) and (x.rubs or x.sticks)]
+    return replace(found, left_out=tuple(rubbing))
 
 
 def _modes(mechanism: Mechanism, analysis: Analysis, t: Any, q: Any, free: int, by: ControlFlow) -> Modes:

@@ -11,9 +11,11 @@ from udkjax.annotations import NumericArray
 from udkjax.arrays import is_traced
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis
+from udkjax.equations.directed_friction import with_directed_friction
 from udkjax.equations.effort_arrays import efforts_by_numpy
 from udkjax.equations.rubbing import settled_loads
 from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.stick_or_slip import AT_REST
 from udkjax.pinv import SVD
 from udkjax.positions.coordinates import Coordinate, choose_name, constant_motion, named_element, value_of
 from udkjax.positions.drive import with_drivers
@@ -65,9 +67,15 @@ def _by_jax(
     scales = analysis.scales
     units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
     coordinates = [value_of(mechanism, element) for element in values]
+    directed = with_directed_friction(mechanism)
+    fastest = jax.lax.stop_gradient(scales.size(jnp.where(jnp.isfinite(v), v, 0.0)))
 
     def at(t: Array, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
         q, v, a = q.ravel(), v.ravel(), a.ravel()
+        speed = directed.sliding_speeds(q, v)
+        moves = jnp.abs(speed) > AT_REST.closed * fastest * directed.units(scales.length)
+        sides = jnp.stack([jnp.where(moves, jnp.sign(speed), 0.0), jnp.zeros(len(speed))], axis=-1)
+        mechanism = directed.with_sides(jax.lax.stop_gradient(sides))
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
         J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
         free, determined = _free_part(J), jnp.asarray(True)

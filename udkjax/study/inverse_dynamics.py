@@ -7,9 +7,10 @@ the joints' rows J and the drivers' rows C of Psi_q, the equation of motion is
 
 The joints carry any force in the range of J^T; the drivers must supply the rest. With N a basis of the null space of J,
 N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. If there are more drivers than degrees of freedom, f is the
-solution with the least sum_i w_i f_i^2. Friction that depends on the loads of joints is in F, with mu of least norm. Where
-branches meet, N has another column, along the other branch, in which the joints carry load too; with one degree of freedom, N is
-therefore replaced by the direction v of the motion.
+solution with the least sum_i w_i f_i^2. Friction is in F, of both laws, with mu of least norm where it depends on the loads of
+joints; a joint at rest has none of the set-valued law (`holding_efforts` has the bounds). Where branches meet, N has another
+column, along the other branch, in which the joints carry load too; with one degree of freedom, N is therefore replaced by the
+direction v of the motion.
 """
 
 import math
