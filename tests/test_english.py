@@ -52,6 +52,7 @@ CLEAN = [  # folders with all below them, or files
     "udkjax/study",
     "udkjax/synthesis",
     "udkjax/transforms",
+    "udkjax/complementarity",
     "tests/show",
     "tests/studio",
 ]

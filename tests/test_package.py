@@ -19,7 +19,7 @@ ROOT = Path(udkjax.__file__).parent
 GROUND_FLOOR = {"annotations", "arrays", "devices", "extras", "folders", "lazy_names", "printing", "progress"}
 GROUND_FLOOR |= {"requirements", "threads", "wording"}
 PROGRAMS = {"expressions", "programs"}
-EQUATIONS = PROGRAMS | {"pinv", "scene", "transforms", "equations"}
+EQUATIONS = PROGRAMS | {"complementarity", "pinv", "scene", "transforms", "equations"}
 POSITIONS = EQUATIONS | {"native", "positions"}
 STUDY = POSITIONS | {"integrate", "statics", "synthesis", "study"}
 BELOW = {
@@ -28,6 +28,7 @@ BELOW = {
     "programs": set(),
     "pinv": PROGRAMS,
     "scene": PROGRAMS,
+    "complementarity": PROGRAMS | {"transforms"},
     "transforms": PROGRAMS | {"pinv", "scene"},
     "equations": EQUATIONS,
     "native": EQUATIONS,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.integrate.events.complementarity import solve_complementarity
+from udkjax.complementarity.linear import solve_complementarity
 from udkjax.integrate.events.impacts import ContactRows, impulses_of_impact
 
 G = 9.81

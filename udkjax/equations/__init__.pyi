@@ -15,7 +15,6 @@ from udkjax.equations.dense_rows import KinematicRows as KinematicRows
 from udkjax.equations.dense_rows import TruncatedPseudoinverse as TruncatedPseudoinverse
 from udkjax.equations.determinacy import Uniqueness as Uniqueness
 from udkjax.equations.differentiable_programs import DifferentiableProgram as DifferentiableProgram
-from udkjax.equations.directed_friction import SIDES as SIDES
 from udkjax.equations.directed_friction import with_directed_friction as with_directed_friction
 from udkjax.equations.effort_arrays import efforts_by_numpy as efforts_by_numpy
 from udkjax.equations.element_programs import has_rheonomic_joints as has_rheonomic_joints
@@ -63,17 +62,12 @@ from udkjax.equations.reactions import unique_reactions as unique_reactions
 from udkjax.equations.redundancy import dependent_constraints as dependent_constraints
 from udkjax.equations.redundancy import holders_of_driver as holders_of_driver
 from udkjax.equations.redundancy import kinematic_rows as kinematic_rows
-from udkjax.equations.rubbing import settled_loads as settled_loads
 from udkjax.equations.run_programs import RunPrograms as RunPrograms
 from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales
 from udkjax.equations.scales import scales_p as scales_p
 from udkjax.equations.scene_programs import scene_programs as scene_programs
 from udkjax.equations.sparse_rows import SparseRows as SparseRows
-from udkjax.equations.stick_or_slip import AT_REST as AT_REST
-from udkjax.equations.stick_or_slip import FrictionModes as FrictionModes
-from udkjax.equations.stick_or_slip import JointsAtRest as JointsAtRest
-from udkjax.equations.sticking_state import known_sticking as known_sticking
 from udkjax.equations.structure import numbers_as_vector as numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations as TextbookEquations
 from udkjax.equations.textbook import prepare as prepare

@@ -1,5 +1,6 @@
 """Set-valued friction in given modes: the direction of sliding is a number, with which its loads are smooth."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -7,15 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.annotations import NumberLike, Vector
+from udkjax.annotations import NumberLike, Time, Vector
 from udkjax.arrays import make_module
+from udkjax.complementarity.stick_or_slip import SIDES
 from udkjax.equations import rubbing
 from udkjax.scene.fields import given_number
 from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
-
-SIDES = 2  # numbers of a `DirectedFriction` among all sides
 
 
 class DirectedFriction(Friction):
@@ -65,6 +65,12 @@ class DirectedMechanism(NamedTuple):
             joint = self.mechanism.joints[name]
             found.append(self.mechanism._forces[k].sliding_speed(joint, *(frames[body] for body in joint.frame_names)))
         return jnp.stack(found) if found else jnp.zeros(0)
+
+    def friction(
+        self, sides: Float[Array, "F 2"], multipliers: Callable[[Vector], Float[Array, "m"]], t: Time, q: Vector, v: Vector
+    ) -> Float[Array, "n"]:
+        """Return the friction that depends on the loads of joints: see `rubbing.settled_loads`."""
+        return rubbing.settled_loads(multipliers, self.with_sides(sides), t, q, v)
 
     def units(self, length: NumberLike) -> Float[Array, "F"]:
         """Return the units of displacements of the joints: one radian, or a length."""

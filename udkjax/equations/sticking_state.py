@@ -18,12 +18,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
+from udkjax.complementarity.stick_or_slip import AT_REST, FrictionModes, JointsAtRest, Response
 from udkjax.equations import constraints, loads, rubbing
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.compliance import sharing
 from udkjax.equations.directed_friction import DirectedMechanism, with_directed_friction
 from udkjax.equations.scales import Scales
-from udkjax.equations.stick_or_slip import AT_REST, FrictionModes, JointsAtRest, Response
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.mechanism import Mechanism

@@ -11,12 +11,12 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.annotations import Time, Vector
 from udkjax.equations import constraints, loads, rubbing
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.abstract_system import MechanismSystem, PseudoinverseOperator, TangentPart
+from udkjax.equations.abstract_system import HistoryLike, MechanismSystem, PseudoinverseOperator, TangentPart
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.loose_friction import LooseFriction, loose_friction
 from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.sticking_state import StickingState
+from udkjax.equations.sticking_state import StickingState, known_sticking
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
@@ -93,6 +93,11 @@ class TextbookEquations(MechanismSystem):
     def with_compliances(self, soft: Float[Array, "m"] | None) -> "TextbookEquations":
         """Return the equations whose redundant forces are shared by the compliances of the rows."""
         return replace(self, soft=soft)
+
+    @staticmethod
+    def known_sticking(mechanism: Mechanism, solution: HistoryLike) -> Bool[Array, "T F"] | None:
+        """Return which joints stick in a run, for `known_to_stick`; None if it does not tell, or there are none."""
+        return known_sticking(mechanism, solution)
 
     def known_to_stick(self, sticking: Bool[Array, "F"] | None) -> "TextbookEquations":
         """Return the equations at states at which these joints are known to stick, in the order of `sticking_joints`."""

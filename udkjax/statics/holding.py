@@ -24,7 +24,6 @@ from udkjax.equations import constraints
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.directed_friction import with_directed_friction
-from udkjax.equations.rubbing import settled_loads
 from udkjax.pinv import SVD
 from udkjax.positions.assembly import State
 from udkjax.positions.coordinates import Coordinate
@@ -133,7 +132,8 @@ def _efforts(mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], r
 
         def acceleration(effort: Array, sign: float) -> Array:
             """Return C a where all joints resist a motion in the direction `sign`."""
-            rubbing = directed.with_sides(jnp.stack([sign * forwards, jnp.ones(count)], axis=-1))
+            sides = jnp.stack([sign * forwards, jnp.ones(count)], axis=-1)
+            rubbing = directed.with_sides(sides)
 
             def b(load: Array) -> Array:
                 return -free * (A @ uk.a_F(rubbing, 0.0, q, still, load))
@@ -141,7 +141,7 @@ def _efforts(mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], r
             def multipliers(friction: Array) -> Array:
                 return -free * (plus.T @ (plus @ b(friction + effort * C)))
 
-            load = settled_loads(multipliers, rubbing, 0.0, q, still) + effort * C
+            load = directed.friction(sides, multipliers, 0.0, q, still) + effort * C
             return C @ (uk.a_F(rubbing, 0.0, q, still, load) + root * (plus @ b(load)))
 
         one = jnp.ones(())

@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.annotations import Numbers
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.sticking_state import known_sticking
-from udkjax.equations.textbook import prepare
+from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.pinv import SVD
 from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, LocalPoint, Quantity, StateHistory, locate, point_of_pin
 from udkjax.programs.deferred import deferred
@@ -47,7 +46,7 @@ def measure(
     """
     if isinstance(mechanism, ConstrainedSystem):
         return _measure_system(mechanism, solution, channels)
-    motion, placed, reached = _fill(mechanism, solution, known_sticking(mechanism, solution))
+    motion, placed, reached = _fill(mechanism, solution, TextbookEquations.known_sticking(mechanism, solution))
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
     if not columns:
@@ -96,7 +95,7 @@ def path(
     accelerations = getattr(solution, "a", None)
     analysis = analyse(mechanism) if derivative == 2 and accelerations is None else None
     motion = jnp.asarray(solution.ts), jnp.asarray(solution.q), jnp.asarray(solution.v)
-    given = accelerations if derivative == 2 else None, known_sticking(mechanism, solution)
+    given = accelerations if derivative == 2 else None, TextbookEquations.known_sticking(mechanism, solution)
     return _path(mechanism.without_origin, analysis, *motion, *given, local, body, derivative)
 
 

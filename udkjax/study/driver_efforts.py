@@ -9,13 +9,12 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import NumericArray
 from udkjax.arrays import is_traced
+from udkjax.complementarity.stick_or_slip import AT_REST
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.directed_friction import with_directed_friction
 from udkjax.equations.effort_arrays import efforts_by_numpy
-from udkjax.equations.rubbing import settled_loads
 from udkjax.equations.scale_program import RANK_TOL
-from udkjax.equations.stick_or_slip import AT_REST
 from udkjax.pinv import SVD
 from udkjax.positions.coordinates import Coordinate, choose_name, constant_motion, named_element, value_of
 from udkjax.positions.drive import with_drivers
@@ -74,8 +73,8 @@ def _by_jax(
         q, v, a = q.ravel(), v.ravel(), a.ravel()
         speed = directed.sliding_speeds(q, v)
         moves = jnp.abs(speed) > AT_REST.closed * fastest * directed.units(scales.length)
-        sides = jnp.stack([jnp.where(moves, jnp.sign(speed), 0.0), jnp.zeros(len(speed))], axis=-1)
-        mechanism = directed.with_sides(jax.lax.stop_gradient(sides))
+        sides = jax.lax.stop_gradient(jnp.stack([jnp.where(moves, jnp.sign(speed), 0.0), jnp.zeros(len(speed))], axis=-1))
+        mechanism = directed.with_sides(sides)
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
         J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
         free, determined = _free_part(J), jnp.asarray(True)
@@ -96,7 +95,7 @@ def _by_jax(
             carried = units * (given - friction - C.T @ efforts(friction))
             return jnp.zeros(0) if bearing is None else -scales.weights * (bearing.T @ carried)
 
-        friction = settled_loads(multipliers, mechanism, t, q, v)
+        friction = directed.friction(sides, multipliers, t, q, v)
         required, f = free(units * (given - friction)), efforts(friction)
         # Relative to the single terms, since their sum may be a rounding error.
         parts = units * (loads.mass(mechanism) * jnp.abs(a) + load_sizes(mechanism, t, q, v))

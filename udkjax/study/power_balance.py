@@ -17,8 +17,7 @@ from jaxtyping import Array, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import analyse
-from udkjax.equations.sticking_state import known_sticking
-from udkjax.equations.textbook import prepare
+from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.positions.channels import StateHistory
@@ -98,7 +97,7 @@ def power_balance(
     ts, flat = jnp.asarray(solution.ts), (len(solution.ts), -1)
     q, v = (jnp.asarray(x).reshape(flat) for x in (solution.q, solution.v))
     analysis, method = analyse(mechanism), SVD() if method is None else method
-    given = analysis, ts, q, v, known_sticking(mechanism, solution), method, stabilization
+    given = analysis, ts, q, v, TextbookEquations.known_sticking(mechanism, solution), method, stabilization
     by_row, by_force, by_joint, kinetic, potential = _powers(mechanism.without_origin, *given)
     owners = [name for name, _ in analysis.row_names]
 

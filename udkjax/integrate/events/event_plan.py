@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.equations.directed_friction import SIDES
+from udkjax.complementarity.stick_or_slip import SIDES
 from udkjax.integrate.events.actions import Action
 from udkjax.integrate.events.conditions import sees_velocity
 from udkjax.integrate.events.event import Event

@@ -36,10 +36,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from udkjax.complementarity.linear import diagonal, solve_complementarity, solve_rows, times
+from udkjax.complementarity.stick_or_slip import AT_REST
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.stick_or_slip import AT_REST
 from udkjax.equations.textbook import TextbookEquations
-from udkjax.integrate.events.complementarity import diagonal, solve_complementarity, solve_rows, times
 from udkjax.integrate.events.crossings import ZERO_RATE, ZERO_RATE_2, ConditionValues
 from udkjax.transforms.gradients import stop_gradients
 

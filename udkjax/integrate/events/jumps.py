@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from udkjax.equations.stick_or_slip import FrictionModes
+from udkjax.complementarity.stick_or_slip import FrictionModes
 from udkjax.integrate.events.crossings import NO_EVENT, ConditionValues
 from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions, rows_of_system
 from udkjax.integrate.events.runs import MemberIndices, RunState, take

@@ -14,9 +14,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.arrays import is_traced, is_within_jit, number, put_arrays
+from udkjax.complementarity.stick_or_slip import SIDES
 from udkjax.devices import computing_on_host, on_host
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.directed_friction import SIDES
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
 from udkjax.integrate.events.condition_program import (

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from udkjax.equations.stick_or_slip import AT_REST, FrictionModes, JointsAtRest
+from udkjax.complementarity.stick_or_slip import AT_REST, FrictionModes, JointsAtRest
 from udkjax.integrate.events.runs import MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import System, condition_values
 from udkjax.integrate.solution import Result

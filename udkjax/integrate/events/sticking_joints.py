@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
 from udkjax.arrays import make_module, number
-from udkjax.equations.directed_friction import SIDES, with_directed_friction
+from udkjax.complementarity.stick_or_slip import SIDES
+from udkjax.equations.directed_friction import with_directed_friction
 from udkjax.integrate.events.actions import Action, Displacement
 from udkjax.integrate.events.conditions import BodyCondition, Frames
 from udkjax.integrate.events.event import Event

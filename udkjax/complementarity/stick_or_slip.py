@@ -34,6 +34,9 @@ REPETITIONS, SWEEPS, SAME_SHARE = 10, 20, 1e-6
 BLOCK_STEPS, SINGLE_STEPS = 2, 8
 
 
+SIDES = 2  # numbers that stand for the modes of a joint
+
+
 class RestTolerances(NamedTuple):
     """Bounds below which contacts and joints are at rest, or constraints leave them no motion."""
 
@@ -67,7 +70,7 @@ class FrictionModes(NamedTuple):
     driven: Bool[Any, "*m F"]  # joints at rest without a motion of their own, which wait for drivers
 
     def sides(self, xp: ModuleType) -> Float[Any, "*m F 2"]:
-        """Return the numbers of a `DirectedFriction` of each joint."""
+        """Return the modes as numbers: the direction, and one for a joint at rest, two for one that waits for drivers."""
         direction = xp.where(self.locked, 0.0, self.direction)
         return xp.stack([direction, xp.where(self.locked, 0.0, 1.0 * self.at_rest + self.driven)], axis=-1)
 
