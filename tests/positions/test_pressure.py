@@ -111,13 +111,8 @@ def test_places_that_are_not_reached_have_no_angle():
     motion = udk.kinematics(mech, "motor", np.deg2rad(AT))
     q = np.array(motion.q)
     q[2] = np.nan
-    assert np.isnan(udk.pressure_angle(mech, SimpleNamespace(ts=motion.values, q=q, v=motion.v), "cam")).tolist() == [
-        False,
-        False,
-        True,
-        False,
-        False,
-    ]
+    found = udk.pressure_angle(mech, SimpleNamespace(ts=motion.values, q=q, v=motion.v), "cam")
+    assert np.isnan(found).tolist() == [False, False, True, False, False]
 
 
 def test_mistakes():

@@ -36,12 +36,15 @@ def pressure_angle(mechanism: Mechanism, motion: StateHistory, cam: str, driver:
         driver: a driver or coordinate, as for `kinematics`; by default the only driver.
 
     Returns:
-        The angle (T,) in rad; NaN in a singular position.
+        The angle (T,) in rad; NaN in a singular position, and where a value is not reached.
 
     Raises:
         SceneError: there is no such cam or driver, or without the cam the follower has not one way to move.
     """
-    return pressure_angles(mechanism, np.asarray(motion.q, float), cam, driver)
+    q = np.asarray(motion.q, float)
+    angles, reached = np.full(len(q), np.nan), np.isfinite(q).all((1, 2))
+    angles[reached] = pressure_angles(mechanism, q[reached], cam, driver)
+    return angles
 
 
 def pressure_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], cam: str, driver: Drive) -> Float[np.ndarray, "T"]:
@@ -88,6 +91,6 @@ def _slope(mechanism: Mechanism, driver: str | Coordinate, q: Float[Array, "bodi
 
 def _ways(rows: Float[np.ndarray, "T rows n"]) -> Float[np.ndarray, "T n"]:
     """Return the one motion that each of several Jacobians leaves free; NaN if there is none, or several."""
-    values, vectors = np.linalg.svd(np.where(np.isfinite(rows).all((1, 2), keepdims=True), rows, 0.0))[1:]
+    values, vectors = np.linalg.svd(rows)[1:]
     free = rows.shape[2] - np.sum(values > RANK * values[:, :1], axis=1)
     return np.where(free[:, None] == 1, vectors[:, -1], np.nan)
