@@ -13,6 +13,8 @@ NAMES = (
     "trajectory",
     "batch",
     "gradients",
+    "stiff",
+    "systems",
     "mechanisms",
     "startup",
     "waiting",

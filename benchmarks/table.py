@@ -98,6 +98,20 @@ def _claims() -> Iterable[Claim]:
         yield Claim(f"gradient, {count} parameters, forward, time relative to the run", "gradients", 1.4 + 0.2 * count, forward)
     reverse = value("times_run", name="udkjax", mode="reverse", parameters=8)
     yield Claim("gradient, 8 parameters, reverse, time relative to the run", "gradients", 4.0, reverse)
+    for power in (-1, 3, 5, 9):
+        name = f"damper, {10.0**power:.0e}"
+        yield Claim(f"four-bar with a {name} N m s, 5 s: ms", "stiff", 2.0, value("ms", name=name))
+        yield Claim(f"four-bar with a {name} N m s, 5 s: error, rad", "stiff", 1e-5, value("error", name=name))
+    yield Claim("64 dampers of 0.1 to 1e9 N m s in vmap: ms", "stiff", 20.0, value("ms", name="64 dampers in vmap"))
+    for name, most in (("forward derivative", 3.0), ("gradient", 4.0)):
+        yield Claim(f"stiff four-bar, {name}: time relative to the run", "stiff", most, value("times_run", name=name))
+        yield Claim(f"stiff four-bar, {name}: first call, s", "stiff", 2.0, value("first", name=name))
+    yield Claim("a bushing of 1e9 N/m, 20 s: ms", "stiff", 5.0, value("ms", name="bushing, 1e+09"))
+    yield Claim("a bumper of 1e7 N m/rad, 20 s: ms", "stiff", 5.0, value("ms", name="bumper, 1e+07"))
+    for name, least in (("spatial pendulum", 20.0), ("1024 in vmap", 50.0), ('64 linkages, engine="diffrax"', 0.67)):
+        yield Claim(f"{name}: a script's time relative to ours", "systems", least, value("times_ours", name=name), True)
+    for name, most in (("spatial pendulum", 1.0), ("its gradient", 1.5)):
+        yield Claim(f"{name}: first call, s", "systems", most, value("first", name=name))
     for case in IDENTIFIED:
         reached = value("reached", name=case, protocol="without noise")
         yield Claim(f"identified from within 50 %, {case}: share right to 1e-8", "identification", 0.95, reached, True)

@@ -46,6 +46,12 @@ SMALL = {  # what must be true of the figures of a small run; most hold their pr
         and all(0 < row["error"] < 200 * row["tol"] and row["calls"] > 100 for row in rows)
         and all(row["ratio"] < 1.5 for row in rows if row["solver"] in ("Adams", "BDF"))
     ),
+    "stiff": lambda rows: (
+        names(rows)[:2] == ["damper, 1e-01", "damper, 1e+04"]
+        and all(row["successful"] and row["error"] < 1e-5 for row in rows if row["name"].startswith("damper"))
+        and rows[1]["implicit"] > 0 == rows[0]["implicit"]
+    ),
+    "systems": lambda rows: names(rows)[0] == "spatial pendulum" and all(row["apart"] < 1e-2 for row in rows),
     "mechanisms": lambda rows: (
         all(row.get("per_second", row.get("ms", 0.0)) > 0 for row in rows)
         and {*names(rows)} >= {"SciPy's fsolve", "udkjax: kinematics() in a batch"}
