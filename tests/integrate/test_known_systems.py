@@ -148,7 +148,7 @@ def test_the_benchmark_a04():
     assert_allclose(np.asarray(solution.q)[:, 3:6], path_of_a04(TS), rtol=0, atol=1e-9)
     energy = udk.energy(system, solution)
     assert np.ptp(energy.total) < 1e-9 * energy.kinetic.max()
-    assert udk.diagnose(system, udk.State(system.q0, system.v0)).degrees_of_freedom == 1
+    assert udk.diagnose(system, udk.State(solution.q[0], solution.v[0])).degrees_of_freedom == 1
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ from udkjax.equations.directed_friction import with_directed_friction as with_di
 from udkjax.equations.effort_arrays import efforts_by_numpy as efforts_by_numpy
 from udkjax.equations.element_programs import has_rheonomic_joints as has_rheonomic_joints
 from udkjax.equations.elements import has_pieces as has_pieces
-from udkjax.equations.elements import traced_loads as traced_loads
 from udkjax.equations.evaluate import force as force
 from udkjax.equations.evaluate import gamma as gamma
 from udkjax.equations.evaluate import kinetic_energy as kinetic_energy
@@ -67,6 +66,7 @@ from udkjax.equations.scale_program import RANK_TOL as RANK_TOL
 from udkjax.equations.scales import Scales as Scales
 from udkjax.equations.scales import scales_p as scales_p
 from udkjax.equations.scene_programs import scene_programs as scene_programs
+from udkjax.equations.smooth_loads import SmoothLoads as SmoothLoads
 from udkjax.equations.sparse_rows import SparseRows as SparseRows
 from udkjax.equations.structure import numbers_as_vector as numbers_as_vector
 from udkjax.equations.textbook import TextbookEquations as TextbookEquations

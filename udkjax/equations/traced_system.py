@@ -11,7 +11,7 @@ Two systems whose graphs are equal share their programs, whatever their numbers 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Time, Vector
 from udkjax.equations.elements import choose_shorter, gamma_by_entries
-from udkjax.expressions import Differential, Graph, Scalar, trace
+from udkjax.expressions import Differential, Graph, Scalar, may_have_kinks, trace
 from udkjax.expressions.differential import SparseRow
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError
@@ -90,6 +90,39 @@ class SystemFunctions:
     def has(self, name: str) -> bool:
         """Return whether the system has a function."""
         return name in self._functions
+
+    @property
+    def other_terms(self) -> dict[str, list[Scalar]]:
+        """The terms of all functions but the loads, by the names of the functions."""
+        rows = {"mass": self.mass, "constraint": self.psi_q, "velocity_constraint": self.phi_v}
+        further = {"mass": [], "constraint": [*self.psi, *self.psi_dot, *self.gamma], "velocity_constraint": self.phi + self.bend}
+        return {name: [*further[name], *(s for row in parts for s in row.values())] for name, parts in rows.items()}
+
+    @cached_property
+    def may_have_kinks(self) -> bool:
+        """True if a function contains an operation that may have jumps or kinks."""
+        return may_have_kinks(self.graph, [*self.force, *(s for terms in self.other_terms.values() for s in terms)])
+
+    @staticmethod
+    def moving(breaks: bool) -> tuple[str, ...]:
+        """Return the groups of inputs that change along a motion; with breakpoints in time nothing else happens at a time."""
+        return ("position", "velocity") if breaks else ("position", "velocity", "time")
+
+    def with_force(self, force: Callable[..., Array], count: int) -> "SystemFunctions":
+        """Return the functions with `force(numbers, t, q, v)` as all loads, where `count` further numbers are the last array."""
+        known = [np.array([s.constant is None for s in x.flat], dtype).reshape(shape) for x, (shape, dtype) in self._arrays]
+        known.append(np.ones(count))
+        structs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in known]
+        state = [self._examples[x] for x in FUNCTIONS["force"]]
+        closed = jax.make_jaxpr(lambda *given: force(given[: len(known)], *given[len(known) :]))(*structs, *state)
+        constants = [(None, x) for x in closed.consts]
+        others = {name: x for name, x in self._functions.items() if name not in ("force", "potential")}
+        whole = closed.replace(consts=[None] * len(constants)), constants, list(range(len(known)))
+        return SystemFunctions(others | {"force": whole}, known, [True] * len(known), self.n)
+
+    @property
+    def _arrays(self) -> list[tuple[np.ndarray, tuple[Any, Any]]]:
+        return list(zip(self.numbers, self.shapes, strict=True))
 
     def call(self, name: str, numbers: Sequence[Any], *arguments: Any) -> Array:
         """Return the value of a function on arrays."""
@@ -189,10 +222,9 @@ class TracedSystem(eqx.Module):
     def _function(self, name: str) -> Callable[..., Array] | None:
         return partial(self.functions.call, name, self.numbers) if self.functions.has(name) else None
 
-    @property
-    def _forces(self) -> tuple[()]:
-        """The force elements whose kinks are located: none."""
-        return ()
+    def with_functions(self, functions: SystemFunctions, more: Array) -> "TracedSystem":
+        """Return the system with functions of its numbers and of one further array."""
+        return TracedSystem([*self.numbers, more], functions, self.row_labels, self.breakpoints)
 
     @property
     def without_origin(self) -> "TracedSystem":

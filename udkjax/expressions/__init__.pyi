@@ -11,6 +11,8 @@ from udkjax.expressions.graph import Graph as Graph
 from udkjax.expressions.graph import Scalar as Scalar
 from udkjax.expressions.jaxpr_reader import read_jaxpr as read_jaxpr
 from udkjax.expressions.jaxpr_reader import trace as trace
+from udkjax.expressions.kinks import has_kinks as has_kinks
+from udkjax.expressions.kinks import may_have_kinks as may_have_kinks
 from udkjax.expressions.kinks import smooth_pieces as smooth_pieces
 from udkjax.expressions.loop_derivative import COTANGENT as COTANGENT
 from udkjax.expressions.loop_derivative import FORWARD as FORWARD

@@ -21,6 +21,9 @@ _RISING, _FALLING = ("gt", "ge"), ("lt", "le")
 _ONE_SIGNED = (*_RISING, *_FALLING, "max", "min", "abs", "sign")  # without a kink if the sign of their difference is known
 
 
+_KINKED = (*_ONE_SIGNED, *_OPAQUE, "clamp", "atan2", "floor", "ceil", "round", "rem")
+
+
 class Leaving(NamedTuple):
     """A way to leave a smooth piece: `condition` falls through zero, and the side becomes `factor` times itself plus `shift`."""
 
@@ -49,6 +52,18 @@ def smooth_pieces(graph: Graph, outputs: Sequence[Scalar], moving: Collection[st
     nodes = [graph.nodes[i] for i in graph.dependencies([s.index for s in outputs])]
     opaque = any(n.kind == "call" and n.detail.primitive.name in _OPAQUE and n.depends & set(moving) for n in nodes)
     return Pieces(smooth, held.sides, held.ways, renewal.new_sides, opaque)
+
+
+def may_have_kinks(graph: Graph, outputs: Sequence[Scalar]) -> bool:
+    """Return whether expressions contain operations that may have jumps or kinks, whatever moves."""
+    nodes = (graph.nodes[i] for i in graph.dependencies([s.index for s in outputs]))
+    return any(n.kind in ("apply", "call") and n.detail.primitive.name in _KINKED for n in nodes)
+
+
+def has_kinks(graph: Graph, outputs: Sequence[Scalar], moving: Collection[str]) -> bool:
+    """Return whether expressions have jumps or kinks in inputs of the groups `moving`, or may have some."""
+    pieces = smooth_pieces(graph, outputs, moving)
+    return pieces.has_opaque or len(pieces.sides) > 0
 
 
 class _Held:

@@ -202,10 +202,10 @@ def simulate(
 
     sticks = isinstance(mechanism, Mechanism) and _may_stick(mechanism)
     is_located, located = events is not None or sticks, None
-    if isinstance(mechanism, Mechanism) and _may_have_kinks(mechanism):
+    if _may_have_kinks(system):
         from udkjax.integrate.events.kinks import kinks_of
 
-        found = kinks_of(mechanism)
+        found = kinks_of(system)
         by_steps = "with a diffrax adjoint" if choices.adjoint else "with a progress meter" if choices.meter else ""
         by_steps = f"with {choices.only_by_diffrax}" if choices.only_by_diffrax else by_steps
         is_located = is_located or (found.are_held and not by_steps)
@@ -222,26 +222,32 @@ def simulate(
         solution = simulate_events(system, events, analysis, ts, state, closure, choices, most)
         if not _has_failed(solution.code) or not is_concrete or int(solution.stats.get("events", 0)):
             return _required(solution, throw)  # events may have changed what moved
-        if not isinstance(mechanism, Mechanism):
+        if events is not None and isinstance(mechanism, ConstrainedSystem):
             return _required(solution, throw)
         if events is not None or sticks:
+            assert isinstance(mechanism, Mechanism)  # no joint of a system sticks
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
         located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
 
     solution, missed, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
     if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(code):
-        return _required(explained_system(solution, system, end), throw)
+        return _required(explained_system(solution if located is None else located, system, end), throw)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
-        return _required(solution, throw)
+        return _required(_as_located(solution, located), throw)
     if missed:
         analysis = analyse(mechanism)  # with the numbers of the given analysis more rows were redundant
         solution, _, end, code = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
     if _has_failed(code):
         found = solution if located is None else located
         return _required(explained(found, mechanism, analysis, choices.drift_tol, solver, end), throw)
-    if located is not None:
-        return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
-    return solution
+    return _as_located(solution, located)
+
+
+def _as_located(solution: Solution, located: Solution | None) -> Solution:
+    """Return a solution without located kinks, with the time until which a run that failed has located them, if there was one."""
+    if located is None:
+        return solution
+    return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
 
 
 def _releases(events: Any) -> bool:
@@ -255,8 +261,14 @@ def _may_stick(mechanism: Mechanism) -> bool:
     return Friction.may_stick(mechanism.forces.values())
 
 
+def _may_have_kinks(system: Any) -> bool:
+    if isinstance(system, Mechanism):
+        return _may_force_have_kinks(system)
+    return not isinstance(system, ConstrainedSystem) and system.functions.may_have_kinks  # traced
+
+
 @cached_by_identity
-def _may_have_kinks(mechanism: Mechanism) -> bool:
+def _may_force_have_kinks(mechanism: Mechanism) -> bool:
     return any(force.may_have_kinks for force in mechanism.forces.values())
 
 

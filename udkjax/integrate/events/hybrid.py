@@ -168,7 +168,7 @@ class Hybrid(eqx.Module):
         """Return the sides after event k at a state."""
         factor, shift = (jnp.asarray(x)[k] for x in self.plan.side_changes)
         sides = at.joints[-1] * factor + shift
-        return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[SCENE]._forces, at.t, at.q, at.v, sides))
+        return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[SCENE], at.t, at.q, at.v, sides))
 
     def values(self, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False) -> StateValues:
         """Return conditions and their derivatives in a state; see `System.look`."""

@@ -1,7 +1,8 @@
 """Jumps and kinks of forces that the state decides, as events of their own: a step ends there, and derivatives pass through.
 
 A force with comparisons of the state becomes a `HeldForce`: the sides of its comparisons are numbers, with which its loads are
-smooth, also beyond the crossing (expressions/kinks.py). Where a condition falls through zero, its side turns.
+smooth, also beyond the crossing (expressions/kinks.py). Where a condition falls through zero, its side turns. The loads of a
+user-defined system are held in the same way, all together: the sides are the last of its numbers.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.equations.elements import traced_loads
-from udkjax.expressions import ScalarProgram, smooth_pieces
+from udkjax.equations.smooth_loads import SmoothLoads
+from udkjax.expressions import has_kinks
 from udkjax.integrate.events.actions import Action
 from udkjax.integrate.events.event import Event
 from udkjax.programs.identity_cache import cached_by_identity
-from udkjax.scene.bodies import GROUND, Frame
+from udkjax.scene.bodies import GROUND
 from udkjax.scene.element_setup import attached_bodies
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
@@ -27,31 +28,6 @@ from udkjax.wording import quote
 
 FREE = np.inf  # a side that is not held
 MOST_KINKS = 256  # of a run; then sides are no longer held, as a run at rest where a force jumps would make no progress
-
-
-class SmoothLoads:
-    """The programs of all force elements of one structure; compared by identity, so that equal elements share compiled code."""
-
-    def __init__(self, traced: Any, breaks: bool):
-        graph, pieces = traced.graph, smooth_pieces(traced.graph, traced.loads, ("q", "v") if breaks else ("q", "v", "time"))
-        self.kind, self.count, self.has_opaque = traced.kind, len(pieces.sides), pieces.has_opaque
-        inputs = [*traced.inputs, *pieces.sides]
-        self.loads = ScalarProgram(graph, inputs, pieces.outputs)
-        self.conditions = [ScalarProgram(graph, inputs, [way.condition]) for way in pieces.ways]
-        self.turns = [(way.side, way.factor, way.shift) for way in pieces.ways]
-        self.renewal = ScalarProgram(graph, inputs, pieces.renewed)
-        self.by_velocity = [any(map(program.uses, traced.velocities)) for program in self.conditions]
-
-    def values(self, element: Any, sides: Any, t: Any, frames: Sequence[Frame]) -> list[Any]:
-        """Return the values of the inputs."""
-        numbers = [x for leaf in jax.tree.leaves(element) for x in jnp.ravel(leaf)]
-        moving = [f for f, fixed in zip(frames, self.kind.ground, strict=True) if not fixed]
-        q, v = ([getattr(f, x) for f in moving for x in names] for names in (("x", "y", "angle"), ("vx", "vy", "omega")))
-        return [*numbers, t, *q, *(0.0 if x is None else x for x in v), *sides]
-
-
-# The smooth loads of traced loads; an element with breakpoints in time has no other kinks in time.
-smooth_loads = lru_cache(maxsize=256)(SmoothLoads)
 
 
 class HeldForce(ForceElement):
@@ -62,8 +38,9 @@ class HeldForce(ForceElement):
     smooth: SmoothLoads = eqx.field(static=True)
 
     def loads(self, t, *frames):
-        values = iter(self.smooth.loads(self.smooth.values(self.element, self.sides, t, frames)))
-        return [(0.0, 0.0, 0.0) if fixed else (next(values), next(values), next(values)) for fixed in self.smooth.kind.ground]
+        kind, values = self.smooth.kind, iter(self.smooth.loads(self.element, self.sides, t, *self.smooth.state(frames)))
+        assert kind is not None  # loads of an element
+        return [(0.0, 0.0, 0.0) if fixed else (next(values), next(values), next(values)) for fixed in kind.ground]
 
     @property
     def breakpoints(self):
@@ -73,17 +50,22 @@ class HeldForce(ForceElement):
 class Kink(eqx.Module):
     """The condition under which a comparison keeps its side: positive, and falling where it changes."""
 
-    bodies: tuple[str, ...] = eqx.field(static=True)
-    element: Any
+    bodies: tuple[str, ...] | None = eqx.field(static=True)  # None: of a system, whose conditions see q and v
+    element: Any  # or the numbers of a system
     sides: Float[Array, "k"]
     smooth: SmoothLoads = eqx.field(static=True)
     index: int = eqx.field(static=True)
 
-    def __call__(self, t, frames):
-        found = [frames[name] for name in self.bodies]
-        if self.smooth.by_velocity[self.index] and any(f.vx is None for f in found):
+    def __call__(self, t, *state):
+        if self.bodies is None:
+            (q, v), is_moving = state, state[1] is not None
+            v = v if is_moving else jnp.zeros_like(q)
+        else:
+            found = [state[0][name] for name in self.bodies]
+            (q, v), is_moving = self.smooth.state(found), not any(f.vx is None for f in found)
+        if self.smooth.by_velocity[self.index] and not is_moving:
             raise TypeError("the condition depends on velocities")
-        return self.smooth.conditions[self.index](self.smooth.values(self.element, self.sides, t, found))[0]
+        return self.smooth.condition(self.index, self.element, self.sides, t, q, v)
 
 
 class TurnSide(Action):
@@ -101,17 +83,22 @@ class TurnSide(Action):
 
 
 class HeldElement(NamedTuple):
-    """A force element with held sides, by index among the forces of a mechanism; hashable."""
+    """Loads with held sides, of a force element or of a system; hashable."""
 
-    force: int
+    force: int | None  # index of the element among the forces of a mechanism; None: the loads are those of a system
     smooth: SmoothLoads
-    bodies: tuple[int, ...]  # indices of the bodies that move
+    coordinates: tuple[int, ...]  # on which they may depend
     first: int  # index of its first side
     event: int  # index of the first of its events, counted from the first kink
 
     @property
     def sides(self) -> slice:
         return slice(self.first, self.first + self.smooth.count)
+
+    def renewed(self, numbers: Sequence[Any], t: Any, q: Any, v: Any, sides: Any) -> list[Any]:
+        """Return the inputs of `smooth.renewal` at a state with all coordinates."""
+        at = np.array(self.coordinates, int)
+        return self.smooth.inputs(numbers, t, q[at], v[at], sides)
 
 
 def with_sides(events: Sequence[Event], sides: Float[Array, "S"], held: Sequence[HeldElement]) -> tuple[Event, ...]:
@@ -124,10 +111,10 @@ def with_sides(events: Sequence[Event], sides: Float[Array, "S"], held: Sequence
 
 
 class FoundKinks(NamedTuple):
-    """The kinks of a mechanism's forces, as far as they are known before a run."""
+    """The kinks of forces, as far as they are known before a run."""
 
     are_held: bool  # whether a force has kinks that can be located
-    others: tuple[str, ...]  # forces with kinks that cannot
+    others: tuple[str, ...]  # forces, or functions of a system, with kinks that cannot
 
     def remark(self, by_steps: str) -> str:
         """Return whether kinks are located, as text; empty without any. A run `by_steps` locates none."""
@@ -137,9 +124,20 @@ class FoundKinks(NamedTuple):
         return ", ".join(filter(None, ["located" if self.are_held else "", unseen]))
 
 
-def kinks_of(mechanism: Mechanism) -> FoundKinks:
-    """Return which forces of a mechanism have jumps or kinks that the state decides."""
-    return (_concrete_kinks if mechanism.is_concrete else _kinks)(mechanism)
+def kinks_of(model: Any) -> FoundKinks:
+    """Return which forces of a mechanism, or which functions of a system, have jumps or kinks that the state decides."""
+    if not isinstance(model, Mechanism):
+        return _kinks_of_system(model.functions, model.breakpoints is not None)
+    return (_concrete_kinks if model.is_concrete else _kinks)(model)
+
+
+@lru_cache(maxsize=64)
+def _kinks_of_system(functions: Any, breaks: bool) -> FoundKinks:
+    """Return the kinks of the `SystemFunctions` of a system: only those of its loads are located."""
+    smooth, moving = SmoothLoads.of_system(functions, breaks), functions.moving(breaks)
+    others = [] if not smooth.has_opaque else ["force"]
+    others += [name for name, terms in functions.other_terms.items() if has_kinks(functions.graph, terms, moving)]
+    return FoundKinks(smooth.count > 0, tuple(others))
 
 
 def _kinks(mechanism: Mechanism) -> FoundKinks:
@@ -154,54 +152,78 @@ def _kinks(mechanism: Mechanism) -> FoundKinks:
 _concrete_kinks = cached_by_identity(_kinks)
 
 
-def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, "SmoothLoads", bool]]:
+def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, SmoothLoads, bool]]:
     """Return for each force that may have kinks its name, its smooth loads, and whether its sides can be held."""
     sampled = {k for section, k, _ in mechanism.samples if section == "_forces"}
     rows = mechanism.without_samples._forces if sampled else mechanism._forces
     for k, (name, element) in enumerate(mechanism.forces.items()):
         if element.may_have_kinks:
-            traced = traced_loads(rows[k], attached_bodies(element, mechanism.joints))
+            smooth = SmoothLoads.of_element(rows[k], attached_bodies(element, mechanism.joints), len(element.breakpoints) > 0)
             has_numbers = all(map(eqx.is_inexact_array, jax.tree.leaves(element)))
-            yield name, smooth_loads(traced, len(element.breakpoints) > 0), k not in sampled and has_numbers
+            yield name, smooth, k not in sampled and has_numbers
 
 
-def with_held_forces(mechanism: Mechanism, first: int = 0) -> tuple[Mechanism, tuple[HeldElement, ...], tuple[Event, ...]]:
-    """Return a mechanism with held forces, what these are, and the events at which their sides turn; without kinks, itself.
+def with_held_forces(model: Any, first: int = 0) -> tuple[Any, tuple[HeldElement, ...], tuple[Event, ...]]:
+    """Return a model with held loads, what these are, and the events at which their sides turn; without kinks, itself.
 
     `first` is the number of other sides, which come first.
     """
-    if not isinstance(mechanism, Mechanism):
-        return mechanism, (), ()
+    return _with_held_elements(model, first) if isinstance(model, Mechanism) else _with_held_loads(model)
+
+
+def _with_held_loads(system: Any) -> tuple[Any, tuple[HeldElement, ...], tuple[Event, ...]]:
+    smooth = SmoothLoads.of_system(system.functions, system.breakpoints is not None)
+    if not smooth.count:
+        return system, (), ()
+    sides = jnp.full(smooth.count, FREE)
+    found = HeldElement(None, smooth, tuple(range(system.functions.n)), 0, 0)
+    return (
+        system.with_functions(smooth.held(system.functions), sides),
+        (found,),
+        tuple(_turn(Kink(None, system.numbers, sides, smooth, i), 0, i, "force") for i in range(len(smooth.turns))),
+    )
+
+
+def _turn(condition: Kink, first: int, index: int, name: str) -> Event:
+    """Return the event at which a side turns."""
+    side, factor, shift = condition.smooth.turns[index]
+    return Event(condition, TurnSide(first + side, factor, shift), -1, f"kink {index + 1} of {name}")
+
+
+def _with_held_elements(mechanism: Mechanism, first: int) -> tuple[Mechanism, tuple[HeldElement, ...], tuple[Event, ...]]:
     elements, events, forces = [], [], list(mechanism._forces)
     for name, smooth, can_be_held in _smooth_forces(mechanism):
         if not smooth.count or not can_be_held:
             continue
         k, element = mechanism.force_names.index(name), mechanism.forces[name]
         frames = attached_bodies(element, mechanism.joints)
+        assert smooth.kind is not None  # loads of an element
         nameless = jax.tree.unflatten(smooth.kind.tree, jax.tree.leaves(element))
         sides = jnp.full(smooth.count, FREE)
         forces[k] = HeldForce(bodies=tuple(frames), element=nameless, sides=sides, smooth=smooth)
-        bodies = tuple(mechanism.body_names.index(b) for b in frames if b != GROUND)
-        elements.append(HeldElement(k, smooth, bodies, first, len(events)))
-        for i, (side, factor, shift) in enumerate(smooth.turns):
-            condition = Kink(tuple(frames), nameless, sides, smooth, i)
-            events.append(Event(condition, TurnSide(first + side, factor, shift), -1, f"kink {i + 1} of {name}"))
+        bodies = (mechanism.body_names.index(b) for b in frames if b != GROUND)
+        elements.append(HeldElement(k, smooth, tuple(3 * b + i for b in bodies for i in range(3)), first, len(events)))
+        kinks = (Kink(tuple(frames), nameless, sides, smooth, i) for i in range(len(smooth.turns)))
+        events += [_turn(kink, first, i, name) for i, kink in enumerate(kinks)]
         first += smooth.count
     if not elements:
         return mechanism, (), ()
     return eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces)), tuple(elements), tuple(events)
 
 
-def renewed_sides(elements: Sequence[HeldElement], forces: Sequence[Any], t: Any, q: Any, v: Any, sides: Any) -> Array:
+def sides_in(model: Any, force: int | None) -> Float[Array, "k"]:
+    """Return the sides of a force of a mechanism, or of the loads of a system."""
+    return model.numbers[-1] if force is None else model._forces[force].sides
+
+
+def renewed_sides(elements: Sequence[HeldElement], model: Any, t: Any, q: Any, v: Any, sides: Any) -> Array:
     """Return all sides at a state, with those of kinks that are not known yet or depend on others."""
     if not elements:
         return sides
     result = list(sides[: elements[0].first])
     for held in elements:
-        element, q3, v3 = forces[held.force].element, jnp.reshape(q, (-1, 3)), jnp.reshape(v, (-1, 3))
-        numbers = [x for leaf in jax.tree.leaves(element) for x in jnp.ravel(leaf)]
-        state = [x for y in (q3, v3) for b in held.bodies for x in y[b]]
-        result += held.smooth.renewal([*numbers, t, *state, *sides[held.sides]])
+        numbers = SmoothLoads.numbers(model.numbers[:-1] if held.force is None else model._forces[held.force].element)
+        result += held.smooth.renewal(held.renewed(numbers, t, jnp.ravel(q), jnp.ravel(v), sides[held.sides]))
     return jnp.stack([jnp.asarray(s, float) for s in result])
 
 
@@ -227,10 +249,10 @@ def places_of_kinks(events: Sequence[Event], held: Sequence[HeldElement]) -> Kin
     return KinkPlaces(tuple(sides), tuple(elements))
 
 
-def places_of_sides(mechanism: Mechanism, held: Sequence[Any]) -> tuple[int, ...]:
-    """Return the places of all sides among all numbers of a mechanism; `held` has all forces with sides, in order."""
+def places_of_sides(model: Any, held: Sequence[Any]) -> tuple[int, ...]:
+    """Return the places of all sides among all numbers of a model; `held` has all loads with sides, in order."""
     sides = [np.arange(x.sides.start, x.sides.stop) + 1.0 for x in held]
-    zeros = jax.tree.map(lambda x: np.zeros(np.shape(x)), mechanism)
-    marked = eqx.tree_at(lambda m: [m._forces[x.force].sides for x in held], zeros, sides)
+    zeros = jax.tree.map(lambda x: np.zeros(np.shape(x)), model)
+    marked = eqx.tree_at(lambda m: [sides_in(m, x.force) for x in held], zeros, sides)
     numbers = np.concatenate([np.ravel(x) for x in jax.tree.leaves(marked)])
     return tuple(int(np.flatnonzero(numbers == k + 1.0)[0]) for k in range(int(numbers.max())))

@@ -158,18 +158,9 @@ class MachineSystem:
     def _renew(self, members: MemberIndices, at: RunState, sides: np.ndarray) -> np.ndarray:
         result = sides.copy()
         for held, places in self._held:
-            numbers, q = (
-                take(self._event_numbers, members if len(self._event_numbers) > 1 else None),
-                at.q.reshape(len(at.t), -1, 3),
-            )
-            v = at.v.reshape(q.shape)
-            state = [x for y in (q, v) for b in held.bodies for x in y[:, b].T]
-            given = [
-                *np.broadcast_to(numbers[:, list(places)], (len(at.t), len(places))).T,
-                at.t,
-                *state,
-                *result[:, held.sides].T,
-            ]
+            numbers = take(self._event_numbers, members if len(self._event_numbers) > 1 else None)
+            own = np.broadcast_to(numbers[:, list(places)], (len(at.t), len(places))).T
+            given = held.renewed(list(own), at.t, at.q.T, at.v.T, result[:, held.sides].T)
             result[:, held.sides] = np.stack(held.smooth.renewal.by_numpy(given), axis=1)
         return result
 

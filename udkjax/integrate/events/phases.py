@@ -8,6 +8,7 @@ switch on and off (switched.py), so that no phase needs equations or code of its
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from udkjax.arrays import is_traced, number
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.event import Event
-from udkjax.integrate.events.kinks import HeldElement
+from udkjax.integrate.events.kinks import HeldElement, sides_in
 from udkjax.integrate.events.sticking_joints import StickingJoint, lock_of
 from udkjax.integrate.events.switched import switch, switched, with_switched_friction
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
@@ -81,7 +82,7 @@ class Phases(eqx.Module):
         """
         mechanism, (*joints, sides) = self.mechanisms[which], added
         for sided in self.sided:
-            at = lambda m, k=sided.force: m._forces[k].sides  # noqa: E731
+            at = partial(sides_in, force=sided.force)
             mechanism = eqx.tree_at(at, mechanism, sides[sided.sides])
         if which == SCENE:
             return mechanism
@@ -94,15 +95,18 @@ class Phases(eqx.Module):
         """Return the joints that events add, as they would be at the initial guess."""
         return tuple(self.joint_at(k, self.mechanisms[SCENE].q0.ravel()) for k in range(len(self.added)))
 
-    def with_kinks(self, mechanism: Mechanism, held: tuple[HeldElement, ...], count: int) -> "Phases":
-        """Return the phases with the forces of a mechanism some of which are held, and with events at `count` kinks."""
+    def with_kinks(self, model: Any, held: tuple[HeldElement, ...], count: int) -> "Phases":
+        """Return the phases with the loads of a model some of which are held, and with events at `count` kinks."""
         switches, none = self.switches, (False,) * len(self.switches.names)
         more = {name: (*getattr(switches, name), *[none] * count) for name in ("removed", "added")}
         more |= {name: (*getattr(switches, name), *[-1] * count) for name in ("contacts", "rows")}
         more |= {"joint_rows": (*switches.joint_rows, *[()] * count)}
         found = replace(self, held=held, switches=switches._replace(**more))
-        forces = [mechanism._forces[x.force] for _ in self.mechanisms for x in held]
-        return eqx.tree_at(lambda p: [m._forces[x.force] for m in p.mechanisms for x in held], found, forces)
+        if not isinstance(model, Mechanism):
+            return replace(found, mechanisms=(model,))
+        places = [x.force for x in held if x.force is not None]
+        forces = [model._forces[k] for _ in self.mechanisms for k in places]
+        return eqx.tree_at(lambda p: [m._forces[k] for m in p.mechanisms for k in places], found, forces)
 
     def joint_at(self, k: int, q: Array) -> Joint:
         """Return the k-th joint that events add, added at q."""

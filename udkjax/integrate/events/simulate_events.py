@@ -214,7 +214,7 @@ def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
     of_kinks = jnp.full(sum(held.smooth.count for held in phases.held), FREE)
     free = jnp.concatenate([jnp.zeros(SIDES * len(phases.sticking)), of_kinks])
     at = problem.ts[0], problem.q, problem.v, free
-    return stop_gradients(renewed_sides(phases.held, phases.mechanisms[SCENE]._forces, *at))
+    return stop_gradients(renewed_sides(phases.held, phases.mechanisms[SCENE], *at))
 
 
 _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
