@@ -208,6 +208,48 @@ def test_what_mjcf_cannot_hold_is_refused_by_name():
     assert [text.split(":")[0] for text in error.value.problems] == ['force "held"', 'force "push"']
 
 
+def frictions(mech):
+    """Return joint, torque and law of each friction; the smooth law has further numbers."""
+    found = [force for force in mech.forces.values() if isinstance(force, udk.Friction)]
+    assert all(force.velocity is None and force.torque is not None for force in found)
+    return [(force.joint, float(np.asarray(force.torque)), force.law) for force in found]
+
+
+def test_dry_friction_of_hinges_is_read_and_written():
+    text = model("frictionloss='0.25' damping='0.1'")
+    mech = udk.loads(text)
+    assert frictions(mech) == [("h", 0.25, "set-valued")]
+    assert not frictions(udk.read_mjcf(text, leave_out=["frictionloss"]))
+    disabled = text.replace("<worldbody>", '<option><flag frictionloss="disable"/></option><worldbody>')
+    assert not frictions(udk.loads(disabled))
+    written = udk.mjcf_text(mech)
+    assert 'frictionloss="0.25"' in written and udk.mjcf_text(udk.loads(written)) == written
+
+
+def test_hinges_with_friction_do_not_close_loops():
+    """MJCF has friction in hinges only, so that another joint of the loop becomes an equality."""
+    bar = library.n_four_bar(1)
+    for pin in bar.joints:
+        mech = udk.Mechanism(bar.bodies, bar.joints, forces={"rub": udk.Friction(pin, torque=0.5, law="set-valued")})
+        text = udk.mjcf_text(mech)
+        assert f'<joint name="{pin}"' in text and text.count("frictionloss") == 1 and "<connect" in text
+        assert frictions(udk.loads(text)) == [(pin, 0.5, "set-valued")]
+
+
+def test_other_friction_is_refused():
+    rod = library.compound_pendulum()
+    (pin,) = rod.joints
+    forces = {
+        "smooth": udk.Friction(pin, torque=1.0, velocity=0.1),
+        "loaded": udk.Friction(pin, coefficient=0.1, radius=0.01, law="set-valued"),
+        "one": udk.Friction(pin, torque=1.0, law="set-valued"),
+        "two": udk.Friction(pin, torque=1.0, law="set-valued"),
+    }
+    with pytest.raises(udk.SceneError) as error:
+        udk.mjcf_text(udk.Mechanism(rod.bodies, rod.joints, forces=forces))
+    assert [text.split(":")[0] for text in error.value.problems] == ['force "smooth"', 'force "loaded"', 'force "two"']
+
+
 def test_rods_in_a_row_keep_their_velocities():
     bodies = {
         "a": udk.Body(1.0, 0.1, (0, -1), velocity=(1, 0), angular_velocity=0.5),
@@ -277,7 +319,8 @@ TWO = '<body name="b"><joint name="h2" axis="0 1 0" pos="1 0 0"/><joint name="h1
         (model(world=FREE.replace("freejoint", 'joint type="ball"')), "a ball joint does not stay in a plane"),
         (model(world=TILTED), '<joint> "t" (line 4): leaves the plane in which the other joints move'),
         (model("range='-90 30'"), 'give the event `udk.JointLimit("h", -0.523599, 1.5708)`; leave_out=["limits"]'),
-        (model("frictionloss='1'"), 'frictionloss is not supported: give `udk.Friction`; leave_out=["frictionloss"]'),
+        (model("frictionloss='1' type='slide'"), "frictionloss is supported in a hinge that is its body's only joint"),
+        (model("frictionloss='-1'"), "frictionloss must not be negative"),
         (model("springdamper='1 1'"), 'springdamper="1 1" is not supported: give stiffness and damping'),
         (model("damping='1 0 2'"), "grows with powers of the motion"),
         (model("dampign='1'"), 'dampign="1" is not supported'),
@@ -309,7 +352,8 @@ def test_what_is_not_ours_is_refused_by_name_and_line(text, said):
 
 
 def test_all_mistakes_are_named_at_once_and_what_is_left_out_is_asked_for():
-    text = model("range='-90 30' frictionloss='1'", rest="<actuator><motor joint='h' forcerange='-1 1'/></actuator>")
+    loss = "type='slide' frictionloss='1'"
+    text = model(f"range='-90 30' {loss}", rest="<actuator><motor joint='h' forcerange='-1 1'/></actuator>")
     with pytest.raises(udk.SceneError) as error:
         udk.read_mjcf(text)
     assert len(error.value.problems) == 3

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.scene.forces import Force, ForceElement, Spring, Torque, TorsionSpring
+from udkjax.scene.friction import Friction
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
 from udkjax.scene.mjcf.model_settings import merge_parts
@@ -33,6 +34,8 @@ class ForceReader:
     def __init__(self, root: XmlElement, lengths: CoupledLengths, controls: Mapping[str, float], leave_out: Collection[str]):
         self.lengths, self.model, self.settings, self.leave_out = lengths, lengths.model, lengths.settings, leave_out
         self.forces: dict[str, ForceElement] = {}
+        # Hinges that are revolute joints of the mechanism.
+        self.revolute = {name for name, _, joints in self.model.named_joints() if [joint.kind for joint in joints] == ["hinge"]}
         for joint in self.model.joints:
             self._add_passive(joint.name, lengths.joints[joint.name], joint.read)
         for name, length in lengths.tendons.items():
@@ -47,8 +50,8 @@ class ForceReader:
         disabled = self.settings.disabled
         if "limit" not in disabled and self.settings.is_limited(read, "limited", "range"):
             self._leave_or_refuse("limits", read, f"range is not supported: {self._limit_cure(name, length, read)}")
-        if "frictionloss" not in disabled and read.number("frictionloss"):
-            self._leave_or_refuse("frictionloss", read, "frictionloss is not supported: give `udk.Friction`")
+        if "frictionloss" not in disabled and (loss := read.number("frictionloss")):
+            self._add_friction(name, read, loss)
         if "actuation" not in disabled and self.settings.is_limited(read, "actuatorfrclimited", "actuatorfrcrange"):
             self._leave_or_refuse("forceranges", read, "actuatorfrcrange is not supported: forces have no limits here")
         stiffness, damping = (
@@ -56,6 +59,15 @@ class ForceReader:
             for key, flag in (("stiffness", "spring"), ("damping", "damper"))
         )
         self._add_force(name, length, read, LinearForce(stiffness, damping, length.at_rest))
+
+    def _add_friction(self, name: str, read: AttributeReader, loss: float) -> None:
+        """Add the dry friction of a hinge, whose torque is at most `loss`."""
+        if loss < 0:
+            read.refuse("frictionloss must not be negative")
+        elif read.element.tag != "joint" or name not in self.revolute:
+            self._leave_or_refuse("frictionloss", read, "frictionloss is supported in a hinge that is its body's only joint")
+        elif "frictionloss" not in self.leave_out:
+            self._put(name, Friction(name, torque=loss, law="set-valued"))
 
     def _linear_term(self, read: AttributeReader, name: str) -> float:
         value = read.numbers(name, (0.0, 0.0, 0.0), fewest=1)

@@ -40,8 +40,8 @@ def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), k
 
     Args:
         source: The file, or its text.
-        leave_out: Parts to ignore, of "limits", "frictionloss", "forceranges" and "contacts". By default the first three are
-            refused, and contacts give a warning.
+        leave_out: Parts to ignore, of "limits", "frictionloss", "forceranges" and "contacts". By default limits and force ranges
+            are refused, frictionloss is read in hinges and refused elsewhere, and contacts give a warning.
         key: The keyframe of the initial state; by default the one named "initial", or else the position of the file.
 
     Returns:

@@ -14,6 +14,7 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.forces import Spring, Torque, TorsionSpring
+from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Angle, Constraint, Distance, Gear, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
@@ -70,10 +71,13 @@ class _Writer:
         self.frames = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in mechanism.bodies.items()}
         self.sites: dict[str, list[Attributes]] = {name: [] for name in self.frames}
         self.springs: dict[str, Attributes] = {}  # attributes of hinges by name
+        self.losses: dict[str, Attributes] = {}  # dry friction of hinges by name
         self.sections: dict[str, list[str]] = {"tendon": [], "equality": [], "actuator": []}
         self.controls: list[float] = []
         self.taken: set[str] = set()  # names of sites and tendons
-        preferred = [name for kinds in IN_TREE for name, joint in mechanism.joints.items() if isinstance(joint, kinds)]
+        rubbing = {force.joint for force in mechanism.forces.values() if isinstance(force, Friction)}  # no equality has friction
+        by_kind = [[name for name, joint in mechanism.joints.items() if isinstance(joint, kinds)] for kinds in IN_TREE]
+        preferred = [name for names in by_kind for name in sorted(names, key=lambda name: name not in rubbing)]
         self.tree = {edge.body: edge for edge in spanning_tree(mechanism, {name: k for k, name in enumerate(preferred)})}
         tree_joints = {edge.joint for edge in self.tree.values()}
         self.turns: dict[str, dict[str, float]] = {GROUND: {}}  # hinges whose sum is the angle of each body
@@ -193,12 +197,15 @@ class _Writer:
         look = {"mass": "0", "contype": "0", "conaffinity": "0", "size": _numbers(radius)}
         return [
             f"<body{_attributes(name=name, pos=position, axisangle=f'{NORMAL} {_numbers(angle)}')}>",
-            *(f"  <joint{_attributes(name=j.name, **j.attributes, **self.springs.get(j.name, {}))}/>" for j in self.joints[name]),
+            *(f"  <joint{_attributes(name=j.name, **j.attributes, **self._passive(j.name))}/>" for j in self.joints[name]),
             f"  <inertial{_attributes(pos='0 0 0', mass=_numbers(body.mass), diaginertia=inertia)}/>",
             *(f"  <geom{_attributes(type='capsule', fromto=f'0 0 0 {end}', **look)}/>" for end in sorted(ends)),
             *([] if ends else [f"  <geom{_attributes(**look)}/>"]),
             *(f"  <site{_attributes(**site)}/>" for site in self.sites[name]),
         ]
+
+    def _passive(self, hinge: str) -> Attributes:
+        return self.springs.get(hinge, {}) | self.losses.get(hinge, {})
 
     # --- loop closures and forces
 
@@ -237,8 +244,25 @@ class _Writer:
             self._add_spatial(name, force.bodies, force.points, **attributes, **_damping(force.damping))
         elif isinstance(force, TorsionSpring | Torque):
             self._add_turning(name, force)
+        elif isinstance(force, Friction):
+            self._add_friction(name, force)
         else:
             self.problems.append(f"force {quote(name)}: MJCF has no element for a {type(force).__name__.lower()}")
+
+    def _add_friction(self, name: str, force: Friction) -> None:
+        """Add friction to a hinge of the tree: MuJoCo's is a torque of constant size, which holds at rest."""
+        hinges = [joint.name for joints in self.joints.values() for joint in joints]
+        is_hinge = isinstance(self.mechanism.joints[force.joint], Revolute) and force.joint in hinges
+        if force.coefficient is not None:
+            self.problems.append(f"force {quote(name)}: MJCF has no friction that depends on the load of a joint")
+        elif not force.sticks:
+            self.problems.append(f'force {quote(name)}: friction in MJCF sticks: give it law="set-valued", without a velocity')
+        elif not is_hinge:
+            self.problems.append(f"force {quote(name)}: its joint closes a loop, and MJCF has friction in hinges only")
+        elif force.joint in self.losses:
+            self.problems.append(f"force {quote(name)}: a second friction in joint {quote(force.joint)}")
+        else:
+            self.losses[force.joint] = {"frictionloss": _numbers(force.torque)}
 
     def _add_turning(self, name: str, force: Any) -> None:
         """Add a torsion spring, or a torque, to the hinge between its bodies, or to a tendon over several hinges."""
