@@ -79,6 +79,55 @@ def test_rounding_that_counts_as_rank_ends_a_projected_run(method):
     assert codes == [Result.spurious_rank, Result.successful]
 
 
+def squares():
+    return udk.library.n_four_bar(2, angular_velocity=-1.5)
+
+
+@pytest.mark.parametrize(
+    ("make", "method"),
+    [
+        (squares, udk.Greville(0.1)),
+        *(pytest.param(squares, method(0.1), marks=pytest.mark.slow) for method in (udk.SVD, udk.Householder, udk.Elimination)),
+        pytest.param(lambda: swing(np.deg2rad(40.0)), udk.Elimination(0.01), marks=pytest.mark.slow),
+    ],
+)
+def test_independent_rows_that_count_as_dependent_end_a_projected_run(make, method):
+    """Near singular configurations the motion has more freedom than the mechanism, until the rows count again."""
+    run = {"rtol": 1e-7, "atol": 1e-7, "throw": False}
+    found = udk.simulate(make(), 2 * TS, method=method, **run)
+    assert found.result == Result.missing_rank and "rank_tol" in found.cause
+    assert np.isfinite(found.q[:2]).all() and not np.isfinite(found.q[-1]).any()
+    small = type(method)(1e-5)
+    assert udk.simulate(make(), TS, method=small, **run).result == Result.successful
+    together = jax.vmap(lambda tol: udk.simulate(make(), 2 * TS, method=method, **run | {"rtol": tol}).code)(TOLERANCES)
+    assert together.tolist() == [Result.missing_rank] * 2
+
+
+@pytest.mark.slow
+def test_the_other_engine_looks_for_missing_rows_at_outputs():
+    """Positions that are too far open end a run as drift, there and in machine code."""
+    ts, mech = np.linspace(0.0, 10.0, 501), swing(np.deg2rad(40.0))
+    results = [
+        udk.simulate(mech, ts, method=udk.Elimination(tol), engine="jax", rtol=1e-7, atol=1e-7, throw=False).result
+        for tol in (0.01, 1e-5)
+    ]
+    assert results[0] in (Result.missing_rank, Result.drift) and results[1] == Result.successful
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [udk.SVD, udk.Varga, udk.Householder, udk.GramSchmidt, udk.Greville, udk.Elimination])
+def test_default_thresholds_leave_out_no_row_that_counts(method):
+    """Across singular configurations, at any tolerance; also thresholds of a thousandth, which leave out rows for a moment."""
+    for mech in (swing(np.deg2rad(40.0)), squares(), kite(), equal_crank()):
+        for rank_tol, least in ((None, 12), (1e-3, 8)):
+
+            def code(tol, mech=mech, rank_tol=rank_tol):
+                return udk.simulate(mech, 2 * TS, method=method(rank_tol), rtol=tol, atol=tol, throw=False).code
+
+            codes = jax.vmap(code)(10.0 ** -jnp.arange(3.0, least + 1))
+            assert not np.isin(codes, [Result.missing_rank, Result.spurious_rank]).any(), (mech.name, rank_tol, codes)
+
+
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("gain", [10.0, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_a_run_that_is_stabilized_well_passes(gain, engine):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.textbook import TextbookEquations
@@ -69,6 +69,10 @@ def integrate_by_diffrax(
         most = len(equations.scales.rows) - len(equations.redundant)
         is_held = equations.rank(t_end[0], jnp.split(end[0], 2)[0]) > most
         status = jnp.where(is_held & jnp.isfinite(problem.drift_tol), Status.SPURIOUS_RANK, status)
+    if isinstance(equations, TextbookEquations) and problem.compiled.plan.projected:
+        mean_step = (t_end[0] - ts[0]) / jnp.maximum(run.stats["num_accepted_steps"], 1)
+        misses = reached & _misses_rows(problem, equations, ts, ys, mean_step)
+        status = jnp.where(jnp.any(misses), Status.MISSING_RANK, status)
     controller_state: Any = run.controller_state
     if measures_drift:
         controller_state, drifted = controller_state.inner, controller_state.status
@@ -80,6 +84,20 @@ def integrate_by_diffrax(
     output = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides, jnp.array(0))
     q, v = (jnp.where(output.kept[:, None], y, jnp.nan) for y in (q, v))
     return output._replace(q=q, v=v)
+
+
+def _misses_rows(problem: Problem, equations: TextbookEquations, ts: Array, ys: Array, step: Array) -> Bool[Array, "T"]:
+    """Return at which outputs projected velocities would open Psi too far in a step, as rows were left out.
+
+    Machine code looks at the end of each step, by the same rule. The first state is that which was given.
+    """
+
+    def misses(at: tuple[Array, Array]) -> Array:
+        t, y = stop_gradients(at)
+        rate = equations.violation_size(equations.violation(t, *jnp.split(y, 2))[1])
+        return rate * step > jnp.maximum(problem.drift_tol, problem.rtol + problem.atol)
+
+    return jax.lax.map(misses, (ts, ys), batch_size=STATES_AT_ONCE) & (np.arange(len(ts)) > 0)
 
 
 def _leave_breakpoints(problem: Problem) -> Float[Array, "T"]:

@@ -48,6 +48,7 @@ def failure(status: Any, xp: ModuleType = jnp) -> Any:
         (Status.LOST, Result.drift),
         (Status.SINGULAR, Result.singular),
         (Status.SPURIOUS_RANK, Result.spurious_rank),
+        (Status.MISSING_RANK, Result.missing_rank),
     ):
         code = xp.where(status == status_of, result, code)
     return code

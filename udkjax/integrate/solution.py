@@ -43,6 +43,7 @@ class Result(PrintsWords):
     undefined_condition = 13
     singular = 14
     spurious_rank = 15
+    missing_rank = 16
 
     @property
     def is_success(self) -> bool:
@@ -82,6 +83,8 @@ CAUSES = {
     Result.spurious_rank: "rows that depend on others along the whole motion counted as independent, and hold back what is free "
     "to move: the method's `rank_tol` is below rounding errors or, without `Projection()`, below the violation of the rows; "
     "raise it or use `Auto()`",
+    Result.missing_rank: "rows that are independent counted as dependent near a singular configuration, and the motion violates "
+    "them: the method's `rank_tol` is too large; lower it or use `Auto()`",
     Result.undefined_condition: "the condition of an event is not a number: look at what it divides by, or takes the root of",
 }
 

@@ -63,6 +63,7 @@ class Module(Running):
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
         self.measures_drift = plan.steps and m > 0 and not plan.projected
+        self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports  # whatever that leaves open
         self.pieces = code.piece_count if plan.breaks else 0
         names = self.program_names()
         self.settles = code.rubs and any(name in SETTLING for name in names)  # friction may need further rounds
@@ -125,7 +126,7 @@ class Module(Running):
             self._add_arrays("", {"couplings": code.scratch["couplings"], "change": n})
         if self.takes_dense_rows and "root" not in p.places:
             self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.unrolled else {}))
-        if self.is_formulated or self.settles:
+        if self.is_formulated or self.settles or self.drops_rows:
             p.add("saved v", n)
         if self.settles:
             self._add_arrays("", {"further a": n} | ({"settled": code.scratch["settled"]} if self.unrolled else {}))
@@ -164,7 +165,7 @@ class Module(Running):
         if self.is_dense:
             names += ["dense_accelerations", *(["dense_newton_q", "dense_newton_v", "psi_dot"] if self.plan.projected else [])]
         else:
-            names += self.solving
+            names += [*self.solving, *(["psi_dot"] if self.drops_rows else [])]
         if self.is_formulated and not self.is_dense:
             names.append("dense_accelerations")
         if self.measures_drift:
