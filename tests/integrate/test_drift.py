@@ -106,10 +106,10 @@ def test_independent_rows_that_count_as_dependent_end_a_projected_run(make, meth
 @pytest.mark.slow
 def test_the_other_engine_looks_for_missing_rows_at_outputs():
     """Positions that are too far open end a run as drift, there and in machine code."""
-    ts, mech = np.linspace(0.0, 10.0, 501), swing(np.deg2rad(40.0))
+    ts, mech = np.linspace(0.0, 2.0, 201), squares()
     results = [
-        udk.simulate(mech, ts, method=udk.Elimination(tol), engine="jax", rtol=1e-7, atol=1e-7, throw=False).result
-        for tol in (0.01, 1e-5)
+        udk.simulate(mech, ts, method=udk.Greville(tol), engine="jax", rtol=1e-7, atol=1e-7, throw=False).result
+        for tol in (0.1, 1e-5)
     ]
     assert results[0] in (Result.missing_rank, Result.drift) and results[1] == Result.successful
 

@@ -33,7 +33,7 @@ from udkjax.scene.mechanism import Mechanism
 
 MOST_STEPS = 50  # of Newton's method, which needs three to five
 STAGES = 8  # of equal shares; fewer may do, but most mechanisms need none
-SETTLED = 1e-13  # change of the loads of friction by a step, relative to these loads
+LAST_CHANGE = 1e-13  # change of the loads of friction by a step, relative to these loads
 
 
 def rubbing_names(mechanism: Mechanism) -> list[str]:
@@ -205,7 +205,7 @@ def settle(
             x, _, count = state
             new = x - jnp.linalg.solve(jax.jacfwd(remainder)(x, share), remainder(x, share))
             before, after = root * friction(x), root * friction(new)
-            return new, jnp.linalg.norm(after - before) > SETTLED * jnp.linalg.norm(after), count + 1
+            return new, jnp.linalg.norm(after - before) > LAST_CHANGE * jnp.linalg.norm(after), count + 1
 
         def goes_on(state: tuple[Array, Array, Array]) -> Array:
             return state[1] & (state[2] < MOST_STEPS)

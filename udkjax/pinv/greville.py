@@ -28,7 +28,8 @@ class Greville(Dense):
     The error is of the order of eps cond(D)^2, because the error of P, eps cond(D) |P|, enters c. The remainder of a dependent
     row is of this order too, while that of an independent row may be as small as 1/cond(D). Hence the default `rank_tol`
     eps^(1/3), where the two are equal; beyond cond(D) = eps^(-1/3) no threshold is right. A dependent row mistaken for
-    independent can make the result wrong by any factor.
+    independent can make the result wrong by any factor. Rows are taken in their order: cond(D) here is the largest of all first
+    rows together, which is large also where later rows make up for a dependent one.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> GrevilleFactors:

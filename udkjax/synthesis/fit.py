@@ -14,7 +14,9 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.designs import FoundDesign
 from udkjax.synthesis.goals import FunctionGoal, Goal, PoseGoal
 
-MOST = 0.1  # deviation relative to the extent of the targets beyond which a design is no fit: its motion looks like another one
+# Deviation relative to the extent of the targets beyond which a design is no fit: its motion looks like another one. The word is
+# for people: no computation depends on it, and a curve of another form misses its targets by about this much.
+MOST = 0.1
 
 
 class Deviation(NamedTuple):

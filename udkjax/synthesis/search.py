@@ -23,7 +23,7 @@ HIGH = 20.0  # unit of weights, relative to the root of the loss over the scale;
 # Squared transmissions: the first margin, and the factor by which it shrinks to the requested one whenever a trial has converged.
 FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
 LIMIT_TOL = 1e-8  # accepted excess over a limit before the last polish, in scales
-SETTLED = 1e-9  # relative decrease of the loss below which a trial has converged
+LEAST_FALL = 1e-9  # relative decrease of the loss below which a trial has converged
 PRESSED = 1e-5  # relative decrease of the loss below which exceeded limits get a larger weight
 ROUNDING = 1e-26  # losses below this, relative to the squared scale, are rounding errors
 AHEAD = 0.1  # fraction of a step at which residuals are evaluated for their second derivative along it
@@ -133,7 +133,7 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     accepted, rejected = active[better], active[~better]
     state.accept(problem, accepted, new.take(better), trial.take(better), merits[better])
     slow = fall[better] < PRESSED * old_merit[better]
-    settled = fall[better] < SETTLED * old_merit[better]
+    settled = fall[better] < LEAST_FALL * old_merit[better]
     settled[slow] |= must_continue(problem, state, accepted[slow])
     state.damping[accepted] = np.maximum(RELAX * state.damping[accepted], LEAST_DAMPING)
     state.damping[rejected] *= TIGHTEN

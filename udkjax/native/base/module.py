@@ -63,7 +63,7 @@ class Module(Running):
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
         self.measures_drift = plan.steps and m > 0 and not plan.projected
-        self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports  # whatever that leaves open
+        self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports
         self.pieces = code.piece_count if plan.breaks else 0
         names = self.program_names()
         self.settles = code.rubs and any(name in SETTLING for name in names)  # friction may need further rounds

@@ -64,7 +64,8 @@ STAGE_TOL, STAGE_ITERATIONS, FADING, SLOW, RENEWALS, EAGER, DIVERGING, STAGE_SHR
 
 # Change to an implicit method. The largest rate of the equations is measured in one of PATIENCE attempts: in all, it would take a
 # tenth of the time of small scenes. Where the length of an explicit step times this rate exceeds LIMIT, stability may limit it:
-# Dopri8 is stable up to 3.7 for undamped oscillations, and up to STABLE for others, and the controller takes four fifths of that.
+# Dopri8 is stable up to 3.7 for undamped oscillations, and up to STABLE for others, and the controller takes four fifths of that:
+# both are properties of its tableau, and ten times as much would never be reached.
 # But steps as long may be due to a visible vibration, which every method must follow. Therefore the next attempt is an implicit
 # step that is CLEARLY longer than one has to be to pay. If its error is below the tolerance, the run goes on implicitly, until
 # UNPAID steps in succession do not pay. After each failure of either kind the run waits twice as many attempts until the next
