@@ -1,0 +1,171 @@
+"""Thresholds and limits of repetitions ten times as large or as small leave motions and verdicts as they are."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.equations.test_rubbing import states
+from tests.equations.test_stationary_rows import rod_between_guides
+from tests.friction import cart, drawer, pendulum, rubbing
+from tests.integrate.own_systems import G
+from tests.integrate.own_systems import pendulum as spatial_pendulum
+from tests.integrate.test_matrices_in_forces import SolvedSpring
+from tests.integrate.test_own_system_events import coupled, swung
+from tests.integrate.test_sticking import block, oscillator, sticking
+from tests.native.test_implicit_stages import damped
+from tests.synthesis.test_design import FOUR_BAR
+from tests.ten_times import multiplied
+from udkjax.equations.redundancy import examine_rows
+from udkjax.integrate.solvers import method_of
+from udkjax.native.base.steps import LIMIT, STABLE
+
+pytestmark = pytest.mark.slow
+TIGHT: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-9, "throw": False}
+
+
+def held_pins() -> dict[str, Any]:
+    """Rods across guides, and mechanisms without any: what `analyse` finds in their rows."""
+    scenes = {f"rod {x:g}": rod_between_guides(x, 0.4) for x in (0.05, 3.0, 40.0)}
+    for name in ("parallelogram", "peaucellier", "elliptic_trammel", "slider_crank"):
+        scenes[name] = getattr(udk.library, name)()
+    scenes["flat"] = udk.library.parallelogram(1e-3)  # near a singular configuration
+    rows = {name: examine_rows(mechanism) for name, mechanism in scenes.items()}
+    return {name: (found.redundant, [pin.name for pin in found.held]) for name, found in rows.items()}
+
+
+def impacts_of_systems() -> dict[str, Any]:
+    """Impacts, and contacts that the constraints block: that of a pendulum with a sphere about its pivot that grows."""
+    grows = udk.Event(lambda t, q, v: 1.5 - t - q @ q, udk.Impact(0.5, at_rest="stop"), name="sphere")
+    start = udk.State([0.8, 0.0, -0.6], [0.0, 0.8 * np.sqrt(G / 0.6), 0.0])
+    blocked = udk.simulate(spatial_pendulum(), [0.0, 1.0], start, **TIGHT, events=grows)
+    runs = {"swung": swung("native"), "coupled": coupled(3.0), "blocked": blocked}
+    return {name: (int(run.code), run.q) for name, run in runs.items()}
+
+
+def matrices_in_forces() -> dict[str, Any]:
+    rod, pin = udk.Body(1.0, 0.1, [0.5, 0.0]), udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]])
+    spring = SolvedSpring(["ground", "rod"], jnp.asarray(7.0))
+    mechanism = udk.Mechanism({"rod": rod}, {"pin": pin}, forces={"spring": spring})
+    return {"rod": udk.simulate(mechanism, [0.0, 0.5, 1.0], **TIGHT).q}
+
+
+def sticking_joints() -> dict[str, Any]:
+    """Joints at rest of which some lock each other, some slide: times of events and last places."""
+    found: dict[str, Any] = {}
+    for name in ("four_bar", "slider_crank", "double_pendulum"):
+        run = udk.simulate(sticking(getattr(udk.library, name)()), np.linspace(0.0, 6.0, 4), **TIGHT)
+        assert run.events is not None and run.sticking is not None
+        found[name] = run.q, run.events.time, run.sticking
+    for name, mechanism in {"block": block(0.2, 2.0, coefficient=0.3), "oscillator": oscillator()}.items():
+        found[name] = udk.simulate(mechanism, [0.0, 1.0, 50.0], **TIGHT).q
+    return found
+
+
+def rubbing_joints() -> dict[str, Any]:
+    """Friction of three tenths of that which jams, by machine code and by JAX."""
+    scenes = {"pendulum": pendulum(coefficient=1.5, radius=0.1, speed=0.05), "cart": cart(0.3, 0.2, speed=0.05)}
+    scenes |= {name: rubbing(getattr(udk.library, name)(), 1.0, speed=0.05) for name in ("four_bar", "slider_crank")}
+    found: dict[str, Any] = {name: udk.simulate(x, [0.0, 0.1, 0.2], **TIGHT).q for name, x in scenes.items()}
+    for name, x in scenes.items():
+        for k, (q, v) in enumerate(states(x, 2)):
+            found[f"{name} {k}"] = np.asarray(udk.accelerations(x, 0.0, q.reshape(-1, 3), v.reshape(-1, 3))) / 1e3
+    return found
+
+
+def jams() -> dict[str, Any]:
+    """The joints that jam, by name."""
+    scenes = {"drawer": drawer(0.26), "pin": pendulum(coefficient=5.7, radius=0.1)}
+    return {name: udk.simulate(x, [0.0, 1.0], throw=False).cause.partition(" at ")[0] for name, x in scenes.items()}
+
+
+def designs() -> dict[str, Any]:
+    """Four-bars through places of a circle and of a bow: the sums of squares that they leave, in lengths of 10."""
+    places = {"circle": [[2.0, 8.0], [5.0, 11.0], [8.0, 8.0], [5.0, 5.0]], "bow": [[0.0, 8.0], [2.0, 12.0], [9.0, 14.0]]}
+    found = {name: udk.design(FOUR_BAR, udk.PathGoal("P", at), starts=40, results=1)[0] for name, at in places.items()}
+    return {name: found.loss / 100 for name, found in found.items()}
+
+
+def stiff_runs() -> dict[str, Any]:
+    """Whether dampers make a run go on implicitly, and where it ends."""
+    scenes = {  # tolerance, seconds
+        "four_bar": (damped(1e5), 1e-6, 1.0),
+        "pendulum": (damped(1e7, scene=udk.library.compound_pendulum()), 1e-6, 1.0),
+        "parallelogram": (udk.library.parallelogram(), 1e-6, 5.0),
+        "double_pendulum": (udk.library.double_pendulum(), 1e-9, 5.0),
+    }
+    runs = {name: udk.simulate(x, [0.0, end / 2, end], rtol=tol, atol=tol, throw=False) for name, (x, tol, end) in scenes.items()}
+    return {name: (int(run.stats["implicit"]) > 0, run.q) for name, run in runs.items()}
+
+
+CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = {
+    "FITS": (held_pins, ("equations.stationary_rows.FITS",), 0.0),
+    "SMALL": (held_pins, ("equations.stationary_rows.SMALL",), 0.0),
+    "BLOCKED_IN_SYSTEM": (impacts_of_systems, ("integrate.events.impacts.BLOCKED_IN_SYSTEM",), 0.0),
+    "MOST_ROWS": (matrices_in_forces, ("expressions.matrix_rules.MOST_ROWS",), 1e-8),
+    "REPETITIONS": (sticking_joints, ("integrate.events.sticking.REPETITIONS",), 1e-9),
+    "SWEEPS": (sticking_joints, ("integrate.events.sticking.SWEEPS",), 1e-9),
+    "SAME_SHARE": (sticking_joints, ("integrate.events.sticking.SAME_SHARE",), 1e-9),
+    "BLOCK_STEPS": (sticking_joints, ("integrate.events.sticking.BLOCK_STEPS",), 1e-9),
+    "SINGLE_STEPS": (sticking_joints, ("integrate.events.sticking.SINGLE_STEPS",), 1e-9),
+    "SETTLED": (rubbing_joints, ("equations.friction_elimination.SETTLED",), 1e-8),
+    "LAST_CHANGE": (rubbing_joints, ("equations.rubbing.LAST_CHANGE",), 1e-8),
+    "ROUNDS": (rubbing_joints, ("equations.friction_elimination.ROUNDS",), 1e-8),
+    "SETTLING_ROUNDS": (rubbing_joints, ("native.base.steps.SETTLING_ROUNDS",), 1e-8),
+    "MOST_STEPS": (rubbing_joints, ("equations.rubbing.MOST_STEPS",), 1e-8),
+    "ROUNDS, of starts": (designs, ("synthesis.starts.ROUNDS",), 1e-6),
+    "LEAST_FALL": (designs, ("synthesis.search.LEAST_FALL",), 1e-6),
+    "JAMMING_TIMES": (jams, ("integrate.causes.jamming.JAMMING_TIMES",), 0.0),
+}
+USUAL: dict[Any, Any] = {}
+
+
+def usual(results: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    if results not in USUAL:
+        USUAL[results] = results()
+    return USUAL[results]
+
+
+def assert_same(found: dict[str, Any], expected: dict[str, Any], atol: float) -> None:
+    """Compare results: numbers up to a tolerance, everything else exactly."""
+    for key, value in expected.items():
+        assert jax.tree.structure(value) == jax.tree.structure(found[key]), key
+        for x, y in zip(jax.tree.leaves(found[key]), jax.tree.leaves(value), strict=True):
+            is_number = not isinstance(y, str) and np.issubdtype(np.asarray(y).dtype, np.floating)
+            compare = np.testing.assert_allclose if is_number else np.testing.assert_array_equal
+            compare(x, y, err_msg=key, **({"atol": atol, "rtol": 0} if is_number else {}))
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+@pytest.mark.parametrize("name", CASES)
+def test_ten_times(name, factor):
+    results, constants, atol = CASES[name]
+    expected = usual(results)
+    with multiplied(factor, *constants):
+        found = results()
+    assert_same(found, expected, atol)
+
+
+def test_what_limits_explicit_steps_is_the_stability_of_dopri8():
+    """|R(z)| <= 1 up to z = -STABLE, and up to five fourths of LIMIT along the imaginary axis: steps are four fifths as long."""
+    A, b = method_of(None).v[:-1], method_of(None).v[-1]
+    one = np.ones(len(b))
+
+    def growth(z: complex) -> float:
+        return abs(1 + z * (b @ np.linalg.solve(np.eye(len(b)) - z * A, one)))
+
+    for axis, bound in ((-1.0, STABLE), (1j, 1.25 * LIMIT)):
+        assert all(growth(axis * bound * share) <= 1 + 1e-3 for share in np.linspace(0.01, 0.97, 50)), axis
+        assert growth(axis * bound * 1.25) > 1.05, axis
+
+
+def test_early_trials_of_implicit_steps_change_little():
+    """Trials begin far from the limit, or are as long as has to pay: stiff runs go on implicitly, others never."""
+    expected = usual(stiff_runs)
+    for factor, name in ((0.1, "LIMIT"), (0.5, "CLEARLY"), (2.0, "CLEARLY")):
+        with multiplied(factor, f"native.base.steps.{name}"):
+            assert_same(stiff_runs(), expected, 3e-5)
