@@ -135,9 +135,10 @@ def assert_same(found: dict[str, Any], expected: dict[str, Any], atol: float) ->
     for key, value in expected.items():
         assert jax.tree.structure(value) == jax.tree.structure(found[key]), key
         for x, y in zip(jax.tree.leaves(found[key]), jax.tree.leaves(value), strict=True):
-            is_number = not isinstance(y, str) and np.issubdtype(np.asarray(y).dtype, np.floating)
-            compare = np.testing.assert_allclose if is_number else np.testing.assert_array_equal
-            compare(x, y, err_msg=key, **({"atol": atol, "rtol": 0} if is_number else {}))
+            if isinstance(y, str) or not np.issubdtype(np.asarray(y).dtype, np.floating):
+                np.testing.assert_array_equal(x, y, err_msg=key)
+            else:
+                np.testing.assert_allclose(np.asarray(x), np.asarray(y), atol=atol, rtol=0, err_msg=key)
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
