@@ -91,8 +91,9 @@ def _decide(
     if xp is np and not rest.any():
         return FrictionModes(rest, xp.sign(speed), rest, rest), xp.zeros(at.t.shape, bool)
     normals, directions = (x[..., forwards, :] for x in (state_values.by_v, state_values.directions))
-    mobility = (normals**2 * take(system.inverse_mass, members)[..., None, :]).sum(-1)
-    W, at = normals @ directions.swapaxes(-1, -2), _with_locks(system, members, at, rest & ~before.locked)
+    inverse_mass = take(system.inverse_mass, members)[..., None, :]
+    mobility, W = (normals**2 * inverse_mass).sum(-1), directions / inverse_mass @ directions.swapaxes(-1, -2)
+    at = _with_locks(system, members, at, rest & ~before.locked)
     joints = JointsAtRest.of(rest, xp.sign(speed), W, mobility, before.locked, scale * rate, xp)
 
     def respond(modes: FrictionModes) -> tuple[Any, Any, Any]:
