@@ -2,12 +2,22 @@
 
 from collections.abc import Mapping
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import udkjax as udk
+from experiments.parts.random_scenes import build, random_scene
 from tests.friction import rubbing
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.determinacy import left_null_space
+from udkjax.equations.rubbing import rubbing_names, settle, single_rubbing_loads
+from udkjax.equations.textbook import prepare
 
 pytestmark = pytest.mark.slow
+
+SAMPLED = 10.0  # size of sampled loads that balance each other, relative to the largest load of the motion
 
 
 def verdict(mechanism: udk.Mechanism) -> tuple[dict[str, tuple[bool, bool]], str]:
@@ -72,3 +82,45 @@ def test_a_joint_that_cannot_slide_moves_nothing():
     assert all(accelerations for _, accelerations in found.values())
     assert not all(load for load, _ in found.values())
     assert "but the accelerations are" in text
+
+
+def test_verdicts_agree_with_loads_that_equilibrium_allows():
+    """Two guides share a carriage, which a closed chain of pins and a slide follows.
+
+    As long as both press to the same side, the sum of their friction is constant, and nothing answers to it: samples must reach
+    loads that are clamped between the guides, several times those of the motion.
+    """
+    scene = random_scene(1, 7, 6, forces=False)
+    speed = 1e-3 * scene.length / scene.time
+    mechanism = rubbing(build(scene.table), 0.2, 0.03 * scene.length, speed=speed)
+    rubs = {name: force for name, force in mechanism.forces.items() if name.startswith("rub ")}
+    mechanism = udk.Mechanism(mechanism.bodies, mechanism.joints, forces=rubs, gravity=mechanism.gravity)
+    found, _ = verdict(mechanism)
+    spread = spreads(mechanism)
+    assert {name: bool(x < 1e-9) for name, x in spread.items()} == {name: load for name, (load, _) in found.items()}
+    assert all(x < 1e-9 or x > 1e-4 for x in spread.values())
+
+
+def spreads(mechanism: udk.Mechanism, samples: int = 6) -> dict[str, float]:
+    """Return how much the friction of each joint varies, relative to its largest value, over multipliers that balance it."""
+    analysis, equations = udk.analyse(mechanism), prepare(mechanism, udk.SVD())
+    scales, q = equations.scales, mechanism.q0.ravel()
+    N = left_null_space(mechanism, 0.0, q, analysis).basis
+    unit, draw = scales.coordinates(q.size), np.random.default_rng(0)
+    v = equations.tangent_part(0.0, q, q, q, jnp.asarray(draw.normal(size=q.size)) * unit * scales.rate).dv
+    D, root = uk.D(mechanism, 0.0, q, scales.weights), uk.inverse_sqrt_mass(mechanism)
+    plus, b = uk.pseudoinverse(equations.method, D), uk.b(mechanism, 0.0, q, v, None, scales.weights)
+
+    def drags(y: jax.Array) -> jax.Array:
+        def balance(friction: jax.Array) -> jax.Array:
+            least = -scales.weights * (plus.T @ (plus @ (b - D @ (root * friction))))
+            return least + N @ y / scales.rows
+
+        multipliers = settle(balance, mechanism, jnp.asarray(0.0), q, v)
+        found = single_rubbing_loads(mechanism, 0.0, q, v, multipliers)
+        return jnp.stack([jnp.linalg.norm(x * unit) for x in found.values()])
+
+    size = jnp.max(jnp.abs(uk.multipliers(mechanism, 0.0, q, v, equations.method, None, scales.weights) * scales.rows))
+    sizes = np.asarray(jax.jit(jax.vmap(drags))(SAMPLED * size * jnp.asarray(draw.normal(size=(samples, len(N))))))
+    assert np.isfinite(sizes).all()
+    return dict(zip(rubbing_names(mechanism), np.ptp(sizes, axis=0) / sizes.max(0), strict=True))
