@@ -84,6 +84,7 @@ def test_block_slides_up_and_sticks_for_ever():
     np.testing.assert_allclose(along, stop * np.array([0.0, 0.75, 1.0, 1.0]), atol=1e-12)
     assert solution.settings["engine"] == "native"
     assert solution.sticking["S"].tolist() == [False, False, True, True]
+    assert "S at 2 of 4 times" in str(solution)
     assert solution.events.of("S sticks") == pytest.approx([stop], abs=1e-12)
 
 

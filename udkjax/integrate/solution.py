@@ -178,6 +178,9 @@ class Solution(PrintsTable):
         if several:
             rows["bodies"] = ", ".join(self.bodies)
             return PrintedTable(f"simulation of {np.size(self.code)} members", list(rows.items()))
+        counts = {joint: int(np.sum(np.asarray(sticks))) for joint, sticks in (self.sticking or {}).items()}
+        if counts:
+            rows["sticking"] = ", ".join(f"{joint} at {count} of {len(ts)} times" for joint, count in counts.items())
         q = np.asarray(self.q).reshape(len(ts), -1, np.shape(self.q)[-1])
         for k, body in enumerate(self.bodies):
             rows[body] = f"from {format_pose(q[0, k], size_of(q))} to {format_pose(q[-1, k], size_of(q))}"
