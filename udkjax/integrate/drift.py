@@ -69,11 +69,11 @@ class DriftController(diffrax.AbstractAdaptiveStepSizeController):
         keep, *times, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state.inner
         )
-        equations, t, y, tol = stop_gradients((args, t1, y1_candidate, self.drift_tol))
+        equations, before, t, y, tol = stop_gradients((args, (t0, y0), t1, y1_candidate, self.drift_tol))
         size = violation(equations, t, y)
 
         def measured(_: Array) -> Array:
-            return distance(equations, t, y)
+            return jnp.maximum(distance(equations, t, y), distance(equations, *before))
 
         is_small = size <= tol * NEAREST**2  # at any distance: most steps do not measure it
         near = jax.lax.cond(keep & ~is_small, measured, lambda _: jnp.array(0.0), 0)

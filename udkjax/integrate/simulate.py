@@ -89,11 +89,11 @@ def simulate(
     code also ends a run at a projected step that leaves more than `drift_tol`, a hundred tolerances and the threshold of pivots,
     or more than 0.01 (relative to L, or rad). Where rows become dependent, a run that is not projected may lose its energy or
     change its branch: it ends as `singular` at a step whose violation of Psi exceeds `drift_tol` times the square of the
-    distance from such a configuration, relative to the largest distance of the run. Where rows depend on others along the whole
-    motion, a run whose method finds a larger rank ends as `spurious_rank`. Where a method leaves out rows that are independent, a
-    projected run ends as `missing_rank` as soon as a step with such velocities opens Psi by more than `drift_tol` and the
-    tolerance. Machine code looks after each step, other solvers at outputs or at the end. With an infinite `drift_tol` none of
-    these ends a run.
+    distance of its farther end from such a configuration, relative to the largest of the run. Where rows depend on others along
+    the whole motion, a run whose method finds a larger rank ends as `spurious_rank`. Where a method leaves out rows that are
+    independent, a projected run ends as `missing_rank` as soon as a step with such velocities opens Psi by more than `drift_tol`
+    and the tolerance. Machine code looks after each step, other solvers at outputs or at the end. With an infinite `drift_tol`
+    none of these ends a run.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.

@@ -246,14 +246,16 @@ def _judge_drift(module: Module, f: Function, s: Lane, accept: Value) -> Value:
 
     Where the distance from singular configurations is d, a violation x of Psi moves the state by x / d and turns its velocity by
     x / d^2: near the intersection of two branches, the curves of constant Psi are hyperbolas, and lead from one branch to the
-    other. Therefore the bound of x is `drift_tol` times d^2, with d relative to the largest distance of the run. A distance
+    other. Therefore the bound of x is `drift_tol` times d^2, with d relative to the largest distance of the run. Steps that
+    are short beside d follow such a curve, and a longer one passes: d is the distance of the farther end of the step. A distance
     below which the method leaves rows out counts as this distance: `NEAREST` for elimination, else the threshold of the rank.
     """
     nearest = f.const(NEAREST, DOUBLE, f.width)
     if module.takes_dense_rows:
         nearest = f.min(nearest, s.fallback_tol)
     s.where(accept, farthest=f.max(s.farthest, s.distance))
-    nearness = f.max(s.distance, nearest) / f.max(s.farthest, nearest)
+    farther = f.max(s.distance, f.select(s.distance1 < np.inf, s.distance1, 0.0))
+    nearness = f.max(farther, nearest) / f.max(s.farthest, nearest)
     violated, status = largest_violation(module, f), lambda code: f.const(float(code), DOUBLE, f.width)
     is_turned = accept & (violated > s.drift_tol * (nearness * nearness))
     return f.select(is_turned, f.select(violated > s.drift_tol, status(Status.LOST), status(Status.SINGULAR)), 0.0)
