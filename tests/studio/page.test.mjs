@@ -184,6 +184,17 @@ test("the outline of a cam by laws touches its follower as drawn, whether that s
   assert.equal(shapes.camOutline(drawn({P: [0, 30]}, ["P"], swing), {pins: ["O", "P"], profile: {base: 40, law, angle: angles, ...swing}}), null);
 });
 
+test("the path of a pin is a smooth curve where its link turns fast, from few instants", async () => {
+  const {pathsOf} = await page("page_run"), n = 9, turn = k => 2 * Math.PI * k / (n - 1);
+  const run = {ts: Float64Array.from({length: n}, (_, k) => k), count: n, q: new Float64Array(3 * n), v: new Float64Array(3 * n)};
+  for (let k = 0; k < n; k++) { run.q[3 * k + 2] = turn(k); run.v[3 * k + 2] = turn(1); }
+  const [{line}] = pathsOf(run, new Float64Array(3), [0], [{name: "A", link: 0, place: [1, 0]}]);
+  for (let k = 2; k < line.length; k += 2) {
+    const middle = [(line[k] + line[k - 2]) / 2, (line[k + 1] + line[k - 1]) / 2];
+    assert.ok(Math.abs(Math.hypot(...middle) - 1) < 1e-3);
+  }
+});
+
 test("a periodic spline goes through its values and has no corner where it closes", () => {
   const angles = [0, 1, 2.5, 4, 5], values = [1, 2, 1.5, 3, 1.2], f = shapes.periodicSpline(angles, values);
   angles.forEach((x, k) => assert.ok(Math.abs(f(x) - values[k]) < 1e-13));
@@ -249,6 +260,7 @@ test("lengths are read and written with units", () => {
 });
 
 test("values are typed as they are shown", () => {
+  assert.equal(valueText([0.1 + 0.2, 1 / 3]), "[0.3, 0.333333333333333]");  // without rounding errors
   for (const value of [12, -1.5e-3, "12 mm", ["A", "B"], [1, 2], ["0 N", "-10 N"], [[1, 2], [3, 4]], true, {type: "sine", amplitude: 1}]) assert.deepEqual(readValue(valueText(value)), Array.isArray(value) && value.every(x => /^[A-Z]$/.test(x)) ? "A, B" : value);
   assert.deepEqual(readValue("A, B", true), ["A", "B"]);
   assert.equal(readValue("12", true), "12");

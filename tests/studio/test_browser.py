@@ -173,8 +173,7 @@ def test_a_drag_released_over_a_panel_has_ended_and_escape_takes_one_away(studio
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_a_pin_that_is_pulled_takes_the_mechanism_along_and_loops_stay_closed(studio, template):
     studio.js(f"studio.files.openTemplate({json.dumps(template)})")
-    studio.until("studio.motion.pageEngine !== null")
-    studio.page.wait_for_timeout(100)
+    studio.until("studio.motion.run !== null")  # then the view shows its paths, and stays
     studio.tool("h")
     carried = "studio.canvas.carrier(studio.document, p) >= 0 && studio.canvas.places.has(p)"
     moving = studio.js(f"Object.keys(studio.document.pins).filter(p => {carried})")
@@ -191,6 +190,24 @@ def test_a_pin_that_is_pulled_takes_the_mechanism_along_and_loops_stay_closed(st
     assert max(violation for violation, _ in frames) < 1e-9
     moved = studio.js("Math.max(...studio.motion.motions.map(Math.abs))") > 0
     assert moved or any("Home" not in words for _, words in frames)
+
+
+@pytest.mark.slow
+def test_the_view_stays_under_a_hand_that_pulls_before_the_first_run_is_there(studio):
+    studio.js("window.take = studio.motion.take.bind(studio.motion); studio.motion.take = run => { window.held = run; }; null")
+    studio.js("studio.files.openTemplate('peaucellier')")
+    studio.until("window.held !== undefined")
+    studio.tool("h")
+    name = studio.js("Object.keys(studio.document.pins).find(p => studio.canvas.carrier(studio.document, p) >= 0)")
+    before = studio.js("studio.view")
+    x, y = studio.pin(name)
+    studio.page.mouse.move(x, y)
+    studio.page.mouse.down()
+    studio.page.mouse.move(x + 10, y)
+    studio.js("take(held)")
+    studio.page.mouse.move(x + 20, y)
+    assert studio.js("studio.motion.posed !== null") and studio.js("studio.view") == before
+    studio.page.mouse.up()
 
 
 @pytest.mark.slow

@@ -1,12 +1,14 @@
 // The run of a drawing by its engine: the motion from the drawn position or another one, the energies, and the paths of pins.
 
 import {carry, motionsOf} from "./motions.js";
+import {stateAt} from "./player/motion.js";
 import {PartRun} from "./player/part_run.js";
 
 const INSTANTS = 401;
 // Steps of a first attempt, which shows a standstill early, of the first part of a run, which few runs exceed, and of further parts,
 // each of which begins with a new step size.
 const ATTEMPT = 300, FIRST_PART = 2000, PART = 100;
+const PIECE = 0.06, MOST_PIECES = 16;  // rad by which a link turns within a straight piece of a path, and most pieces between instants
 const STILL = 1e-9;  // characteristic lengths, or rad: a smaller motion is rounding
 
 /** The run of a request {parameters, drawn, order, length, duration, from, carried}.
@@ -39,13 +41,21 @@ function moves({q, count}, length) {
   return false;
 }
 
-/** The paths of pins over a run: [x, y, ...] in metres, and the link that carries each. */
-export function pathsOf({q, count}, drawn, order, carried) {
+/** The paths of pins over a run: [x, y, ...] in metres, and the link that carries each; smooth also where links turn fast. */
+export function pathsOf(run, drawn, order, carried) {
+  const {ts, q, count} = run, size = drawn.length, lines = carried.map(() => []);
   if (count < 2) return [];
-  const found = carried.map(({name, link}) => ({name, link, line: new Float64Array(2 * count)})), size = drawn.length;
-  for (let i = 0; i < count; i++) {
-    const motions = motionsOf(q.subarray(i * size, (i + 1) * size), drawn, order);
-    carried.forEach(({link, place}, k) => found[k].line.set(carry(motions, link, place), 2 * i));
+  const put = coordinates => {
+    const motions = motionsOf(coordinates, drawn, order);
+    carried.forEach(({link, place}, k) => lines[k].push(...carry(motions, link, place)));
+  };
+  put(q.subarray(0, size));
+  for (let i = 1; i < count; i++) {
+    let turned = 0;
+    for (let k = 2; k < size; k += 3) turned = Math.max(turned, Math.abs(q[i * size + k] - q[(i - 1) * size + k]));
+    const pieces = Math.min(Math.ceil(turned / PIECE), MOST_PIECES);
+    for (let k = 1; k < pieces; k++) put(stateAt(run, ts[i - 1] + (ts[i] - ts[i - 1]) * k / pieces, size).q);
+    put(q.subarray(i * size, (i + 1) * size));
   }
-  return found;
+  return carried.map(({name, link}, k) => ({name, link, line: Float64Array.from(lines[k])}));
 }

@@ -4,6 +4,7 @@
 export function valueText(value) {
   if (value === undefined || value === null) return "";
   if (Array.isArray(value)) return value.every(x => typeof x === "string" && /^[^\s,[\]{}"]+$/.test(x) && !/^[-+.\d]/.test(x)) ? value.join(", ") : `[${value.map(valueText).join(", ")}]`;
+  if (typeof value === "number") return String(+value.toPrecision(15));  // 0.5 for 0.5000000000000001
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
 
