@@ -181,8 +181,6 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
         plain, formulation = equations.equations, equations.formulation
     if plain.programs is None and jax.config.jax_enable_x64:
         return f"it does not know {type(plain).__name__}"
-    if formulation is not None and not isinstance(plain, TextbookEquations):
-        return f"it knows {type(formulation).__name__} of mechanisms only"
     if isinstance(plain, TextbookEquations) and plain.rubs:
         if formulation is not None or not eliminates(plain.method):
             return "it computes friction that depends on the loads of joints by elimination only"

@@ -5,6 +5,8 @@ With the unconstrained accelerations a_F, their change x by the constraints, and
     M x + A^T lambda = 0,        A x = b,        a = a_F + x,
 
 all in the scene's own units, in which coordinates, rows and masses are of order one. States are projected by the pseudoinverse.
+A mass matrix that is not diagonal, M = L C^(-1) L^T, is diagonal in the coordinates L^T x of equations/system_solver.py:
+there the rows are A L^(-T), and the program `spread` leads back.
 """
 
 from abc import ABC, abstractmethod
@@ -52,8 +54,14 @@ class FormulatedAccelerations(ABC):
         f, _ = module.function(FORMULATE, [(POINTER, "work"), (POINTER, "out")])
         module.invoke(f, "dense_accelerations")
         x = self.solve(DenseMatrices(self._layout, f))
+        couples = module.code.couples
+        if couples:
+            with f.each(module.n) as i:
+                module.put_entry(f, "change", i, self._unit(f, i) * x.entry(i))
+            module.invoke(f, "spread", "change")
         with f.each(module.n) as i:
-            a = f.fma(self._unit(f, i), x.entry(i), self._array(f, "terms", i))
+            free = self._array(f, "terms", i)
+            a = free + self._array(f, "change", i) if couples else f.fma(self._unit(f, i), x.entry(i), free)
             f.store(a, f.given["out"], i * f.width, f.width)
 
     @abstractmethod

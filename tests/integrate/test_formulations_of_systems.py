@@ -1,0 +1,74 @@
+"""Other formulations of a user-defined system by machine code: the same motion, with any mass matrix and redundant rows."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+
+TS = np.linspace(0.0, 1.0, 5)
+FORMULATIONS = {
+    "Augmented": udk.Augmented(),
+    "Augmented, SVD": udk.Augmented(udk.SVD()),
+    "NullSpaceQR": udk.NullSpaceQR(),
+    "NullSpaceSVD": udk.NullSpaceSVD(),
+}
+START = udk.State(np.array([0.6, 0.0, -0.8, 0.3]), np.array([0.0, 1.5, 0.0, 0.4]))
+
+
+def system(copies=1, coupling=0.3, rolls=True):
+    """A point on a sphere with a fourth coordinate, by a full M of q; a row of velocities ties it to the second."""
+
+    def mass(q):
+        M = jnp.diag(jnp.array([2.0, 1.5, 1.0, 0.7]))
+        return M + coupling * jnp.cos(q[3]) * (jnp.ones((4, 4)) - jnp.eye(4)) if coupling else M
+
+    return udk.ConstrainedSystem(
+        mass,
+        lambda t, q, v: jnp.array([0.0, 0.2, -9.81, 0.5]) - 0.1 * v,
+        lambda t, q: jnp.tile(q[:3] @ q[:3] - 1.0, copies),
+        (lambda t, q, v: v[3] - 0.3 * v[1] * jnp.cos(q[0]) - 0.4 + 0.45 * jnp.cos(0.6)) if rolls else None,
+    )
+
+
+def run(found, formulation=None, engine: Any = "native", **choices):
+    return udk.simulate(found, TS, START, rtol=1e-10, atol=1e-10, formulation=formulation, engine=engine, **choices)
+
+
+def test_a_full_mass_matrix():
+    found = run(system(), FORMULATIONS["NullSpaceQR"])
+    assert found.settings["engine"] == "native" and found.settings["formulation"] == "NullSpaceQR"
+    assert_allclose(found.q, run(system()).q, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMULATIONS)
+@pytest.mark.parametrize(("copies", "coupling", "rolls"), [(1, 0.0, True), (1, 0.3, False), (2, 0.3, True)])
+def test_both_engines_and_the_equation_of_udwadia_and_kalaba(name, copies, coupling, rolls):
+    """Also with a row that is given twice, which LU refuses at once."""
+    found, formulation = system(copies, coupling, rolls), FORMULATIONS[name]
+    if name == "Augmented" and copies > 1:
+        for engine in ("native", "jax"):
+            assert run(found, formulation, engine, throw=False).result == udk.Result.not_finite
+        return
+    one, other, reference = run(found, formulation), run(found, formulation, "jax"), run(found)
+    assert_allclose(one.q, other.q, rtol=0, atol=1e-9)
+    assert_allclose(one.q, reference.q, rtol=0, atol=1e-8)
+    assert_allclose(one.v, reference.v, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMULATIONS)
+def test_derivatives_and_members(name):
+    def end(a, formulation):
+        found = system()
+        return run(udk.ConstrainedSystem(lambda q: a * found.mass(q), found.force, found.constraint), formulation).q[-1]
+
+    a = jnp.array([0.9, 1.2])
+    members = jax.vmap(lambda a: end(a, FORMULATIONS[name]))(a)
+    assert_allclose(members, [end(x, None) for x in np.asarray(a)], rtol=0, atol=1e-8)
+    assert_allclose(jax.jacfwd(end)(a[0], FORMULATIONS[name]), jax.jacfwd(end)(a[0], None), rtol=0, atol=1e-7)
