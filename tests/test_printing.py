@@ -58,7 +58,7 @@ def objects() -> dict[str, object]:
         *(free, mech, *mech.bodies.values(), *JOINTS.values(), *DRIVERS.values(), *FORCES.values()),
         *(run, run.events, udk.assemble(free), udk.check(free), udk.analyse(free), udk.energy(free, run)),
         *(motion, udk.travel(linkage, "joint.C.angle"), rest, udk.modes(free, rest.state), driven, udk.power_balance(free, run)),
-        udk.motion_ranges(free, motion),
+        *(udk.motion_ranges(free, motion), udk.holding_efforts(free, coordinate, [0.1, 0.2])),
         udk.LiftProfile(0.04, ["cycloidal", "3-4-5"], [np.pi, np.pi], [0.02, -0.02]),
         udk.SwingProfile(0.04, ["cycloidal", "3-4-5"], [np.pi, np.pi], [0.4, -0.4], 0.09, 0.07),
         udk.motion_at(free, 0.3, coordinate),

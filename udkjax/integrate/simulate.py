@@ -235,20 +235,18 @@ def simulate(
     if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(code):
         return _required(explained_system(solution if located is None else located, system, end), throw)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
-        return _required(_as_located(solution, located), throw)
+        return _required(solution if located is None else _as_located(solution, located), throw)
     if missed:
         analysis = analyse(mechanism)  # with the numbers of the given analysis more rows were redundant
         solution, _, end, code = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
     if _has_failed(code):
         found = solution if located is None else located
         return _required(explained(found, mechanism, analysis, choices.drift_tol, solver, end), throw)
-    return _as_located(solution, located)
+    return solution if located is None else _as_located(solution, located)
 
 
-def _as_located(solution: Solution, located: Solution | None) -> Solution:
-    """Return a solution without located kinks, with the time until which a run that failed has located them, if there was one."""
-    if located is None:
-        return solution
+def _as_located(solution: Solution, located: Solution) -> Solution:
+    """Return a solution without located kinks, with the time until which a run that failed has located them."""
     return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
 
 
@@ -263,15 +261,11 @@ def _may_stick(mechanism: Mechanism) -> bool:
     return Friction.may_stick(mechanism.forces.values())
 
 
+@cached_by_identity
 def _may_have_kinks(system: Any) -> bool:
     if isinstance(system, Mechanism):
-        return _may_force_have_kinks(system)
+        return any(force.may_have_kinks for force in system.forces.values())
     return not isinstance(system, ConstrainedSystem) and system.functions.may_have_kinks  # traced
-
-
-@cached_by_identity
-def _may_force_have_kinks(mechanism: Mechanism) -> bool:
-    return any(force.may_have_kinks for force in mechanism.forces.values())
 
 
 def _has_failed(code: Any) -> bool:

@@ -259,9 +259,7 @@ class _Writer:
             self.problems.append(f'force {quote(name)}: friction in MJCF sticks: give it law="set-valued", without a velocity')
         elif not is_hinge:
             self.problems.append(f"force {quote(name)}: its joint closes a loop, and MJCF has friction in hinges only")
-        elif force.joint in self.losses:
-            self.problems.append(f"force {quote(name)}: a second friction in joint {quote(force.joint)}")
-        else:
+        else:  # the only friction of its joint: a scene has no second one beside friction that sticks
             self.losses[force.joint] = {"frictionloss": _numbers(force.torque)}
 
     def _add_turning(self, name: str, force: Any) -> None:
