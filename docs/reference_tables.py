@@ -1,5 +1,7 @@
 """A hook of MkDocs: adds a table of arguments or fields to each public class of the reference, and makes the page of commands.
 
+It also puts the tables and plots of the study `atlas` into the site.
+
 Their meanings come from the docstring of a class (Args, Attributes) or from the comment on the line of a field, the rest from its
 signature. Commands are functions of their options, with the same sections.
 """
@@ -12,22 +14,39 @@ import re
 import tokenize
 from collections.abc import Iterator
 from enum import Enum
-from typing import Annotated, get_args, get_origin
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, get_args, get_origin
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
 
 DIRECTIVE = re.compile(r"^::: (udkjax[\w.]*\.([A-Z]\w*))$", re.M)
 ARRAY = re.compile(r"(?:jaxtyping\.)?(?:Float|Int|Bool)\[[\w.]*(?:Array|ArrayLike|ndarray|Union\[.*?\]), *(['\"])(.*?)\1\]")
 MODULE = re.compile(r"\b(?:udkjax|collections|typing|jax|numpy|pathlib|diffrax|optimistix|scipy)(?:\.\w+)*\.(?=\w)")
-COMMANDS = "<!-- commands -->"
+COMMANDS, ATLAS = "<!-- commands -->", "<!-- atlas -->"
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 ITEM = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {5,}.*)*)", re.M)
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Add a table after each class on a page of the reference, and replace `COMMANDS` by all commands."""
+    """Add a table after each class on a page of the reference, and replace `COMMANDS` by all commands, `ATLAS` by its tables."""
     if COMMANDS in markdown:
         from udkjax.cli import COMMANDS as names
 
         markdown = markdown.replace(COMMANDS, "\n".join(command(name) for name in names))
+    if ATLAS in markdown:
+        *_, tables = (EXPERIMENTS / "atlas.md").read_text(encoding="utf-8").split("\n", 4)  # after its title and links
+        markdown = markdown.replace(ATLAS, f"[All plots](atlas-plots.html), by mechanism and choice, are one page.\n{tables}")
     return DIRECTIVE.sub(lambda found: found[0] + OPTIONS + table(resolve(found[1])), markdown)
+
+
+def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
+    """Add the page of plots."""
+    from mkdocs.structure.files import File  # which tests of this module do without
+
+    files.append(File.generated(config, "theory/atlas-plots.html", abs_src_path=str(EXPERIMENTS / "atlas.html")))
+    return files
 
 
 def command(name: str) -> str:

@@ -178,7 +178,7 @@ def _sweep(problem: Problem, expected: Reference, part: Part, cells: list[dict[s
     if part.steps:
         shared = shared | {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": tolerances[0] * problem.end}
     axes = varied | {
-        "tol": udk.Zipped({"rtol": tolerances, "atol": tolerances * problem.lengths.min()}),
+        "tol": udk.Zipped({"rtol": tolerances, "atol": tolerances}),
         "start": udk.Axis(problem.states(len(expected.q))[: part.starts], of="state"),
     }
     measures = {"wrong": compare(problem, expected), "closure": "violation", "energy": "energy_drift"}

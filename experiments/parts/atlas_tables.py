@@ -167,13 +167,19 @@ def markdown(data: xarray.Dataset) -> str:
         work = _number(row["right_hand_sides"], ".0f")
         name = row["best"] if best else ""
         lines.append(_row((titles[row["problem"]], f"{row['error']:.0e}", tolerances[0], own, work, name, tolerances[1], best)))
-    lines += ["", "Runs that ended as successful and are wrong, and those that ended with a reason:", ""]
-    heads = ("Mechanism", "Stabilization", "Runs", "Silently wrong", "Refused")
-    lines += [_row(heads), "|---" * len(heads) + "|"]
-    for (problem, stabilization), some in runs.groupby(["problem", "stabilization"], sort=False):
-        refused = int((some.result != 0).sum())
-        lines.append(_row((titles[problem], stabilization, f"{len(some):,}", int(wrong[some.index].sum()), f"{refused:,}")))
+    kinds = runs.stabilization.unique()
+    said = "Runs that ended as successful and are wrong / those that ended with a reason / all, by stabilization:"
+    lines += ["", said, "", _row(("Mechanism", *kinds)), "|---" * (1 + len(kinds)) + "|"]
+    for name, title in titles.items():
+        lines.append(_row((title, *(_failures(runs, wrong, name, kind) for kind in kinds))))
     return "\n".join(lines) + "\n"
+
+
+def _failures(runs: Runs, wrong: Any, problem: str, stabilization: str) -> str:
+    some = runs[(runs.problem == problem) & (runs.stabilization == stabilization)]
+    if some.empty:
+        return ""
+    return f"{int(wrong[some.index].sum())} / {int((some.result != 0).sum()):,} / {len(some):,}"
 
 
 def _times(runs: Runs) -> str:
