@@ -35,7 +35,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 MOST_STEPS = 50  # of Newton's method, which needs three to six
-SETTLED = 1e-12  # relative change of an effort by its last step
+LAST_STEP = 1e-12  # relative change of an effort by its last step
 LOCKED = 1e-9  # growth of the acceleration with the effort, relative to that without friction: less is rounding
 STILL = 1e-9  # speed of sliding in a motion, relative to the fastest coordinate: slower is rounding
 
@@ -160,7 +160,7 @@ def _efforts(mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], r
 
             def goes_on(state: tuple[Array, Array, Array]) -> Array:
                 x, change, k = state
-                return jnp.isfinite(x) & (jnp.abs(change) > SETTLED * jnp.abs(x)) & (k < MOST_STEPS)
+                return jnp.isfinite(x) & (jnp.abs(change) > LAST_STEP * jnp.abs(x)) & (k < MOST_STEPS)
 
             start = jax.lax.stop_gradient(sign * exact)
             x, _, _ = jax.lax.while_loop(goes_on, step, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))
