@@ -16,7 +16,8 @@ START = (jnp.array([0.6, 0.0, -0.8]), jnp.array([0.0, 2.0, 0.0]))  # of the spat
 END, OUTPUTS, TOLERANCE = 10.0, 101, 1e-8
 LINKAGES, LINKAGE_END, LINKAGE_OUTPUTS, COARSE = 64, 5.0, 51, 1e-5
 MEMBERS, ROUNDS = 1024, 7
-AGREE = 1e-5  # m: tolerance within which all candidates must agree
+# m: tolerances within which candidates must agree; the script of the linkages regularizes its matrix by 1e-4, and errs by that.
+AGREE, LINKAGES_AGREE = 1e-5, 1e-2
 
 
 def by_udkjax(length: Any) -> jax.Array:
@@ -98,7 +99,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
     for name, (own, script, argument) in cases.items():
         one, other = Compiled(own, argument), Compiled(script, argument)
         apart = float(np.max(np.abs(np.asarray(one.result) - np.asarray(other.result))))
-        assert apart < (1e-2 if "linkages" in name else AGREE), (name, apart)
+        assert apart < (LINKAGES_AGREE if "linkages" in name else AGREE), (name, apart)
         times = in_turn(
             {
                 "udkjax": lambda one=one, argument=argument: one.cpu_seconds(argument, at_least=at_least),
