@@ -1,7 +1,9 @@
 """Pressure angles of cams against formulas of textbooks: followers that slide in line and offset, that swing, and flat ones."""
 
-from types import SimpleNamespace
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,6 +15,12 @@ LAW |= {"angle": [RISE, 60, 120, 60], "lift": [LIFT, 0, -LIFT, 0]}
 AT = np.array([10.0, 45.0, 60.0, 100.0, 150.0])  # deg
 UPWARDS = [{"link": "follower", "direction": [0, 1]}]
 WHEEL = {"mass": 1, "width": 10}
+
+
+class States(NamedTuple):
+    ts: jax.Array
+    q: jax.Array
+    v: jax.Array
 
 
 def cam(pins, follower, ground, **choices):
@@ -109,9 +117,7 @@ def test_limits_are_printed_with_the_characteristics():
 def test_places_that_are_not_reached_have_no_angle():
     mech = cam({"O": [0, 0], "P": [0, BASE]}, ["P"], ["O"], slides=UPWARDS, cam={"profile": LAW})
     motion = udk.kinematics(mech, "motor", np.deg2rad(AT))
-    q = np.array(motion.q)
-    q[2] = np.nan
-    found = udk.pressure_angle(mech, SimpleNamespace(ts=motion.values, q=q, v=motion.v), "cam")
+    found = udk.pressure_angle(mech, States(motion.values, motion.q.at[2].set(jnp.nan), motion.v), "cam")
     assert np.isnan(found).tolist() == [False, False, True, False, False]
 
 
