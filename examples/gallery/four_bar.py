@@ -1,4 +1,4 @@
-"""A live four-bar linkage of five pins: sliders change its pins and the speed of its motor, and its bodies can be dragged.
+"""A live four-bar linkage by its lengths: sliders change them and the speed of its motor, and its bodies can be dragged.
 
 The drawing is the same as in the README. If the loops cannot be closed, or the motor cannot turn on, the page says so.
 """
@@ -7,14 +7,20 @@ import numpy as np
 
 import udkjax as udk
 
-LIVE = ["motor.motor.speed", "pin.A", "pin.B", "pin.P", "pin.C", "gravity[1]"]  # changed by sliders of its page
+LIVE = ["motor.motor.speed", "pin.A.length", "pin.B.length", "pin.P.length", "pin.P.angle", "gravity[1]"]  # of sliders
 FILM = {"width": 400, "fps": 12.5, "speed": 0.35}  # samples of one turn
 
 
 def make():
     """Return the torque of the motor, and the player."""
     drawing = udk.Drawing(
-        pins={"O": (0, 0), "A": (30, 40), "B": (120, 90), "P": (60, 120), "C": (100, 0)},  # mm
+        pins={
+            "O": (0, 0),
+            "C": (100, 0),
+            "A": udk.polar("O", 40, 60),  # mm, deg
+            "B": udk.circles(("A", "C"), (120, 80), "left"),
+            "P": udk.polar("A", 70, 40, line=("A", "B")),
+        },
         links={
             "crank": {"pins": ["O", "A"], "density": 7850, "width": 15, "thickness": 5},
             "coupler": {"pins": ["A", "B", "P"], "density": 7850, "thickness": 5},
@@ -22,7 +28,7 @@ def make():
         },
         ground=["O", "C"],
         motors={"motor": {"pin": "O", "speed": "60 rpm"}},
-        units={"length": "mm"},
+        units={"length": "mm", "angle": "deg"},
         name="four-bar",
     )
     mech = drawing.mechanism()
