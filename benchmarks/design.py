@@ -1,7 +1,7 @@
 """The five classic cases of path synthesis from many seeds, and published errors: `python -m benchmarks.design [SEEDS]`.
 
-Each run is one call with one seed, on one core; its loss is that of the motion of the found mechanism. The first call, which
-compiles, is not counted.
+Each run is one call with one seed, on one core; its loss is computed from the motion of the found mechanism. The first call,
+which compiles, is not counted.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Systems of the user's own, and the other engine, beside plain scripts with diffrax."""
+"""User-defined systems, and the diffrax engine, compared with plain scripts for diffrax."""
 
 from typing import Any
 
@@ -16,12 +16,12 @@ START = (jnp.array([0.6, 0.0, -0.8]), jnp.array([0.0, 2.0, 0.0]))  # of the spat
 END, OUTPUTS, TOLERANCE = 10.0, 101, 1e-8
 LINKAGES, LINKAGE_END, LINKAGE_OUTPUTS, COARSE = 64, 5.0, 51, 1e-5
 MEMBERS, ROUNDS = 1024, 7
-# m: tolerances within which candidates must agree; the script of the linkages regularizes its matrix by 1e-4, and errs by that.
+# Tolerances (m) within which candidates must agree. The script for linkages regularizes its matrix by 1e-4: hence its errors.
 AGREE, LINKAGES_AGREE = 1e-5, 1e-2
 
 
 def by_udkjax(length: Any) -> jax.Array:
-    """Return the positions of a spatial pendulum of this length (m), whose start is that of `START` in proportion."""
+    """Return the positions of a spatial pendulum of this length (m); the position of `START` is scaled with the length."""
     system = udk.ConstrainedSystem(
         lambda q: MASS * jnp.eye(3),
         constraint=lambda t, q: q @ q - length**2,
@@ -33,7 +33,7 @@ def by_udkjax(length: Any) -> jax.Array:
 
 
 def by_script(length: Any) -> jax.Array:
-    """Do the same by a user's script: the Udwadia-Kalaba equation with derivatives by JAX, stabilized, by diffrax."""
+    """Return the same by a user's script: the stabilized Udwadia-Kalaba equation, derivatives by JAX, steps by diffrax."""
 
     def psi(q):
         return jnp.stack([q @ q - length**2])
@@ -63,7 +63,7 @@ def by_script(length: Any) -> jax.Array:
 
 
 def linkages_by_engine(angles: Any) -> jax.Array:
-    """Return the coordinates of many of the paper's linkages by the other engine."""
+    """Return the coordinates of many copies of the paper's linkage by the diffrax engine."""
     ts = np.linspace(0.0, LINKAGE_END, LINKAGE_OUTPUTS)
 
     def run(angle):
@@ -74,7 +74,7 @@ def linkages_by_engine(angles: Any) -> jax.Array:
 
 
 def linkages_by_script(angles: Any) -> jax.Array:
-    """Do the same by the script of other benchmarks."""
+    """Return the same by the script of the other benchmarks."""
     run = solve(jnp.linspace(0.0, LINKAGE_END, LINKAGE_OUTPUTS))
 
     def start(angle):
@@ -84,7 +84,7 @@ def linkages_by_script(angles: Any) -> jax.Array:
 
 
 def main(smoke: bool = False) -> list[dict[str, Any]]:
-    """Print times and first calls, and those of the scripts relative to ours."""
+    """Print times and first calls of udkjax and of the scripts, and the ratios of the times."""
     members, linkages, rounds, at_least = (8, 2, 1, 0.0) if smoke else (MEMBERS, LINKAGES, ROUNDS, 0.02)
     lengths = jnp.linspace(0.5, 1.5, members)
     angles = jnp.linspace(-0.9, -0.6, linkages)

@@ -86,6 +86,12 @@ PHRASES = [
     (r"\bwhich one,", "a letter says which one, and", "which one is it?"),
     (r"(?<!there )\b(is|are) no (number|name|batch|program)\b", "where something is no name", "there is no number"),
     (r"\blikewise\b\.?$", "y: likewise.", "Likewise, rows are scaled."),
+    (r"\b(that|those) which\b", "a thirtieth of that which jams", "the coefficient that jams"),
+    (r"\bless (that|those|the)\b", "total energy, less that of the start", "no less than the load"),
+    (r"\bof the user's own\b", "a system of the user's own", "the user's own system"),
+    (r"\bnone to (see|be)\b", "no cause, if there is none to see", "there is none"),
+    (r"\bis said by\b", "A wrong threshold is said by its result.", "It is said to be exact."),
+    (r"\bcounts? as (it is|they are) drawn\b", "Angles count as they are drawn.", "Angles are those of the drawing."),
 ]
 
 

@@ -67,7 +67,7 @@ def sticking_joints() -> dict[str, Any]:
 
 
 def rubbing_joints() -> dict[str, Any]:
-    """Friction of three tenths of that which jams, by machine code and by JAX."""
+    """Friction at three tenths of the jamming coefficient, by machine code and by JAX."""
     scenes = {"pendulum": pendulum(coefficient=1.5, radius=0.1, speed=0.05), "cart": cart(0.3, 0.2, speed=0.05)}
     scenes |= {name: rubbing(getattr(udk.library, name)(), 1.0, speed=0.05) for name in ("four_bar", "slider_crank")}
     found: dict[str, Any] = {name: udk.simulate(x, [0.0, 0.1, 0.2], **TIGHT).q for name, x in scenes.items()}

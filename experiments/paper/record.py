@@ -31,7 +31,7 @@ HISTORIES = {
     "position_error": ("m", "largest error of a coordinate of a centre of mass, against the exact solution"),
     "psi2": ("m2", "sum of the squared constraint violations"),
     "psi_dot2": ("m2/s2", "sum of the squared rates of the constraint violations"),
-    "energy": ("J", "total energy, less that of the start"),
+    "energy": ("J", "total energy minus that at the start"),
     "sigma_1": ("kg-1/2", "largest singular value of D"),
     "sigma_11": ("kg-1/2", "eleventh singular value of D"),
     "sigma_12": ("kg-1/2", "twelfth and least singular value of D: zero on the constraint manifold"),

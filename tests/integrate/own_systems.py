@@ -1,4 +1,4 @@
-"""Systems of the user's own with known motions, for tests."""
+"""User-defined systems with known motions, for tests."""
 
 from typing import Any
 

@@ -74,7 +74,7 @@ def test_engines_agree_and_energy_falls(name):
 
 @pytest.mark.slow
 def test_strong_friction_takes_more_rounds():
-    """Friction of 0.9 of that which jams the pin: machine code settles, and lanes with less friction stay as they are."""
+    """Friction at 0.9 of the jamming coefficient: machine code settles, and lanes with less friction stay as they are."""
     mechanism, ts, strong = pendulum(coefficient=0.3, radius=0.1, speed=0.05), np.linspace(0.0, 0.2, 3), 4.6
 
     def end(coefficient):

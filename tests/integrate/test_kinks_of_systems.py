@@ -1,4 +1,4 @@
-"""Jumps and kinks of the forces of a user-defined system are located, as those of a mechanism are."""
+"""Jumps and kinks of the forces of a user-defined system are located, as in a mechanism."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Systems of the user's own whose motion is known: exactly, by independent equations, or by what it conserves."""
+"""User-defined systems whose motion is known: exactly, by independent equations, or by what it conserves."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Pseudoinverses, formulations, stabilizations, integrators and step sizes of the user's own."""
+"""User-defined pseudoinverses, formulations, stabilizations, integrators and step sizes."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Systems of the user's own by machine code: the same functions, motions and derivatives as in plain JAX."""
+"""User-defined systems by machine code: the same functions, motions and derivatives as in plain JAX."""
 
 from typing import Any
 

@@ -433,7 +433,7 @@ def test_what_cannot_be_driven_is_refused():
         udk.kinematics(mech, "body.crank.omega", [1.0])
     with pytest.raises(udk.SceneError, match="held is given with driver=None"):
         udk.kinematics(udk.library.slider_crank(0.3, 4.0), None, [0.0, 1.0], held={"motor": 1.0})
-    with pytest.raises(udk.SceneError, match="driver is None: travel is that of a coordinate"):
+    with pytest.raises(udk.SceneError, match="driver is None: name one of the drivers"):
         udk.travel(udk.library.slider_crank(0.3, 4.0), None)
     for of in (lambda f: f, jax.jit, jax.grad):  # known, traced, differentiated
         with pytest.raises(udk.SceneError, match="the scene has no driver: name a coordinate that drives it"):

@@ -37,9 +37,9 @@ def kinematics(
     """Answer what a course asks of a mechanism: positions, velocities, accelerations, dead points, strokes, type, transmission.
 
     With --at, tables of all pins and links in one position, with its instant centres; with --count, tables by the driver's value.
-    Values may have units, "60 deg" or "2 turns"; plain numbers are in the unit of the drawing, or in SI units without one. They
-    count as in the drawing: the angle of a crank is that of its direction from its pin on the ground, from the x axis. The exit
-    code is 1 if a value cannot be reached.
+    Values may have units, "60 deg" or "2 turns"; plain numbers are in the unit of the drawing, or in SI units without one. Angles
+    are those of the drawing: the angle of a crank is measured from the x axis to the line from its pin on the ground to its other
+    pin. The exit code is 1 if a value cannot be reached.
 
     Args:
         scene: the mechanism.

@@ -46,7 +46,7 @@ class Analysis(PrintsTable):
         coordinates: number of coordinates.
         row_names: for each row of Psi, its constraint and its index within that constraint.
         redundant_rows: indices of the rows that depend on others; None: unknown.
-        only_switched: whether all rows that depend on others are those of constraints that are switched off.
+        only_switched: whether all dependent rows belong to constraints that are switched off.
     """
 
     scales: Scales
@@ -115,7 +115,7 @@ class Analysis(PrintsTable):
 
         Args:
             mechanism: The mechanism with more constraints.
-            only_switched: Whether all rows that depend on others are those of constraints that are switched off.
+            only_switched: Whether all dependent rows belong to constraints that are switched off.
         """
         own = (concrete_scales if mechanism.is_concrete else traced_scales)(mechanism)
         xp = jnp if is_traced((self.scales, own)) else np

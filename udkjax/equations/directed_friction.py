@@ -1,4 +1,4 @@
-"""Set-valued friction in given modes: the direction of sliding is a number, with which its loads are smooth."""
+"""Set-valued friction in given modes: the direction of sliding is an input, so that the loads are smooth."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,8 +21,8 @@ from udkjax.scene.mechanism import Mechanism
 class DirectedFriction(Friction):
     """Set-valued friction of a joint that slides in a given direction, or sticks.
 
-    Its `sides` are the direction of sliding, 1 or -1 (0: the friction has no force), and one if the joint is at rest although no
-    constraint of its own locks it, so that the coefficient is the static one; two if it waits for its drivers.
+    The first of its `sides` is the direction of sliding, 1 or -1 (0: no friction). The second is one if the joint is at rest
+    without a constraint that locks it, so that the static coefficient applies; two if it waits for its drivers; else zero.
     """
 
     sides: Float[Array, "2"] = eqx.field(converter=given_number, default=(0.0, 0.0))

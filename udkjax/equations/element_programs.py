@@ -100,7 +100,7 @@ class RubbingPrograms(ElementPrograms):
     def __init__(self, structure: ElementStructure, row_count: int, rows: tuple[int, ...]):
         super().__init__(structure)
         zero = self.graph.constant(0.0)
-        self.x = [self.graph.input(("x of row", row), "position") for row in rows]  # no name of a coordinate
+        self.x = [self.graph.input(("x of row", row), "position") for row in rows]  # differs from all names of coordinates
         x = dict(zip(rows, self.x, strict=True))
         multipliers = [-x[row] if row in x else zero for row in range(row_count)]
         loads, slopes = trace_rubbing(self.graph, structure, self.leaves, self.t, self.q, self.v, multipliers)

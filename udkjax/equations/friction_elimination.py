@@ -15,10 +15,10 @@ relative to friction that is a share s of them, becomes s e^2 by a step and s^2 
 is of third order. The first slopes are those at x after a correction without slopes, where e is s^2. Loads with a fixed
 direction, such as those of slides, are exact once their signs are.
 
-One round leaves an error of s^8: it suffices where friction is less than about a thirtieth of that which jams the mechanism, as
-in most machines. Programs that a run evaluates often take one round, and say where the loads are not settled; machine code
-then takes as many more as are needed (`further`). Others take `ROUNDS`. If the loads do not settle, friction admits no motion
-(the mechanism jams), and the accelerations are NaN.
+One round leaves an error of s^8: it suffices if the coefficients are below about a thirtieth of those that jam the mechanism, as
+in most machines. Programs that a run evaluates often take one round, and report loads that have not settled; machine code then
+takes as many further rounds as are needed (`further`). Other programs take `ROUNDS`. If the loads do not settle, friction admits
+no motion (the mechanism jams), and the accelerations are NaN.
 """
 
 from collections.abc import Callable
@@ -32,12 +32,12 @@ from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import greater, where
 
-# Rounds of programs that cannot ask for more. Friction of 0.9 of that which jams pins needs three; the slopes of a fourth round
-# are those at the solution, as derivatives need them.
+# Rounds of programs that cannot ask for more. At 0.9 of the coefficients that jam pins, three are needed; the fourth evaluates
+# the slopes at the solution, for derivatives.
 ROUNDS = 4
 CORRECTION = SOLVES  # the number of the system of corrections
-# Change of the loads of friction by another correction, relative to these loads. The accelerations have this error times the
-# share of friction, which is below the least tolerance of runs; one more round would end at rounding errors.
+# Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
+# which is below the smallest tolerance of runs; one more round would end at rounding errors.
 SETTLED = 1e-10
 
 

@@ -1,10 +1,10 @@
-"""Friction whose load equilibrium does not determine, and what follows from it.
+"""Friction of joints whose loads equilibrium does not determine, and its consequences.
 
 The multipliers that agree with equilibrium and with friction G are lambda = L(G(lambda)) + N y, for any y, with the null space N
 of Psi_q^T (determinacy.py). G of each joint is homogeneous: G(N y) = 0 for all y if and only if the load of the joint does not
-depend on y. In a joint that slides, the power of friction grows with its load, and the power of no other joint makes up for that:
-all are negative. So accelerations are unique if and only if no joint that slides has a load that is loose. Where they are not,
-the loads of all joints that respond to the friction of these are loose as well.
+depend on y. In a sliding joint, the power lost to friction grows with the load, and no other joint compensates for this, as the
+power of all friction is negative. So accelerations are unique if and only if no sliding joint has a load that depends on y (a
+*loose* load). If they are not unique, the loads of all joints that respond to the friction of these joints are loose as well.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class LooseFriction(NamedTuple):
-    """Marks of joints with friction: of a load that is not unique, of sliding, and of the joints (rows) that load others."""
+    """Masks of the joints with friction: `loose` loads, sliding, and which joints (rows) load which others."""
 
     loose: Bool[Array, "j"]
     slides: Bool[Array, "j"]

@@ -42,7 +42,7 @@ class SceneSolver:
 
     @property
     def free_with_friction(self) -> list[KernelLoop | Reset]:
-        """Compute sines and cosines, and a_F with the friction that depends on x, by elimination without dependent rows."""
+        """Compute sines, cosines and a_F, including friction proportional to x = -lambda; elimination drops dependent rows."""
         terms = self.terms
         if self.friction is None:
             return [terms.sincos(), *terms.free_accelerations("v")]

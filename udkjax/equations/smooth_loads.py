@@ -1,6 +1,6 @@
-"""Loads with held sides: those of a force element or a user-defined system, as smooth functions of the state and the sides.
+"""Smooth loads: the loads of a force element or a user-defined system, with the sides of their comparisons as inputs.
 
-The sides of comparisons are numbers, with which loads are smooth, also beyond a crossing (expressions/kinks.py).
+With its sides held, a load is a smooth function of the state, also beyond the crossing of a comparison (expressions/kinks.py).
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -27,8 +27,8 @@ class SmoothLoads:
         numbers: The numbers of an element or of a system.
         state: t, q and v.
         loads: The loads.
-        moving: The groups of inputs that change along a motion.
-        kind: The structure of the element; None: the loads are those of a system.
+        moving: The groups of inputs that change during a motion.
+        kind: The structure of the element; None for a system.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class SmoothLoads:
     ):
         pieces, (t, q, v) = smooth_pieces(graph, loads, moving), state
         self.kind, self.count, self.has_opaque = kind, len(pieces.sides), pieces.has_opaque
-        self._used = [k for k, s in enumerate(numbers) if s.constant is None]  # others are zeros by structure
+        self._used = [k for k, s in enumerate(numbers) if s.constant is None]  # others are structural zeros
         inputs = [*(numbers[k] for k in self._used), t, *q, *v, *pieces.sides]
         self._loads = ScalarProgram(graph, inputs, pieces.outputs)
         self._conditions = [ScalarProgram(graph, inputs, [way.condition]) for way in pieces.ways]
@@ -63,7 +63,7 @@ class SmoothLoads:
         return self._conditions[index](self.inputs(SmoothLoads.numbers(of), t, q, v, sides))[0]
 
     def state(self, frames: Sequence[Frame]) -> tuple[list[Any], list[Any]]:
-        """Return q and v of the bodies that move; without velocities v is zero."""
+        """Return q and v of the moving bodies; v is zero for frames without velocities."""
         assert self.kind is not None  # loads of an element
         moving = [f for f, fixed in zip(frames, self.kind.ground, strict=True) if not fixed]
         q, v = ([getattr(f, x) for f in moving for x in names] for names in (("x", "y", "angle"), ("vx", "vy", "omega")))
@@ -76,7 +76,7 @@ class SmoothLoads:
 
     @classmethod
     def of_element(cls, element: ForceElement, frames: Sequence[str], breaks: bool) -> "SmoothLoads":
-        """Return the smooth loads of an element attached to `frames`; with breakpoints in time it has no other kinks in time."""
+        """Return the smooth loads of an element attached to `frames`; its breakpoints, if any, are all of its kinks in time."""
         return _of_element(traced_loads(element, frames), breaks)
 
     @classmethod

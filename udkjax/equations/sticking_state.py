@@ -34,7 +34,7 @@ class StickingLoads(NamedTuple):
     """The multipliers of a mechanism some of whose joints stick, and its friction."""
 
     multipliers: Float[Array, "m"]
-    friction: Float[Array, "n"]  # loads of all friction, less those of constant torques that `loads.force` has at this state
+    friction: Float[Array, "n"]  # loads of all friction without the constant torques, which `loads.force` includes
     by_name: dict[str, Float[Array, "n"]]  # loads of each friction
 
 
@@ -95,7 +95,7 @@ class StickingState(eqx.Module):
         mechanism = directed.with_sides(modes.sides(jnp))
         _, A, rate = self._rows(directed, q, v)
         length = self.scales.length
-        held = jnp.where(modes.locked, length / directed.units(length), 0.0)  # weights as those of `Scales`
+        held = jnp.where(modes.locked, length / directed.units(length), 0.0)  # weights as in `Scales`
         root, rows, w = uk.inverse_sqrt_mass(mechanism), len(self.w), jnp.concatenate([self.w, held])
         D = w[:, None] * jnp.concatenate([constraints.psi_q(mechanism, t, q), A]) * root
         plus, share = uk.pseudoinverse(self.method, D), sharing(D, self.soft, w)
@@ -143,7 +143,7 @@ def sticking_joints(mechanism: Mechanism) -> tuple[str, ...]:
 
 
 def known_sticking(mechanism: Any, solution: Any) -> Bool[Array, "T F"] | None:
-    """Return which joints stick in a run, if it tells.
+    """Return which joints stick in a run, if this is known.
 
     Args:
         mechanism: The scene.

@@ -221,7 +221,7 @@ def prepare(
 
     Args:
         mechanism: The scene; its numbers may be traced.
-        method: The pseudoinverse, by default `Auto`; the default of its `rank_tol` is that of the scales.
+        method: The pseudoinverse, by default `Auto`, with the `rank_tol` of the scales.
         baumgarte: Gains of Baumgarte stabilization; None: no stabilization.
         analysis: The mechanism's `Analysis`; by default computed here.
 

@@ -33,7 +33,7 @@ _CUMULATIVE = {"cumsum": lax.add_p, "cumprod": lax.mul_p, "cummax": lax.max_p, "
 
 
 def join(primitive: Any, a: Scalar, b: Scalar) -> Scalar:
-    """Apply a binary primitive to two scalars; of floats, sums and products are those of the graph."""
+    """Apply a binary primitive to two scalars; sums and products of floats are operations of the graph."""
     if np.issubdtype(a.node.dtype, np.floating):
         if primitive is lax.add_p:
             return a + b

@@ -21,7 +21,7 @@ class Constrained(Wrapper):
     (A multistep method would discard its whole history: its `made_jump` is unchanged, since it detects that its newest point
     moved.) The part of an error that projection removes has a small weight. If only some coordinates are integrated, only their
     errors count.
-    Error estimates, with their counts, and interpolation are those of the wrapped solver. A `Stabilization` of the user's own
+    Error estimates, with their counts, and interpolation are those of the wrapped solver. A user-defined `Stabilization`
     changes the rates within a step, or the state at its end.
     """
 

@@ -89,7 +89,7 @@ def integrate_by_diffrax(
 def _misses_rows(problem: Problem, equations: TextbookEquations, ts: Array, ys: Array, step: Array) -> Bool[Array, "T"]:
     """Return at which outputs projected velocities would open Psi too far in a step, as rows were left out.
 
-    Machine code looks at the end of each step, by the same rule. The first state is that which was given.
+    Machine code applies the same rule at the end of each step. The first state is given, not projected.
     """
 
     def misses(at: tuple[Array, Array]) -> Array:

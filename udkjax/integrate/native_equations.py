@@ -74,7 +74,7 @@ class NativeEquations(WrappedSystem):
 
 
 def native_equations(compiled: CompiledMechanism, marks: Float[Array, "m"] | None) -> NativeEquations:
-    """Return equations by machine code; `marks` are those of independent rows, None if the machine code contains them."""
+    """Return equations by machine code; `marks` select the independent rows, None if the machine code contains them."""
     operation, textbook = compiled.plan.evaluation, compiled.textbook
     assert operation is not None  # checked by the caller
     scene = scene_inputs(compiled.equations, textbook.mechanism.at(0.0), operation.code.policy)

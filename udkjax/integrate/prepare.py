@@ -72,7 +72,7 @@ class Choices(NamedTuple):
 
     @property
     def only_by_diffrax(self) -> str:
-        """The argument of the user's own that neither machine code nor runs with events take; empty if there is none."""
+        """The user-defined argument that excludes machine code and events; empty without any."""
         own = "a stabilization of your own" if isinstance(self.stabilization, Stabilization) else ""
         return "a step size controller" if self.stepper is not None else own
 

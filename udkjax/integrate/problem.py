@@ -32,7 +32,7 @@ class Problem:
     max_steps: Int[ArrayLike, ""]
     drift_tol: Float[Array, ""]  # violation of Psi, relative to the scales of the rows, beyond which a run has failed
     stepper: Any = None  # a step size controller of diffrax; None: the default
-    stabilization: Any = None  # a `Stabilization` of the user's own
+    stabilization: Any = None  # a user-defined `Stabilization`
     marks: Float[Array, "m"] | None = None  # 1 for each independent row of Psi, else 0; None: machine code contains the marks
     # Capacity of a record for reverse mode; None: by breakpoints.
     points: int | None = field(default=None, metadata={"static": True})

@@ -229,7 +229,7 @@ def simulate(
         if events is not None or sticks:
             assert isinstance(mechanism, Mechanism)  # no joint of a system sticks
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
-        located = solution  # a run that locates kinks fails; perhaps one does not that leaves them to its steps
+        located = solution  # locating kinks failed; perhaps a run succeeds without
 
     solution, missed, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
     if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(code):

@@ -1,4 +1,4 @@
-"""Stabilizations of the user's own: rates within a step, or a correction at its end.
+"""User-defined stabilizations: rates within a step, or a correction at its end.
 
 A `Stabilization` receives a `ConstraintState`: a state within a step, its residuals Psi and (Psi_dot, phi), and the least
 changes, in the metric of M, that remove given residuals to first order.

@@ -1,7 +1,7 @@
 """Records between the two passes of reverse mode: whether a batch stores them, or integrates again in the second pass.
 
-The shape of a record is that of the longest that is stored, so that records of a large batch would take far more memory than
-their steps. The second pass then makes the record of a member anew, in memory of the thread that runs it.
+All stored records have the length of the longest one, so the records of a large batch would take far more memory than their steps
+need. The second pass of such a batch therefore makes the record of each member again, in the memory of the thread that runs it.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""A pseudoinverse of the user's own, by one method that returns D^+ as a matrix."""
+"""User-defined pseudoinverses: one method returns D^+ as a matrix."""
 
 from abc import abstractmethod
 from typing import NamedTuple

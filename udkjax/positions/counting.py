@@ -95,8 +95,8 @@ def units_of_drawing(mechanism: Mechanism) -> Units:
 def count_of(mechanism: Mechanism, driver: str | Coordinate) -> Count:
     """Return the count of the values of a driver or coordinate; numbers of the mechanism are concrete.
 
-    The angle of a drawn link on the ground is that of the direction from its pin on the ground to its first other pin; other
-    angles are those of the bodies. Lengths are in the unit of the drawing, coordinates of slides from the drawn position.
+    The angle of a drawn link on the ground is that of the line from its pin on the ground to its first other pin; the angles of
+    other links are those of their bodies. Lengths are in the unit of the drawing, coordinates of slides from the drawn position.
     """
     units, element = units_of_drawing(mechanism), element_of(mechanism, driver)
     first, second = element.bodies

@@ -213,7 +213,7 @@ def travel(
         SceneError: no such driver or coordinate, or positions do not follow from it.
     """
     if driver is None:
-        raise SceneError(["driver is None: travel is that of a coordinate; name it, or one of the drivers"], mechanism.name)
+        raise SceneError(["driver is None: name one of the drivers, or the coordinate whose travel is computed"], mechanism.name)
     carried = carried_bodies(mechanism, driver, held)
     if not carried.carrier:
         driven, q = _start(mechanism, driver, 0.0, state, held)

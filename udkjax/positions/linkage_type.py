@@ -108,8 +108,8 @@ class Mobility(NamedTuple):
     """Degrees of freedom without drivers.
 
     Attributes:
-        counted: by Gruebler: three for each moving link, less the rows of all joints.
-        true: three for each moving link, less their rank in a generic position.
+        counted: by Gruebler: three for each moving link, minus the rows of all joints.
+        true: three for each moving link, minus the rank of these rows in a generic position.
         links: the number of links with the ground.
         joints: the number of joints.
     """

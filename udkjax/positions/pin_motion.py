@@ -174,7 +174,7 @@ def motion_at(
 ) -> PinMotion:
     """Return the motion of all pins and links where a course asks for it: `udk.motion_at(mech, "60 deg", rate="600 rpm")`.
 
-    Values count as in the drawing: the angle of a crank is that of the direction from its pin on the ground to its other pin,
+    Angles are those of the drawing: the angle of a crank is that of the line from its pin on the ground to its other pin,
     from the x axis.
 
     Args:

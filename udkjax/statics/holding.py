@@ -1,14 +1,14 @@
-"""Efforts that hold a mechanism at rest against friction: any between two bounds.
+"""Efforts that hold a mechanism at rest with friction: all efforts between two bounds.
 
-At rest a joint carries any friction within its limit: the constant torque, and the static coefficient times the load. The
-mechanism begins to move along a coordinate c, in the direction s = 1 or -1, where all joints that slide in this motion are at
-their limits against it, and the effort f along c is larger than they resist,
+At rest the friction of a joint has any value up to its limit: the constant torque, plus the static coefficient times the load.
+The mechanism begins to move along a coordinate c, in the direction s = 1 or -1, when all joints that slide in this motion resist
+it with their limits, and the effort f along c exceeds this resistance,
 
     s C a > 0,        M a + Psi_q^T lambda = F + C^T f + G_s(lambda),        C = c_q.
 
-C a grows with s f less than in proportion, as friction is a sum of norms of loads: the first zero is the bound. It is found by
-Newton's method, which approaches it from within. If s C a stops growing before, no effort moves the mechanism in this direction:
-friction locks it, and the bound is infinite.
+Friction is a sum of norms of loads, so s C a is a concave function of s f: its first zero is the bound. Newton's method
+approaches this zero from within. If s C a stops growing below zero, no effort moves the mechanism in this direction: friction
+locks it, and the bound is infinite.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,14 +34,14 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
-MOST_STEPS = 50  # of Newton's method, which needs three to six
+MOST_STEPS = 50  # Newton's method needs three to six
 LAST_STEP = 1e-12  # relative change of an effort by its last step
-LOCKED = 1e-9  # growth of the acceleration with the effort, relative to that without friction: less is rounding
-STILL = 1e-9  # speed of sliding in a motion, relative to the fastest coordinate: slower is rounding
+LOCKED = 1e-9  # smaller derivatives of the acceleration by the effort, relative to that without friction, are rounding errors
+STILL = 1e-9  # smaller sliding speeds in a motion, relative to the fastest coordinate, are rounding errors
 
 
 class HoldingEfforts(PrintsTable):
-    """Efforts along a coordinate between which friction holds a mechanism at rest, at each value of the coordinate.
+    """Bounds of the effort along a coordinate between which friction holds a mechanism at rest, for each value of the coordinate.
 
     All are NaN where the position is not reached, and at dead points of the coordinate.
 

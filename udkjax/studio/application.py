@@ -157,6 +157,6 @@ def page_files() -> Mapping[str, tuple[bytes, str]]:
 
 
 def _unit_sizes() -> str:
-    """Return the module with the sizes of the units of length and angle (m, rad) by all their spellings."""
+    """Return a JavaScript module with the sizes of all units of length (m) and angle (rad), by each of their spellings."""
     tables = {"LENGTHS": Units.sizes("m"), "ANGLES": Units.sizes("rad")}
     return "".join(f"export const {name} = {json.dumps(sizes)};\n" for name, sizes in tables.items())

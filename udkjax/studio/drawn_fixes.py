@@ -89,7 +89,7 @@ def _body_numbers(mechanism: Mechanism, body: str) -> JsonObject:
 
 
 def _pin_of(tables: Document, constraint: str) -> str:
-    """Return the pin of a revolute, whose name is that of the pin, with a number for a third link there."""
+    """Return the pin of a revolute, whose name is the pin's, with a number if the pin has more than two links."""
     return max((name for name in tables["pins"] if constraint == name or constraint.startswith(f"{name}-")), key=len, default="")
 
 

@@ -1,4 +1,4 @@
-"""Systems of the user's own in the player, by a drawing."""
+"""User-defined systems in the player, by a drawing."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -11,11 +11,11 @@ from udkjax.integrate.causes.find import FoundCause
 from udkjax.integrate.solution import Solution
 from udkjax.programs.deferred import deferred
 
-SINGULAR = 1e-12  # largest ratio of the smallest eigenvalue of M to its largest that counts as zero
+SINGULAR = 1e-12  # M is singular if its smallest eigenvalue is at most this, relative to the largest
 
 
 def explained_system(solution: Solution, system: Any, end: tuple[Any, Any]) -> Solution:
-    """Return a failed solution with its cause, from the last state of the integrator; unchanged if there is none to see."""
+    """Return a failed solution with its cause, found at the last state of the integrator; unchanged if there is no cause."""
     t, (q, v) = np.asarray(end[0]), np.split(np.asarray(end[1]), 2)
     with jax.ensure_compile_time_eval():
         text = _cause(_values(system, t, q, v))

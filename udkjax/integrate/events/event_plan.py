@@ -133,7 +133,7 @@ class EventPlan:
 
     @cached_property
     def has_only_contacts(self) -> bool:
-        """True if all switches are those of contacts and of joints that stick."""
+        """True if all switches belong to contacts and to joints that stick."""
         return bool(self._switches_of_contacts.all())
 
     # Joints that may stick, F.

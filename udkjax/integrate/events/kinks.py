@@ -85,7 +85,7 @@ class TurnSide(Action):
 class HeldElement(NamedTuple):
     """Loads with held sides, of a force element or of a system; hashable."""
 
-    force: int | None  # index of the element among the forces of a mechanism; None: the loads are those of a system
+    force: int | None  # index of the element among the forces of a mechanism; None for the loads of a system
     smooth: SmoothLoads
     coordinates: tuple[int, ...]  # on which they may depend
     first: int  # index of its first side

@@ -1,4 +1,4 @@
-"""The events of a run as its user sees them: without kinks, and with the joints that stick, slip or turn round by name."""
+"""The events of a run that are listed for the user: no kinks, but joints that stick, slip or reverse, by name."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -32,7 +32,7 @@ class Listing(NamedTuple):
 
 
 def names_of_events(events: Sequence[Event], phases: Phases) -> tuple[str, ...]:
-    """Return the names of all events that may be listed; `events` are those of the user, of joints that stick, and kinks."""
+    """Return the names of all events that may be listed; `events` are the user's, then those of joints that stick, then kinks."""
     names = tuple(e.name for e in events[: _own_count(events, phases)])
     others = (f"{name} {text}" for text in ("lets go", "rests") for name in names)
     return (*names, *others, *(f"{x.name} {text}" for x in phases.sticking for text in TRANSITIONS))

@@ -1,8 +1,8 @@
 """Phases: the sets of constraints that hold one after another, as events release or add some and contacts come to rest.
 
 A phase is a mask of the *switches*: the constraints that events release or add, and the contacts that are held at rest. A run
-begins with the mechanism of the scene. In all other phases it has the mechanism with all switches, whose constraints numbers
-switch on and off (switched.py), so that no phase needs equations or code of its own.
+begins with the mechanism of the scene. All other phases share one mechanism with all switches. Its numbers switch the constraints
+on and off (switched.py), so no phase needs its own equations or code.
 """
 
 from collections.abc import Callable, Sequence

@@ -25,7 +25,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class SlidingSpeed(BodyCondition):
-    """The condition of sliding in the direction `sign`: the speed, and while the joint sticks, what its force lacks to slide."""
+    """Condition of sliding in the direction `sign`: the speed, or while the joint sticks, the limit minus its force."""
 
     bodies: tuple[str, ...] = eqx.field(static=True)
     joint: Joint
@@ -39,7 +39,7 @@ class SlidingSpeed(BodyCondition):
         return self.sign * Friction.sliding_speed(self.joint, *(frames[name] for name in self.bodies))
 
     def reserve(self, multipliers: Sequence[Number], lock: Number) -> Number:
-        """Return the largest force less the force in the direction: negative where the joint must slide.
+        """Return the largest force minus the force in the direction `sign`: negative where the joint must slide.
 
         Args:
             multipliers: The multipliers of the joint.
@@ -49,7 +49,7 @@ class SlidingSpeed(BodyCondition):
 
 
 class StickOrSlip(Action):
-    """A joint with set-valued friction begins to slide, ends sliding or turns round; the run decides which."""
+    """A joint with set-valued friction begins to slide, stops sliding or reverses; the run decides which."""
 
 
 class StickingJoint(NamedTuple):

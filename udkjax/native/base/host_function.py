@@ -54,7 +54,7 @@ class HostFunction(Hashable, Protocol):
 
 
 def call_host(function: HostFunction, inputs: Sequence[Any]) -> list[Array]:
-    """Call a function on arrays that may be traced; the first axis is that of the members."""
+    """Call a function on arrays that may be traced, with members along the first axis."""
     return host_p.bind(*(jnp.asarray(x, float) for x in inputs), function=function)
 
 

@@ -36,7 +36,7 @@ ROUNDING_GROWTH = 3e-14
 # distance.
 SURE, EXPECTED = 0.85, 0.3
 
-# Further rounds of Newton's method for the loads of joints with friction. Friction of 0.99 of that which jams needs five.
+# Further rounds of Newton's method for the loads of joints with friction. Five are needed at 0.99 of the jamming coefficients.
 SETTLING_ROUNDS = 20
 
 # Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.

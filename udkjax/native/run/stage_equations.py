@@ -243,7 +243,7 @@ class StageEquations:
         """Write the accelerations of all stages after the first, of the step from a point."""
         module, method = self._in, self._method
         f, s = module.function(f"take_stages_from_{start}")
-        f.cold = module.plan.stiff is not None  # few runs need it, and its time is that of the functions that it calls
+        f.cold = module.plan.stiff is not None  # few runs need it, and it spends its time in the functions that it calls
         with f.if_(~f.any_of(s.cleared > 0.5)):
             start_place, end = (place * module.plan.width for place in module.unused)
             with f.each(end - start_place) as k:

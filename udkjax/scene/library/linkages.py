@@ -29,7 +29,7 @@ def parallelogram(
 ) -> Mechanism:
     """Return the paper's five-bar parallelogram: three parallel links carry a coupler. 12 rows, rank 11, one degree of freedom.
 
-    `length` (m) is that of the links alone, and `spacing` (m) the distance of neighbouring pivots, on the ground and on the
+    `length` (m) is the length of the links, and `spacing` (m) the distance of neighbouring pivots, on the ground and on the
     coupler: a parallelogram of another size needs both. Ground pivots are at (0, 0), (spacing, 0), (2 spacing, 0); `angle` and
     `angular_velocity` are those of the links. Bodies link1, link2, link3, coupler; rows A1, A2, A3 (link minus ground), then B1,
     B2, B3 (link minus coupler). The paper does not print the initial state: release from rest at -45 degrees is inferred from

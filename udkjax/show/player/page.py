@@ -19,7 +19,7 @@ ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
 def page(data: JsonObject, options: JsonObject | None = None) -> str:
-    """Return the player of `data` (player_data.py) as one HTML page; `options` are those of `mount` in mount.js."""
+    """Return the player of `data` (player_data.py) as one HTML page; `options` are passed to `mount` in mount.js."""
     template = Template(files("udkjax.show.player").joinpath("page.html").read_text(encoding="utf-8"))
     return template.substitute(
         title=html.escape(data["title"]),

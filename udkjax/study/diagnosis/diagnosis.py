@@ -236,7 +236,7 @@ def _friction(result: Diagnosis) -> list[str]:
     text = f"the loads of {', '.join(loose)} are not unique"
     if all(friction.accelerations for friction in result.friction.values()):
         return [f"{text}, but the accelerations are"]
-    return [f"{text}, nor are the accelerations: they are those of the loads of least norm"]
+    return [f"{text}, nor are the accelerations: those computed belong to the loads of least norm"]
 
 
 def _conditioning(result: Diagnosis) -> list[str]:

@@ -1,4 +1,4 @@
-"""Diagnosis of a user-defined system: freedoms, redundant rows, rank and unique multipliers, from J = (Psi_q; phi_v)."""
+"""Diagnosis of a user-defined system by J = (Psi_q; phi_v): degrees of freedom, redundant rows, rank and unique multipliers."""
 
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ class RowSet(NamedTuple):
 
 
 class SystemDiagnosis(NamedTuple):
-    """Freedoms, redundant rows and unique multipliers of a `ConstrainedSystem` in one state.
+    """Degrees of freedom, redundant rows and unique multipliers of a `ConstrainedSystem` in one state.
 
     Attributes:
         q: closed coordinates (n,); `v` closed velocities.

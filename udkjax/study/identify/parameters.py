@@ -182,7 +182,7 @@ def _parts(mechanism: StudyModel, p: Parameter) -> list[_Part]:
         of, scaled = _read(mechanism, of, scaled)
     if isinstance(of, Length):
         if not isinstance(mechanism, Mechanism):
-            raise ValueError("a length is that of a body, and a ConstrainedSystem has none: name a number of the system")
+            raise ValueError("a ConstrainedSystem has no bodies, and thus no lengths: name a number of the system")
         lengths = [float(length_of(mechanism, body)) for body in of.bodies or ("",)]
         return [_Part(Target(function=of), lengths[0], len(set(lengths)) == 1)]
     if callable(of):

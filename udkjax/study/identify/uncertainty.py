@@ -281,7 +281,7 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
         size, why = f"only {ratio:.3g}", "the noise is smaller, or its samples are not independent"
     else:
         return
-    end = "standard errors are those of the given noise"
+    end = "standard errors follow from the given noise"
     yield f"residuals are {size} times as large as the given noise ({numbers}): {why}; {end}"
 
 

@@ -44,7 +44,7 @@ def _arc(f: Function, numerator: Value, denominator: Value) -> tuple[Value, Valu
 
 
 def _less(f: Function, mask: Value, constant: tuple[float, float], high: Value, low: Value) -> tuple[Value, Value]:
-    """Return a constant less high + low, in two parts, where `mask` holds; high + low elsewhere."""
+    """Return constant - (high + low) where `mask` holds, and high + low elsewhere, in two parts."""
     new = constant[0] - high
     rest = constant[0] - new - high + (constant[1] - low)
     return f.select(mask, new, high), f.select(mask, rest, low)
