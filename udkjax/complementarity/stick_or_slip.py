@@ -1,20 +1,20 @@
 """Joints with set-valued friction at one instant: which of them stick, and in which direction the others slide.
 
-Joints that are at rest relative to each other carry any force within their limits; joints that slide carry their friction. A
-joint i at rest, with acceleration a_i, force f_i and limit c_i, obeys
+A joint at rest carries any force within its limit; a joint that slides carries its friction. A joint i at rest, with
+acceleration a_i, force f_i and limit c_i, obeys
 
     |f_i| <= c_i,        a_i = 0 where |f_i| < c_i,        f_i = -c_i sign(a_i) where a_i is not zero.
 
-Limits depend on the loads of the joints, and these on the forces, so that the law is not a linear complementarity problem. It is
-solved by pivots (Murty 1974; Judice and Pires 1994): a joint is either within its limit, or at it in one direction. Each set is
-evaluated by the equations of motion, with locked joints as constraints; a locked joint whose force is beyond its limit goes to
-it, and a joint at its limit that accelerates against its direction returns. If several joints are at rest, pivots begin with the
-solution for limits that are found by repetition: with given limits the law is a quadratic program with bounds, which has one
-solution for the accelerations.
+Limits depend on the loads of the joints, and these on the forces, so the law is not a linear complementarity problem. It is
+solved by pivots (Murty 1974; Judice and Pires 1994): each joint is either within its limit, or at its limit in one direction. The
+equations of motion are solved for these modes, with locked joints as constraints. Then a locked joint whose force exceeds the
+limit is set to its limit, and a joint at its limit that accelerates against its direction is locked again. If several joints are
+at rest, the first modes come from a fixed-point iteration of the limits: with given limits the law is a quadratic program with
+bounds, whose accelerations are unique.
 
-Where the joints of a mechanism at rest lock each other, their forces are not unique. As many joints are locked as have
-independent rows; the others are kept at rest by these, with the forces that they had. If a locked joint reaches its limit,
-another one takes its place, until all that could be are at their limits: only then does the mechanism move.
+Where the joints of a mechanism at rest lock each other, their forces are not unique. Only joints with independent rows are
+locked; they keep the others at rest, whose forces stay as they were. If a locked joint reaches its limit, another one is locked
+instead. The mechanism moves once no joint is left that could be locked.
 
 Arrays are JAX's, for one member, or NumPy's, for several (*m).
 """
@@ -27,14 +27,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-# Number of repetitions for the limits, with sweeps of a projected Gauss-Seidel method in each, and the change of the shares of
-# the limits by the last. Pivots correct what these leave: they decide where pivots begin, and so their number.
+# Iterations for the limits, sweeps of a projected Gauss-Seidel method in each, and the change of the forces, as shares of their
+# limits, at which iterations end. They decide with which modes pivots begin, and so only the number of pivots.
 REPETITIONS, SWEEPS, SAME_SHARE = 10, 20, 1e-6
-# Number of pivots of all joints that violate their law, for each joint; then only the first such joint pivots, which ends.
+# Pivots per joint: at first of all joints that violate their law, then only of the first such joint, which does not cycle.
 BLOCK_STEPS, SINGLE_STEPS = 2, 8
 
 
-SIDES = 2  # numbers that stand for the modes of a joint
+SIDES = 2  # numbers that represent the mode of a joint
 
 
 class RestTolerances(NamedTuple):
@@ -58,7 +58,7 @@ class RestTolerances(NamedTuple):
 AT_REST = RestTolerances()
 
 
-Response: TypeAlias = tuple[Any, Any, Any]  # accelerations along the joints; limits less the forces, in both directions (*m, F)
+Response: TypeAlias = tuple[Any, Any, Any]  # accelerations along the joints; limit minus force, in both directions (*m, F)
 
 
 class FrictionModes(NamedTuple):
@@ -77,7 +77,7 @@ class FrictionModes(NamedTuple):
 
 class _Pivot(NamedTuple):
     within: Any  # whether the force of a joint at rest is within its limit
-    departs: Any  # whether others move a joint that is at rest at this instant alone
+    departs: Any  # whether others move a joint that is at rest only at this instant
     direction: Any
     steps: Any
     done: Any
@@ -114,8 +114,8 @@ class JointsAtRest(NamedTuple):
 
         Args:
             respond: evaluates the equations of motion in given modes.
-            direction: the direction in which a joint at rest is at its limit, at first; 0: within it.
-            departs: whether others move a joint that is at rest at this instant alone, at first.
+            direction: the first guess of the direction in which a joint at rest is at its limit; 0: within it.
+            departs: the first guess whether others move a joint that is at rest only at this instant.
             is_given: whether the first direction is known to be right.
             xp: jax.numpy, or NumPy.
         """
@@ -162,11 +162,11 @@ class JointsAtRest(NamedTuple):
     def _guess(
         self, respond: Callable[[FrictionModes], Response], direction: Float[Any, "*m F"], xp: ModuleType
     ) -> Float[Any, "*m F"]:
-        """Return the direction of each joint at rest at its limit, 0 within it, for limits that are nearly right."""
+        """Return the direction of each joint at rest at its limit, 0 within it, for approximate limits."""
         F, none, mobile = self.rest.shape[-1], self.rest & False, xp.diagonal(self.W, axis1=-2, axis2=-1) > 0
 
         def improve(share: Any) -> Any:
-            """Return the forces as shares of the limits, from those before."""
+            """Return the next iterate of the forces, as shares of the limits."""
             a, limit, _ = respond(FrictionModes(none, xp.where(self.rest, share, self.sliding), self.rest, none))
             a, limit = a / self.size, self.size * limit
             force = share * limit
@@ -190,7 +190,7 @@ class JointsAtRest(NamedTuple):
         return xp.where(xp.abs(share) > 1 - AT_REST.closed, xp.sign(share), 0.0)
 
     def _modes(self, pivot: _Pivot, xp: ModuleType) -> FrictionModes:
-        """Return the modes of a set of joints within their limits: as many locked ones as have independent rows."""
+        """Return the modes for given joints within their limits; of these, joints with independent rows are locked."""
         locked, remainder = xp.zeros_like(self.rest), self.W
         F = self.W.shape[-1]
         wanted = self.rest & pivot.within

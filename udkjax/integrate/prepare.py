@@ -1,5 +1,6 @@
 """Preparation of all kinds of runs before their first step, with concrete or traced numbers."""
 
+from collections.abc import Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -9,8 +10,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from udkjax.arrays import number
-from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.analysis import Analysis, analyse, hold_pins
 from udkjax.equations.formulations import Formulation
+from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.native_engine import mark_rows
@@ -25,6 +27,7 @@ from udkjax.positions.assembly import Closure, State, close, moves_from_guess
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentTypeError, describe
 from udkjax.scene.checks import traced_numbers_are_valid
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -67,14 +70,19 @@ class Choices(NamedTuple):
     @property
     def take_diffrax(self) -> bool:
         """True if diffrax integrates every mechanism with these choices."""
-        others = self.adjoint is not None or self.meter is not None or not has_method(self.solver) or bool(self.only_by_diffrax)
-        return self.engine in ("diffrax", "jax") or others
+        return self.engine in ("diffrax", "jax") or not has_method(self.solver) or bool(self.without_events)
 
     @property
     def only_by_diffrax(self) -> str:
         """The user-defined argument that excludes machine code and events; empty without any."""
         own = "a stabilization of your own" if isinstance(self.stabilization, Stabilization) else ""
         return "a step size controller" if self.stepper is not None else own
+
+    @property
+    def without_events(self) -> str:
+        """The argument with which a run cannot locate events, kinks and stick-slip; empty without any."""
+        meter = "" if self.meter is None else "a progress meter"
+        return self.only_by_diffrax or (meter if self.adjoint is None else "a diffrax adjoint")
 
     @property
     def integrator(self) -> str:
@@ -104,6 +112,46 @@ class Choices(NamedTuple):
             *([("held pins", self.held)] if self.held else []),
             *([("kinks", self.kinks)] if self.kinks else []),
         )
+
+
+def with_held_pins(
+    mechanism: Mechanism, events: Any, analysis: Analysis | None, choices: Choices
+) -> tuple[Mechanism, Analysis | None, Choices]:
+    """Return the mechanism, analysis and choices of a run with held pins; unchanged if no pin is held.
+
+    Constraints may prevent a pin from turning to second order only. Its angle is then held to first order, unless an event
+    removes a constraint.
+    """
+    listed = () if events is None else events if isinstance(events, Sequence) else (events,)
+    if any(getattr(getattr(event, "action", None), "removed", None) for event in listed):
+        return mechanism, analysis, choices
+    holding = hold_pins(mechanism)
+    if not holding.pins:
+        return mechanism, analysis, choices
+    return holding.mechanism, None, choices._replace(held=", ".join(pin.name for pin in holding.pins))
+
+
+@cached_by_identity
+def may_stick(mechanism: Mechanism) -> bool:
+    """Return True if a joint of the mechanism has set-valued friction."""
+    return Friction.may_stick(mechanism.forces.values())
+
+
+def with_kinks(system: Any, choices: Choices) -> tuple[Choices, bool]:
+    """Return the choices with a remark on jumps and kinks of forces, and whether a run locates them."""
+    if not _may_have_kinks(system):
+        return choices, False
+    from udkjax.integrate.events.kinks import kinks_of  # most runs do not need it
+
+    found, without = kinks_of(system), choices.without_events
+    return choices._replace(kinks=found.remark(f"with {without}" if without else "")), found.are_held and not without
+
+
+@cached_by_identity
+def _may_have_kinks(system: Any) -> bool:
+    if isinstance(system, Mechanism):
+        return any(force.may_have_kinks for force in system.forces.values())
+    return not isinstance(system, ConstrainedSystem) and system.functions.may_have_kinks  # traced
 
 
 class Beginning(NamedTuple):

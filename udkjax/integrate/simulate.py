@@ -15,7 +15,7 @@ from jaxtyping import Array
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays
 from udkjax.devices import on_host
-from udkjax.equations.analysis import Analysis, analyse, hold_pins
+from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -34,8 +34,11 @@ from udkjax.integrate.prepare import (
     begin,
     begin_concrete,
     jax_adjoint,
+    may_stick,
     prepare_run,
     progress_meter,
+    with_held_pins,
+    with_kinks,
 )
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.projection import Projection
@@ -44,10 +47,8 @@ from udkjax.integrate.stabilization import Stabilization
 from udkjax.pinv import Pseudoinverse
 from udkjax.positions.assembly import AssemblyWarning, Closure, State, close, require_closed
 from udkjax.programs.deferred import deferred
-from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError, require_output_times
 from udkjax.scene.arguments import checked
-from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -178,11 +179,8 @@ def simulate(
         engine=engine,
         stepper=stepsize_controller,
     )
-    if isinstance(mechanism, Mechanism) and not _releases(events):
-        holding = hold_pins(mechanism)
-        if holding.pins:
-            names = ", ".join(pin.name for pin in holding.pins)
-            mechanism, analysis, choices = holding.mechanism, None, choices._replace(held=names)
+    if isinstance(mechanism, Mechanism):
+        mechanism, analysis, choices = with_held_pins(mechanism, events, analysis, choices)
     system = mechanism
     if isinstance(mechanism, ConstrainedSystem):
         assert state is not None  # closed above
@@ -202,20 +200,11 @@ def simulate(
         if throw and closure is not None and begun.is_open:
             require_closed(mechanism, closure, start)  # before anything runs
 
-    sticks = isinstance(mechanism, Mechanism) and _may_stick(mechanism)
-    is_located, located = events is not None or sticks, None
-    if _may_have_kinks(system):
-        from udkjax.integrate.events.kinks import kinks_of
-
-        found = kinks_of(system)
-        by_steps = "with a diffrax adjoint" if choices.adjoint else "with a progress meter" if choices.meter else ""
-        by_steps = f"with {choices.only_by_diffrax}" if choices.only_by_diffrax else by_steps
-        is_located = is_located or (found.are_held and not by_steps)
-        choices = choices._replace(kinks=found.remark(by_steps))
-    if is_located:
-        if choices.adjoint is not None or choices.meter is not None or choices.only_by_diffrax:
-            others = choices.only_by_diffrax or ("a diffrax adjoint" if choices.adjoint else "progress")
-            raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {others}")
+    sticks, located = isinstance(mechanism, Mechanism) and may_stick(mechanism), None
+    choices, locates_kinks = with_kinks(system, choices)
+    if events is not None or sticks or locates_kinks:
+        if without := choices.without_events:
+            raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {without}")
         if isinstance(system, ConstrainedSystem):
             raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
@@ -248,24 +237,6 @@ def simulate(
 def _as_located(solution: Solution, located: Solution) -> Solution:
     """Return a solution without located kinks, with the time until which a run that failed has located them."""
     return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
-
-
-def _releases(events: Any) -> bool:
-    """Return whether an event removes a constraint."""
-    listed = () if events is None else events if isinstance(events, Sequence) else (events,)
-    return any(getattr(getattr(event, "action", None), "removed", None) for event in listed)
-
-
-@cached_by_identity
-def _may_stick(mechanism: Mechanism) -> bool:
-    return Friction.may_stick(mechanism.forces.values())
-
-
-@cached_by_identity
-def _may_have_kinks(system: Any) -> bool:
-    if isinstance(system, Mechanism):
-        return any(force.may_have_kinks for force in system.forces.values())
-    return not isinstance(system, ConstrainedSystem) and system.functions.may_have_kinks  # traced
 
 
 def _has_failed(code: Any) -> bool:
