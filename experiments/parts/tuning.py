@@ -15,8 +15,8 @@ from udkjax.equations import prepare
 from udkjax.integrate.diffrax_engine import derivative
 from udkjax.integrate.solution import Result
 from udkjax.pinv import Pseudoinverse
-from udkjax.study.identify.fit_problem import Residuals
 from udkjax.study.identify.least_squares import Fit, minimize_squares
+from udkjax.study.identify.residuals import Residuals
 
 SCENES = ("parallelogram", "four-bar")
 DEGREES = -45.0  # the parallelogram's start, at rest
@@ -101,7 +101,7 @@ class Drift:
     def tuned(self) -> list[Fit]:
         """Fits from all guesses."""
         self.calls = 0
-        return [minimize_squares(self.evaluate, guess, step_tol=SETTLED) for guess in np.log(GUESSES)]
+        return [minimize_squares(lambda z: [self.evaluate(z)], guess, step_tol=SETTLED) for guess in np.log(GUESSES)]
 
     def last(self, z: Any) -> tuple[np.ndarray, np.ndarray]:
         """The length of Psi (B, 2) at the end of the run, and its derivative with respect to the logarithms of both gains."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from udkjax.study.noise import whiteness_of
+from udkjax.study.noise import MAX_LAGS, HatBands, whiteness_of
 
 SEEDS = 300
 
@@ -19,7 +19,20 @@ def left(kind, samples, unknowns, correlation, seed):
         a = correlation ** ((t[i] - t[i - 1]) / (10.0 / samples)) if correlation else 0.0
         e[i] = a * e[i - 1] + np.sqrt(1.0 - a * a) * e[i]
     U = np.linalg.qr(np.cos(np.pi * np.outer(t, np.arange(unknowns)) / 10.0))[0]
-    return t, e - U @ (U.T @ e), U
+    bands = HatBands(len(t), unknowns)
+    bands.add(U)
+    return t, e - U @ (U.T @ e), bands.values
+
+
+@pytest.mark.parametrize("parts", [(20,), (3, 1, 4, 12), (7, 0, 13)])
+def test_diagonals_of_the_hat_matrix_from_rows_in_parts(parts):
+    U = np.random.default_rng(0).standard_normal((20, 3))
+    bands = HatBands(20, 3)
+    for own in np.split(U, np.cumsum(parts)[:-1]):
+        bands.add(own)
+    H = U @ U.T
+    expected = [np.append(np.diagonal(H, k), np.zeros(k)) for k in range(MAX_LAGS + 1)]
+    np.testing.assert_allclose(bands.values, expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ["regular", "gaps", "irregular"])
@@ -34,8 +47,8 @@ def test_what_a_fit_takes_away_is_allowed_for():
     """A fit of ten unknowns makes neighbours of white noise differ: without the hat matrix this looks like a correlation."""
     with_it, without = [], []
     for seed in range(SEEDS):
-        t, e, U = left("regular", 100, 10, 0.0, seed)
-        with_it.append(whiteness_of(t, e, U).p < 0.05)
+        t, e, hat = left("regular", 100, 10, 0.0, seed)
+        with_it.append(whiteness_of(t, e, hat).p < 0.05)
         without.append(whiteness_of(t, e).p < 0.05)
     assert np.mean(without) > 0.2 and np.mean(with_it) < 0.09
 

@@ -74,7 +74,7 @@ class Whiteness(NamedTuple):
 
 
 def whiteness_of(
-    times: Float[np.ndarray, "N"], residuals: Float[np.ndarray, "N"], projection: Float[np.ndarray, "N D"] | None = None
+    times: Float[np.ndarray, "N"], residuals: Float[np.ndarray, "N"], hat: Float[np.ndarray, "L N"] | None = None
 ) -> Whiteness:
     """Test the residuals of one channel of one record for correlation in time.
 
@@ -88,14 +88,14 @@ def whiteness_of(
     Args:
         times: increasing, s; samples may be irregular and have gaps.
         residuals: residuals; NaN where nothing was measured.
-        projection: the rows of U for these residuals; by default there was no fit.
+        hat: the `hat_bands` of those residuals that are not NaN, N entries or fewer; by default there was no fit.
 
     Source: Lobato, Nankervis & Savin, International Economic Review 42 (2001) 187.
     """
     present = np.isfinite(residuals)
     t, e = np.asarray(times, float)[present], np.asarray(residuals, float)[present]
-    U = np.zeros((len(e), 0)) if projection is None else np.asarray(projection, float)[present]
-    left = len(e) - float(np.sum(U**2))
+    H = np.zeros((MAX_LAGS + 1, len(e))) if hat is None else hat
+    left = len(e) - float(np.sum(H[0]))
     square = float(e @ e)
     if len(e) < 3 or left <= 0 or square == 0.0:
         return Whiteness(np.nan, np.nan, 0, np.nan, len(e))
@@ -106,7 +106,7 @@ def whiteness_of(
         if len(pairs) < PAIRS_PER_LAG * MAX_LAGS:
             break
         products = e[pairs] * e[pairs + k]
-        expected = -variance * np.sum(U[pairs] * U[pairs + k])
+        expected = -variance * np.sum(H[k, pairs])
         z.append((products.sum() - expected) / np.sqrt(np.sum(products**2)))
         if k == 1:
             lag1 = float(products.sum() / np.sqrt(np.sum(e[pairs] ** 2) * np.sum(e[pairs + 1] ** 2)))
@@ -114,3 +114,25 @@ def whiteness_of(
         return Whiteness(lag1, np.nan, 0, np.nan, len(e))
     Q = float(np.sum(np.square(z)))
     return Whiteness(lag1, Q, len(z), float(chdtrc(len(z), Q)), len(e))
+
+
+class HatBands:
+    """The diagonal and the first upper diagonals of H = U U^T, from rows of U that come in sequence.
+
+    `values` (1 + MAX_LAGS, N) are H_(i, i+k), at k and i, zero where i + k is no row.
+    """
+
+    def __init__(self, count: int, columns: int):
+        """Prepare for `count` rows U (D = `columns`)."""
+        self.values = np.zeros((MAX_LAGS + 1, count))
+        self._latest, self._next = np.zeros((0, columns)), 0  # the latest rows, and the index of the next
+
+    def add(self, U: Float[np.ndarray, "n D"]) -> None:
+        """Add rows."""
+        rows, before = np.concatenate([self._latest, U]), len(self._latest)
+        first, self._next = self._next - before, self._next + len(U)
+        for k in range(min(MAX_LAGS + 1, len(rows))):
+            begin = max(before - k, 0)
+            products = np.einsum("ij,ij->i", rows[begin : len(rows) - k], rows[begin + k :])
+            self.values[k, first + begin : first + len(rows) - k] = products
+        self._latest = rows[-MAX_LAGS:]

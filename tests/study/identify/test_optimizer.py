@@ -24,7 +24,7 @@ def problem_of(angle: np.ndarray) -> FitProblem:
 
 
 def objective(problem: FitProblem):
-    return partial(problem.evaluate, tol=TOL)
+    return partial(problem.row_blocks, tol=TOL)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from udkjax.study.identify.fit_problem import Residuals
 from udkjax.study.identify.profile_likelihood import fix_unknown, profile_likelihood, profiles_dataset, trace_profile
+from udkjax.study.identify.residuals import Residuals
 
 
 def linear(J, r0):
@@ -145,7 +145,7 @@ class Linear:
         )
 
     def evaluate(self, z):
-        return Residuals(self.r0 + z @ self.J.T, np.tile(self.J, (len(z), 1, 1)), np.zeros(len(z), int))
+        return [Residuals(self.r0 + z @ self.J.T, np.tile(self.J, (len(z), 1, 1)), np.zeros(len(z), int))]
 
 
 def fitted(problem, noise=()):
@@ -160,7 +160,7 @@ def fitted(problem, noise=()):
 
 def test_one_unknown_is_fixed():
     problem = Linear()
-    found = fix_unknown(problem.evaluate, 1, 0.7)(np.array([[1.0, -1.0], [0.0, 2.0]]))
+    (found,) = fix_unknown(problem.evaluate, 1, 0.7)(np.array([[1.0, -1.0], [0.0, 2.0]]))
     assert_allclose(found.r, problem.r0 + np.array([[1.0, 0.7, -1.0], [0.0, 0.7, 2.0]]) @ problem.J.T)
     assert_allclose(found.J[1], problem.J[:, [0, 2]])
 

@@ -1,13 +1,19 @@
-"""Least squares of few rows: the triangular factor of residuals and Jacobian, and fits that agree."""
+"""Least squares of few rows: residuals in blocks, the triangular factor of their Jacobian, and fits that agree."""
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+import udkjax as udk
+from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
+from udkjax.study.identify import fit_problem
 from udkjax.study.identify.fit_problem import FitProblem
-from udkjax.study.identify.least_squares import Fit, reduce_rows
+from udkjax.study.identify.least_squares import Fit
 from udkjax.study.identify.parameters import unknowns_of
 from udkjax.study.identify.records import Record
+from udkjax.study.identify.residuals import reduce_rows
 from udkjax.study.identify.search import count_agreeing
 
 TOL = 1e-7, 1e-7
@@ -27,6 +33,49 @@ def test_reduced_rows_have_the_same_products(rows, columns):
     assert np.all(np.abs(factor.T @ factor - J.T @ J) <= 1e-12 * np.outer(size, size))
 
 
+def use_windows(monkeypatch):
+    """Let each piece be a window of 8 times."""
+    for name, value in {"LEAST_WINDOW": 8, "WINDOW_BYTES": 1, "BLOCK_BYTES": 1}.items():
+        monkeypatch.setattr(fit_problem, name, value)
+
+
+def two_records() -> list[Record]:
+    """One begins before its first sample; the other is shorter, and its state is unknown."""
+    angle = swing(pendulum()) + 0.01 * np.random.default_rng(0).standard_normal(len(TS))
+    late = Record(TS[3:], {ANGLE: angle[3:]}, t0=0.0)
+    return [late, Record(TS[:20], {ANGLE: angle[:20]}, initial_state=udk.Start(estimate="velocity"))]
+
+
+@pytest.mark.parametrize("horizon", [None, 1.5])
+def test_windows_have_the_rows_of_the_whole(monkeypatch, horizon):
+    first, records, tol = pendulum(0.4, 0.15), two_records(), (1e-11, 1e-11)
+    z = np.array([[0.1, -0.2, 0.05]])
+    expected = FitProblem(first, unknowns_of(first, NAMES), records).evaluate(z, tol, horizon)
+    use_windows(monkeypatch)
+    problem = FitProblem(first, unknowns_of(first, NAMES), records)
+    blocks = list(problem.row_blocks(z, tol, horizon))
+    assert len(problem.runs.ts) == 2 * 8 and problem.runs.ts.shape[1] == 9
+    assert len(blocks) == (16 if horizon is None else len(problem.runs.ts) - np.sum(problem.runs.ts[:, 1] > horizon))
+    found = problem.evaluate(z, tol, horizon)
+    np.testing.assert_allclose(found.r, expected.r, atol=1e-6)
+    np.testing.assert_allclose(found.J, expected.J, atol=1e-6 * np.abs(expected.J).max())
+
+
+@pytest.mark.slow
+def test_an_estimate_is_the_same_from_windows(monkeypatch):
+    records = two_records()
+    records[0].values[ANGLE][[5, 30]] += 1.0
+    whole = udk.identify(pendulum(0.4, 0.15), records, NAMES, loss="huber", progress=False)
+    use_windows(monkeypatch)
+    parts = udk.identify(pendulum(0.4, 0.15), records, NAMES, loss="huber", progress=False)
+    assert len(parts.problem.runs.ts) == 16
+    assert [(one.record, one.row) for one in parts.outliers] == [(one.record, one.row) for one in whole.outliers]
+    np.testing.assert_allclose(parts.values, whole.values, rtol=1e-6)
+    np.testing.assert_allclose(parts.uncertainty.standard_errors, whole.uncertainty.standard_errors, rtol=1e-4)
+    for key, white in whole.whiteness.items():
+        np.testing.assert_allclose(parts.whiteness[key], white, rtol=1e-4)
+
+
 def test_fits_agree_whatever_the_value_of_an_unknown_at_its_bound():
     """Where a damping is best at zero, z tends to minus infinity, and each fit stops elsewhere on the way."""
     first, angle = pendulum(damping=0.2), np.sin(TS)
@@ -42,3 +91,35 @@ def test_fits_agree_whatever_the_value_of_an_unknown_at_its_bound():
     assert count_agreeing(problem, [best, fit([0.3, -11.0], bound, 1.1)], TOL) == 1  # another minimum
     assert count_agreeing(problem, [fit([0.1, -5.0], ~bound & bound), fit([0.1, -3.0], None, 1.1)], TOL) == 1
     assert count_agreeing(problem, [fit([0.1, -15.0], bound, np.inf)], TOL) == 0
+
+
+PEAK = """
+import resource, sys
+import numpy as np, udkjax as udk
+from udkjax.study.identify import fit_problem
+from udkjax.study.identify.optimizer import Minimizer
+
+fit_problem.BLOCK_BYTES = fit_problem.WINDOW_BYTES = 2**23
+scene, ts = udk.library.four_bar(), np.linspace(0.0, 2.0, int(sys.argv[1]))
+springs = {f"s{k}": udk.Spring(["ground", b], points=[[k, 1.0], [0.1, 0.0]], stiffness=5.0, damping=0.5, length=0.5)
+           for k, b in enumerate(scene.bodies)}
+mech = udk.Mechanism(scene.bodies, scene.joints, forces=springs)
+values = {f"body.{b}.angle": np.sin(ts) for b in scene.bodies}
+names = [f"force.{s}.{number}" for s in springs for number in ("stiffness", "damping", "length")]
+problem = fit_problem.build_problem(mech, [udk.Record(ts, values, noise=0.1)] * 2, names, {}, tol=1e-7)
+Minimizer().minimize(problem, np.zeros(problem.K), (1e-7, 1e-7), None, 1)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no `resource`")
+def test_memory_holds_residuals_but_no_jacobian():
+    """States with derivatives by 9 parameters are 1.4 kB a sample, and J is 216 B; a few vectors of residuals remain."""
+    few, many = 10_000, 110_000
+    peaks = [
+        int(subprocess.run([sys.executable, "-c", PEAK, str(count)], check=True, capture_output=True, text=True).stdout)
+        for count in (few, many)
+    ]
+    per_sample = (peaks[1] - peaks[0]) / (2 * (many - few))  # of two records
+    assert per_sample < 500.0

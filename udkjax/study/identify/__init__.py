@@ -4,9 +4,10 @@ records, tables, record_reader                     measurements, from files and 
 parameters, unknowns                               parameters to identify, and the unknowns of a fit
 prediction, fit_problem, shooting                  predictions and residuals
 loop_consistency                                   parameters that keep closed loops closed
+windows, residuals                                 residuals and their Jacobian in blocks of rows, and their reduction
 least_squares, optimizer                           minimization
 growing_records, search                            search for the global minimum
-uncertainty, profile_likelihood                    standard errors and confidence intervals
+row_statistics, uncertainty, profile_likelihood    standard errors and confidence intervals
 gradient_check                                     check of derivatives against differences
 identification, estimate, experiment_design        the public functions and their results
 """

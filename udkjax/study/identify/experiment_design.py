@@ -24,6 +24,7 @@ from udkjax.study.identify.fit_problem import FitProblem, build_problem
 from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import MEDIUM_TOL, TolerancePair
 from udkjax.study.identify.records import ChannelKey, IdentificationError, Noise, Record, Start
+from udkjax.study.identify.residuals import Reduction
 from udkjax.study.identify.uncertainty import SMALLEST_PART
 from udkjax.study.identify.unknowns import INVISIBLE_RATIO
 from udkjax.wording import suggestion
@@ -182,18 +183,18 @@ def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.nda
 
 def _information_of_records(problem: FitProblem, tol: TolerancePair) -> list[np.ndarray]:
     """Return rows J (., P) for each record, whose information is J^T J; no rows if a record cannot be computed."""
-    P = len(problem.unknowns.names)
-    J = problem.evaluate(np.zeros((1, problem.K)), tol).J[0, : len(problem.index)]
-    information = []
-    for k in range(len(problem.records)):
-        of_record = J[problem.index[:, 0] == k]
-        fine = np.isfinite(of_record).all()
-        information.append(
-            _eliminate(of_record, np.arange(P, problem.K), INVISIBLE_RATIO * np.linalg.norm(of_record, 2))
-            if fine
-            else np.zeros((0, P))
-        )
-    return information
+    P, fine = len(problem.unknowns.names), np.ones(len(problem.records), bool)
+    reduced = [Reduction(problem.K) for _ in problem.records]
+    for block in problem.row_blocks(np.zeros((1, problem.K)), tol):
+        count = block.count_before(len(problem.index))
+        record, J = problem.index[block.row_numbers[:count], 0], block.J[0, :count]
+        for k in np.unique(record).tolist():
+            own = J[record == k]
+            fine[k] &= np.isfinite(own).all()
+            if fine[k]:
+                reduced[k].add(np.zeros(len(own)), own)
+    roots = [rows.J if well else rows.J[:0] for rows, well in zip(reduced, fine, strict=True)]
+    return [_eliminate(J, np.arange(P, problem.K), INVISIBLE_RATIO * np.linalg.norm(J, 2) if len(J) else 0.0) for J in roots]
 
 
 def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarray:
@@ -208,7 +209,10 @@ def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarra
         raise IdentificationError([f"given: is an estimate of {', '.join(given.names)}, not of {', '.join(u.names)}"])
     P, earlier = len(u.names), given.problem.unknowns
     scale = np.append(given.uncertainty.noise, 1.0)[given.problem.noise_groups()]
-    J = given.problem.evaluate(given.z[None], given.tol).J[0] / scale[:, None]
+    reduced = Reduction(given.problem.K)
+    for block in given.problem.row_blocks(given.z[None], given.tol):
+        reduced.add(block.r[0], block.J[0] / scale[block.row_numbers, None])
+    J = reduced.J
     rows = _eliminate(J, np.arange(P, given.problem.K), INVISIBLE_RATIO * np.linalg.norm(J, 2))
     factor = u.dx_dz(np.zeros(P)) / earlier.dx_dz(given.z[:P])  # the two sets of unknowns have different first guesses
     return rows * factor  # these include the priors of the estimate

@@ -5,9 +5,14 @@ With y the measured values, yhat(z) the values predicted with the unknowns z, an
     r = (yhat(z) - y) / sigma,        J = dr/dz,
 
 followed by (x - mean) / sigma of each prior. Every measured number is one residual; the order is record, time, channel.
+
+J is computed in blocks, of several records each, or of a part of a long one (a window). The motion of each window is computed
+from the beginning of its record, since a motion with events cannot begin anew in between: this takes few steps for the many
+samples that make a record long.
 """
 
 import inspect
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -28,9 +33,11 @@ from udkjax.study.identify.loop_consistency import nearest_closable, require_con
 from udkjax.study.identify.parameters import ParametersLike, unknowns_of
 from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, Members, Prediction, Predictor, Runs, TolerancePair
 from udkjax.study.identify.record_reader import Data, records_of
-from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, pad_times, tabulate
+from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Record, Start, output_times, tabulate
+from udkjax.study.identify.residuals import Residuals, join_rows
 from udkjax.study.identify.unknowns import Unknowns, conditions_of, guessed_states, with_conditions
-from udkjax.study.quantities import StudyModel, analysis_of
+from udkjax.study.identify.windows import BLOCK_BYTES, LEAST_WINDOW, WINDOW_BYTES, cut_into_windows, times_until
+from udkjax.study.quantities import StudyModel, analysis_of, state_shape
 from udkjax.wording import suggestion
 
 STILL_DEVIATION = 1e-12  # standard deviation below which a channel is constant, relative to its largest number
@@ -40,17 +47,11 @@ DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "prog
 Strategy = Literal["auto", "pieces"]
 
 
-class Residuals(NamedTuple):
-    """Residuals r and Jacobians J = dr/dz at B sets of unknowns; `code` is the worst result of the runs of all records."""
+class RunEnds(NamedTuple):
+    """States at the first and last time of runs, (B, runs, 2 times, 2, n), and their derivatives (B, runs, 2, 2, n, P + S)."""
 
-    r: Float[np.ndarray, "B R"]
-    J: Float[np.ndarray, "B R K"]
-    code: Int[np.ndarray, "B"]
-
-    @property
-    def ok(self) -> np.ndarray:
-        """True (B,) where all runs were completed and all values are finite."""
-        return (self.code == Result.successful) & np.isfinite(self.r).all(1) & np.isfinite(self.J).all((1, 2))
+    states: np.ndarray
+    slopes: np.ndarray
 
 
 class FitProblem:
@@ -59,10 +60,11 @@ class FitProblem:
     Attributes:
         ts: times (records, times) of the records, from their beginning (s).
         y: measured values (records, times, channels), NaN where nothing was measured.
-        present: mask of the measured values; the R rows of `index` (R, 3) are record, time and channel of each residual.
+        present: mask of the `measured` values; the R rows of `index` (R, 3) are record, time and channel of each residual.
         sigma: standard deviations (R,) of the residuals; `noise_given` (R,) marks the given ones.
         channel_scale: scale of the values of each channel (C,).
-        runs: runs to simulate; `run` and `time` (R,) are the indices of run and time of each residual.
+        runs: runs to simulate, one or more windows per record; `run` and `time` (R,) are the indices of run and time of each
+            residual.
         state_sizes: change of each initial-state unknown, in its units, per unit of z (K - P,).
         columns: indices in z of the unknowns of each run's initial state (N, S); -1 for unused entries.
         beginnings: the run that each record begins with (records,).
@@ -87,12 +89,13 @@ class FitProblem:
         self.K = len(self.all_names)
         self.ts, self.y, sigma = tabulate(self.records, keys)
         self.present, self.index = np.isfinite(self.y), np.argwhere(np.isfinite(self.y))
-        self.noise_given = np.isfinite(sigma)[self.present]
+        self.measured, self.noise_given = self.y[self.present], np.isfinite(sigma)[self.present]
         self.channel_scale = np.array([_size_of(self.y[:, :, c]) for c in range(len(keys))])
         self.sigma = np.where(np.isfinite(sigma), sigma, self.channel_scale)[self.present]
-        self.run, self.time, _ = self.index.T
-        self.runs = Runs(self.ts, *guessed_states(mechanism, self.records), bases, conditions_of(mechanism, self.records))
-        self.beginnings = np.arange(len(self.records))
+        runs = Runs(self.ts, *guessed_states(mechanism, self.records), bases, conditions_of(mechanism, self.records))
+        length = max(WINDOW_BYTES // self._bytes_per_time, LEAST_WINDOW)
+        self.runs, self.beginnings, self.run, self.time = cut_into_windows(runs, self.index, length)
+        self.columns = self.columns[np.searchsorted(self.beginnings, np.arange(len(self.runs.ts)), side="right") - 1]
         self.priors = np.flatnonzero(np.isfinite(unknowns.sigma))
         self.extra_rows = len(self.priors)
         self.settings = {"analysis": analysis_of(mechanism), **(settings or {})}
@@ -128,51 +131,91 @@ class FitProblem:
             )
         return tuple(tables)
 
-    def members(self, z: Float[np.ndarray, "B K"], horizon: float | None = None) -> Members:
-        """Return the members of B sets of unknowns: all runs of the first set, then all runs of the next."""
-        sets, (N, S) = len(z), self.columns.shape
-        x = np.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)]), N, axis=0)
-        shift = np.where(self.columns < 0, 0.0, z[:, self.columns]).reshape(sets * N, S)
-        all_members = self.members_of(np.tile(np.arange(N), sets), x, shift)
+    def members(self, z: Float[np.ndarray, "B K"], runs: Int[np.ndarray, "N"], horizon: float | None = None) -> Members:
+        """Return the members of B sets of unknowns: N runs of the first set, then the same of the next."""
+        columns, sets = self.columns[runs], len(z)
+        x = np.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)]), len(runs), axis=0)
+        shift = np.where(columns < 0, 0.0, z[:, columns]).reshape(len(x), columns.shape[1])
+        members = self.members_of(np.tile(runs, sets), x, shift)
         if horizon is None:
-            return all_members
-        ts = np.tile([_times_until(ts, horizon) for ts in self.runs.ts], (sets, 1))
-        return all_members._replace(runs=all_members.runs._replace(ts=ts))
+            return members
+        ts = np.tile([times_until(ts, horizon) for ts in self.runs.ts[runs]], (sets, 1))
+        return members._replace(runs=members.runs._replace(ts=ts))
 
     def members_of(self, runs: Int[np.ndarray, "M"], x: Float[np.ndarray, "M P"], shift: Float[np.ndarray, "M S"]) -> Members:
         """Return the members of some runs with given parameters and unknowns of their initial states."""
         return Members(x, shift, jax.tree.map(lambda leaf: leaf[runs], self.runs))
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
-        """Compute residuals and their Jacobian.
+        """Compute residuals and their Jacobian as a whole: see `row_blocks`. Later residuals than the horizon are zero."""
+        return join_rows(self.row_blocks(z, tol, horizon), len(self.index) + self.extra_rows)
+
+    def row_blocks(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Iterator[Residuals]:
+        """Compute residuals and their Jacobian in blocks of rows, each when it is asked for, in the order of rows.
 
         Args:
             z: B sets of unknowns.
             tol: tolerances of the integration.
-            horizon: duration of the part of each record that is used (s); later residuals are zero. None: the whole record.
+            horizon: duration of the part of each record that is used (s); later residuals are left out. None: the whole record.
         """
-        prediction = self.predictor(self.members(z, horizon), tol)
-        prediction = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), prediction)
-        entries = self.run, self.time, self.index[:, 2]
-        r = (prediction.y[:, *entries] - self.y[self.present]) / self.sigma
-        J = self.by_unknowns(prediction.dy[:, *entries] / self.sigma[:, None], self.run, z)
-        if horizon is not None:
-            record, time, _ = self.index.T
-            beyond = self.ts[record, time] - self.ts[record, 0] > horizon
-            r[:, beyond], J[:, beyond] = 0.0, 0.0
-        for more_r, more_J in self.further_rows(prediction, z):
-            r, J = np.concatenate([r, more_r], axis=1), np.concatenate([J, more_J], axis=1)
-        return Residuals(r, J, prediction.code.max(1))
+        ends, code = [], np.zeros(len(z), int)
+        together = max(1, int(BLOCK_BYTES // (len(z) * self._bytes_per_time * self.runs.ts.shape[1])))
+        runs = np.arange(len(self.runs.ts))
+        if horizon is not None:  # the first window of a record is computed in any case, for its beginning
+            later = self.runs.ts[:, 1] - self.runs.ts[:, 0] > horizon
+            later[self.beginnings] = False
+            runs = runs[~later]
+        for first in range(0, len(runs), together):
+            some = runs[first : first + together]
+            prediction = self.predictor(self.members(z, some, horizon), tol)
+            prediction = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), prediction)
+            rows = np.arange(*np.searchsorted(self.run, [some[0], some[-1] + 1]))
+            if horizon is not None:
+                record, time, _ = self.index[rows].T
+                rows = rows[self.ts[record, time] - self.ts[record, 0] <= horizon]
+            yield self._residuals_of(prediction, rows, some, z)
+            code = np.maximum(code, prediction.code.max(1))
+            if prediction.ends is not None:
+                ends.append(RunEnds(np.asarray(prediction.ends), np.asarray(prediction.d_ends)))
+        row = len(self.index)
+        for r, J in self.further_rows(
+            RunEnds(*map(partial(np.concatenate, axis=1), zip(*ends, strict=True))) if ends else None, z
+        ):
+            yield Residuals(r, J, code, np.arange(row, row + r.shape[1]))
+            row += r.shape[1]
+
+    def code(self, z: Float[np.ndarray, "K"], tol: TolerancePair) -> int:
+        """Return the worst result of the runs of all records."""
+        return max(int(block.code[0]) for block in self.row_blocks(z[None], tol))
+
+    @property
+    def sets_together(self) -> int:
+        """The number of sets of unknowns that may be evaluated together."""
+        return max(1, int(BLOCK_BYTES // (self._bytes_per_time * self.runs.ts.size)))
+
+    @property
+    def _bytes_per_time(self) -> int:
+        """Size of the numbers of a run at one time: states and channels, with their derivatives."""
+        states = 2 * math.prod(state_shape(self.mechanism))
+        return 8 * (states + len(self.channels)) * (1 + len(self.unknowns.names) + self.columns.shape[1])
+
+    def _residuals_of(self, prediction: Prediction, rows: Int[np.ndarray, "R"], runs: np.ndarray, z: np.ndarray) -> Residuals:
+        """Return the residuals of some rows from the prediction of their runs."""
+        entries = np.searchsorted(runs, self.run[rows]), self.time[rows], self.index[rows, 2]
+        r = (prediction.y[:, *entries] - self.measured[rows]) / self.sigma[rows]
+        by = prediction.dy[:, *entries]
+        by /= self.sigma[rows, None]
+        return Residuals(r, self.by_unknowns(by, self.run[rows], z), prediction.code.max(1), rows)
 
     def first_states(self, mechanism: StudyModel, z: Float[np.ndarray, "K"]) -> tuple[State, ...]:
         """Return the closed initial states of the records for a mechanism with the parameters of z."""
-        members, states = self.members(z[None]), []
-        for record, run in zip(self.records, self.beginnings, strict=True):
-            guess = self.predictor.guess(members, int(run))
+        members, states = self.members(z[None], self.beginnings), []
+        for k, record in enumerate(self.records):
+            guess = self.predictor.guess(members, k)
             states.append(assemble(with_conditions(mechanism, record), record.t0, guess, throw=False))
         return tuple(states)
 
-    def further_rows(self, prediction: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def further_rows(self, ends: RunEnds | None, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Iterate over further residuals with their Jacobians: those of priors, (x - mean) / sigma."""
         which, u = self.priors, self.unknowns
         if not len(which):
@@ -183,8 +226,14 @@ class FitProblem:
         yield (u.values(z)[:, which] - u.mean[which]) / u.sigma[which], J
 
     def by_unknowns(self, by: np.ndarray, run: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Convert derivatives with respect to x and the state of each row's run, (B, R, P + S), to those for z, (B, R, K)."""
+        """Convert derivatives with respect to x and the state of each row's run, (B, R, P + S), to those for z, (B, R, K).
+
+        The given ones may be overwritten.
+        """
         P = len(self.unknowns.names)
+        if self.K == P:
+            by *= self.unknowns.dx_dz(z)[:, None]
+            return by
         J = np.zeros((*by.shape[:2], self.K + 1))  # the last column collects the derivatives for unused entries
         columns = self.columns[run] % (self.K + 1)
         np.put_along_axis(J, np.broadcast_to(columns, (len(z), *columns.shape)), by[..., P:], 2)
@@ -198,12 +247,6 @@ def _size_of(values: np.ndarray) -> float:
     size = np.abs(finite).max(initial=0.0)
     deviation = finite.std() if finite.size else 0.0
     return float(deviation if deviation > STILL_DEVIATION * size else size or 1.0)
-
-
-def _times_until(ts: np.ndarray, horizon: float) -> np.ndarray:
-    """Return the times of a record up to `horizon` after its beginning, padded to the same length."""
-    last = max(1, int(np.searchsorted(ts - ts[0], horizon, side="right")) - 1)
-    return pad_times(ts[: last + 1], len(ts))
 
 
 # --- from the arguments of `identify`
@@ -282,8 +325,7 @@ def _closable_problem(
     if unknowns.at_scene_values and analyse(mechanism).redundant_rows == ():
         try:
             problem = FitProblem(mechanism, unknowns, records, settings)
-            first = problem.evaluate(np.zeros((1, problem.K)), (max(tol, LOOSE_TOL), max(tol, LOOSE_TOL)))
-            if first.code[0] != Result.could_not_assemble:
+            if problem.code(np.zeros(problem.K), (max(tol, LOOSE_TOL), max(tol, LOOSE_TOL))) != Result.could_not_assemble:
                 return problem
         except AssemblyError:
             pass

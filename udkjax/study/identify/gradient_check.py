@@ -245,7 +245,7 @@ def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePai
     together = max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns))
     batches = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
     r, code = np.concatenate([batch.r for batch in batches]), np.concatenate([batch.code for batch in batches])
-    values = r[:, :rows] * problem.sigma + problem.y[problem.present]
+    values = r[:, :rows] * problem.sigma + problem.measured
     return np.where((code == Result.successful)[:, None], values, np.nan)
 
 

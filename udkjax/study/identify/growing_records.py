@@ -12,6 +12,7 @@ with s the noise of the record,
     min sum (r / s)^2 + |z - z_0|^2 / SPREAD^2,        C = (J^T J / s^2 + 1 / SPREAD^2)^-1.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
@@ -19,10 +20,11 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
-from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, CostHistory, Fit, reduce_rows
+from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem
+from udkjax.study.identify.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, CostHistory, Fit
 from udkjax.study.identify.optimizer import Minimizer, huber, robust
 from udkjax.study.identify.prediction import TolerancePair
+from udkjax.study.identify.residuals import Reduction, Residuals
 from udkjax.study.identify.unknowns import Unknowns
 from udkjax.study.noise import noise_of_differences
 
@@ -59,20 +61,19 @@ class RegularizedProblem:
         """The parameters."""
         return self.problem.unknowns
 
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
-        """Compute residuals and their Jacobian, as `FitProblem.evaluate` does, with outliers weighted by Huber's loss."""
-        return robust(self.plain(z, tol, horizon), partial(huber, c=HUBER_LIMIT), len(self.noise))
+    def row_blocks(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Iterator[Residuals]:
+        """Compute residuals and their Jacobian, as `FitProblem.row_blocks` does, with outliers weighted by Huber's loss."""
+        for block in self.plain(z, tol, horizon):
+            yield robust(block, partial(huber, c=HUBER_LIMIT), len(self.noise))
 
-    def plain(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
+    def plain(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Iterator[Residuals]:
         """Compute the same without Huber's loss."""
-        residuals = self.problem.evaluate(z, tol, horizon)
-        scale = np.concatenate([1.0 / self.noise, np.ones(residuals.r.shape[1] - len(self.noise))])
-        prior = np.broadcast_to(np.eye(len(self.guess)) / GUESS_SPREAD, (len(z), len(self.guess), len(self.guess)))
-        return Residuals(
-            np.concatenate([residuals.r * scale, (z - self.guess) / GUESS_SPREAD], axis=1),
-            np.concatenate([residuals.J * scale[:, None], prior], axis=1),
-            residuals.code,
-        )
+        scale, K = np.append(1.0 / self.noise, np.ones(self.problem.extra_rows)), len(self.guess)
+        for block in self.problem.row_blocks(z, tol, horizon):
+            of_block = scale[block.row_numbers]
+            yield block._replace(r=block.r * of_block, J=block.J * of_block[:, None])
+        prior = np.broadcast_to(np.eye(K) / GUESS_SPREAD, (len(z), K, K))
+        yield Residuals((z - self.guess) / GUESS_SPREAD, prior, np.zeros(len(z), int), len(scale) + np.arange(K))
 
 
 def fit_growing_records(
@@ -134,19 +135,27 @@ def _predictable_time(regularized: RegularizedProblem, z: np.ndarray, tol: Toler
     `size` is the root mean square of the residuals of this fit.
     """
     problem, times = regularized.problem, _times(regularized.problem)
-    residuals = regularized.plain(z[None], tol)
-    J, R = residuals.J[0], len(times)
-    data, usable = J[:R], np.isfinite(residuals.r[0]) & np.isfinite(J).all(1)  # a run may fail before its end
-    in_part = (times <= fitted) & usable[:R]
-    enough = in_part.sum() >= RESIDUALS_PER_UNKNOWN * problem.K
+    R, K = len(times), problem.K
+    usable, data, priors = np.zeros(R, bool), Reduction(K), Reduction(K)
+    for block in regularized.plain(z[None], tol):
+        fine = np.isfinite(block.r[0]) & np.isfinite(block.J[0]).all(1)  # a run may fail before its end
+        count = block.count_before(R)
+        rows, measured = block.row_numbers[:count], np.arange(len(fine)) < count
+        usable[rows] = fine[:count]
+        fitted_rows = np.append(times[rows] <= fitted, np.zeros(len(fine) - count, bool)) & fine
+        for reduction, own in ((data, fitted_rows), (priors, fine & ~measured)):
+            reduction.add(block.r[0, own], block.J[0, own])
+    enough = data.count >= RESIDUALS_PER_UNKNOWN * K
     square = size**2 if enough and np.isfinite(size) else 1.0
-    prior_rows = J[R:][usable[R:]]
-    root = np.concatenate([data[in_part] / np.sqrt(max(square, np.finfo(float).eps)), prior_rows])  # C^-1 = root^T root
-    _, s, vt = np.linalg.svd(reduce_rows(root[:, 0], root)[1], full_matrices=False)  # C = V S^-2 V^T
-    with np.errstate(invalid="ignore", over="ignore"):
-        deviation = np.linalg.norm(data @ (vt.T / s), axis=1)
+    root = np.concatenate([data.J / np.sqrt(max(square, np.finfo(float).eps)), priors.J])  # C^-1 = root^T root
+    _, s, vt = np.linalg.svd(root, full_matrices=False)  # C = V S^-2 V^T
     scale = problem.channel_scale[problem.index[:, 2]] / (regularized.noise * problem.sigma)
-    beyond = ~(usable[:R] & (deviation <= LINEAR_PART * scale)) & (times > fitted)
+    beyond = ~usable & (times > fitted)
+    for block in regularized.plain(z[None], tol):
+        rows = block.row_numbers[: block.count_before(R)]
+        with np.errstate(invalid="ignore", over="ignore"):
+            deviation = np.linalg.norm(block.J[0, : len(rows)] @ (vt.T / s), axis=1)
+        beyond[rows] |= ~(deviation <= LINEAR_PART * scale[rows]) & (times[rows] > fitted)
     return float(times[beyond].min()) if beyond.any() else np.inf
 
 

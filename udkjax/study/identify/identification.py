@@ -12,17 +12,27 @@ from udkjax.integrate.solution import CAUSES, Result
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.scene.arguments import checked
 from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.fit_problem import FitProblem, Residuals, Strategy, build_problem
+from udkjax.study.identify.fit_problem import FitProblem, Strategy, build_problem
 from udkjax.study.identify.least_squares import CostHistory, Fit
-from udkjax.study.identify.optimizer import Loss, Minimizer, Optimizer, UserLoss, choose_method, named_loss, squares
+from udkjax.study.identify.optimizer import (
+    Loss,
+    Minimizer,
+    Optimizer,
+    UserLoss,
+    choose_method,
+    named_loss,
+    squares,
+    weighted_residuals,
+)
 from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
 from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, TolerancePair
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
+from udkjax.study.identify.residuals import Residuals, reduce_groups, residual_vector
+from udkjax.study.identify.row_statistics import hat_bands, residuals_of_others
 from udkjax.study.identify.search import N_STARTS, SearchResult, search
 from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
-from udkjax.study.identify.unknowns import INVISIBLE_RATIO
 from udkjax.study.noise import Whiteness, whiteness_of
 from udkjax.study.quantities import StudyModel
 
@@ -125,8 +135,8 @@ def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None
 
 def _require_finite(problem: FitProblem, result: SearchResult) -> None:
     if not np.isfinite(result.fit.cost):
-        code = problem.evaluate(result.fit.z[None], (LOOSE_TOL, LOOSE_TOL)).code[0]
-        raise IdentificationError([f"the records cannot be simulated with any first guess: {CAUSES[Result(int(code))]}"])
+        code = problem.code(result.fit.z, (LOOSE_TOL, LOOSE_TOL))
+        raise IdentificationError([f"the records cannot be simulated with any first guess: {CAUSES[Result(code)]}"])
 
 
 # --- the end of a fit
@@ -155,7 +165,7 @@ def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, 
     """
     old_sigma = problem.sigma.copy()
     rows = len(problem.index)
-    r = problem.evaluate(z[None], tol).r[0, :rows]
+    r = residual_vector(problem.row_blocks(z[None], tol))[0][:rows]
     residuals, inliers = r * problem.sigma, ~find_outlier_rows(problem, r)
     for c in range(len(problem.channels)):
         measured_inliers = (problem.index[:, 2] == c) & ~problem.noise_given & inliers
@@ -176,9 +186,8 @@ def _estimate_of(
     problem = search_result.problem
     unknowns, P, z = problem.unknowns, len(problem.unknowns.names), fit.z
     x, states = unknowns.values(z[:P]), problem.state_sizes * z[P:]
-    plain, rows = problem.evaluate(z[None], tol), len(problem.index)
-    weighted = loss(plain)
-    outlying, robust = find_outlier_rows(problem, plain.r[0, :rows]), loss is not squares
+    plain, rows = residual_vector(problem.row_blocks(z[None], tol))[0], len(problem.index)
+    outlying, robust = find_outlier_rows(problem, plain[:rows]), loss is not squares
     # Outliers hardly affect a robust loss and are left out here; in least squares they count, also for standard errors.
     inliers = np.concatenate([~outlying | (not robust), np.ones(problem.extra_rows, bool)])
     groups = problem.noise_groups()
@@ -189,33 +198,35 @@ def _estimate_of(
         np.concatenate([unknowns.dx_dz(z[:P]), problem.state_sizes]),
         (*unknowns.kinds, *["free"] * (problem.K - P)),
     )
-    J, r = weighted.J[0][inliers], weighted.r[0][inliers]
-    if (stuck := unknowns.stuck_at_bounds(z, r, J, len(r))).any():
+    blocks = weighted_residuals(problem, tol, loss)
+    reduced = reduce_groups(blocks(z[None]), problem.K, groups, len(problem.priors), inliers)
+    stuck, factor = unknowns.stuck_at_bounds(z, reduced.r, reduced.J, reduced.rows), np.ones(problem.K)
+    if stuck.any():
         # dr/dz vanishes at a bound; dr/dx, from within, does not.
         scale = np.append(unknowns.range_scale, problem.state_sizes)
-        J = J * np.where(stuck, scale / values.dx_dz, 1.0)
+        factor = np.where(stuck, scale / values.dx_dz, 1.0)
         values = values._replace(dx_dz=np.where(stuck, scale, values.dx_dz))
-    uncertainty = estimate_uncertainty(J, r, values, groups[inliers], P, len(problem.priors))
+    uncertainty = estimate_uncertainty(reduced.scaled(factor), values, P)
     scale = np.append(uncertainty.noise, 1.0)[groups]
-    projection = np.zeros((len(inliers), uncertainty.projection.shape[1]))
-    projection[inliers] = uncertainty.projection
-    residual = -plain.r[0, :rows] * problem.sigma
-    sigma, whitened = problem.sigma * scale[:rows], weighted.r[0, :rows]
+    residual = -plain[:rows] * problem.sigma
+    sigma, whitened = problem.sigma * scale[:rows], loss(_without_slopes(plain)).r[0, :rows]
     if outlying.any():
-        inlier_residuals = _residuals_of_others(problem, plain, outlying)
+        inlier_residuals = residuals_of_others(problem, z, tol, outlying)
         for g in np.unique(groups[:rows][outlying & (groups[:rows] >= 0)]):
             in_group = groups[:rows] == g
             sigma[in_group] = problem.sigma[in_group] * np.sqrt(
                 np.nanmean(inlier_residuals[in_group] ** 2) / (1.0 - problem.K / inliers.sum())
             )
         whitened = inlier_residuals
+    by = scale[:rows] if np.isfinite(uncertainty.noise).all() else np.ones(rows)
+    hat = hat_bands(problem, blocks(z[None]), factor[:, None] * uncertainty.projector, by, ~outlying)
     white: dict[tuple[int, str], Whiteness] = {}
     for places in problem.series():
         record, _, channel = problem.index[places[0]]
         if np.abs(residual[places]).max() > INTEGRATION_ERROR * problem.channel_scale[channel]:
             times = problem.ts[record, problem.index[places, 1]]
             white[int(record), problem.channel_names[channel]] = whiteness_of(
-                times, (whitened / scale[:rows])[places], projection[places]
+                times, (whitened / scale[:rows])[places], hat[int(record), int(channel)]
             )
     names = [name for state in problem.initial_states for name in state.names]
     return Estimate(
@@ -225,7 +236,7 @@ def _estimate_of(
         uncertainty=uncertainty,
         at_bounds=tuple(name for k, name in enumerate(unknowns.names) if stuck[k] or name in unknowns.at_bounds(x)),
         initial_state_values=dict(zip(names, zip(states.tolist(), uncertainty.state_errors.tolist(), strict=True), strict=False)),
-        predicted=problem.by_record(problem.y[problem.present] - residual),
+        predicted=problem.by_record(problem.measured - residual),
         residuals=problem.by_record(residual),
         noise=problem.by_record(sigma),
         outliers=list_outliers(problem, outlying, residual, sigma),
@@ -244,8 +255,6 @@ def _estimate_of(
     )
 
 
-def _residuals_of_others(problem: FitProblem, fitted: Residuals, outlying: np.ndarray) -> Float[np.ndarray, "R"]:
-    """Return the residuals of a fit without the outliers, to first order; NaN at the outliers."""
-    r, J, inliers = fitted.r[0], fitted.J[0], np.concatenate([~outlying, np.ones(problem.extra_rows, bool)])
-    residuals = r - J @ np.linalg.lstsq(J[inliers], r[inliers], rcond=INVISIBLE_RATIO)[0]
-    return np.where(outlying, np.nan, residuals[: len(outlying)])
+def _without_slopes(r: Float[np.ndarray, "R"]) -> Residuals:
+    """Return residuals without unknowns."""
+    return Residuals(r[None], np.zeros((1, len(r), 0)), np.zeros(1, int))

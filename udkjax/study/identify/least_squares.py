@@ -6,7 +6,7 @@ predicted, and shrinks if it does not, or if a trial cannot be computed. Near a 
 Source: M. A. Branch, T. F. Coleman & Y. Li, SIAM Journal on Scientific Computing 21 (1999) 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import lstsq
 
-from udkjax.study.identify.fit_problem import Residuals
+from udkjax.study.identify.residuals import Residuals, reduce_blocks
 from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN, INVISIBLE_RATIO
 
 # Gauss-Newton steps (largest change of a dimensionless unknown) at which a fit has converged: for a part of the records; with
@@ -28,10 +28,9 @@ FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
 # number of residuals, it is the Gauss-Newton step in standard errors, of which a thousandth is negligible.
 ORTHOGONAL_COSINE = 1e-5
 MOST_REFUSED_STEPS = 8  # number of successive rejected steps after which a fit is given up
-BLOCK_NUMBERS = 4096  # size of a block of rows, of which BLAS computes products without threads
 ROUNDING = 4 * float(np.finfo(float).eps)  # steps below this, relative to the unknowns, are rounding errors
 
-Objective: TypeAlias = Callable[[np.ndarray], Residuals]  # residuals and their Jacobian at B sets of K unknowns (B, K)
+Objective: TypeAlias = Callable[[np.ndarray], Iterable[Residuals]]  # blocks of residuals at B sets of K unknowns (B, K)
 Stuck: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]  # `Unknowns.stuck_at_bounds`
 ReportStep: TypeAlias = Callable[[str], None]  # called with a message after each step
 CostHistory: TypeAlias = list[tuple[float, float]]  # cost after each step, and largest change of an unknown in the next step
@@ -103,12 +102,13 @@ class _TrustRegionFit(Descent):
     refused = 0  # number of trials since the last improvement
 
     def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "2K+1"]:
-        """Return the residuals, reduced by `reduce_rows`; infinite if they cannot be computed."""
+        """Return the residuals, reduced to K + 1, some of which may be zero; infinite if they cannot be computed."""
         z = self.guess + change
-        found = self.evaluate(z[None])
-        ok = found.ok[0] and np.abs(z).max(initial=0.0) < FARTHEST_UNKNOWN
-        self.count, size = found.r.shape[1], min(found.r.shape[1], len(z) + 1)
-        self.r, self.J = reduce_rows(found.r[0], found.J[0]) if ok else (np.full(size, np.inf), found.J[0, :size])
+        reduced = reduce_blocks(self.evaluate(z[None])) if np.abs(z).max(initial=0.0) < FARTHEST_UNKNOWN else None
+        self.r, self.J = np.full(len(z) + 1, np.inf if reduced is None else 0.0), np.zeros((len(z) + 1, len(z)))
+        if reduced is not None:
+            self.count, size = reduced.count, len(reduced.r)
+            self.r[:size], self.J[:size] = reduced.r, reduced.J
         cost = float(0.5 * self.r @ self.r)
         if cost < self.end.cost:
             self.end, self.refused = self.end._replace(z=z, cost=cost), 0
@@ -133,23 +133,6 @@ class _TrustRegionFit(Descent):
         if cosine <= ORTHOGONAL_COSINE:
             self.stop(True)
         return np.concatenate([J, np.diag(held)])
-
-
-def reduce_rows(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most K + 1 residuals and their Jacobian with the same r.r, J^T r and J^T J, all that least squares depend on.
-
-    They are the triangular factor of [J r] = Q R, which loses no accuracy, as J^T J would. It is computed from the factors of
-    blocks of rows, since BLAS would start threads for tall matrices, in which they wait for each other most of the time.
-    """
-    table = np.column_stack([J, r])
-    columns = table.shape[1]
-    block = max(2 * columns, BLOCK_NUMBERS // columns)
-    while len(table) > 2 * block:
-        blocks = np.zeros((-(-len(table) // block), block, columns))
-        blocks.reshape(-1, columns)[: len(table)] = table
-        table = np.linalg.qr(blocks, mode="r").reshape(-1, columns)
-    factor = np.linalg.qr(table, mode="r")
-    return factor[:, -1], factor[:, :-1]
 
 
 def gauss_newton(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[float, float]:

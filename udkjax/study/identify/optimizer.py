@@ -1,6 +1,6 @@
 """Losses of a fit and their minimization: plain or robust least squares, and user-defined losses by their gradients."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.extras import OptionalImport
-from udkjax.study.identify.fit_problem import Residuals
 from udkjax.study.identify.least_squares import (
     EXACT_STEP,
     FINE_STEP,
@@ -25,6 +24,7 @@ from udkjax.study.identify.least_squares import (
 )
 from udkjax.study.identify.prediction import TolerancePair
 from udkjax.study.identify.records import IdentificationError
+from udkjax.study.identify.residuals import Reduction, Residuals, residual_vector
 from udkjax.study.identify.unknowns import INVISIBLE_RATIO, Unknowns
 
 if TYPE_CHECKING:  # imported only when needed, since this takes a second
@@ -85,6 +85,7 @@ def robust(plain: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.nd
 
     `rho` returns rho(|r|) and half of its derivative.
     """
+    residuals = plain.count_before(residuals)
     r = plain.r[:, :residuals]
     size = np.abs(r)
     value, half_slope = rho(size)
@@ -95,6 +96,7 @@ def robust(plain: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.nd
         np.concatenate([np.sign(r) * s, further[0]], 1),
         np.concatenate([slope[..., None] * plain.J[:, :residuals], further[1]], 1),
         plain.code,
+        plain.rows,
     )
 
 
@@ -126,14 +128,14 @@ class Evaluated(Protocol):
         """The parameters, which are the first of the unknowns z."""
         ...
 
-    def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
-        """Compute residuals and their Jacobian: see `FitProblem.evaluate`."""
+    def row_blocks(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Iterable[Residuals]:
+        """Compute residuals and their Jacobian: see `FitProblem.row_blocks`."""
         ...
 
 
 def weighted_residuals(problem: Evaluated, tol: TolerancePair, loss: Loss, horizon: float | None = None) -> Objective:
     """Return the residuals whose squares are minimized, for the first `horizon` seconds of each record (None: all of it)."""
-    return lambda z: loss(problem.evaluate(z, tol, horizon))
+    return lambda z: map(loss, problem.row_blocks(z, tol, horizon))
 
 
 @dataclass(frozen=True)
@@ -214,17 +216,21 @@ class _LossDescent(Descent):
 
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the value of the loss, and its gradient (K,)."""
-        residuals, size = self.evaluate(z[None]), self.size
-        if not residuals.ok[0]:
+        (r, ok), size = residual_vector(self.evaluate(z[None])), self.size
+        if not ok:
             if not self.end.history:
                 self.stop(False)
             return self.failed_cost, np.zeros(len(z))
-        value, slope = self.value_and_slope(jnp.asarray(residuals.r[0]))
-        value, gradient = float(value), residuals.J[0].T @ np.asarray(slope)
+        value, slope = self.value_and_slope(jnp.asarray(r))
+        value, slope, gradient = float(value), np.asarray(slope), np.zeros(len(z))
+        reduction = Reduction(len(z))
+        for block in self.evaluate(z[None]):
+            gradient += block.J[0].T @ slope[reduction.count : reduction.count + block.r.shape[1]]
+            reduction.add(block.r[0], block.J[0])
         if not self.end.history:
             self.failed_cost = FAILED_COST * (abs(value) + 1.0)
         if value < self.end.cost:
-            _, s, vt = np.linalg.svd(residuals.J[0], full_matrices=False)
+            _, s, vt = np.linalg.svd(reduction.J, full_matrices=False)
             shows = s > INVISIBLE_RATIO * s.max(initial=0.0)
             size = float(np.abs(vt[shows].T @ (vt[shows] @ gradient / s[shows] ** 2)).max(initial=0.0))
             self.end = self.end._replace(z=z.copy(), cost=value)

@@ -9,7 +9,7 @@ with one degree of freedom form a confidence interval that does not assume a lin
 (Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.)
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,8 +17,8 @@ from jaxtyping import Float
 from scipy.special import chdtri, fdtri
 
 from udkjax.extras import OptionalImport
-from udkjax.study.identify.fit_problem import Residuals
 from udkjax.study.identify.least_squares import FINE_STEP, Objective, minimize_squares
+from udkjax.study.identify.residuals import Residuals, residual_vector
 from udkjax.study.identify.uncertainty import Uncertainty
 from udkjax.study.identify.unknowns import FARTHEST_UNKNOWN, Unknowns
 
@@ -63,9 +63,9 @@ class _Side(NamedTuple):
 def fix_unknown(evaluate: Objective, index: int, value: float) -> Objective:
     """Return the residuals as a function of all unknowns except one, which is fixed at `value`."""
 
-    def evaluate_others(z: Float[np.ndarray, "B K-1"]) -> Residuals:
-        residuals = evaluate(np.insert(z, index, value, axis=-1))
-        return residuals._replace(J=np.delete(residuals.J, index, axis=2))
+    def evaluate_others(z: Float[np.ndarray, "B K-1"]) -> Iterator[Residuals]:
+        for block in evaluate(np.insert(z, index, value, axis=-1)):
+            yield block._replace(J=np.delete(block.J, index, axis=2))
 
     return evaluate_others
 
@@ -101,9 +101,10 @@ def profile_likelihood(
     )
 
 
-def _cost(residuals: Residuals) -> float:
+def _cost(blocks: Iterable[Residuals]) -> float:
     """Return r.r / 2 of the first set of unknowns; infinite if it cannot be computed."""
-    return float(0.5 * residuals.r[0] @ residuals.r[0]) if residuals.ok[0] else np.inf
+    r, ok = residual_vector(blocks)
+    return float(0.5 * r @ r) if ok else np.inf
 
 
 def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:

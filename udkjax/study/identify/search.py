@@ -16,6 +16,7 @@ from udkjax.study.identify.growing_records import EarlierFits, fit_growing_recor
 from udkjax.study.identify.least_squares import LOOSE_STEP, SOME_STEPS, CostHistory, Fit
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import LOOSE_TOL, MEDIUM_TOL, TolerancePair
+from udkjax.study.identify.residuals import reduce_blocks, residual_vector
 from udkjax.study.identify.shooting import PieceFailed, fit_pieces
 from udkjax.study.identify.unknowns import sample_guesses
 
@@ -111,15 +112,16 @@ def count_agreeing(problem: FitProblem, fits: Sequence[Fit], tol: TolerancePair)
     best, count = _best(fits), 0
     if not np.isfinite(best.cost):
         return count
-    J = problem.evaluate(best.z[None], tol).J[0]
-    noise = np.sqrt(2.0 * best.cost / len(J))
+    reduced = reduce_blocks(problem.row_blocks(best.z[None], tol))
+    noise = np.sqrt(2.0 * best.cost / max(reduced.count if reduced else 0, 1))
     for fit in fits:
         seen = np.ones(len(best.z), bool)
         for at_bound in (best.stuck, fit.stuck):
             seen &= True if at_bound is None else ~at_bound
         change = np.where(seen, fit.z - best.z, 0.0)
         near = SAME_MINIMUM_DISTANCE * (1.0 + np.abs(best.z[seen]).max(initial=0.0))
-        alike = np.abs(change).max(initial=0.0) <= near or np.linalg.norm(J @ change) <= SAME_PREDICTION * noise
+        effect = np.linalg.norm(reduced.J @ change) if reduced else np.inf
+        alike = np.abs(change).max(initial=0.0) <= near or effect <= SAME_PREDICTION * noise
         count += bool(np.isfinite(fit.cost)) and bool(alike)
     return count
 
@@ -157,17 +159,29 @@ def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePai
     """Return True if derivatives grow along a record faster than t^2, the fastest growth for motions that only change phase."""
     record, time, _ = problem.index.T
     late = problem.ts[record, time] > 0.5 * (problem.ts[record, 0] + problem.ts[record, -1])
-    J = np.abs(problem.evaluate(z[None], tol).J[0, : len(problem.index), : len(problem.unknowns.names)])
+    largest = np.zeros((2, len(problem.unknowns.names)))  # in the first half, and in the second
+    for block in problem.row_blocks(z[None], tol):
+        rows = block.row_numbers[: block.count_before(len(late))]
+        J = np.abs(block.J[0, : len(rows), : largest.shape[1]])
+        for half, own in ((0, ~late[rows]), (1, late[rows])):
+            largest[half] = np.maximum(largest[half], J[own].max(0, initial=0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return bool((J[late].max(0, initial=0.0) / J[~late].max(0, initial=0.0) > CHAOTIC_GROWTH).any())
+        return bool((largest[1] / largest[0] > CHAOTIC_GROWTH).any())
 
 
 def rank_guesses(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B K"]:
     """Return guesses, the best first, sorted by the residuals of the records and of their first parts, with equal weights."""
     record, time, _ = problem.index.T
-    r, since = problem.evaluate(z, tol).r[:, : len(record)], problem.ts[record, time] - problem.ts[record, 0]
+    since, durations = problem.ts[record, time] - problem.ts[record, 0], horizons(problem)
+    sums = np.zeros((len(durations), len(z)))
+    for first in range(0, len(z), problem.sets_together):
+        some = slice(first, first + problem.sets_together)
+        for block in problem.row_blocks(z[some], tol):
+            rows = block.row_numbers[: block.count_before(len(record))]
+            square = np.square(block.r[:, : len(rows)])
+            sums[:, some] += [square[:, since[rows] <= duration].sum(axis=1) for duration in durations]
     with np.errstate(divide="ignore"):
-        logs = [np.log(np.sum(np.square(r[:, since <= duration]), axis=1)) for duration in horizons(problem)]
+        logs = np.log(sums)
     # A failed run counts as a prediction without any motion.
     worst = np.log(np.sum((problem.channel_scale[problem.index[:, 2]] / problem.sigma) ** 2))
     return z[np.argsort(np.sum(np.nan_to_num(logs, nan=worst), axis=0), kind="stable")]
@@ -188,10 +202,10 @@ def explains(problem: FitProblem, fit: Fit, tol: TolerancePair) -> bool:
     """Return True if the residuals of a fit are only noise."""
     if not (np.isfinite(fit.cost) and fit.converged):
         return False
-    residuals = problem.evaluate(fit.z[None], tol)
-    if not residuals.ok[0]:
+    r, ok = residual_vector(problem.row_blocks(fit.z[None], tol))
+    if not ok:
         return False
-    r = residuals.r[0, : len(problem.index)]
+    r = r[: len(problem.index)]
     size = np.mean(r[problem.noise_given] ** 2) <= LIKELY_SQUARE if problem.noise_given.any() else True
     unknown_noise = r[~problem.noise_given]
     if size and (not unknown_noise.size or np.sqrt(np.mean(unknown_noise**2)) <= EXPLAINED_PART):

@@ -12,6 +12,7 @@ H. G. Bock, Recent advances in parameter identification techniques for ODE, 1983
 J. Kurths, Nonlinear dynamical system identification from uncertain and indirect measurements, 2004.
 """
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.positions.assembly import State
-from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, Residuals
+from udkjax.study.identify.fit_problem import RESIDUALS_PER_UNKNOWN, FitProblem, RunEnds
 from udkjax.study.identify.initial_states import InitialStateUnknowns, state_unknowns
 from udkjax.study.identify.least_squares import (
     COARSE_STEP,
@@ -34,6 +35,7 @@ from udkjax.study.identify.least_squares import (
 )
 from udkjax.study.identify.optimizer import Minimizer
 from udkjax.study.identify.prediction import Prediction, Predictor, Runs, TolerancePair
+from udkjax.study.identify.residuals import Residuals
 from udkjax.study.identify.unknowns import apply_values, with_conditions
 from udkjax.study.quantities import state_shape
 
@@ -87,9 +89,11 @@ class MultipleShooting(FitProblem):
         self.state_sizes = np.concatenate([self.state_sizes, *[free.sizes] * len(self.following)])
         self.columns, bases = np.full((N, self.S), -1), np.zeros((N, 2, n, self.S))
         S = whole.columns.shape[1]
-        self.columns[self.beginnings, :S], bases[self.beginnings, ..., :S] = whole.columns, whole.runs.bases
+        begun = whole.beginnings
+        self.columns[self.beginnings, :S], bases[self.beginnings, ..., :S] = whole.columns[begun], whole.runs.bases[begun]
         self.columns[self.following] = whole.K + np.arange(self.constrained).reshape(-1, self.S)
-        q, v, conditions = jax.tree.map(lambda leaf: leaf[records], (whole.runs.q, whole.runs.v, whole.runs.conditions))
+        of_record = begun[records]
+        q, v, conditions = jax.tree.map(lambda leaf: leaf[of_record], (whole.runs.q, whole.runs.v, whole.runs.conditions))
         if q is None:
             q, v = (np.repeat(np.asarray(x)[None], N, axis=0) for x in (self.mechanism.q0, self.mechanism.v0))
         self.runs = Runs(times, q, v, bases, conditions)
@@ -142,31 +146,32 @@ class MultipleShooting(FitProblem):
     def _residuals_of_piece(self, p: int, x: np.ndarray, tol: TolerancePair) -> Objective:
         """Return the residuals of a piece as a function of its initial state, damped towards the end of the previous piece."""
         rows, S, damping = np.flatnonzero(self.run == p), self.S, None
-        entries, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.y[self.present][rows]
+        entries, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.measured[rows]
 
-        def evaluate(shift: Float[np.ndarray, "B S"]) -> Residuals:
+        def evaluate(shift: Float[np.ndarray, "B S"]) -> Iterator[Residuals]:
             nonlocal damping
             prediction = self._predict_piece(p, x, shift, tol)
             r, J = (prediction.y[:, *entries] - measured) / sigma, prediction.dy[:, *entries, len(x) :] / sigma[:, None]
             damping = float(CONTINUED_PART * np.linalg.norm(J[0], 2)) if damping is None else damping
             damped = np.broadcast_to(damping * np.eye(S), (len(shift), S, S))
-            return Residuals(np.concatenate([r, damping * shift], 1), np.concatenate([J, damped], 1), prediction.code)
+            yield Residuals(np.concatenate([r, damping * shift], 1), np.concatenate([J, damped], 1), prediction.code)
 
         return evaluate
 
-    def further_rows(self, prediction: Prediction, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def further_rows(self, ends: RunEnds | None, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Iterate over the residuals of priors and of continuity, (F_p - s_{p+1}) / scale * weight."""
-        yield from super().further_rows(prediction, z)
+        yield from super().further_rows(ends, z)
+        assert ends is not None
         sets, preceding, following = len(z), self.following - 1, self.following
-        ends, d_ends, inverse = np.asarray(prediction.ends), np.asarray(prediction.d_ends), self.inverse[following]
+        (states, slopes), inverse = ends, self.inverse[following]
         weight = self._defect_weight / self.scale
-        gap = (ends[:, preceding, 1] - ends[:, following, 0]).reshape(sets, len(following), -1)
+        gap = (states[:, preceding, 1] - states[:, following, 0]).reshape(sets, len(following), -1)
         defects = np.einsum("psn,bpn->bps", inverse, gap) * weight
         J = 0.0
         for sign, pieces, which in ((1.0, preceding, 1), (-1.0, following, 0)):
-            flat = d_ends[:, pieces, which].reshape(sets, len(following), -1, d_ends.shape[-1])
+            flat = slopes[:, pieces, which].reshape(sets, len(following), -1, slopes.shape[-1])
             by_both = sign * weight[:, None] * np.einsum("psn,bpnk->bpsk", inverse, flat)
-            J = J + self.by_unknowns(by_both.reshape(sets, -1, d_ends.shape[-1]), np.repeat(pieces, self.S), z)
+            J = J + self.by_unknowns(by_both.reshape(sets, -1, slopes.shape[-1]), np.repeat(pieces, self.S), z)
         yield defects.reshape(sets, -1), np.asarray(J)
 
     @property
@@ -176,8 +181,8 @@ class MultipleShooting(FitProblem):
 
     def gaps(self, z: np.ndarray, tol: TolerancePair) -> np.ndarray:
         """Return the largest defect (B,), relative to the motion of coordinates in a piece."""
-        r = self.evaluate(z, tol).r[:, len(self.index) + self.whole.extra_rows :]
-        return np.abs(r).max(1, initial=0.0) / self._defect_weight
+        defects = deque(self.row_blocks(z, tol), maxlen=1)[0]
+        return np.abs(defects.r).max(1, initial=0.0) / self._defect_weight
 
 
 class PieceFailed(Exception):

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.special import chdtr, chdtrc
 
 from udkjax.pinv.row_spaces import echelon, null_space
+from udkjax.study.identify.residuals import ReducedGroups, Reduction
 from udkjax.study.identify.unknowns import INVISIBLE_RATIO
 from udkjax.study.noise import SIGNIFICANCE
 from udkjax.wording import join_names
@@ -75,7 +76,8 @@ class Uncertainty:
         chi2: sum of squares of the residuals divided by their noise, given or estimated.
         degrees_of_freedom: number of residuals minus number of determined directions.
         noise: for each group of residuals with unknown noise, its estimate relative to the assumed noise.
-        projection: U; its columns span the part of the residuals that the fit removes.
+        rows: number of residuals.
+        projector: W; U = J W, with J divided by the noise, spans the part of the measured residuals that the fit removes.
         state_errors: standard errors of the unknowns of initial states.
     """
 
@@ -90,7 +92,8 @@ class Uncertainty:
     chi2: float
     degrees_of_freedom: int
     noise: Float[np.ndarray, "G"]
-    projection: Float[np.ndarray, "R D"]
+    rows: int
+    projector: Float[np.ndarray, "K D"]
     state_errors: Float[np.ndarray, "K-P"]
 
     @property
@@ -128,30 +131,23 @@ class Uncertainty:
         return tuple(_sentences(self))
 
 
-def estimate_uncertainty(
-    J: Float[np.ndarray, "R K"],
-    r: Float[np.ndarray, "R"],
-    values: UnknownValues,
-    noise_group: Int[np.ndarray, "R"] | None = None,
-    parameters: int | None = None,
-    priors: int = 0,
-) -> Uncertainty:
+def estimate_uncertainty(reduced: ReducedGroups, values: UnknownValues, parameters: int | None = None) -> Uncertainty:
     """Compute the uncertainty of unknowns: the covariance (J^T J)^-1, and the directions that J does not determine.
 
-    `noise_group` is the group (0, 1, ...) of residuals with a common unknown noise, or -1 if the noise is known (the default).
-    The first `parameters` unknowns, by default all, are the parameters. The last rows are those of `priors`; directions that only
-    priors determine have the priors' uncertainty, however well other directions are measured.
+    The first `parameters` unknowns, by default all, are the parameters. Directions that only priors determine have the priors'
+    uncertainty, however well other directions are measured.
     """
     K, P = len(values.names), len(values.names) if parameters is None else parameters
-    size, prior_rows = np.linalg.norm(J, axis=0), J[len(J) - priors :]
+    size, prior_rows = np.linalg.norm(reduced.J, axis=0), reduced.prior_rows
     alive = np.flatnonzero((size > INVISIBLE_RATIO * size.max(initial=0.0)) | np.any(prior_rows != 0.0, axis=0))
-    group = np.full(len(r), -1) if noise_group is None else np.asarray(noise_group, int)
-    noise = _noise_scales(J[:, alive], r, group)
-    scale = np.append(noise, 1.0)[group]
-    noise_known = np.isfinite(scale).all()
-    u, sigma, vt = np.linalg.svd(J[:, alive] / (scale[:, None] if noise_known else 1.0), full_matrices=False)
+    noise = _noise_scales(reduced.groups, alive)
+    noise_known = np.isfinite(noise).all()
+    scales = np.append(noise, 1.0) if noise_known else np.ones(len(reduced.groups))
+    scaled = [group.J[:, alive] / scale for group, scale in zip(reduced.groups, scales, strict=True)]
+    _, sigma, vt = np.linalg.svd(np.concatenate(scaled), full_matrices=False)
     shown = sigma > INVISIBLE_RATIO * sigma.max(initial=0.0)
-    sigma, vt, u, shown = _with_priors(prior_rows[:, alive], sigma, vt, u, shown)
+    projector = vt[shown].T / sigma[shown]
+    sigma, vt, shown = _with_priors(prior_rows[:, alive], sigma, vt, shown)
     x, dx_dz = (np.asarray(part, float)[alive] for part in (values.x, values.dx_dz))
     free = simplest_basis(null_space(vt[shown], 0.5), x, dx_dz, [values.kinds[k] for k in alive.tolist()])
     directions, flats = (_insert_columns(rows, alive, K) for rows in (vt, free))
@@ -174,31 +170,26 @@ def estimate_uncertainty(
         directions=directions,
         dead=tuple(values.names[k] for k in range(P) if k not in alive),
         flat=tuple(describe(values, row) for row in flats),
-        chi2=float(np.sum((r / scale) ** 2)),
-        degrees_of_freedom=len(r) - int(shown.sum()),
+        chi2=float(sum(group.r @ group.r / scale**2 for group, scale in zip(reduced.groups, np.append(noise, 1.0), strict=True))),
+        degrees_of_freedom=reduced.rows - int(shown.sum()),
         noise=noise,
-        projection=u[:, shown],
+        rows=reduced.rows,
+        projector=_insert_columns(projector.T, alive, K).T,
         state_errors=all_errors[P:],
     )
 
 
 def _with_priors(
-    prior_rows: np.ndarray, sigma: np.ndarray, vt: np.ndarray, u: np.ndarray, shown: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    prior_rows: np.ndarray, sigma: np.ndarray, vt: np.ndarray, shown: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Add singular values and vectors of the directions that only priors determine; the threshold is relative to the priors."""
     unshown = null_space(vt[shown], 0.5)
     if not len(unshown) or not len(prior_rows):
-        return sigma, vt, u, shown
+        return sigma, vt, shown
     _, prior_sigma, w = np.linalg.svd(prior_rows @ unshown.T, full_matrices=False)
     determined = prior_sigma > INVISIBLE_RATIO * np.linalg.norm(prior_rows, axis=1).max(initial=0.0)
-    rows = np.concatenate(
-        [
-            np.zeros((len(u) - len(prior_rows), int(determined.sum()))),
-            (prior_rows @ unshown.T @ w[determined].T) / prior_sigma[determined],
-        ]
-    )
     sigma, vt = np.concatenate([sigma[shown], prior_sigma[determined]]), np.concatenate([vt[shown], w[determined] @ unshown])
-    return sigma, vt, np.concatenate([u[:, shown], rows], axis=1), np.ones(len(sigma), bool)
+    return sigma, vt, np.ones(len(sigma), bool)
 
 
 def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.ndarray:
@@ -207,12 +198,10 @@ def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.nda
     return table
 
 
-def _noise_scales(J: np.ndarray, r: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _noise_scales(reduced: Sequence[Reduction], alive: np.ndarray) -> np.ndarray:
     """Return the factor s of each group of residuals; NaN for a group with no more residuals than unknowns that it determines."""
-    groups = [np.flatnonzero(group == g) for g in range(group.max(initial=-1) + 1)]
-    sums, counts = np.array([r[g] @ r[g] for g in groups]), np.array([len(g) for g in groups], float)
-    # The factor R of QR replaces the rows of a group, since only J^T J is needed.
-    factors = [np.linalg.qr(J[g], mode="r") for g in (*groups, np.flatnonzero(group < 0))]
+    groups, factors = reduced[:-1], [group.J[:, alive] for group in reduced]
+    sums, counts = np.array([group.r @ group.r for group in groups]), np.array([group.count for group in groups], float)
     s2 = sums / np.maximum(counts, 1.0)
     for _ in range(NOISE_ITERATIONS if groups else 0):
         scaled = [factor / s for factor, s in zip(factors, [*np.sqrt(np.where(s2 > 0, s2, 1.0)), 1.0], strict=True)]
@@ -257,7 +246,7 @@ def _sentences(result: Uncertainty) -> Iterator[str]:
         yield f"no measured quantity changes with {flat.text}: {cure}"
     if not np.isfinite(result.noise).all():
         yield (
-            f"{result.projection.shape[0]} residuals are too few to estimate the noise, and standard errors are unknown: give "
+            f"{result.rows} residuals are too few to estimate the noise, and standard errors are unknown: give "
             "the noise, or more data"
         )
     for name in result.poor:
