@@ -178,9 +178,8 @@ class FitProblem:
             if prediction.ends is not None:
                 ends.append(RunEnds(np.asarray(prediction.ends), np.asarray(prediction.d_ends)))
         row = len(self.index)
-        for r, J in self.further_rows(
-            RunEnds(*map(partial(np.concatenate, axis=1), zip(*ends, strict=True))) if ends else None, z
-        ):
+        of_all = RunEnds(*(np.concatenate(parts, axis=1) for parts in zip(*ends, strict=True))) if ends else None
+        for r, J in self.further_rows(of_all, z):
             yield Residuals(r, J, code, np.arange(row, row + r.shape[1]))
             row += r.shape[1]
 
