@@ -71,6 +71,8 @@ class Run {
   }
   /** The coordinates and their rates at any time between the first and the last instant. */
   state(t) { return stateAt(this, t, this.size); }
+  /** The joints that stick at a time; those of a motion computed in the page never do. */
+  stuck(t) { return (this.sticking ?? []).filter(({spans}) => spans.some(([from, to]) => from <= t && t <= to)); }
   find(t) { return interval(this.ts, t); }
   /** The coordinates x, y, angle of each body in turn; the next call reuses the array. */
   pose(t, amplitude = 1) {
@@ -347,6 +349,10 @@ class Painter {
       stroke(Math.max(0, Math.ceil(now - tail)), Math.floor(now), 2.4, 0.8);
     });
   }
+  /** Draw a ring around each joint that sticks. */
+  sticking(run, t) {
+    for (const {at} of run.stuck(t)) this.circle(this.anchor(at), 8 * this.pt, {stroke: this.theme.force, width: 3.5});
+  }
   /** Draw arrows of forces, at most three times as long as the usual one, and a reference arrow with its force. */
   reactions(run, t, width, height) {
     const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;
@@ -601,7 +607,8 @@ class EventMarks {
       context.strokeStyle = runs.length > 1 ? theme.bodies[k % theme.bodies.length] : theme.force;
       context.stroke();
       const last = run.events.findLast(event => event.t <= t && event.t >= t - NAME_SHOWN * (end - start));
-      const words = last ? `${last.name}, ${+last.t.toPrecision(5)} s` : "";
+      const stuck = run.stuck(t).map(({name}) => name), now = stuck.length ? `${stuck.join(", ")} ${stuck.length > 1 ? "stick" : "sticks"}` : "";
+      const words = [now, last ? `${last.name}, ${+last.t.toPrecision(5)} s` : ""].filter(Boolean).join("; ");
       if (panels[k].happened.textContent !== words) panels[k].happened.textContent = words;
     });
   }
@@ -988,13 +995,14 @@ class Engine {
   }
   /** One over the mass, or the inertia, of each coordinate. */
   inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
-  /** Energies (J) at the states of a run and, if requested, the force or torque of each driver (N or N m) and the forces x, y (N)
-   *  of the joints of `data.forces`, for all joints time by time, and accelerations `a`; these are empty if rows are redundant: forces are not unique. */
+  /** Energies (J) at the states of a run and, if requested, the force or torque of each driver (N or N m) with the power of all
+   *  friction (W), and the forces x, y (N) of the joints of `data.forces`, for all joints time by time, and accelerations `a`; these
+   *  are empty if rows are redundant: forces are not unique. */
   measure(parameters, run, efforts = false, forces = false, accelerations = false) {
     if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
     const {ts, q, v, count, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
-    const wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
+    const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
     const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);
@@ -1002,7 +1010,7 @@ class Engine {
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
       efforts: Object.fromEntries((efforts ? data.efforts : []).map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
-      a: accelerations ? new Float64Array(count * size) : null, forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
+      friction: rubs ? new Float64Array(count) : null, a: accelerations ? new Float64Array(count * size) : null, forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
     let next = -Infinity;  // time of the next sample, which changes the constants
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
@@ -1015,8 +1023,9 @@ class Engine {
       copy("v", v.subarray(i * size, (i + 1) * size));
       module.exports.energy(work, work);
       [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
-      if (!wanted.length && !found.forces.length && !accelerations) continue;
+      if (!wanted.length && !found.forces.length && !accelerations && !rubs) continue;
       module.exports.accelerations(work, work);
+      if (rubs) found.friction[i] = module.view(work + 8 * places.friction_power, 1)[0];
       found.a?.set(module.view(work + 8 * places.a, size), i * size);
       for (const {driver, place} of wanted) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
       if (found.forces.length) found.forces.set(this.forces(module.view(work, module.module.size), places), 2 * i * data.forces.length);
@@ -1036,6 +1045,7 @@ class Engine {
     const joined = of => Float64Array.from(parts.flatMap(part => [...of(part)]));
     return {kinetic: joined(p => p.kinetic), potential: joined(p => p.potential),
       efforts: Object.fromEntries(Object.keys(parts[0].efforts).map(name => [name, joined(p => p.efforts[name])])),
+      friction: parts[0].friction && joined(p => p.friction),
       forces: joined(p => (parts.every(({forces}) => forces.length) ? p.forces : []))};
   }
   /** Forces x, y of each joint at the last evaluated state. */
@@ -1399,7 +1409,8 @@ class LiveRun {
     const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
     const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
-      "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
+      "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential,
+      "power of friction": found.friction ?? [], ...Object.fromEntries(efforts)};
     return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
   }
   /** The state at the time shown. */
@@ -1839,6 +1850,7 @@ class Player {
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.symbols);
+      painter.sticking(run, t);
       live?.paintHand(painter);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);
       if (show.names) painter.names(run);

@@ -73,7 +73,7 @@ def evaluated():
             host.memory.write(host.store, np.asarray(x, float).tobytes(), work + 8 * module["places"][name])
         host.call("accelerations", work, work)
         host.call("energy", work, work)
-        sizes = {"a": np.size(q), "energy": 2, "x0": len(engine.data["rows"])}
+        sizes = {"a": np.size(q), "energy": 2, "friction_power": 1, "x0": len(engine.data["rows"])}
         found = {name: host.numbers(work + 8 * module["places"][name], size) for name, size in sizes.items()}
         return found | {"places": [effort["place"] for effort in engine.data["efforts"]]}
 
@@ -90,7 +90,7 @@ def test_accelerations_energies_and_efforts_are_those_of_the_textbook(evaluated,
             [
                 udk.Spring(bodies=("ground", "door"), points=((0.2, -0.3), (0.1, 0.0)), stiffness=300.0, length=0.2, damping=9.0),
                 udk.TorsionSpring(bodies=("ground", "door"), stiffness=5.0, angle=0.3, damping=1.0),
-                udk.Friction(joint="hinge", torque=0.5, velocity=0.1),
+                udk.Friction(joint="hinge", torque=0.5, velocity=0.1, coefficient=0.3, radius=0.02),
                 udk.Torque(bodies=("ground", "door"), value=2.0),
             ],
         )
@@ -102,6 +102,9 @@ def test_accelerations_energies_and_efforts_are_those_of_the_textbook(evaluated,
     assert_allclose(found["a"], np.asarray(udk.accelerations(mechanism, t, q, v)).ravel(), rtol=1e-9, atol=1e-9)
     energy = udk.energy(mechanism, run)
     assert_allclose(found["energy"], [energy.kinetic[1], energy.potential[1]], rtol=1e-12)
+    frictions = [name for name, force in mechanism.forces.items() if isinstance(force, udk.Friction)]
+    powers = udk.power_balance(mechanism, run).forces if frictions else {}
+    assert_allclose(found["friction_power"], [sum(powers[name][1] for name in frictions)], rtol=1e-9)
     for place, effort in zip(found["places"], udk.efforts(mechanism, run).values(), strict=True):
         assert found["x0"][place] == pytest.approx(float(effort[1]), rel=1e-9)
 

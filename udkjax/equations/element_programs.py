@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations.elements import differentiate_constraint, has_pieces, trace_force, trace_piece, trace_rubbing
-from udkjax.equations.structure import ElementStructure, element_kinds
+from udkjax.equations.structure import Element, ElementStructure, element_kinds
 from udkjax.expressions import Graph, Scalar, frontier
 from udkjax.scene.mechanism import Mechanism
 
@@ -39,9 +39,14 @@ class ElementPrograms:
         self.state += [(name, body, scalar) for name, scalar in zip(names, scalars, strict=True)]
         return scalars
 
+    @property
+    def element(self) -> Element:
+        """The element, with scalars for its numbers."""
+        return jax.tree.unflatten(self.structure.tree, self.leaves)
+
     def _find_constants(self):
         """Find the sines and cosines of the bodies' angles, and the constants, which depend only on parameters."""
-        if has_pieces(jax.tree.unflatten(self.structure.tree, self.leaves)):
+        if has_pieces(self.element):
             self.outputs["piece"] = [trace_piece(self.graph, self.structure, self.leaves, self.t, self.q, self.v)]
         angles = {s.index: body for name, body, s in self.state if name == "angle"}
         for index, node in enumerate(self.graph.nodes):

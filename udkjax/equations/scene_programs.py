@@ -159,6 +159,11 @@ class ScenePrograms(RunPrograms):
         return program(self.settled_accelerations.parts, self._terms.multipliers(0))
 
     @cached_property
+    def accelerations_and_friction(self) -> LoopProgram:
+        """Compute a, and friction_power, the power of all friction (W); set safe."""
+        return program(self.settled_accelerations.parts, self._terms.friction_power(0))
+
+    @cached_property
     def newton_q(self) -> LoopProgram:
         """Compute q1, q after a Newton step to Psi = 0; set safe."""
         return program(self._solver.newton("psi", "q"), [self._solver.safe])

@@ -24,6 +24,7 @@ from udkjax.equations.scene_layout import (
 )
 from udkjax.expressions import Graph, Scalar, trace
 from udkjax.expressions.loop_program import ADD, SET, Kernel, KernelLoop, KernelWriter, Reset
+from udkjax.scene.friction import Friction
 
 ProgramParts = Iterator[KernelLoop | Reset]
 Write = Callable[[KernelWriter], None]
@@ -215,6 +216,24 @@ class SceneTerms:
                 w.write(group.programs.outputs["potential"][0], "energy", None, 1, ADD)
 
             yield self.over_group("potential", group, write_potential)
+
+    def friction_power(self, solution: int) -> ProgramParts:
+        """Compute the power of all friction (W), with the loads of joints by the x of a linear system."""
+        yield Reset("friction_power", 0, 1)
+
+        def writer(programs: ElementPrograms) -> Write:
+            def write(w: KernelWriter):
+                speeds = [s for name, _, s in programs.state if name in VELOCITY_INPUTS]
+                w.write(dot(w.graph, programs.outputs["loads"], speeds), "friction_power", None, 0, ADD)
+
+            return write
+
+        for group in self.layout.forces:
+            if isinstance(group.programs.element, Friction):
+                yield self.over_group("power", group, writer(group.programs))
+        for group in self.layout.rubbing:
+            assert group.rubbing is not None
+            yield self.over_rubbing("power", group, writer(group.rubbing), x=f"x{solution}")
 
     def pieces(self) -> ProgramParts:
         """Compute the index of the smooth piece of each piecewise smooth element."""

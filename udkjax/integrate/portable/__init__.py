@@ -27,6 +27,7 @@ info         names of the first numbers of a run's result "info", which are foll
 sampled      places in `numbers` of sampled quantities; `samples`: base64 of float64, a row for each interval between breaks
 masses       for each body the places in `numbers` of its mass and inertia
 efforts      a list of {driver, unit, row of Psi, place of that row in x0}
+friction     whether there is friction, whose power the module "evaluate" computes
 forces       how to compute the forces of joints if no row is redundant
 pulls        for each body the places in `numbers` of a spring that pulls it: point x, y, target x, y, stiffness, damping; or []
 why          the reason why there is no "run"; else empty

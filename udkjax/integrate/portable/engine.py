@@ -248,6 +248,7 @@ def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram
         for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
     ]
     data["forces"] = [] if data["why"] else joint_forces(mechanism, code)
+    data["friction"] = any(isinstance(force, Friction) for force in mechanism.forces.values())
     linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
     return _module(linked.code, linked.data_end, places=evaluation.places, size=evaluation.size)
 

@@ -154,7 +154,7 @@ class Evaluation:
 
         numbers(parameters, numbers)      numbers of the scene that depend on parameters, into the vector of all numbers
         prologue(numbers, work)           the constants of the scene from its numbers
-        accelerations(work, work)         "a", and the solution "x0" of the linear system, from "t", "q" and "v"
+        accelerations(work, work)         "a", the solution "x0" of the linear system, and "friction_power" (W), of "t", "q", "v"
         energy(work, work)                "energy", kinetic and potential (J), from "q" and "v"
 
     `places` are the offsets of the arrays of these names in `work`, in numbers; `work` begins with the constants.
@@ -166,7 +166,7 @@ class Evaluation:
         n = code.coordinate_count
         self._code, self._further = code, list(further)
         layout = Layout(1, 1)
-        sizes = {"constants": len(code.constants), "t": 1, "q": n, "v": n, "a": n, "safe": 1, "energy": 2}
+        sizes = {"constants": len(code.constants), "t": 1, "q": n, "v": n, "a": n, "safe": 1, "energy": 2, "friction_power": 1}
         for name, count in (sizes | code.scratch).items():
             layout.add(name, count)
         self.places, self.size = layout.places, layout.size
@@ -176,7 +176,7 @@ class Evaluation:
         loops = LoopWriter(1)
         at = {name: ("work", place) for name, place in self.places.items()}
         loops.write(self._code.prologue, "prologue", ("numbers", "work"), at | {"numbers": ("numbers", 0)})
-        programs = {"accelerations": self._code.settled_accelerations, "energy": self._code.energy}
+        programs = {"accelerations": self._code.accelerations_and_friction, "energy": self._code.energy}
         for name, program in programs.items():
             loops.write(program, name, ("work", "out"), at)
         return text_of_module([*self._further, *loops.functions], loops.globals)

@@ -7,7 +7,7 @@
 //   engine.mark(parameters, state)             -> for each row of Psi 1 if it is independent near a state, else 0; null if all are
 //   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, events,
 //                                                 held, last}
-//   engine.measure(parameters, run, efforts, forces, accelerations) -> {kinetic, potential, efforts: {driver: values}, forces, a}
+//   engine.measure(parameters, run, efforts, forces, accelerations) -> {kinetic, potential, efforts: {driver: values}, friction, forces, a}
 //
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q has x, y (m), angle (rad) of each
 // body in turn, and v their rates; in a run time is the first axis. Results are not overwritten by later calls.
@@ -217,13 +217,14 @@ class Engine {
   /** One over the mass, or the inertia, of each coordinate. */
   inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
 
-  /** Energies (J) at the states of a run and, if requested, the force or torque of each driver (N or N m) and the forces x, y (N)
-   *  of the joints of `data.forces`, for all joints time by time, and accelerations `a`; these are empty if rows are redundant: forces are not unique. */
+  /** Energies (J) at the states of a run and, if requested, the force or torque of each driver (N or N m) with the power of all
+   *  friction (W), and the forces x, y (N) of the joints of `data.forces`, for all joints time by time, and accelerations `a`; these
+   *  are empty if rows are redundant: forces are not unique. */
   measure(parameters, run, efforts = false, forces = false, accelerations = false) {
     if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
     const {ts, q, v, count, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
-    const wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
+    const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
     const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
     const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);
@@ -231,7 +232,7 @@ class Engine {
     const at = name => module.view(work + 8 * places[name], 1), copy = (name, from) => module.view(work + 8 * places[name], size).set(from);
     const found = {kinetic: new Float64Array(count), potential: new Float64Array(count),
       efforts: Object.fromEntries((efforts ? data.efforts : []).map(({driver}) => [driver, new Float64Array(count).fill(NaN)])),
-      a: accelerations ? new Float64Array(count * size) : null, forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
+      friction: rubs ? new Float64Array(count) : null, a: accelerations ? new Float64Array(count * size) : null, forces: new Float64Array(forces && unique ? 2 * data.forces.length * count : 0)};
     let next = -Infinity;  // time of the next sample, which changes the constants
     for (let i = 0; i < count; i++) {
       if (ts[i] >= next) {
@@ -244,8 +245,9 @@ class Engine {
       copy("v", v.subarray(i * size, (i + 1) * size));
       module.exports.energy(work, work);
       [found.kinetic[i], found.potential[i]] = module.view(work + 8 * places.energy, 2);
-      if (!wanted.length && !found.forces.length && !accelerations) continue;
+      if (!wanted.length && !found.forces.length && !accelerations && !rubs) continue;
       module.exports.accelerations(work, work);
+      if (rubs) found.friction[i] = module.view(work + 8 * places.friction_power, 1)[0];
       found.a?.set(module.view(work + 8 * places.a, size), i * size);
       for (const {driver, place} of wanted) found.efforts[driver][i] = module.view(work + 8 * (places.x0 + place), 1)[0];
       if (found.forces.length) found.forces.set(this.forces(module.view(work, module.module.size), places), 2 * i * data.forces.length);
@@ -266,6 +268,7 @@ class Engine {
     const joined = of => Float64Array.from(parts.flatMap(part => [...of(part)]));
     return {kinetic: joined(p => p.kinetic), potential: joined(p => p.potential),
       efforts: Object.fromEntries(Object.keys(parts[0].efforts).map(name => [name, joined(p => p.efforts[name])])),
+      friction: parts[0].friction && joined(p => p.friction),
       forces: joined(p => (parts.every(({forces}) => forces.length) ? p.forces : []))};
   }
 

@@ -1,4 +1,4 @@
-// Events on the timeline: a tick for each, and the name of the one that has just happened.
+// Events on the timeline: a tick for each, the name of the one that has just happened, and the joints that stick.
 
 import {make} from "./elements.js";
 import {contextOf} from "./painter.js";
@@ -26,7 +26,8 @@ export class EventMarks {
       context.strokeStyle = runs.length > 1 ? theme.bodies[k % theme.bodies.length] : theme.force;
       context.stroke();
       const last = run.events.findLast(event => event.t <= t && event.t >= t - NAME_SHOWN * (end - start));
-      const words = last ? `${last.name}, ${+last.t.toPrecision(5)} s` : "";
+      const stuck = run.stuck(t).map(({name}) => name), now = stuck.length ? `${stuck.join(", ")} ${stuck.length > 1 ? "stick" : "sticks"}` : "";
+      const words = [now, last ? `${last.name}, ${+last.t.toPrecision(5)} s` : ""].filter(Boolean).join("; ");
       if (panels[k].happened.textContent !== words) panels[k].happened.textContent = words;
     });
   }

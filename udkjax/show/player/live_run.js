@@ -135,7 +135,8 @@ export class LiveRun {
     const total = found.kinetic.map((x, k) => x + found.potential[k]), change = total.map(x => x - total[0]);
     const efforts = Object.entries(found.efforts).flatMap(([name, x]) => [[`torque of ${name}`, x], [`force of ${name}`, x]]);
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
-      "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential, ...Object.fromEntries(efforts)};
+      "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential,
+      "power of friction": found.friction ?? [], ...Object.fromEntries(efforts)};
     return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
   }
 

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from udkjax.annotations import JsonObject
 from udkjax.equations import determinacy
 from udkjax.equations.analysis import analyse
-from udkjax.equations.quantities import efforts, energy, violation
+from udkjax.equations.quantities import efforts, energy, friction_loads, violation
 from udkjax.equations.reactions import reactions, unique_reactions
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
@@ -111,7 +112,40 @@ def _effort(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     return [MeasureCurve(f"{units[name][0]} of {name}", units[name][1], np.asarray(values)) for name, values in by_driver]
 
 
-MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank, "effort": _effort}
+def _friction(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
+    """Return the power of all friction together; nothing for a mechanism without friction."""
+    loads, v = friction_loads(mechanism, solution), np.asarray(solution.v, float)
+    if not loads:
+        return []
+    bodies = mechanism.body_names
+    powers = [np.asarray(load) * v[:, bodies.index(body)] for of in loads.values() for body, load in of.items()]
+    return [MeasureCurve("power of friction", "W", np.sum(powers, axis=(0, 2)))]
+
+
+MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank, "effort": _effort, "friction": _friction}
+
+
+def sticking_spans(mechanism: Mechanism, solution: ShownMotion) -> list[JsonObject]:
+    """Return when each joint with set-valued friction sticks: its name, its place as [body, x, y], and spans of time (s).
+
+    A span begins and ends at the events of its joint, or else at output times.
+    """
+    ts, events = np.asarray(solution.ts, float), getattr(solution, "events", None)
+    happened = {} if events is None else {name: events.of(name) for name in events.names}
+    found: list[JsonObject] = []
+    for name, sticks in (getattr(solution, "sticking", None) or {}).items():
+        joint, states = mechanism.joints[name], np.asarray(sticks)
+        side = 0 if joint.bodies[1] == GROUND else 1
+        place = [mechanism.body_names.index(joint.bodies[side]), *np.asarray(joint.points, float)[side].tolist()]
+        turns = {True: happened.get(f"{name} sticks", ()), False: happened.get(f"{name} slips", ())}
+        changes = [ts[0]] if states[0] else []
+        for k in np.flatnonzero(states[1:] != states[:-1]).tolist():
+            located = [float(t) for t in turns[bool(states[k + 1])] if ts[k] <= t <= ts[k + 1]]
+            changes.append(located[-1] if located else float(ts[k + 1]))
+        changes += [float(ts[-1])] if len(changes) % 2 else []
+        spans = [[float(start), float(end)] for start, end in zip(changes[::2], changes[1::2], strict=True)]
+        found.append({"name": name, "at": place, "spans": spans})
+    return found
 
 
 def reaction_arrows(mechanism: Mechanism, solution: ShownMotion) -> ReactionArrows:

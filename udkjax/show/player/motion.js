@@ -80,6 +80,9 @@ export class Run {
   /** The coordinates and their rates at any time between the first and the last instant. */
   state(t) { return stateAt(this, t, this.size); }
 
+  /** The joints that stick at a time; those of a motion computed in the page never do. */
+  stuck(t) { return (this.sticking ?? []).filter(({spans}) => spans.some(([from, to]) => from <= t && t <= to)); }
+
   find(t) { return interval(this.ts, t); }
 
   /** The coordinates x, y, angle of each body in turn; the next call reuses the array. */

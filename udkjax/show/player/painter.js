@@ -180,6 +180,11 @@ export class Painter {
     });
   }
 
+  /** Draw a ring around each joint that sticks. */
+  sticking(run, t) {
+    for (const {at} of run.stuck(t)) this.circle(this.anchor(at), 8 * this.pt, {stroke: this.theme.force, width: 3.5});
+  }
+
   /** Draw arrows of forces, at most three times as long as the usual one, and a reference arrow with its force. */
   reactions(run, t, width, height) {
     const forces = run.force(t), {anchors, usual, unique} = run.reactions, length = 70 * this.pt, colour = this.theme.force;

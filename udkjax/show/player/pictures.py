@@ -21,6 +21,7 @@ DXF_LAYERS: dict[str, str] = {
     MarkKind.FLOOR: "ground",
     MarkKind.RACK: "ground",
     MarkKind.SUPPORT: "ground",
+    "sticking": "sticking",
 }  # other layers are named by their kind
 
 
@@ -41,6 +42,10 @@ class Posed(Protocol):
         """Return the arrows of the reactions of each run at time t."""
         ...
 
+    def sticking(self, t: float | None = None) -> list[list[list[float]]]:
+        """Return the places of the joints of each run that stick at time t."""
+        ...
+
     def labels(self) -> list[PictureLabels]:
         """Return the names of points and the lengths of links of each run."""
         ...
@@ -57,8 +62,8 @@ def sketches(
         raise ValueError(f"theme {theme!r} must be {' or '.join(THEMES)}")
     runs = animation.data["runs"]
     view = view_of(animation.data["bounds"], width // len(runs), times, any(run["reactions"] for run in runs))
-    shown = zip(runs, animation.pose(t), animation.paths(), animation.arrows(t), strict=True)
-    found = [Sketch(run["marks"], pose, view, theme, paths, arrows) for run, pose, paths, arrows in shown]
+    shown = zip(runs, animation.pose(t), animation.paths(), animation.arrows(t), animation.sticking(t), strict=True)
+    found = [Sketch(run["marks"], pose, view, theme, paths, arrows, stuck) for run, pose, paths, arrows, stuck in shown]
     for sketch, words in zip(found, animation.labels() if labels else [], strict=labels):
         sketch.shapes += Placing(words, sketch).shapes()
     return view, found

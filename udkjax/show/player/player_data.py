@@ -18,6 +18,7 @@ runs       a list of
     mode           instead of time, q, v: {q: numbers, shape: numbers, frequency: Hz or null}
     measures       a list of {name, unit, log, values: single precision}
     events         a list of {t, name}
+    sticking       a list of {name, at: anchor, spans: [[from, to], ...]}: when each joint with set-valued friction sticks (s)
     reactions      {anchors, usual: force of an arrow of usual length (N), unique: booleans, force: packed table of T rows with x
                    and y of each anchor}, or null
 """
@@ -37,7 +38,13 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.mark_places import body_points, to_ground
 from udkjax.show.player.marks import BodyPoints, marks
-from udkjax.show.player.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows
+from udkjax.show.player.measure_curves import (
+    Measures,
+    ShownMotion,
+    measures_of,
+    reaction_arrows,
+    sticking_spans,
+)
 from udkjax.show.player.packing import floats, pack, unpack
 from udkjax.show.player.sketch import POINT, ForceArrow, TracedPath, view_of
 from udkjax.show.player.symbols import symbols_of
@@ -97,6 +104,7 @@ def run_record(
             for m in measures_of(mechanism, solution, measures, label)
         ],
         "events": _events_of(solution),
+        "sticking": sticking_spans(mechanism, solution),
         "reactions": None,
     }
     if with_reactions:
@@ -131,6 +139,7 @@ def mode_record(
         "mode": {"q": q.ravel().tolist(), "shape": shape.ravel().tolist(), "frequency": frequency},
         "measures": [],
         "events": [],
+        "sticking": [],
         "reactions": None,
     }
     return record, poses
@@ -143,6 +152,11 @@ def _events_of(solution: ShownMotion) -> list[JsonObject]:
         return []
     times, index = np.asarray(events.time), np.asarray(events.index)
     return [{"t": float(t), "name": events.names[k]} for t, k in zip(times, index, strict=True) if k >= 0]
+
+
+def stuck_at(record: Record, t: float) -> list[list[float]]:
+    """Return the anchors of the joints of a run that stick at a time."""
+    return [joint["at"] for joint in record["sticking"] if any(start <= t <= end for start, end in joint["spans"])]
 
 
 def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]]:

@@ -30,6 +30,7 @@ MARGIN = 44.0  # margin of a picture (px)
 ARROW, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols; the longest arrow relative to this one
 HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # head and width in units of symbols; half of the head's angle (rad)
 NOT_UNIQUE_TINT = 0.5  # fraction of the background colour mixed into the colour of a force
+STUCK = 8.0, 3.5  # radius and width, in units of symbols, of the ring around a joint that sticks
 PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the background colour mixed into the colour of a body
 
 
@@ -124,10 +125,14 @@ class Sketch:
         theme: str = "light",
         paths: Sequence[TracedPath] = (),
         arrows: Sequence[ForceArrow] = (),
+        stuck: Sequence[Sequence[float]] = (),
     ):
         self.pose, self.view, self.theme = pose, view, THEMES[theme]
         symbols = symbols_of(marks, view.pt / view.scale)
         self.shapes: list[Line | Circle | Text] = [*map(self._path, paths), *map(self._shape, symbols)]
+        for body, x, y in stuck:
+            ring = self.anchor(body, x, y), STUCK[0] * view.pt, STUCK[1] * view.pt, self.theme["force"]
+            self.shapes.append(Circle("sticking", *ring))
         for arrow in arrows:
             self.shapes += self._arrow(arrow)
 
