@@ -1071,6 +1071,7 @@ class SymbolUpdater {
     run.marks = structuredClone(run.marks);
     run.traces = structuredClone(run.traces);
     run.arrows = structuredClone(run.reactions);
+    run.placed = run.measures.map(measure => structuredClone(measure.anchors));
     this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
   }
   update(numbers) {
@@ -1079,6 +1080,7 @@ class SymbolUpdater {
     for (const [k, row, x, y] of rows.points) put(run.symbols[k].points[row], 0, x, y);
     for (const [k, , x, y] of rows.traces) put(run.traces[k], 1, x, y);
     for (const [k, , x, y] of rows.arrows) put(run.arrows.anchors[k], 1, x, y);
+    for (const [k, which, x, y] of rows.measures ?? []) put(run.placed[k][which], 1, x, y);
     for (const [k, , x, y] of rows.pins) run.marks[k].at = [numbers[x], numbers[y]];
     for (const [k, place] of rows.angles) run.symbols[k].frame[3] = numbers[place];
     rows.sizes.forEach(([k, place, radius], i) => {
@@ -1301,6 +1303,22 @@ class PartRun {
     return this.goesOn;
   }
 }
+/** The measure at each time of a run of `size` coordinates: m/s, or degrees; empty without anchors. */
+function placedValues({ts, q, v}, size, anchors) {
+  if (!anchors.length) return [];
+  return Float64Array.from(ts, (_, i) => {
+    const now = q.subarray(i * size, (i + 1) * size), rates = v.subarray(i * size, (i + 1) * size);
+    return anchors.length === 1 ? pinSpeed(now, rates, anchors[0]) : acuteAngle(...anchors.map(anchor => place(now, anchor)));
+  });
+}
+function pinSpeed(now, rates, anchor) {
+  const k = 3 * anchor[0], [x, y] = place(now, anchor);
+  return Math.hypot(rates[k] - rates[k + 2] * (y - now[k + 1]), rates[k + 1] + rates[k + 2] * (x - now[k]));
+}
+function acuteAngle(a, corner, b) {
+  const [ux, uy, wx, wy] = [a[0] - corner[0], a[1] - corner[1], b[0] - corner[0], b[1] - corner[1]];
+  return 180 / Math.PI * Math.atan2(Math.abs(ux * wy - uy * wx), Math.abs(ux * wx + uy * wy));
+}
 const SMALLEST_POSITIVE = 1e-17;  // m: drawn instead of a zero violation on a logarithmic axis
 const GHOST = 0.28;  // opacity of the first motion
 const REACH = {mouse: 6, touch: 16};  // px around a body within which it can be grasped
@@ -1411,7 +1429,7 @@ class LiveRun {
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
       "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential,
       "power of friction": found.friction ?? [], ...Object.fromEntries(efforts)};
-    return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
+    return this.first.measures.map((m, k) => ({...m, values: known[m.name] ?? placedValues(run, this.engine.size, this.run.placed[k] ?? [])}));
   }
   /** The state at the time shown. */
   stateNow() {

@@ -59,6 +59,8 @@ from udkjax.positions.kinematics import Kinematics as Kinematics
 from udkjax.positions.kinematics import Travel as Travel
 from udkjax.positions.kinematics import kinematics as kinematics
 from udkjax.positions.kinematics import travel as travel
+from udkjax.positions.linkage_type import pins_with_bodies as pins_with_bodies
+from udkjax.positions.linkage_type import transmission_pins as transmission_pins
 from udkjax.positions.motion_ranges import MotionRanges as MotionRanges
 from udkjax.positions.motion_ranges import motion_ranges as motion_ranges
 from udkjax.positions.open_rows import MOST_NAMED as MOST_NAMED

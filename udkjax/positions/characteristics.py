@@ -11,7 +11,7 @@ from udkjax.arrays import ROUNDING
 from udkjax.positions.coordinates import Coordinate, element_of
 from udkjax.positions.counting import Count, count_of
 from udkjax.positions.drive import Drive, only_driver
-from udkjax.positions.linkage_type import FourBarType, Mobility, Pins, four_bars, mobility, pins_with_bodies
+from udkjax.positions.linkage_type import FourBarType, Mobility, four_bars, mobility, transmission_pins
 from udkjax.positions.pressure import pressure_angles
 from udkjax.positions.turning_points import Combination, Cycle, TurningPoint
 from udkjax.printing import PrintedTable, PrintsTable, format_number
@@ -120,7 +120,7 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
     measured = _outputs(mechanism, element) if cycle.is_known else {}
     turning = dict(zip(measured, cycle.turning_points([weights for _, weights in measured.values()]), strict=True))
     outputs = {name: _output(cycle, kind, weights, turning[name]) for name, (kind, weights) in measured.items()}
-    angles = _transmission_angles(mechanism, element, cycle, pins_with_bodies(mechanism)) if cycle.is_known else {}
+    angles = _transmission_angles(mechanism, element, cycle) if cycle.is_known else {}
     has_gears = any(isinstance(joint, Gear) for joint in mechanism.joints.values())
     pressures = _pressure_angles(mechanism, driver, cycle) if cycle.is_known else {}
     ratios = _ratios(mechanism, cycle, element) if has_gears and cycle.is_known else {}
@@ -166,20 +166,14 @@ def _output(cycle: Cycle, kind: str, weights: Combination, turning: list[Turning
     return Output(kind, extent, values, ratio)
 
 
-def _transmission_angles(mechanism: Mechanism, driven: Coordinate, cycle: Cycle, pins: Pins) -> dict[str, tuple[float, float]]:
+def _transmission_angles(mechanism: Mechanism, driven: Coordinate, cycle: Cycle) -> dict[str, tuple[float, float]]:
     """Return the limits of the acute angle between two moving links of two pins each, at pins off the driven links."""
     found = {}
-    of_body = {body: [pin for pin, at in pins.items() if body in at] for body in mechanism.body_names}
-    for pin, at in pins.items():
-        pair = list(at)
-        if len(pair) != 2 or GROUND in pair or {*pair} & {*driven.bodies} or any(len(of_body[body]) != 2 for body in pair):
-            continue
+    for pin, links in transmission_pins(mechanism, driven.bodies).items():
         weights, directions = np.zeros((len(mechanism.bodies), 3)), []
-        for sign, body in zip((-1.0, 1.0), pair, strict=True):
+        for sign, (body, here, other) in zip((-1.0, 1.0), links, strict=True):
             weights[mechanism.body_names.index(body), 2] = sign
-            other = next(p for p in of_body[body] if p != pin)
-            arm = pins[other][body] - at[body]
-            directions.append(np.arctan2(arm[1], arm[0]))
+            directions.append(np.arctan2(*(other - here)[::-1]))
         between = Combination(weights)
         heights = cycle.heights(between, cycle.turning_points([between])[0]) + directions[1] - directions[0]
         found[pin] = acute_range(float(np.min(heights)), float(np.max(heights)))

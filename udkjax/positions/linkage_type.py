@@ -1,10 +1,11 @@
 """Grashof's types of the four-bars in a mechanism, and its mobility, counted and true."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from udkjax.arrays import ROUNDING
 from udkjax.equations.analysis import analyse
@@ -58,7 +59,14 @@ Pins = dict[str, dict[str, np.ndarray]]  # the bodies at each pin, with its plac
 
 
 def pins_with_bodies(mechanism: Mechanism) -> Pins:
-    """Return the pins of revolutes, by the name of the first: those at the same point of a body are one pin of all bodies."""
+    """Return the pins of revolutes: those at the same point of a body are one pin of all bodies.
+
+    Args:
+        mechanism: the mechanism.
+
+    Returns:
+        By the name of the first revolute of a pin, its place in the frame of each body (m), by the names of the bodies.
+    """
     found: Pins = {}
     for name, joint in mechanism.joints.items():
         if not isinstance(joint, Revolute):
@@ -70,6 +78,27 @@ def pins_with_bodies(mechanism: Mechanism) -> Pins:
             if any(body in at and np.allclose(at[body], p, rtol=ROUNDING, atol=0.0) for body, p in ends.items())
         ]
         found.setdefault(same[0] if same else name, {}).update(ends)
+    return found
+
+
+def transmission_pins(
+    mechanism: Mechanism, driven: Collection[str]
+) -> dict[str, list[tuple[str, Float[np.ndarray, "2"], Float[np.ndarray, "2"]]]]:
+    """Return the pins of two moving links of two pins each, between which force is transmitted.
+
+    Args:
+        mechanism: the mechanism.
+        driven: the names of links that are driven, whose pins are left out.
+
+    Returns:
+        By the name of the pin, for both of its links: the name, and the places of the pin and of the other pin in its frame (m).
+    """
+    pins, found = pins_with_bodies(mechanism), {}
+    of_body = {body: [pin for pin, at in pins.items() if body in at] for body in mechanism.body_names}
+    for pin, at in pins.items():
+        if len(at) == 2 and GROUND not in at and not {*at} & {*driven} and all(len(of_body[body]) == 2 for body in at):
+            others = {body: next(other for other in of_body[body] if other != pin) for body in at}
+            found[pin] = [(body, place, pins[others[body]][body]) for body, place in at.items()]
     return found
 
 

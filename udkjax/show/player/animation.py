@@ -176,8 +176,9 @@ def animate(
         drawing: for a `ConstrainedSystem` a function of t and q in jax.numpy that returns x, y (m) and, if it turns, the angle
             (rad) of each body to be drawn, by name; `shapes` has their outlines.
         measures: curves over time below the motion: any of "violation" (constraint violation in m, with radians as arcs of the
-            characteristic length), "energy", "friction" (its power in W, if there is any), "rank" (of the constraint Jacobian)
-            and "effort" (driving torques in N m and forces in N), or {"torque (N m)": array} for your own values, and
+            characteristic length), "energy", "friction" (its power in W, if there is any), "rank" (of the constraint Jacobian),
+            "effort" (driving torques in N m and forces in N), "speed" (of the pins) and "transmission" (acute angles in degrees
+            between coupler and output), or {"torque (N m)": array} for your own values, and
             {"torque (N m)": {label: array}} for several runs.
         reactions: True to draw joint forces as arrows, in pictures and films as well. Forces shared by redundant constraints are
             not unique; the forces of least norm are drawn, dashed in the page and paler in pictures.
@@ -189,8 +190,8 @@ def animate(
         live: parameters (`parameters()`), or single entries of them, that get sliders in a live page. Such a page simulates the
             motion again when a number changes, and lets the reader pull bodies. {"pin.B[0]": (0.5, 2.0)} sets the range of a
             slider; True adds sliders for all numbers of the scene. A slider acts on all runs that have its parameter. Without
-            `solution`, ten seconds are simulated. A live page updates violation, energy, friction and effort; your own
-            measures are shown for the first motion only, and "rank" is left out.
+            `solution`, ten seconds are simulated. A live page has all of these, which follow its numbers, but
+            "rank"; your own measures are shown for the first motion only.
         events: events of live runs, as for `simulate`; the page locates them in each new motion. It supports the actions `Log`,
             `Stop` and `Impact` (one contact at a time), and draws the lines of contacts.
 
@@ -248,9 +249,9 @@ def _live_runs(
         runs = dict(zip(mechanism, solutions, strict=True)) if isinstance(mechanism, Mapping) else solutions[0]
     own_measures: Mapping[str, Any] = measures if isinstance(measures, Mapping) else dict.fromkeys(measures)
     efforts = ["effort"] if any(mech.driver_names for mech in mechanisms) else []
-    # The page updates violation, energy, friction and effort. Unless others are asked for, the effort is shown first.
+    # The page computes these again. Unless others are asked for, the effort is shown first.
     first = () if measures == USUAL_MEASURES else own_measures
-    wanted = dict.fromkeys([*first, *efforts, "energy", "friction", "violation"])
+    wanted = dict.fromkeys([*first, *efforts, "transmission", "speed", "energy", "friction", "violation"])
     return runs, {name: own_measures.get(name) for name in wanted if name != "rank"}
 
 

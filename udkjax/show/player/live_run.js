@@ -3,6 +3,7 @@
 import {Hand, bodyAt} from "./hand.js";
 import {Run, boundsOf, place} from "./motion.js";
 import {PartRun} from "./part_run.js";
+import {placedValues} from "./pin_measures.js";
 import {SymbolUpdater} from "./symbol_updates.js";
 
 const SMALLEST_POSITIVE = 1e-17;  // m: drawn instead of a zero violation on a logarithmic axis
@@ -137,7 +138,7 @@ export class LiveRun {
     const known = {"violation": run.violation.map(x => Math.max(x * length, SMALLEST_POSITIVE)), "energy change": change,
       "work of drivers and loads": change, "kinetic energy": found.kinetic, "potential energy": found.potential,
       "power of friction": found.friction ?? [], ...Object.fromEntries(efforts)};
-    return this.first.measures.map(m => ({...m, values: known[m.name] ?? []}));
+    return this.first.measures.map((m, k) => ({...m, values: known[m.name] ?? placedValues(run, this.engine.size, this.run.placed[k] ?? [])}));
   }
 
   // Pulling

@@ -10,12 +10,15 @@ from numpy.typing import ArrayLike
 from udkjax.annotations import JsonObject
 from udkjax.equations import determinacy
 from udkjax.equations.analysis import analyse
-from udkjax.equations.quantities import efforts, energy, friction_loads, violation
+from udkjax.equations.quantities import efforts, energy, violation
 from udkjax.equations.reactions import reactions, unique_reactions
 from udkjax.scene.bodies import GROUND
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
+from udkjax.show.player.pin_measures import pin_speeds, transmission_angles
 from udkjax.study.accuracy import conserves_energy
 from udkjax.study.diagnosis.configuration import RankedPositions
+from udkjax.study.power_balance import power_balance
 
 SMALLEST_POSITIVE = 1e-17  # drawn instead of zero on a logarithmic axis; less than any nonzero violation or singular value
 
@@ -43,12 +46,16 @@ class ShownMotion(Protocol):
 
 
 class MeasureCurve(NamedTuple):
-    """A number over time: its name, unit, and values at the output times; `log` is True for a logarithmic axis."""
+    """A number over time: its name, unit, and values at the output times; `log` is True for a logarithmic axis.
+
+    `anchors`, if any, are the places [body, x, y] whose speed it is, or the second of which is the corner of its angle.
+    """
 
     name: str
     unit: str
     values: Float[np.ndarray, "T"]
     log: bool = False
+    anchors: Sequence[Sequence[float]] = ()
 
 
 def measures_of(mechanism: Mechanism, solution: ShownMotion, wanted: Measures, label: str) -> list[MeasureCurve]:
@@ -114,15 +121,32 @@ def _effort(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
 
 def _friction(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     """Return the power of all friction together; nothing for a mechanism without friction."""
-    loads, v = friction_loads(mechanism, solution), np.asarray(solution.v, float)
-    if not loads:
+    names = [name for name, force in mechanism.forces.items() if isinstance(force, Friction)]
+    if not names:
         return []
-    bodies = mechanism.body_names
-    powers = [np.asarray(load) * v[:, bodies.index(body)] for of in loads.values() for body, load in of.items()]
-    return [MeasureCurve("power of friction", "W", np.sum(powers, axis=(0, 2)))]
+    powers = power_balance(mechanism, solution).forces
+    return [MeasureCurve("power of friction", "W", np.sum([np.asarray(powers[name]) for name in names], axis=0))]
 
 
-MEASURES = {"violation": _violation, "energy": _energy, "rank": _rank, "effort": _effort, "friction": _friction}
+def _speed(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
+    found = pin_speeds(mechanism, np.asarray(solution.q, float), np.asarray(solution.v, float))
+    return [MeasureCurve(name, unit, values, anchors=anchors) for name, unit, anchors, values in found]
+
+
+def _transmission(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
+    found = transmission_angles(mechanism, np.asarray(solution.q, float))
+    return [MeasureCurve(name, unit, values, anchors=anchors) for name, unit, anchors, values in found]
+
+
+MEASURES = {
+    "violation": _violation,
+    "energy": _energy,
+    "rank": _rank,
+    "effort": _effort,
+    "friction": _friction,
+    "speed": _speed,
+    "transmission": _transmission,
+}
 
 
 def sticking_spans(mechanism: Mechanism, solution: ShownMotion) -> list[JsonObject]:

@@ -12,7 +12,7 @@ from udkjax.annotations import JsonObject
 # Modules of the player; each follows those that it imports.
 SHOWING = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
 # Modules of live pages only.
-SOLVING = ("events", "engine", "symbol_updates", "hand", "sliders", "address", "part_run", "live_run", "live")
+SOLVING = ("events", "engine", "symbol_updates", "hand", "sliders", "address", "part_run", "pin_measures", "live_run", "live")
 LAST = ("player", "mount")
 # Characters that could end a <script>, begin markup, or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}

@@ -16,7 +16,8 @@ runs       a list of
     time, q, v     packed (packing.py) tables of T rows: time; coordinates x, y, angle of each body; their rates times `frame`
     frame          the typical time between two instants (s)
     mode           instead of time, q, v: {q: numbers, shape: numbers, frequency: Hz or null}
-    measures       a list of {name, unit, log, values: single precision}
+    measures       a list of {name, unit, log, values: single precision, anchors: places whose speed it is, or the end, the corner
+                   and the other end of an acute angle; a page computes these again}
     events         a list of {t, name}
     sticking       a list of {name, at: anchor, spans: [[from, to], ...]}: when each joint with set-valued friction sticks (s)
     reactions      {anchors, usual: force of an arrow of usual length (N), unique: booleans, force: packed table of T rows with x
@@ -100,7 +101,7 @@ def run_record(
         "frame": frame,
         "mode": None,
         "measures": [
-            {"name": m.name, "unit": m.unit, "log": m.log, "values": floats(m.values[shown])}
+            {"name": m.name, "unit": m.unit, "log": m.log, "values": floats(m.values[shown]), "anchors": [*map(list, m.anchors)]}
             for m in measures_of(mechanism, solution, measures, label)
         ],
         "events": _events_of(solution),

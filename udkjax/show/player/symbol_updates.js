@@ -9,6 +9,7 @@ export class SymbolUpdater {
     run.marks = structuredClone(run.marks);
     run.traces = structuredClone(run.traces);
     run.arrows = structuredClone(run.reactions);
+    run.placed = run.measures.map(measure => structuredClone(measure.anchors));
     this.whole = rows.sizes.map(([k]) => structuredClone(run.symbols[k]));
   }
 
@@ -18,6 +19,7 @@ export class SymbolUpdater {
     for (const [k, row, x, y] of rows.points) put(run.symbols[k].points[row], 0, x, y);
     for (const [k, , x, y] of rows.traces) put(run.traces[k], 1, x, y);
     for (const [k, , x, y] of rows.arrows) put(run.arrows.anchors[k], 1, x, y);
+    for (const [k, which, x, y] of rows.measures ?? []) put(run.placed[k][which], 1, x, y);
     for (const [k, , x, y] of rows.pins) run.marks[k].at = [numbers[x], numbers[y]];
     for (const [k, place] of rows.angles) run.symbols[k].frame[3] = numbers[place];
     rows.sizes.forEach(([k, place, radius], i) => {

@@ -6,6 +6,7 @@ the vector of all numbers of the scene:
 
     frames                  [symbol; which of its two anchors, or -1; indices of x and y]
     traces, pins, arrows    [trace, mark, or arrow of a force; 0; indices of x and y]
+    measures                [measure, anchor, indices of x and y]
     points                  [symbol, point of its line, indices of x and y]
     angles                  [symbol, index]
     sizes                   [symbol, index, original radius]: all lengths of the symbol scale with the radius
@@ -40,6 +41,7 @@ def symbol_updates(mechanism: Mechanism, record: Mapping[str, Any], symbols: Seq
     angles = {_rounded(e.axis): int(indices.joints[name].axis) for name, e in mechanism.joints.items() if hasattr(e, "axis")}
     radii = _radii(mechanism, indices)
     found: JsonObject = {"frames": [], "points": [], "angles": [], "sizes": [], "traces": [], "pins": [], "arrows": []}
+    found["measures"] = []
     for k, symbol in enumerate(symbols):
         frame = symbol["frame"]
         pair = len(frame) == 2
@@ -60,6 +62,10 @@ def symbol_updates(mechanism: Mechanism, record: Mapping[str, Any], symbols: Seq
         for k, anchor in enumerate(anchors):
             if len(anchor) == 3 and (index := points.get(_key(*anchor))) is not None:
                 found[name].append([k, 0, *index])
+    for k, measure in enumerate(record["measures"]):
+        for which, anchor in enumerate(measure["anchors"]):
+            if (index := points.get(_key(*anchor))) is not None:
+                found["measures"].append([k, which, *index])
     return found
 
 
