@@ -12,8 +12,8 @@ from udkjax.show.player.mark_places import to_ground
 
 AT_REST = 1e-9  # displacements, in characteristic lengths, of pins that do not move and have no speed to show
 
-Anchor = list[float]  # [body, x, y]
-Placed = tuple[str, str, list[Anchor], Float[np.ndarray, "T"]]  # name, unit, anchors and values
+PinAnchor = list[float]  # [body, x, y]
+Placed = tuple[str, str, list[PinAnchor], Float[np.ndarray, "T"]]  # name, unit, anchors and values
 
 
 def pin_speeds(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], v: Float[np.ndarray, "T bodies 3"]) -> list[Placed]:
@@ -44,7 +44,7 @@ def _moving_pins(mechanism: Mechanism) -> dict[str, tuple[str, ArrayLike]]:
     return joined | ({} if mechanism.drawing is None else dict(mechanism.drawing.free_pins()))
 
 
-def _anchor(mechanism: Mechanism, body: str, place: ArrayLike) -> Anchor:
+def _anchor(mechanism: Mechanism, body: str, place: ArrayLike) -> PinAnchor:
     return [mechanism.body_names.index(body), *np.asarray(place, float).tolist()]
 
 
