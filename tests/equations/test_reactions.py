@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from udkjax.equations.compliance import sharing
 from udkjax.equations.determinacy import scaled_jacobian
 
 G = 9.81
@@ -113,6 +114,14 @@ def test_a_joint_without_compliance_is_rigid():
     plain = supports(beam(), None)
     assert_allclose(supports(beam(), {}), plain, atol=1e-12)
     assert_allclose(supports(beam(), dict.fromkeys(("rod0", "rod1", "rod2"), 7e-7)), plain, atol=1e-9)
+
+
+def test_weights_of_rows_do_not_change_the_split():
+    """Two rods side by side share 4 N in the ratio of their stiffnesses."""
+    rows, soft = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), jnp.array([1.0, 3.0, 2.0])
+    for w in (np.ones(3), np.array([1.0, 5.0, 0.2])):
+        share = sharing(jnp.asarray(w[:, None] * rows), soft, jnp.asarray(w))
+        assert_allclose(share(jnp.array([2.0, 2.0, 7.0])), [3.0, 1.0, 7.0], rtol=1e-12)
 
 
 def test_the_split_does_not_depend_on_units():

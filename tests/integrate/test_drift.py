@@ -1,5 +1,8 @@
 """Runs without projection end if their drift is too large for a singular configuration that they meet."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +104,17 @@ def test_independent_rows_that_count_as_dependent_end_a_projected_run(make, meth
     assert udk.simulate(make(), TS, method=small, **run).result == Result.successful
     together = jax.vmap(lambda tol: udk.simulate(make(), 2 * TS, method=method, **run | {"rtol": tol}).code)(TOLERANCES)
     assert together.tolist() == [Result.missing_rank] * 2
+
+
+def test_projected_velocities_may_open_psi_by_the_tolerance():
+    """A step of 0.1 s opens Psi by a tenth of its rate; the first state is not projected."""
+    from udkjax.integrate import diffrax_engine
+
+    problem: Any = SimpleNamespace(drift_tol=1e-6, rtol=1e-4, atol=1e-4)
+    equations: Any = SimpleNamespace(violation=lambda t, q, v: (q, v), violation_size=jnp.max)
+    states = jnp.array([[0.0, 1.0], [0.0, 1.9e-3], [0.0, 2.1e-3]])
+    missed = diffrax_engine._misses_rows(problem, equations, jnp.arange(3.0), states, jnp.array(0.1))
+    assert missed.tolist() == [False, False, True]
 
 
 @pytest.mark.slow

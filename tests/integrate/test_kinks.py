@@ -8,6 +8,7 @@ import pytest
 from jaxtyping import Array, Float
 
 import udkjax as udk
+from udkjax.equations.smooth_loads import SmoothLoads
 
 
 class Of(udk.ForceElement):
@@ -63,6 +64,11 @@ class Wrapped(Of):
 class ByTangent(Of):
     def along(self, t, x, v):
         return -self.k * jnp.arctan2(jnp.sin(10 * x), jnp.cos(10 * x))
+
+
+class Later(Of):
+    def along(self, t, x, v):
+        return jnp.where(t > 0.3, -self.k, 0.0)
 
 
 class LaterFurther(Of):
@@ -181,6 +187,13 @@ def test_what_rests_where_its_force_jumps_is_told():
     found = run(Sign, np.array([0.3, 1.0]), throw=False)
     assert float(found.unlocated) == pytest.approx(0.3, abs=1e-9)
     assert not found.result.is_success
+
+
+def test_kinks_in_time_are_held_unless_a_force_has_breakpoints():
+    """Breakpoints are all times at which anything happens: then only the state may cross a kink."""
+    later, brake = (kind(["b"], k=jnp.array(1.0)) for kind in (Later, Brake))
+    counts = [[SmoothLoads.of_element(x, ["b"], breaks).count for x in (later, brake)] for breaks in (False, True)]
+    assert counts == [[1, 1], [0, 1]]
 
 
 def test_forces_whose_kinks_are_not_located_are_told():

@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
+from udkjax.scene.units import units_of
 
 V = jnp.array([[0.3, -0.2, 1.1], [0.5, 0.4, -0.7], [0.0, 0.1, 0.2]])
 
@@ -80,6 +81,15 @@ def test_torsion_spring_and_friction(everything, at):
     assert_allclose(loads["b"], [0.0, 0.0, -3.0 * (turned - 0.1) - 0.2 * omega], rtol=1e-14)
     assert everything.frames_of(everything.forces["rub"]) == ("ground", "b")
     assert_allclose(total_loads(everything, "rub", at, everything.q0, V)["b"], [0.0, 0.0, -0.5 * np.tanh(1.1 / 0.3)])
+
+
+def test_numbers_of_friction_have_their_units():
+    numbers = {"torque": 1.0, "velocity": 0.1, "coefficient": 0.2, "radius": 0.01, "static_coefficient": 0.3, "viscous": 0.4}
+    rod, pin = udk.Body(1.0, 0.1), udk.Revolute(["ground", "rod"], [[0, 0], [0, 0]])
+    mechanism = udk.Mechanism({"rod": rod}, {"A": pin}, forces={"rub": udk.Friction("A", **numbers)})
+    units = {name: units_of(mechanism, f"force.rub.{name}") for name in (*numbers, "speed")}
+    expected = {"torque": "N m", "velocity": "rad/s", "radius": "m", "viscous": "s/m", "speed": "m/s"}
+    assert {name: unit for name, unit in units.items() if "coefficient" not in name} == expected
 
 
 def test_forces_in_either_frame(everything, at):

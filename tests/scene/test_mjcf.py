@@ -247,6 +247,10 @@ def test_other_friction_is_refused():
         with pytest.raises(udk.SceneError) as error:
             udk.mjcf_text(udk.Mechanism(rod.bodies, rod.joints, forces={name: force}))
         assert [text.split(":")[0] for text in error.value.problems] == [f'force "{name}"']
+    bars = library.four_bar()
+    pins = {f"rub {pin}": udk.Friction(pin, torque=1.0, law="set-valued") for pin in bars.joints}
+    with pytest.raises(udk.SceneError, match="its joint closes a loop"):  # one pin of the four has to
+        udk.mjcf_text(udk.Mechanism(bars.bodies, bars.joints, forces=pins))
 
 
 def test_rods_in_a_row_keep_their_velocities():

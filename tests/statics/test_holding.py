@@ -47,11 +47,15 @@ def clamp(sine: float, push: float = 500.0, coefficient: float = 0.1, radius: fl
 
 
 def test_a_wedge_locks_itself_up_to_the_angle_of_friction():
-    """The horizontal force is W tan(angle + phi) to lift, W tan(angle - phi) to lower, with tan(phi) the coefficient."""
+    """The horizontal force is W tan(angle + phi) to lift, W tan(angle - phi) to lower, with tan(phi) the coefficient.
+
+    Beyond angle + phi = 90 degrees no force lifts the load.
+    """
     weight, phi = 2.0 * G, np.arctan(0.3)
-    for angle, rests in ((phi - 1e-9, True), (phi + 1e-9, False)):
+    for angle, rests in ((phi - 1e-9, True), (phi + 1e-9, False), (np.pi / 2 - phi + 1e-6, False)):
         found = udk.holding_efforts(wedge(angle, coefficient=0.3), "body.load.x", [0.0])
-        np.testing.assert_allclose(found.upper, weight * np.tan(angle + phi), rtol=1e-12)
+        lifting = weight * np.tan(angle + phi)
+        np.testing.assert_allclose(found.upper, lifting if lifting > 0 else np.inf, rtol=1e-12)
         np.testing.assert_allclose(found.lower, weight * np.tan(angle - phi), atol=1e-12)
         np.testing.assert_allclose(found.without_friction, weight * np.tan(angle), rtol=1e-12)
         assert bool(found.rests[0]) is rests

@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.scene.profiles import SwingProfile
 
 SPEED = 10 * np.pi  # 300 rpm
 LAW = {"base": 40, "law": ["cycloidal", "dwell", "4-5-6-7", "dwell"], "angle": [120, 60, 90, 90]}
@@ -89,6 +90,18 @@ def test_a_flat_face_swings_by_the_laws(side):
     mech = follower_of({"O": 0, "Q": PIVOT, "P": PIVOT + arm}, ["Q", "P"], LAW | SWING, face=face)
     expected = [1e-3 * PIVOT, 0, 0] + turned_about(1e-3 * arm, -side * np.deg2rad(25) * shares())
     assert_allclose(motion(mech), expected, rtol=1e-11, atol=1e-10)
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize("pivot", [PIVOT, -PIVOT])
+def test_a_swinging_follower_is_an_arm_from_its_pivot_on_the_side_that_the_sign_says(pivot, clockwise):
+    angles, swings = np.deg2rad(LAW["angle"]), np.deg2rad(SWING["swing"])
+    profile = SwingProfile(LAW["base"], LAW["law"], angles, swings, pivot=pivot, arm=ARM, start=0.3, clockwise=clockwise)
+    for turn in (0.4, 2.5, 3.9):
+        distance = float(profile(turn))
+        point = distance * np.exp(1j * float(profile.sight(distance, flat=False)))  # with the pivot on the x axis
+        assert abs(point - PIVOT) == pytest.approx(ARM, rel=1e-12) and np.sign(point.imag) == np.sign(pivot)
+        assert float(profile.turn(distance, float(profile.bearing(turn)))) == pytest.approx(turn, rel=1e-12)
 
 
 def test_a_file_keeps_what_guides_the_follower():

@@ -1,0 +1,31 @@
+"""Active sets and pivots: tolerances in the units of each row, and joints whose modes depend on each other."""
+
+import numpy as np
+import pytest
+
+from udkjax.complementarity.linear import solve_complementarity
+from udkjax.complementarity.stick_or_slip import JointsAtRest
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_the_tolerance_of_a_row_has_the_units_of_the_row(size):
+    """y = -1e-9 of its size is within a tolerance of 1e-8 of its size, and y = -1e-7 is not."""
+    scale = np.array([size, 1.0])
+    for y, x in ((-1e-9, 0.0), (-1e-7, 1e-7)):
+        found = solve_complementarity(np.diag(scale**2), scale * [y, 1.0], np.ones(2, bool), 1e-8 * scale, np)
+        np.testing.assert_allclose(found.x, [x / size, 0.0], rtol=1e-12)
+
+
+def test_one_joint_at_a_time_changes_its_mode_if_two_alternate():
+    """Each of two joints exceeds its limit while the other sticks, and sticks again once the other slides."""
+
+    def respond(modes):
+        other_sticks = modes.locked[::-1]
+        a = np.where(modes.locked, 0.0, np.where(other_sticks, 1.0, -1.0))
+        return a, np.where(other_sticks, -1.0, 1.0), np.ones(2)
+
+    no, yes = np.zeros(2, bool), np.ones(2, bool)
+    joints = JointsAtRest.of(yes, np.zeros(2), np.eye(2), np.ones(2), no, np.full(2, 1e-9), np)
+    modes, has_failed = joints.decide(respond, np.zeros(2), no, yes, np)
+    assert not has_failed and sorted(modes.locked) == [False, True]
+    assert modes.direction[~modes.locked] == 1.0
