@@ -1,3 +1,5 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +86,14 @@ def test_torsion_spring_and_friction(everything, at):
 
 
 def test_numbers_of_friction_have_their_units():
-    numbers = {"torque": 1.0, "velocity": 0.1, "coefficient": 0.2, "radius": 0.01, "static_coefficient": 0.3, "viscous": 0.4}
+    numbers: dict[str, Any] = {
+        "torque": 1.0,
+        "velocity": 0.1,
+        "coefficient": 0.2,
+        "radius": 0.01,
+        "static_coefficient": 0.3,
+        "viscous": 0.4,
+    }
     rod, pin = udk.Body(1.0, 0.1), udk.Revolute(["ground", "rod"], [[0, 0], [0, 0]])
     mechanism = udk.Mechanism({"rod": rod}, {"A": pin}, forces={"rub": udk.Friction("A", **numbers)})
     units = {name: units_of(mechanism, f"force.rub.{name}") for name in (*numbers, "speed")}

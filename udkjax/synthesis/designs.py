@@ -5,21 +5,21 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from udkjax.positions.channels import locate
 from udkjax.positions.drive import Drive
 from udkjax.positions.free_numbers import FreeNumbers
-from udkjax.positions.kinematics import FULL_TURN, Kinematics, kinematics
-from udkjax.printing import PrintedTable, PrintsTable, format_numbers
+from udkjax.positions.kinematics import FULL_TURN, kinematics
+from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.sources import AbstractDrawing
 from udkjax.synthesis.design_problem import DesignProblem
+from udkjax.synthesis.found_mechanism import FoundMechanism
 
 AGREEMENT = 1e-6  # tolerance between the losses of search and motion, relative to the loss and to the squared scale
 
 
-class FoundDesign(PrintsTable):
+class FoundDesign(FoundMechanism):
     """A design that meets the goal, drawn at the first position of the goal if its pins are free.
 
     Attributes:
@@ -44,30 +44,16 @@ class FoundDesign(PrintsTable):
     parameters: dict[str, np.ndarray]
     driver: Drive = eqx.field(static=True)
 
-    def motion(self, count: int = 361) -> Kinematics:
-        """Return the motion, found by `kinematics`: a whole turn from the first position, or from the first to the last one.
-
-        Args:
-            count: number of values.
-        """
-        last = self.values[0] + FULL_TURN if self.turns else self.values[-1]
-        return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
-
     @property
-    def pins(self) -> dict[str, Float[Array, "2"]]:
-        """The places of the drawing's pins by name (m); empty without a drawing."""
-        return {} if self.mechanism.drawing is None else dict(self.mechanism.drawing.pins)
-
-    @property
-    def drawing(self) -> AbstractDrawing | None:
-        """The drawing, if the design started from one."""
-        return self.mechanism.drawing
+    def last_value(self) -> float:
+        """The value of the driver at the last position of the goal."""
+        return self.values[-1]
 
     def _table(self) -> PrintedTable:
         rows = [("loss", f"{self.loss:.6g}"), ("largest residual", f"{np.max(np.abs(self.residuals)):.3g}")]
         rows += [("measures", ", ".join(f"{np.min(m):.4g} to {np.max(m):.4g}" for m in self.measures))] if self.measures else []
         rows += [("transmission", f"{self.transmission:.3g}"), ("turns", "yes" if self.turns else "no")]
-        rows += [(f"pin.{name}", format_numbers(place, "m")) for name, place in self.pins.items()]
+        rows += self._pin_rows()
         lengths = {} if self.drawing is None else self.drawing.length_texts()
         rows += [(f"length of {name}", text) for name, text in lengths.items()]
         return PrintedTable(f"design {self.mechanism.name}".strip(), rows)
@@ -132,7 +118,17 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
         return None
     tau = problem.transmission_at(x, s, q)
     parameters = dict(zip(numbers.names, numbers.values, strict=True))
-    return FoundDesign(loss_of_motion, mechanism, values, residuals, tuple(measures), tau, turns, parameters, problem.driver)
+    return FoundDesign(
+        loss=loss_of_motion,
+        mechanism=mechanism,
+        values=values,
+        residuals=residuals,
+        measures=tuple(measures),
+        transmission=tau,
+        turns=turns,
+        parameters=parameters,
+        driver=problem.driver,
+    )
 
 
 def follow(mechanism: Mechanism, driver: Drive, values: np.ndarray) -> np.ndarray | None:

@@ -6,19 +6,18 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from udkjax.positions.drive import Drive
-from udkjax.positions.kinematics import FULL_TURN, Kinematics, kinematics
-from udkjax.printing import PrintedTable, PrintsTable, format_numbers
+from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.sources import AbstractDrawing
+from udkjax.synthesis.found_mechanism import FoundMechanism
 
 NEARLY_REAL = 1e-4  # relative to the extent; singular ends are at best accurate to the square root of the rounding error
 
 
-class CompleteDesign(PrintsTable):
+class CompleteDesign(FoundMechanism):
     """One four-bar, drawn in the first position of the goal.
 
     Attributes:
@@ -54,33 +53,18 @@ class CompleteDesign(PrintsTable):
     cognate: int = eqx.field(static=True)
     driver: Drive = eqx.field(static=True)
 
-    def motion(self, count: int = 361) -> Kinematics:
-        """Return the motion from the first position, found by `kinematics`: a whole turn, or up to the end of its branch.
-
-        Args:
-            count: number of values.
-        """
+    @property
+    def last_value(self) -> float:
+        """The value of the driver at the end of the branch of the first position."""
         on_branch = self.values[self.branches == 0]
-        farthest = on_branch[np.argmax(np.abs(on_branch - self.values[0]))]
-        last = self.values[0] + FULL_TURN if self.turns else farthest if len(on_branch) > 1 else self.values[0]
-        return kinematics(self.mechanism, self.driver, np.linspace(self.values[0], last, count))
-
-    @property
-    def pins(self) -> dict[str, Float[Array, "2"]]:
-        """The places of the pins by name (m), in the first position."""
-        return {} if self.mechanism.drawing is None else dict(self.mechanism.drawing.pins)
-
-    @property
-    def drawing(self) -> AbstractDrawing | None:
-        """The drawing with these pins."""
-        return self.mechanism.drawing
+        return on_branch[np.argmax(np.abs(on_branch - self.values[0]))]
 
     def _table(self) -> PrintedTable:
         rows = [("kind", f"{self.kind}{', turns' if self.turns else ''}"), ("defect", self.defect)]
         rows += [("confirmed by motion", f"{int(self.confirmed.sum())} of {len(self.values)} positions")]
         rows += [("transmission", f"{self.transmission:.3g}"), ("proven within", f"{self.radius:.2g} m")]
         rows += [("class", f"{self.number}, cognate {self.cognate}")]
-        rows += [(f"pin.{name}", format_numbers(place, "m")) for name, place in self.pins.items()]
+        rows += self._pin_rows()
         return PrintedTable(f"four-bar {self.mechanism.name}".strip(), rows)
 
 
@@ -172,10 +156,21 @@ class CompleteDesigns(PrintsTable):
             mechanism = self.mechanism.with_parameters(places | {f"link.{self.coupler}.width": 0.0})
         order = tuple(int(j) for j in self.order[k] if j >= 0)
         return CompleteDesign(
-            mechanism, self.values[k], self.kinds[k], bool(self.turns[k]), self.defects[k], self.circuits[k], self.branches[k],
-            order, float(self.transmission[k]), self.confirmed[k], float(self.radius[k]), int(self.numbers[k]),
-            int(self.cognates[k]), self.driver,
-        )  # fmt: skip
+            mechanism=mechanism,
+            values=self.values[k],
+            kind=self.kinds[k],
+            turns=bool(self.turns[k]),
+            defect=self.defects[k],
+            circuits=self.circuits[k],
+            branches=self.branches[k],
+            order=order,
+            transmission=float(self.transmission[k]),
+            confirmed=self.confirmed[k],
+            radius=float(self.radius[k]),
+            number=int(self.numbers[k]),
+            cognate=int(self.cognates[k]),
+            driver=self.driver,
+        )
 
     def __iter__(self) -> Iterator[CompleteDesign]:
         return (self[k] for k in range(len(self)))
