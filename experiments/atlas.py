@@ -71,7 +71,13 @@ def study(smoke: bool, keep: int = 1) -> xarray.Dataset:
     columns: dict[str, list[np.ndarray]] = {}
     names: dict[str, list[str]] = {name: [] for name in CODES}
     apart = np.full((len(chosen), starts), np.nan)
-    results = {one.problem: one for one in tracked(each(list(chosen), smoke), "atlas", len(chosen))}
+    results: dict[str, Results] = {}
+    others: list[dict[str, Any]] = []
+    for one in tracked(each(list(chosen), smoke), "atlas", len(chosen) + 1):
+        if isinstance(one, Results):
+            results[one.problem] = one
+        else:
+            others = one
     for row, (name, problem) in enumerate(chosen.items()):
         apart[row, : len(results[name].apart)] = results[name].apart
         for kind, found in results[name].parts.items():
@@ -88,7 +94,7 @@ def study(smoke: bool, keep: int = 1) -> xarray.Dataset:
     data["apart"] = (("problem_name", "start_number"), apart, {"long_name": "distance between the two references", "units": "1"})
     data = data.assign_coords(problem_name=list(chosen))
     titles = {name: problem.title for name, problem in chosen.items()}
-    data = data.assign_attrs(peers=json.dumps(peers(smoke)), license="CC0-1.0", titles=json.dumps(titles))
+    data = data.assign_attrs(peers=json.dumps(others), license="CC0-1.0", titles=json.dumps(titles))
     if not smoke:
         shutil.rmtree(KEPT, ignore_errors=True)
     models = [problem.mechanism for problem in chosen.values()]
@@ -104,17 +110,19 @@ class Results(NamedTuple):
     parts: dict[str, list[tuple[list[dict[str, Any]], xarray.Dataset]]]
 
 
-def each(names: list[str], smoke: bool) -> Iterator[Results]:
-    """Run the mechanisms, each in a process of one thread, as many at once as there are cores; yield results in any order.
+def each(names: list[str], smoke: bool) -> Iterator[Results | list[dict[str, Any]]]:
+    """Run the mechanisms and the other programs, in processes of one thread, one for each core; yield results in any order.
 
     A core then computes one sweep at a time, from the first to the last, also where functions are traced and compiled.
     """
     if smoke:
         yield from (runs_of(name, smoke) for name in names)
+        yield peers(smoke)
         return
     waiting = sorted(names, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))
     with ProcessPoolExecutor(thread_count(), get_context("spawn"), initializer=alone) as pool:
-        for done in as_completed([pool.submit(runs_of, name, smoke) for name in waiting]):
+        tasks = [pool.submit(runs_of, name, smoke) for name in waiting]
+        for done in as_completed([*tasks, pool.submit(peers, smoke)]):
             yield done.result()
 
 

@@ -78,7 +78,9 @@ class Part(NamedTuple):
     starts: int | None = None  # None: all
     steps: bool = False  # whether the tolerances are steps, relative to the duration
     timed: bool = False  # whether each method runs by itself, since the time of a chunk is shared by steps, whatever they cost
-    repeats: bool = False  # whether runs with projection are timed twice; the first time may include the loading of code
+    repeats: bool = (
+        False  # whether runs with projection are timed twice, but for the dense methods, which take several times as long
+    )
 
 
 def cell(**chosen: Any) -> dict[str, Any]:
@@ -94,15 +96,16 @@ def parts(problem: Problem) -> dict[str, Part]:
         "integrators": Part([cell(solver=s) for s in SOLVERS], repeats=True),
         "formulations": Part([cell(formulation=f) for f in FORMULATIONS]),
         "gains": Part([cell(stabilization="gains", gain=g, beta=g) for g in GAINS]),
-        "gains, Greville": Part([cell(method="Greville", stabilization="gains", gain=g, beta=g) for g in GAINS], COARSE),
-        "two gains": Part([cell(stabilization="two gains", gain=a, beta=b) for a, b in GAIN_PAIRS], TOLERANCES[1:8:2], 6),
+        "two gains": Part([cell(stabilization="two gains", gain=a, beta=b) for a, b in GAIN_PAIRS], TOLERANCES[1:8:2]),
     }
     if problem.thorough:  # programs that XLA compiles for seconds, and rank thresholds where ranks are at stake
         found["multistep"] = Part([cell(solver=s) for s in MULTISTEP], TOLERANCES[1:8:2], 2)
         found["Braun and Goldfarb"] = Part([cell(stabilization="Braun and Goldfarb")], TOLERANCES[:3], 2)
         found["constant steps"] = Part([cell(solver=s) for s in CONSTANT], (1e-2, 1e-3, 1e-4), 2, steps=True)
         found["partitioning"] = Part([cell(formulation=f) for f in SLOW_FORMULATIONS], TOLERANCES[1:8:2], 2)
-    if problem.crosses or problem.redundant:
+    if problem.crosses or problem.redundant:  # elsewhere Greville finds the accelerations that Auto finds
+        gains = [cell(method="Greville", stabilization="gains", gain=g, beta=g) for g in GAINS]
+        found["gains, Greville"] = Part(gains, COARSE)
         several = [(s, m, x) for s in ("projection", "none") for m in METHODS for x in THRESHOLDS]
         starts = 1 if problem.is_spatial else 4  # violations that count as rank take thirty times as many steps there
         found["thresholds"] = Part([cell(method=m, stabilization=s, threshold=x) for s, m, x in several], COARSE, starts)
@@ -150,9 +153,8 @@ def run(problem: Problem, expected: Reference, part: Part, out: Path | None) -> 
     groups: dict[str, list[dict[str, Any]]] = {}
     for one in part.cells:
         name = one["method"] if part.timed else ""
-        groups.setdefault(f"{name}, projection" if part.repeats and one["stabilization"] == "projection" else name, []).append(
-            one
-        )
+        twice = part.repeats and one["stabilization"] == "projection" and one["method"] not in DENSE
+        groups.setdefault(f"{name}, projection" if twice else name, []).append(one)
     if part.steps:  # of which a sweep takes one
         parts = [part._replace(tolerances=(step,)) for step in part.tolerances]
         return [(one.cells, _sweep(problem, expected, one, one.cells, out and out / str(k))) for k, one in enumerate(parts)]

@@ -42,7 +42,9 @@ class Program:
     def __init__(self, function: MemberFunction, slopes: int, piece: int, devices: Sequence[Any] = ()):
         self.function, self.slopes, self.piece, self.devices = function, slopes, piece, tuple(devices)
         self.size = piece * max(1, len(self.devices))
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._traced: jax.stages.Traced | None = None
+        self._shapes: tuple[dict[str, jax.ShapeDtypeStruct], dict[str, jax.ShapeDtypeStruct]] | None = None
         self._compiled: jax.stages.Compiled | None = None
 
     def __call__(self, shared: PyTree, own: PyTree, on_threads: bool = False) -> Results:
@@ -64,13 +66,25 @@ class Program:
         """Return the executable for members like these, compiled once."""
         with self._lock:
             if self._compiled is None:
-                self._compiled = _compile(jax.jit(self._on_devices()).lower(shared, _rows(own, 0, self.size)), self.devices)
+                self._compiled = _compile(self._trace(shared, own).lower(), self.devices)
+                self.shapes(shared, own)  # before the trace is forgotten
+                self._traced = None
         return self._compiled
 
     def shapes(self, shared: PyTree, own: PyTree) -> tuple[dict[str, jax.ShapeDtypeStruct], dict[str, jax.ShapeDtypeStruct]]:
         """Return shapes and types of the values and slopes of one member."""
-        outputs = jax.eval_shape(self._compute, shared, _rows(own, 0, 1))
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), outputs)
+        with self._lock:
+            shapes = self._shapes
+            if shapes is None:
+                found = self._trace(shared, own).out_info
+                shapes = self._shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found)
+            return shapes
+
+    def _trace(self, shared: PyTree, own: PyTree) -> jax.stages.Traced:
+        """Return the traced program, until it is compiled: its shapes and its executable take one trace."""
+        if self._traced is None:
+            self._traced = jax.jit(self._on_devices()).trace(shared, _rows(own, 0, self.size))
+        return self._traced
 
     def _compute(self, shared: PyTree, own: PyTree) -> tuple[Outputs, Outputs]:
         """Compute values of members, and slopes of the floating-point values."""

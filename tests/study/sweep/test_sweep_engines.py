@@ -183,3 +183,13 @@ def test_methods_gains_tolerances_and_thresholds_are_one_program(compilations):
         member = data.isel({"pseudoinverse": k, "gain": 1, "tol": 1, "threshold": 1})
         assert_allclose(member.q_end, alone.q[-1], rtol=0, atol=1e-9)
         assert int(member.steps) == int(alone.stats["steps"])
+
+
+def test_a_program_is_traced_once(linkage):
+    """Its shapes and its executable come from one trace: a measure is called once for each."""
+    traced = []
+    axes = {"tol": udk.Zipped({"rtol": [1e-4, 1e-6], "atol": [1e-4, 1e-6]})}
+    udk.sweep(
+        linkage, axes, np.linspace(0, 0.1, 2), {"end": lambda mechanism, run: traced.append(1) or run.q[-1, 0, 0]}, progress=False
+    )
+    assert len(traced) == 1
