@@ -7,7 +7,7 @@ const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
 const forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
-const {shapeProblem} = await page("checks");
+const {shapeProblem} = await page("checks"), cams = await page("cam_fields");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("motions"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
@@ -167,6 +167,24 @@ test("the follower of a new cam stands on its profile", () => {
   const outline = shapes.camOutline(found, found.cam[0]), away = Math.hypot(0.02, 0.03);
   assert.ok(Math.min(...outline.points.map(([x, y]) => Math.hypot(x - 0.12, y - 0.09))) < 0.03 * away);
   assert.ok(Math.abs(Math.max(...outline.points.map(([x, y]) => Math.hypot(x - 0.1, y - 0.06))) - 1.4 * away) < 1e-3 * away);
+});
+
+test("segments of a cam by laws: every change leaves a whole turn and a follower that comes back", () => {
+  const document = freeze({...d.EMPTY, units: {length: "mm", angle: "deg"}, pins: {O: [0, 0], P: [0, 40]}}), degrees = x => x * Math.PI / 180;
+  const profile = freeze({base: 40, law: ["cycloidal", "dwell", "3-4-5", "dwell"], angle: [120, "60 deg", 90, 90], lift: [20, 0, "-20 mm", 0]});
+  const wide = cams.withAngle(profile, 0, degrees(150), document), high = cams.withStep(profile, 0, 0.025, document);
+  assert.deepEqual([wide.angle, high.lift], [[150, "30 deg", 90, 90], [25, 0, "-25 mm", 0]]);
+  assert.deepEqual(cams.withAngle(profile, 3, degrees(100), document).angle, [120, "60 deg", 80, 100]);
+  assert.equal(cams.withAngle(profile, 0, degrees(180), document), null);  // no room for the dwell
+  assert.equal(cams.withStep(profile, 1, 0.001, document), null);
+  const still = cams.withLaw(profile, 0, "dwell", document);
+  assert.deepEqual([still.law[0], still.lift], ["dwell", [0, 0, "0 mm", 0]]);
+  assert.equal(cams.withLaw(cams.withLaw(still, 2, "dwell", document), 0, "harmonic", document).law[0], "harmonic");
+  const more = cams.withSegment(profile, document), less = cams.withoutSegment(more, 0, document);
+  assert.deepEqual([more.angle, more.law.length], [[120, "60 deg", 90, 45, 45], 5]);
+  assert.deepEqual([less.angle, less.lift], [["180 deg", 90, 45, 45], [0, "0 mm", 0, 0]]);
+  const laws = cams.profileByLaws(document, {pins: ["O", "P"], profile: {angle: [0, 120, 240], radius: [40, 55, 45]}});
+  assert.deepEqual([laws.base, laws.angle, laws.lift], [40, [120, 60, 120, 60], [15, 0, -15, 0]]);
 });
 
 test("the outline of a cam by laws touches its follower as drawn, whether that slides past the centre, swings, or is flat", () => {

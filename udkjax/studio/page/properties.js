@@ -5,6 +5,7 @@ import {readValue, valueText} from "./values.js";
 import {shapeProblem} from "./checks.js";
 import {copy, remove} from "./keys.js";
 import {swapPair} from "./actions.js";
+import {camFields} from "./cam_fields.js";
 import {carry} from "./motions.js";
 import {formsOf} from "./pin_forms.js";
 import {angle, angleUnit, angleWritten, direction, expressed, isMeasure, length, lengthName, lengthUnit, placeFrom, shown, tidy} from "./units.js";
@@ -211,8 +212,9 @@ export class PropertiesPanel {
 
   entry({kind, index}) {
     const {studio} = this, {document} = studio, entry = list(document, kind)[index] ?? {}, title = nameOf(document, kind, index);
-    const isShown = ([path]) => (USUAL[kind] ?? []).includes(path) || path.split(".")[0] in entry, more = (KEYS[kind] ?? []).filter(one => !isShown(one) && !this.added.has(one[0]));
-    const fields = (KEYS[kind] ?? []).filter(one => !more.includes(one)).map(([path, quantity]) => {
+    const keys = (KEYS[kind] ?? []).filter(([path]) => !entry.profile?.law || !path.startsWith("profile."));
+    const isShown = ([path]) => (USUAL[kind] ?? []).includes(path) || path.split(".")[0] in entry, more = keys.filter(one => !isShown(one) && !this.added.has(one[0]));
+    const fields = keys.filter(one => !more.includes(one)).map(([path, quantity]) => {
       const [key, sub] = path.split("."), given = sub ? entry[key]?.[sub] : entry[key];
       const value = quantity === "direction" && Array.isArray(given) ? angleWritten(direction(given, document), document) : given, plain = value === undefined || typeof [value].flat(2)[0] === "number";
       const take = text => {
@@ -228,7 +230,8 @@ export class PropertiesPanel {
       if (found === document && to !== title) return this.refuse(to ? `another ${kind} is called ${to}` : `a ${kind} needs a name`);
       return this.set(found);
     };
-    const lengths = kind === "link" ? this.shape(entry) : [];
+    const lengths = kind === "link" ? this.shape(entry) : [], units = {angle: unitOf(document, "angle"), length: lengthName(document), step: entry.profile?.swing ? "angle" : "length"};
+    if (kind === "cam") fields.push(...camFields(this, entry, index, units));
     if (more.length) fields.push(this.choice("more", "more …", more.map(([path]) => [path, path]), path => { this.added.add(path); this.again(); }));
     const parts = [make("h3", {}, `${kind} ${title}`), this.field("name", entry.name ?? "", "", rename, title), ...lengths, ...fields,
       ...extra.map(key => this.field(key, valueText(entry[key]), "", text => this.set(withKey(document, kind, index, key, readValue(text)))))];

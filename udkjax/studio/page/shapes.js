@@ -5,7 +5,7 @@ import {angle, direction, length, point} from "./units.js";
 
 const THIN = 0.02;  // area of a plate over its length squared: a thinner one is meant as a bar
 const STEP = 1e-5;  // rad: of the differences that give the envelope of a flat face
-const LAWS = {  // share of the lift over the share of the angle
+export const LAWS = {  // share of the lift over the share of the angle
   dwell: () => 0, cycloidal: x => x - Math.sin(2 * Math.PI * x) / (2 * Math.PI), harmonic: x => (1 - Math.cos(Math.PI * x)) / 2,
   "3-4-5": x => x ** 3 * (10 - 15 * x + 6 * x * x), "4-5-6-7": x => x ** 4 * (35 - 84 * x + 70 * x * x - 20 * x ** 3),
 };
@@ -139,6 +139,14 @@ export function camOutline(document, cam, count = 144) {
     return [at[0] + r * c - across * s, at[1] + r * s + across * c];
   });
   return points.flat().every(Number.isFinite) ? {points, link, follower, other} : null;
+}
+
+/** The distance (m) of the follower of a cam, as drawn, from the centre of the cam, or from its flat face; NaN without places. */
+export function followerDistance(document, {pins = [], face}) {
+  const [centre, point] = pins.map(pin => placeOf(document, pin));
+  if (!centre || !point) return NaN;
+  const [x, y] = minus(point, centre), normal = direction(face, document);
+  return face === undefined ? Math.hypot(x, y) : x * Math.cos(normal) + y * Math.sin(normal);
 }
 
 /** The distance of a follower from the centre of a cam by points, and its direction in world coordinates, over the turn. */
