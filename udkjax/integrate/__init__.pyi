@@ -29,6 +29,7 @@ from udkjax.integrate.solution import format_work as format_work
 from udkjax.integrate.solution import scene_text as scene_text
 from udkjax.integrate.solution import versions as versions
 from udkjax.integrate.solvers import Solver as Solver
+from udkjax.integrate.solvers import StepController as StepController
 from udkjax.integrate.solvers import has_method as has_method
 from udkjax.integrate.solvers import solver_named as solver_named
 from udkjax.integrate.solvers.adams import Adams as Adams

@@ -9,11 +9,11 @@ from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, N
 from udkjax.equations.partitioning import CoordinatePartitioning
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate import Projection
-from udkjax.integrate.solvers import Solver, solver_named
+from udkjax.integrate.solvers import Solver, StepController, solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga
 from udkjax.wording import abbreviate, quote, suggestion
 
-Choice: TypeAlias = "Pseudoinverse | Formulation | Projection | Baumgarte | Solver | None"
+Choice: TypeAlias = "Pseudoinverse | Formulation | Projection | Baumgarte | Solver | StepController | None"
 Constructors = dict[str, Callable[..., Choice]]
 
 

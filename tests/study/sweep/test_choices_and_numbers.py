@@ -1,5 +1,6 @@
 """Choices together with numbers that only some of them have, and labels by which xarray selects."""
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -57,6 +58,26 @@ def test_own_measures_have_units(data):
     assert data.height.units == "m"
     with pytest.raises(udk.SweepError, match='no measure of your own stores "hieght"; did you mean "height"'):
         udk.sweep(udk.library.parallelogram(), {"rtol": [1e-5]}, TS, height, units={"hieght": "m"}, progress=False)
+
+
+@pytest.mark.slow
+def test_constant_steps_show_the_order_of_a_method():
+    """A pendulum as a mechanism, and a point on a circle as a system: errors fall with the square of the step."""
+    pendulum, ts = udk.library.simple_pendulum(), np.linspace(0.0, 1.0, 3)
+    point = udk.ConstrainedSystem(
+        lambda q: jnp.eye(2), lambda t, q, v: jnp.array([0.0, -9.81]), lambda t, q: q @ q - 1.0, q0=[1.0, 0.0]
+    )
+    how = {"solver": diffrax.Heun(), "stepsize_controller": diffrax.ConstantStepSize()}
+    for model in (pendulum, point):
+        exact = udk.simulate(model, ts, rtol=1e-11, atol=1e-11).q[-1]
+        data = udk.sweep(model, {"dt0": [0.02, 0.01, 0.005]}, ts, progress=False, **how)
+        assert data.dt0.units == "s" and data.steps.values.tolist() == [50, 100, 200]
+        errors = np.abs(data.q_end.values - np.asarray(exact)).reshape(3, -1).max(1)
+        assert_allclose(errors[:-1] / errors[1:], 4.0, rtol=0.1)
+        controllers = [None, diffrax.ConstantStepSize()]
+        both = udk.sweep(model, {"stepsize_controller": controllers}, ts, progress=False, dt0=0.01, solver=diffrax.Heun())
+        assert both.stepsize_controller.values.tolist() == ["default", "ConstantStepSize"]
+        assert both.sel(stepsize_controller="ConstantStepSize").steps == 100
 
 
 @pytest.mark.parametrize("out", [False, True])

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import diffrax
 import numpy as np
 import pytest
 import scipy.stats
@@ -15,6 +16,7 @@ from udkjax.study.sweep.measures import MeasureChoice
 from udkjax.study.sweep.plan import make_plan
 
 TS = [0.0, 1.0]
+CONSTANT = diffrax.ConstantStepSize()
 
 
 def problems(mechanism, axes, measure="final", **arguments):
@@ -53,6 +55,18 @@ def test_choices_that_differ_by_numbers_share_a_program(linkage):
     (column, mechanisms) = plan.columns
     assert column.labels == ("Baumgarte(alpha=0, beta=0)", "Baumgarte(alpha=1000, beta=100)", "none")
     assert mechanisms.labels == ("five-bar parallelogram", "five-bar parallelogram #2")
+
+
+def test_controllers_and_solvers_fit_together(linkage):
+    """Zipped, each solver has its own controller; labels show the numbers that differ."""
+    controllers = [diffrax.PIDController(tol, 1e-9) for tol in (1e-4, 1e-6)]
+    how = {"solver": [diffrax.Euler(), diffrax.Tsit5(), None], "stepsize_controller": [CONSTANT, *controllers]}
+    plan = make_plan(linkage, {"how": udk.Zipped(how), "dt0": [1e-3, 1e-4]}, TS)
+    assert plan.columns[1].labels == ("ConstantStepSize", "PIDController(rtol=0.0001)", "PIDController(rtol=1e-06)")
+    assert [len(group.members) for group in plan.groups] == [2, 2, 2]
+    assert "0x" not in str(fingerprint(plan))
+    alone = make_plan(linkage, {"dt0": [1e-3, 1e-4]}, TS, solver=diffrax.Euler(), stepsize_controller=CONSTANT)
+    assert alone.columns[0].units == "s" and len(alone.groups) == 1
 
 
 @pytest.mark.parametrize("design", [udk.Sobol(16, seed=3), udk.LatinHypercube(16, seed=3), udk.Random(16, seed=3)])
@@ -102,6 +116,14 @@ def test_a_latin_hypercube_has_one_member_in_each_part():
         ({"rtol": [1e-4]}, {"measure": "error"}, 'measure "error" needs reference='),
         ({"rtol": [1e-4]}, {"measure": "error", "reference": np.zeros((3, 4, 3))}, "coordinates at the 2 output times"),
         ({"rtol": [1e-4]}, {"reference": np.zeros((2, 4, 3))}, 'is used by the measure "error" only'),
+        ({"stepsize_controller": [None, CONSTANT]}, {}, 'axis "stepsize_controller": stepsize_controller: constant steps need'),
+        ({"rtol": [1e-4]}, {"solver": diffrax.Euler()}, "solver: steps follow from estimated errors"),
+        (
+            {"solver": [diffrax.Euler(), diffrax.Heun()]},
+            {"dt0": 0.1},
+            'axis "solver": solver: steps follow from estimated errors',
+        ),
+        ({"dt0": [0.0, 1e-3]}, {"stepsize_controller": CONSTANT}, "dt0 must be a positive number"),
     ],
 )
 def test_mistakes_are_named(linkage, axes, arguments, message):

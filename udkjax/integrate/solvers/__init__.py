@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import diffrax
 
 Solver: TypeAlias = "diffrax.AbstractSolver"
+StepController: TypeAlias = "diffrax.AbstractStepSizeController"
 OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # the solvers of this folder, with their modules
 
 

@@ -1,9 +1,9 @@
 """Axes: the quantities that a sweep varies, by name; and designs, which sample members from their ranges.
 
 An axis of numbers (parameters, tolerances, gains) is batched in one compiled program. An axis of choices (methods, solvers,
-mechanisms, initial states) divides the members into groups by the structure of their choices. Each group has a program, and no
-member executes the branches of other choices. Choices that differ only in numbers share a program; so do dense pseudoinverses,
-among which machine code selects by number.
+step size controllers, mechanisms, initial states) divides the members into groups by the structure of their choices. Each group
+has a program, and no member executes the branches of other choices. Choices that differ only in numbers share a program; so do
+dense pseudoinverses, among which machine code selects by number.
 """
 
 import abc
@@ -36,6 +36,7 @@ CHOICES = {
     "stabilization": "none",
     "formulation": "UdwadiaKalaba",
     "max_steps": "",
+    "stepsize_controller": "default",
 }
 
 
@@ -144,8 +145,9 @@ class Dimension:
 def labels_of(setting: str, choices: Sequence[AxisChoice], replaced: Collection[str] = ()) -> tuple[str, ...]:
     """Return readable, unique names of choices: the types, with numbers, except `replaced` ones, if types are equal."""
     plain = [_short_label(setting, choice) for choice in choices]
+    alike = {name: [choice for choice, own in zip(choices, plain, strict=True) if own == name] for name in plain}
     names = [
-        name if plain.count(name) == 1 else _label_with_numbers(name, choice, replaced)
+        name if len(alike[name]) == 1 else _label_with_numbers(name, choice, alike[name], replaced)
         for name, choice in zip(plain, choices, strict=True)
     ]
     return tuple(name if name not in names[:k] else f"{name} #{names[:k].count(name) + 1}" for k, name in enumerate(names))
@@ -159,12 +161,22 @@ def _short_label(setting: str, choice: AxisChoice) -> str:
     return str(choice) if isinstance(choice, int) else type(choice).__name__
 
 
-def _label_with_numbers(name: str, choice: AxisChoice, replaced: Collection[str]) -> str:
-    """Return the name of a choice with its scalar fields, except those that other axes replace."""
+def _label_with_numbers(name: str, choice: AxisChoice, alike: Sequence[AxisChoice], replaced: Collection[str]) -> str:
+    """Return the name of a choice with its scalar fields, except those that other axes replace.
+
+    Python numbers are further options of diffrax's classes, which have many: only those are shown in which choices that are
+    `alike` differ.
+    """
     if isinstance(choice, ConstrainedSystem):
         return name
+
+    def is_shown(key: str, value: object) -> bool:
+        if isinstance(value, float | int):
+            return any(getattr(other, key) != value for other in alike)
+        return eqx.is_array(value) and np.ndim(value) == 0
+
     fields = {key: value for key, value in getattr(choice, "__dict__", {}).items() if key not in replaced}
-    numbers = {key: value for key, value in fields.items() if eqx.is_array(value) and value.ndim == 0}
+    numbers = {key: value for key, value in fields.items() if is_shown(key, value)}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name
 
 

@@ -1,6 +1,7 @@
 """Checks axes and converts them to the dimensions of a sweep; all mistakes are reported together."""
 
 import difflib
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import replace
@@ -38,6 +39,8 @@ Settings: TypeAlias = Mapping[str, Any]  # further arguments of `simulate`
 MEMBER = "member"  # the dimension of a design
 NUMBERS_OF = {"stabilization": ("alpha", "beta"), "method": ("rank_tol", "branch_tol")}  # numbers of settings that may be axes
 _SETTING_OF_NUMBER = {name: setting for setting, names in NUMBERS_OF.items() for name in names}
+# Settings that are checked together: constant steps need `dt0`, and solvers that do not estimate errors need constant steps.
+TOGETHER = ("solver", "stepsize_controller", "dt0")
 # Dimensions and variables of the dataset, whose names a dimension of the sweep cannot have.
 TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
 # Arguments of `sel`, `isel` and `interp` of xarray: `data.sel(method="SVD")` would not select anything, without an error.
@@ -240,7 +243,14 @@ def check_settings(mechanism: StudyModel, dimensions: Sequence[Dimension], setti
     targets = {target: column for column in columns if not callable(column.of) for target in column.of}
     problems = [f"{name} is both a setting and an axis: leave one of them out" for name in settings if name in targets]
 
+    for combination in _combinations(dimensions, settings):
+        wrong = argument_problems(simulate, {"mechanism": mechanism, **combination})
+        columns_of = ((text, targets.get(text.partition(" ")[0].rstrip(":"))) for text in wrong)
+        problems += [text if column is None else f"axis {quote(column.name)}: {text}" for text, column in columns_of]
+
     for target, column in targets.items():
+        if target in TOGETHER and column.is_choice:
+            continue
         for value in column.values if column.is_choice else np.unique(column.numbers) if target in NUMBERS else ():
             wrong = argument_problems(simulate, {"mechanism": mechanism, target: value})
             problems += [f"axis {quote(column.name)}: {text}" for text in wrong]
@@ -257,7 +267,20 @@ def check_settings(mechanism: StudyModel, dimensions: Sequence[Dimension], setti
         if np.any(np.isnan(column.numbers) & (is_used if is_zipped else True)):
             cure = "NaN is for members without it" if is_zipped else "Zipped with the choices, it may be NaN for those without it"
             problems.append(f"axis {quote(column.name)}: {wanted} must be finite numbers; {cure}")
-    return problems
+    return list(dict.fromkeys(problems))
+
+
+def _combinations(dimensions: Sequence[Dimension], settings: Settings) -> Iterator[dict[str, Any]]:
+    """Iterate over the combinations of the settings that are checked together."""
+    fixed = {name: settings[name] for name in TOGETHER if name in settings}
+
+    def choices(dimension: Dimension) -> list[dict[str, Any]]:
+        columns = [(name, c) for c in dimension.columns if not callable(c.of) for name in c.of if name in TOGETHER]
+        count = dimension.size if any(column.is_choice for _, column in columns) else 1  # all numbers fit alike
+        return [{name: column.values[k] for name, column in columns} for k in range(count)]
+
+    for parts in itertools.product(*map(choices, dimensions)):
+        yield fixed | {name: value for part in parts for name, value in part.items()}
 
 
 def uses_number(setting: str, choice: AxisChoice, name: str) -> bool:

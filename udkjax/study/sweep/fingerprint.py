@@ -76,7 +76,7 @@ def _solution(plan: SweepPlan) -> Solution:
 def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
     """Describe a function by its name, and digests of its traced operations and constants."""
     program = eqx.filter_make_jaxpr(function)(*arguments)[0]
-    text = re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr))
+    text = _without_addresses(str(program.jaxpr))
     constants = b"".join(np.ascontiguousarray(x).tobytes() for x in program.consts if eqx.is_array(x))
     name = getattr(function, "__qualname__", None) or repr(function)
     return {"name": name, "operations": digest(text.encode()), "constants": digest(constants)}
@@ -110,12 +110,19 @@ def _value(value: PyTree) -> JsonValue:
             "digest": digest(np.ascontiguousarray(array).tobytes()),
         }
     leaves = jax.tree_util.tree_leaves_with_path(value)
-    static = re.sub(r"0x[0-9a-f]+", "", str(jax.tree.structure(value)))
     return {
         "type": type(value).__name__,
-        "digest": digest(static.encode()),
-        **{jax.tree_util.keystr(path).lstrip("."): _value(x) if eqx.is_array(x) else repr(x) for path, x in leaves},
+        "digest": digest(_without_addresses(str(jax.tree.structure(value))).encode()),
+        **{
+            jax.tree_util.keystr(path).lstrip("."): _value(x) if eqx.is_array(x) else _without_addresses(repr(x))
+            for path, x in leaves
+        },
     }
+
+
+def _without_addresses(text: str) -> str:
+    """Return a text without addresses in memory, such as those of functions, which differ between processes."""
+    return re.sub(r"0x[0-9a-f]+", "", text)
 
 
 def digest(content: bytes) -> str:

@@ -107,6 +107,7 @@ class GroupRun:
         is_straight = isinstance(method, STRAIGHT_METHODS) and formulation is None
         in_lanes = (
             has_method(fixed.get("solver"))
+            and fixed.get("stepsize_controller") is None
             and (is_straight or not reason_for_plain(method or Auto(), formulation))
             and (self.redundant is not None or analysis is None)
         )

@@ -22,7 +22,7 @@ from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.quantities import StudyModel, body_names, state_shape
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign, structure_of
-from udkjax.study.sweep.dimensions import Settings, SweepError, check_settings, check_tangents, lay_out
+from udkjax.study.sweep.dimensions import TOGETHER, Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
 OUTSIDE = ("throw", "progress", "adjoint")  # arguments of `simulate` that only a sweep sets
@@ -182,7 +182,8 @@ def make_plan(
     wrong = argument_problems(make_plan, {"mechanism": mechanism})
     if wrong:
         raise SweepError(wrong)
-    problems += argument_problems(simulate, {"mechanism": mechanism, **settings})
+    alone = {name: value for name, value in settings.items() if name not in TOGETHER}
+    problems += argument_problems(simulate, {"mechanism": mechanism, **alone})
     try:
         require_output_times("ts", ts)
     except (TypeError, ValueError) as error:
@@ -197,7 +198,8 @@ def make_plan(
     targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
     if targets & {"alpha", "beta"} and "stabilization" not in targets:
         settings.setdefault("stabilization", Baumgarte())  # an axis of gains needs a stabilization
-    problems += check_settings(mechanism, dimensions, settings)
+    if dimensions or not axes.keys() & {*TOGETHER}:  # with mistakes in axes their values are unknown
+        problems += check_settings(mechanism, dimensions, settings)
     if isinstance(mechanism, ConstrainedSystem) and mechanism.q0 is None and not {"state"} & {*targets, *settings}:
         problems.append("state: a ConstrainedSystem without q0 has no initial guess: give state=State(q, v)")
     problems += check_tangents(mechanism, dimensions, derivatives)

@@ -57,11 +57,11 @@ def sweep(
 
     Args:
         mechanism: the scene, or a `ConstrainedSystem`, whose numbers have the names of its `parameters`.
-        axes: values by name. A name is a parameter (`body.link1.mass`), a setting of `simulate` (`rtol`, `atol`,
-            `drift_tol`, `dt0`, `method`, `solver`, `stabilization`, `formulation`, `max_steps`, `state`), an attribute of
-            settings (`alpha` and `beta` of Baumgarte's stabilization, `rank_tol` and `branch_tol` of the method), `t1`, to which
-            the output times are stretched, or `mechanism`, to compare mechanisms. `Axis(values, of=...)` allows another name of
-            an axis and may tie several quantities; `Zipped({...})` varies axes together. Numbers of
+        axes: values by name. A name is a parameter (`body.link1.mass`), a setting of `simulate` (`rtol`, `atol`, `drift_tol`,
+            `dt0`, `method`, `solver`, `stepsize_controller`, `stabilization`, `formulation`, `max_steps`, `state`), an attribute
+            of settings (`alpha` and `beta` of Baumgarte's stabilization, `rank_tol` and `branch_tol` of the method), `t1`, to
+            which the output times are stretched, or `mechanism`, to compare mechanisms. `Axis(values, of=...)` allows another
+            name of an axis and may tie several quantities; `Zipped({...})` varies axes together. Numbers of
             settings apply to the members that have them: "alpha" and "beta" to those with Baumgarte's stabilization. Zipped with
             the choices, they may be NaN for the others.
         ts: output times (T,), s.
