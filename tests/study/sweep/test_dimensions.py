@@ -123,7 +123,7 @@ def test_a_latin_hypercube_has_one_member_in_each_part():
             {"dt0": 0.1},
             'axis "solver": solver: steps follow from estimated errors',
         ),
-        ({"dt0": [0.0, 1e-3]}, {"stepsize_controller": CONSTANT}, "dt0 must be a positive number"),
+        ({"dt0": [0.0, 1e-3]}, {"stepsize_controller": CONSTANT}, "dt0 must be positive and finite, not 0"),
     ],
 )
 def test_mistakes_are_named(linkage, axes, arguments, message):
