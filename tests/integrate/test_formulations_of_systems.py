@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.integrate.own_systems import disc
 
 TS = np.linspace(0.0, 1.0, 5)
 FORMULATIONS = {
@@ -59,6 +60,29 @@ def test_both_engines_and_the_equation_of_udwadia_and_kalaba(name, copies, coupl
     assert_allclose(one.q, other.q, rtol=0, atol=1e-9)
     assert_allclose(one.q, reference.q, rtol=0, atol=1e-8)
     assert_allclose(one.v, reference.v, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("copies", "rolls"), [(1, False), (2, True)])
+def test_partitions_of_coordinates_and_velocities(copies, rolls):
+    """A nonholonomic row makes a velocity dependent, but no coordinate; all rows hold at each stage."""
+    found = system(copies, rolls=rolls)
+    partitioned, reference = run(found, udk.CoordinatePartitioning(), "auto", stabilization=None), run(found)
+    assert_allclose(partitioned.q, reference.q, rtol=0, atol=1e-8)
+    assert_allclose(partitioned.v, reference.v, rtol=0, atol=1e-7)
+    assert_allclose(udk.violation(found, partitioned), 0.0, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_a_rolling_disc_by_independent_velocities():
+    """Only rows of velocities: all coordinates are integrated, and three of five velocities."""
+    start = udk.State(np.array([0.0, 0.0, 0.0, 0.3, 0.0]), np.array([0.8, 0.0, 1.0, 0.0, 2.0 - np.sin(0.3)]))
+    runs = [
+        udk.simulate(disc(), TS, start, rtol=1e-10, atol=1e-10, formulation=formulation)
+        for formulation in (None, udk.CoordinatePartitioning())
+    ]
+    assert_allclose(runs[1].q, runs[0].q, rtol=0, atol=1e-8)
+    assert_allclose(runs[1].v, runs[0].v, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow

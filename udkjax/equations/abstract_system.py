@@ -123,12 +123,39 @@ class AbstractSystem(eqx.Module):
         return self
 
     @property
-    def independent(self) -> Bool[Array, "n"] | None:
+    def independent(self) -> Bool[Array, "2n"] | None:
         """The coordinates and velocities that are integrated and under error control; None: all."""
         return None
 
 
-class MechanismSystem(AbstractSystem):
+class ConstrainedRows(AbstractSystem):
+    """A system whose rows of positions and of velocities are known, for formulations that solve them."""
+
+    @property
+    @abstractmethod
+    def stabilized(self) -> bool:
+        """True if Baumgarte's stabilization terms are included."""
+
+    @property
+    @abstractmethod
+    def restricts_velocities(self) -> bool:
+        """True if there are rows that restrict velocities alone: nonholonomic ones."""
+
+    @property
+    @abstractmethod
+    def row_weights(self) -> Float[Array, "m"]:
+        """The weights that make rows comparable."""
+
+    @abstractmethod
+    def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """Return D and Psi of all rows of positions, weighted, and the units of coordinates: M^(-1/2) if M is diagonal."""
+
+    @abstractmethod
+    def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """Return the same of all rows of velocities, with their residuals."""
+
+
+class MechanismSystem(ConstrainedRows):
     """The equations of motion of a mechanism; coordinates and velocities are x, y, angle of each body in turn."""
 
     scales: eqx.AbstractVar[Scales]
@@ -146,11 +173,6 @@ class MechanismSystem(AbstractSystem):
     def row_names(self) -> list[tuple[str, int]]:
         """The constraint that each row of Psi belongs to, and the row's index within it."""
 
-    @property
-    @abstractmethod
-    def stabilized(self) -> bool:
-        """True if Baumgarte's stabilization terms are included."""
-
     @abstractmethod
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Kinetic and potential energy (J)."""
@@ -158,10 +180,6 @@ class MechanismSystem(AbstractSystem):
     @abstractmethod
     def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
         """Return Psi_q of all rows."""
-
-    @abstractmethod
-    def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """Return D and Psi of all rows, weighted by `Scales.weights`, and M^(-1/2)."""
 
     @abstractmethod
     def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:

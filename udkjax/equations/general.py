@@ -13,7 +13,7 @@ from typing_extensions import TypeAliasType
 
 from udkjax.annotations import Numbers, Time, Vector
 from udkjax.arrays import is_traced, number, number_called
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart
+from udkjax.equations.abstract_system import ConstrainedRows, TangentPart
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.equations.scales import Scales, UnitScales
@@ -136,7 +136,7 @@ class ForceOfEnergy(eqx.Module):
         return total if self.force is None else total + jnp.asarray(self.force(t, q, v))
 
 
-class GeneralEquations(AbstractSystem):
+class GeneralEquations(ConstrainedRows):
     """The equations of a `ConstrainedSystem` by one method, with the interface of a mechanism's equations.
 
     The rows of Psi come first, then those of phi. With M = L L^T and D = A L^(-T) for the rows A = (Psi_q; phi_v):
@@ -263,6 +263,31 @@ class GeneralEquations(AbstractSystem):
     @property
     def constrained(self) -> bool:
         return self.system.constraint is not None or self.system.velocity_constraint is not None
+
+    @property
+    def stabilized(self) -> bool:
+        return self.baumgarte is not None
+
+    @property
+    def restricts_velocities(self) -> bool:
+        return self.system.velocity_constraint is not None
+
+    @property
+    def row_weights(self) -> Float[Array, "m"]:
+        return jnp.ones(())  # rows are of order one
+
+    def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """Return Psi_q and Psi with coordinates in units of M_ii^(-1/2), and these units."""
+        root = self._units(q)
+        return jax.jacfwd(self._psi, 1)(t, q) * root, self._psi(t, q), root
+
+    def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """Return A, and Psi_dot followed by phi, with the same units."""
+        root = self._units(q)
+        return self._slopes(t, q, v) * root, self.violation(t, q, v)[1], root
+
+    def _units(self, q: Vector) -> Vector:
+        return 1 / jnp.sqrt(jnp.diag(jnp.asarray(self.system.mass(q))))
 
     def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
         return jnp.asarray(self.system.mass(q)), load(self.system, t, q, v), *self._rows(t, q, v)

@@ -6,8 +6,11 @@ independent q_i and v_i, the dependent ones follow from the constraints,
     Psi(t, q_d, q_i) = 0 by Newton's method,        Psi_dot(t, q, v_d, v_i) = 0, which is linear in v_d,
 
 and the equations of motion are projected onto the columns of N, one for each independent coordinate: the velocities of the
-mechanism when this coordinate has rate one and the other independent ones rate zero.
+mechanism when this coordinate has rate one and the other independent ones rate zero. Rows phi(t, q, v) = 0 of a user-defined
+system, which restrict velocities alone, make more velocities dependent than coordinates.
 """
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -16,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
 from udkjax.arrays import number_called
-from udkjax.equations.abstract_system import AbstractSystem, MechanismSystem
+from udkjax.equations.abstract_system import AbstractSystem, ConstrainedRows
 from udkjax.equations.formulations import Formulation, WrappedSystem, null_space_accelerations
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.pinv import SVD, Plus
@@ -37,8 +40,7 @@ class CoordinatePartitioning(Formulation):
     Redundant rows are satisfied in the sense of least squares. In a singular configuration, where the remaining columns of D are
     shorter than `rank_tol` times the longest, a step has more independent coordinates, which later steps constrain again: runs of
     the paper's linkage cross such configurations (20 s at a tolerance of 1e-9 from each of the initial states in
-    tests/integrate/test_accuracy.py: errors up to 9e-7). Only for mechanisms, since the rows of a `ConstrainedSystem` may be
-    nonholonomic.
+    tests/integrate/test_accuracy.py: errors up to 9e-7).
 
     Args:
         rank_tol: threshold of dependence, relative to the longest row or the largest singular value; None: `Scales.rank_tol`.
@@ -47,8 +49,8 @@ class CoordinatePartitioning(Formulation):
     rank_tol: Float[Array, ""] | None = eqx.field(converter=number_called("rank_tol", optional=True), default=None)
 
     def formulate(self, equations: AbstractSystem) -> "PartitionedSystem":
-        if not isinstance(equations, MechanismSystem):
-            raise ValueError("CoordinatePartitioning takes a Mechanism: a ConstrainedSystem may have nonholonomic constraints")
+        if not isinstance(equations, ConstrainedRows):
+            raise ValueError(f"CoordinatePartitioning does not know the rows of {type(equations).__name__}")
         if equations.stabilized:
             raise ValueError(
                 "CoordinatePartitioning satisfies the constraints at every stage and takes no Baumgarte stabilization; "
@@ -58,15 +60,15 @@ class CoordinatePartitioning(Formulation):
 
 
 class PartitionedSystem(WrappedSystem):
-    """The equations of motion of the independent coordinates of a mechanism.
+    """The equations of motion of the independent coordinates of a system.
 
     Unless a partition is fixed, it is chosen anew at each state.
     """
 
     solves_constraints = True
-    equations: MechanismSystem
+    equations: ConstrainedRows
     formulation: CoordinatePartitioning
-    dependent: Bool[Array, "n"] | None = None  # the dependent coordinates, if the partition is fixed
+    dependent: Bool[Array, "2 n"] | None = None  # the dependent coordinates and velocities, if the partition is fixed
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """Return a = a_p + N z at the state, without solving for dependent coordinates."""
@@ -88,20 +90,36 @@ class PartitionedSystem(WrappedSystem):
         """Return the same equations with the partition that pivoting chooses at this state."""
         if self.dependent is not None:
             return self
-        D = self.equations.weighted_rows(t, q)[0]
+        of_positions = of_velocities = self._dependent_columns(self.equations.weighted_rows(t, q)[0])
+        if self.equations.restricts_velocities:
+            of_velocities = self._dependent_columns(self.equations.weighted_rates(t, q, v)[0])
+        dependent = jax.lax.stop_gradient(jnp.stack([of_positions, of_velocities]))
+        return PartitionedSystem(self.equations, self.formulation, dependent)
+
+    def _dependent_columns(self, D: Float[Array, "m n"]) -> Bool[Array, "n"]:
+        """Return the columns that pivoting chooses, as many as are independent."""
+        none = jnp.zeros(D.shape[1], bool)
         if not len(D):
-            return PartitionedSystem(self.equations, self.formulation, jnp.zeros(len(q), bool))
+            return none
         _, _, order, rank = complete_qr(D, self._tol * jnp.linalg.norm(D, axis=0).max())
-        dependent = jnp.zeros(len(q), bool).at[order].set(jnp.arange(len(order)) < rank)
-        return PartitionedSystem(self.equations, self.formulation, jax.lax.stop_gradient(dependent))
+        return none.at[order].set(jnp.arange(len(order)) < rank)
 
     @property
-    def independent(self) -> Bool[Array, "n"] | None:
-        return None if self.dependent is None else ~self.dependent
+    def independent(self) -> Bool[Array, "2n"] | None:
+        return None if self.dependent is None else ~self.dependent.ravel()
 
     @property
-    def dependent_columns(self) -> Bool[Array, "n"]:
+    def dependent_coordinates(self) -> Bool[Array, "n"]:
         """The dependent coordinates of the fixed partition."""
+        return self._fixed[0]
+
+    @property
+    def dependent_velocities(self) -> Bool[Array, "n"]:
+        """The dependent velocities of the fixed partition."""
+        return self._fixed[1]
+
+    @property
+    def _fixed(self) -> Bool[Array, "2 n"]:
         if self.dependent is None:
             raise ValueError("no partition is fixed: call fix_partition first")
         return self.dependent
@@ -111,73 +129,84 @@ class PartitionedSystem(WrappedSystem):
         tol = self.formulation.rank_tol
         return self.equations.scales.rank_tol if tol is None else tol
 
-    def _plus(self, D: Float[Array, "m n"]) -> Plus:
-        """Return D^+ of the dependent columns, zero for the others."""
-        return SVD(self._tol).plus(jnp.where(self.dependent_columns, D, 0))
+    def plus(self, D: Float[Array, "m n"], columns: Bool[Array, "n"]) -> Plus:
+        """Return D^+ of some columns, zero for the others."""
+        return SVD(self._tol).plus(jnp.where(columns, D, 0))
 
 
 # Derivatives. For a fixed partition, Psi(t, q_d, q_i) = 0 defines q_d as a function of t and q_i. One Newton step from a closed
 # state does not change the values and has the tangents of that function.
 
 
-@jax.custom_jvp
+@eqx.filter_custom_jvp
 def _solve_dependent(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
     if not fixed.constrained:
         return q, v
-    tol = jnp.sqrt(jnp.finfo(q.dtype).eps)  # the error after this step is of the order of tol^2
+    q = _solve(fixed, lambda q: _newton(fixed, t, q), q)
+    if fixed.equations.restricts_velocities:  # phi need not be linear in the velocities
+        return q, _solve(fixed, lambda v: _velocity(fixed, t, q, v), v)
+    return q, _velocity(fixed, t, q, v)
+
+
+def _solve(fixed: PartitionedSystem, newton: Callable[[Vector], Vector], x: Vector) -> Vector:
+    """Return the limit of Newton steps; NaN if they do not converge."""
+    tol = jnp.sqrt(jnp.finfo(x.dtype).eps)  # the error after this step is of the order of tol^2
 
     def goes_on(state):
         _, change, k = state
         return (k < PARTITION_NEWTON_STEPS) & (change > tol)
 
     def step(state):
-        q, _, k = state
-        corrected = _newton(fixed, t, q)
-        return corrected, fixed.equations.size(corrected - q), k + 1
+        x, _, k = state
+        corrected = newton(x)
+        return corrected, fixed.equations.size(corrected - x), k + 1
 
-    q, change, _ = jax.lax.while_loop(goes_on, step, (q, jnp.array(jnp.inf, q.dtype), 0))
-    q = jnp.where(change <= tol, q, jnp.nan)
-    return q, _velocity(fixed, t, q, v)
+    x, change, _ = jax.lax.while_loop(goes_on, step, (x, jnp.array(jnp.inf, x.dtype), 0))
+    return jnp.where(change <= tol, x, jnp.nan)
 
 
-@_solve_dependent.defjvp
+@_solve_dependent.def_jvp
 def _(primals, tangents):
     fixed, t, q, v = primals
     closed, rate = _solve_dependent(fixed, t, q, v)
 
     def correct(fixed, t, q, v):
-        start = jnp.where(fixed.dependent_columns, jax.lax.stop_gradient(closed), q)
+        start = jnp.where(fixed.dependent_coordinates, jax.lax.stop_gradient(closed), q)
         q = _newton(fixed, t, start)
-        return q, _velocity(fixed, t, q, jnp.where(fixed.dependent_columns, jax.lax.stop_gradient(rate), v))
+        return q, _velocity(fixed, t, q, jnp.where(fixed.dependent_velocities, jax.lax.stop_gradient(rate), v))
 
-    return (closed, rate), jax.jvp(correct, (fixed, t, q, v), tangents)[1]
+    return (closed, rate), eqx.filter_jvp(correct, (fixed, t, q, v), tangents)[1]
 
 
 def _newton(fixed: PartitionedSystem, t: Time, q: Vector) -> Vector:
     D, psi, root = fixed.equations.weighted_rows(t, q)
-    return jnp.where(fixed.dependent_columns, q - root * (fixed._plus(D) @ psi), q)  # independent coordinates stay exact
+    if not len(psi):
+        return q
+    columns = fixed.dependent_coordinates
+    return jnp.where(columns, q - root * (fixed.plus(D, columns) @ psi), q)  # independent coordinates stay exact
 
 
 def _velocity(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> Vector:
-    D, _, root = fixed.equations.weighted_rows(t, q)
-    rate = fixed.equations.scales.weights * fixed.violation(t, q, v)[1]
-    return jnp.where(fixed.dependent_columns, v - root * (fixed._plus(D) @ rate), v)
+    D, rate, root = fixed.equations.weighted_rates(t, q, v)
+    columns = fixed.dependent_velocities
+    return jnp.where(columns, v - root * (fixed.plus(D, columns) @ rate), v)
 
 
-@jax.custom_jvp
+@eqx.filter_custom_jvp
 def _accelerations(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) -> Vector:
     M, F, A, c = fixed.matrices(t, q, v)
     if not len(A):
-        return F / jnp.diag(M)
-    root, w = 1 / jnp.sqrt(jnp.diag(M)), fixed.equations.scales.weights
-    A, c = w[:, None] * A, w * c
-    plus = fixed._plus(A * root)
-    free = jnp.diag(jnp.where(fixed.dependent_columns, 0.0, 1.0))
+        return jnp.linalg.solve(M, F)
+    root, w = 1 / jnp.sqrt(jnp.diag(M)), fixed.equations.row_weights
+    A, c = (w * A.T).T, w * c
+    columns = fixed.dependent_velocities
+    plus = fixed.plus(A * root, columns)
+    free = jnp.diag(jnp.where(columns, 0.0, 1.0))
     return null_space_accelerations(M, F, free - root[:, None] * (plus @ (A @ free)), root * (plus @ c))
 
 
-@_accelerations.defjvp
+@_accelerations.def_jvp
 def _(primals, tangents):
     """Differentiate the Udwadia-Kalaba equation, which has the same accelerations at constant rank."""
     plain = lambda fixed, *state: fixed.equations.accelerations(*state)  # noqa: E731
-    return _accelerations(*primals), jax.jvp(plain, primals, tangents)[1]
+    return _accelerations(*primals), eqx.filter_jvp(plain, primals, tangents)[1]

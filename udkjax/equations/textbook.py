@@ -164,6 +164,11 @@ class TextbookEquations(MechanismSystem):
         w = self.scales.weights
         return uk.D(self.mechanism, t, q, w), w * constraints.psi(self.mechanism, t, q), uk.inverse_sqrt_mass(self.mechanism)
 
+    def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """Return D and Psi_dot, their rows weighted, and M^(-1/2), of all rows."""
+        D, _, root = self.weighted_rows(t, q)
+        return D, self.row_weights * constraints.psi_dot(self.mechanism, t, q, v), root
+
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Kinetic and potential energy (J)."""
         return loads.kinetic_energy(self.mechanism, v), loads.potential_energy(self.mechanism, t, q, v)
@@ -209,6 +214,14 @@ class TextbookEquations(MechanismSystem):
     @property
     def stabilized(self) -> bool:
         return self.baumgarte is not None
+
+    @property
+    def restricts_velocities(self) -> bool:
+        return False
+
+    @property
+    def row_weights(self) -> Float[Array, "m"]:
+        return self.scales.weights
 
 
 def prepare(

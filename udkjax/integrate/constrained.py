@@ -35,7 +35,7 @@ class Constrained(Wrapper):
         if self.stabilization is not None:
             args = StabilizedEquations(args, self.stabilization, jnp.asarray(t1 - t0))
         equations, solver = args.fix_partition(t0, *jnp.split(y0, 2)), self.solver
-        controlled = None if equations.independent is None else jnp.tile(equations.independent, 2)
+        controlled = equations.independent
         if controlled is not None:
             solver = _with_partial_norm(solver, controlled)
         y1, error, dense, state, result = solver.step(terms, t0, t1, y0, equations, solver_state, made_jump)
