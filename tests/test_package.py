@@ -24,8 +24,8 @@ POSITIONS = EQUATIONS | {"native", "positions"}
 STUDY = POSITIONS | {"integrate", "statics", "synthesis", "study"}
 BELOW = {
     **{module: set() for module in GROUND_FLOOR},
-    "expressions": set(),
     "programs": set(),
+    "expressions": {"programs"},
     "pinv": PROGRAMS,
     "scene": PROGRAMS,
     "complementarity": PROGRAMS | {"transforms"},

@@ -188,6 +188,20 @@ def test_a_traced_derivative_uses_its_own_rule(emit):
     assert [float(o) for o in program(3.0)] == [6.0, 7.0]
 
 
+def test_known_arrays_are_computed_without_jax(emit, monkeypatch):
+    """Identity matrices, comparisons of indices and padding, each of which JAX would compile; sines are those of JAX."""
+    function = lambda x: jnp.pad(x * (jnp.eye(3) - jnp.tri(3)), ((0, 1), (1, 0))) + jnp.arange(4) * x[0]  # noqa: E731
+    expected = function(X)
+
+    def refuse():
+        raise AssertionError("JAX computes a constant")
+
+    monkeypatch.setattr(jax, "ensure_compile_time_eval", refuse)
+    close(emit(function, X)(X), expected)
+    with pytest.raises(AssertionError, match="JAX computes"):
+        emit(lambda x: x + jnp.sin(jnp.arange(3)), X)
+
+
 def test_structural_zeros_of_a_derivative_vanish(emit):
     """d(x0 x1)/dx2 = 0 is known without a run, and so are the ones of the unit directions."""
     jacobian = emit(jax.jacfwd(lambda x: jnp.stack([x[0] * x[1], x[2]])), X).program

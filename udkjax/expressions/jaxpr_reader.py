@@ -228,9 +228,11 @@ def _apply(graph: Graph, equation: Equation, dtype: np.dtype, *scalars: Scalar) 
 
 def _evaluate_constants(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
     values = [_values(i).astype(v.aval.dtype) for i, v in zip(inputs, equation.invars, strict=True)]  # an empty array has no type
+    if not equation.primitive.multiple_results:
+        return [_constants(graph, fold(equation.primitive, equation.params, values).astype(equation.outvars[0].aval.dtype))]
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*map(jax.numpy.asarray, values), **equation.params)
-    return [_constants(graph, r) for r in (results if equation.primitive.multiple_results else [results])]
+    return [_constants(graph, r) for r in results]
 
 
 def _values(array: np.ndarray) -> np.ndarray:

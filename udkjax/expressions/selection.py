@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from numpy.typing import DTypeLike
 
 from udkjax.expressions.graph import Scalar
+from udkjax.programs.numpy_rules import exact_rule
 
 
 def absolute(a: Scalar) -> Scalar:
@@ -50,6 +51,11 @@ def apply(primitive: Primitive, dtype: DTypeLike, *arguments: Scalar) -> Scalar:
 
 
 def fold(primitive: Primitive, parameters: dict, values: Sequence[ArrayLike]) -> np.ndarray:
-    """Apply a primitive of JAX to known numbers."""
+    """Apply a primitive of JAX to known numbers: by NumPy where that is exact, since JAX compiles each operation."""
+    rule = exact_rule(primitive.name)
+    if rule is not None:
+        found = rule(*map(np.asarray, values), **parameters)
+        if found is not NotImplemented:
+            return np.asarray(found)
     with jax.ensure_compile_time_eval():
         return np.asarray(primitive.bind(*map(jax.numpy.asarray, values), **parameters))

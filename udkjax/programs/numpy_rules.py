@@ -3,7 +3,7 @@
 A rule may return `NotImplemented`: then JAX evaluates the operation.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -264,3 +264,31 @@ RULES: dict[str, Rule] = {name: _ufunc(function) for name, function in UFUNCS.it
     "triangular_solve": _triangular_solve,
     "empty2": lambda dtype, **_: np.zeros((), dtype),
 }
+
+# Rules whose results equal those of JAX bit by bit: they move elements, compare, or compute with integers.
+_EXACT = frozenset(
+    """eq ne lt le gt ge and or xor not add sub mul neg iota broadcast_in_dim reshape squeeze expand_dims transpose rev slice pad
+    tile concatenate convert_element_type""".split()
+)
+_OF_INTEGERS = frozenset(("add", "sub", "mul", "neg"))
+
+
+def exact_rule(name: str) -> Rule | None:
+    """Return the rule of a primitive if its results equal those of JAX bit by bit; None if there is no such rule."""
+    if name not in _EXACT:
+        return None
+    rule = RULES[name]
+
+    def exact(*inputs: np.ndarray, **parameters: Any) -> Any:
+        of_floats = any(map(_is_inexact, inputs))
+        if of_floats and (name in _OF_INTEGERS or _makes_integers(parameters)):
+            return NotImplemented
+        with np.errstate(over="ignore"):  # integers wrap, as in JAX
+            return rule(*inputs, **parameters)
+
+    return exact
+
+
+def _makes_integers(parameters: Mapping[str, Any]) -> bool:
+    """Return whether a conversion rounds, and so clips numbers that are too large."""
+    return "new_dtype" in parameters and np.dtype(parameters["new_dtype"]).kind in "iu"
