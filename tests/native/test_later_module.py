@@ -1,5 +1,6 @@
 """The module with the implicit method, which is loaded when a run first needs it."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 
@@ -10,7 +11,7 @@ import pytest
 import udkjax as udk
 from tests.native.test_implicit_stages import damped
 from udkjax.native import primitive
-from udkjax.native.base import loading, machine
+from udkjax.native.base import leaving, loading, machine
 
 TS = np.linspace(0.0, 0.5, 3)
 STIFF, SOFT = 1e5, 0.1
@@ -67,6 +68,30 @@ def test_members_in_lanes_leave_together(motion):
     found = jax.jit(jax.vmap(motion))(dampings)
     for k, damping in enumerate(dampings):
         assert_equal([x[k] for x in found], motion(damping))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "way", [lambda f: f, jax.vmap, lambda f: jax.grad(lambda x: f(x)[0].sum())], ids=["run", "lanes", "gradient"]
+)
+def test_both_modules_share_code(motion, monkeypatch, way):
+    """Their functions are equal but for those that know of the implicit method, and compiled once."""
+    texts, library = {}, machine.library
+
+    def listen(text, names, *level):
+        texts.update({name: text for name in (leaving.LATER, leaving.RESUME) if name in names})
+        return library(text, names, *level)
+
+    monkeypatch.setattr(machine, "library", listen)
+    jax.block_until_ready(jax.jit(way(motion))(np.full(4, STIFF) if way is jax.vmap else STIFF))
+    first, later = (
+        {body[: body.index("(")]: body for body in re.findall(r"^define .*?^}$", texts[name], re.MULTILINE | re.DOTALL)}
+        for name in (leaving.LATER, leaving.RESUME)
+    )
+    different = {name.partition("@")[2] for name, body in first.items() if later[name] != body}
+    assert different <= leaving.DIFFERENT | {"step_back", "differences_back"}
+    parts = [set(machine.split_module(texts[name])) for name in (leaving.LATER, leaving.RESUME)]
+    assert len(parts[0] & parts[1]) >= len(parts[0]) / 2
 
 
 def test_threads_load_it_once(motion, monkeypatch):

@@ -89,7 +89,7 @@ class Unrolled:
         self.constants = frontier(graph, outputs, lambda node: node.depends <= {"parameter"})
         drop_tol = self.numbers[-2]
         if drop_tol.index in graph.dependencies([s.index for s in outputs]):
-            self.constants.append(drop_tol)
+            self.constants.insert(0, drop_tol)  # at the same place whatever else a module needs
         self.drop_tol_index = next((k for k, s in enumerate(self.constants) if s.index == drop_tol.index), None)
         self.prologue = ScalarProgram(graph, self.numbers, self.constants)
         self._inputs = {s: ("constants", k) for k, s in enumerate(self.constants)}

@@ -15,6 +15,7 @@ from functools import cache
 from typing import Any
 
 from udkjax.native.base import code_cache
+from udkjax.native.base.text import named_apart
 from udkjax.threads import thread_count
 
 LEVEL = 1  # level of code generation; level 2 takes a fifth longer to compile, with equal run time
@@ -129,20 +130,25 @@ def _stored_code(text: str, level: int) -> tuple[bytes, int]:
 
 
 def split_module(text: str) -> list[str]:
-    """Split a module into modules for parallel compilation, the largest first, each with its declarations."""
+    """Split a module into modules for parallel compilation, the largest first, each with its declarations.
+
+    Functions that the module names as apart from others are in groups of their own: another module may have the others.
+    """
     text = f"\n{text}"  # searching for newlines is several times as fast as multiline anchors
     definitions = (text[match.end() : text.index("\n}\n", match.end()) + 3] for match in re.finditer(r"\n(?=define )", text))
     bodies = {body[body.index("@") + 1 : body.index("(", body.index("@"))]: body for body in definitions}
     heads = {match[2]: f"{match[1]}\n" for match in re.finditer(r"\n((?:declare [^@\n]*)?@([\w.]+)[ (].*)", text)}
     lines = {name: body.count("\n") for name, body in bodies.items()}
-    groups, size = [[name] for name in bodies if lines[name] >= PART_LINES], GROUP_LINES
-    for name in bodies:
-        if lines[name] < PART_LINES:
-            if size + lines[name] > GROUP_LINES:
-                groups.append([])
-                size = 0
-            groups[-1].append(name)
-            size += lines[name]
+    groups, named = [[name] for name in bodies if lines[name] >= PART_LINES], named_apart(text)
+    for is_apart in (False, True):
+        size = GROUP_LINES
+        for name in bodies:
+            if lines[name] < PART_LINES and (name in named) == is_apart:
+                if size + lines[name] > GROUP_LINES:
+                    groups.append([])
+                    size = 0
+                groups[-1].append(name)
+                size += lines[name]
     groups.sort(key=lambda names: -sum(lines[name] for name in names))
     heads |= {name: f"declare{body[len('define') : body.index(')') + 1]}\n" for name, body in bodies.items()}
     parts = []

@@ -37,6 +37,9 @@ COLD = (
 )
 
 
+SPARE = 16  # places of constants are a multiple: the later module of a run (leaving.py), with a few more, has equal offsets
+
+
 class Module(Running):
     """The text of one module of machine code: its functions.
 
@@ -75,6 +78,7 @@ class Module(Running):
         self._lay_out()
         self.tangents = self.places  # memory of one direction of a derivative
         self.functions: list[Function] = []
+        self.apart: set[str] = set()
         self.begins = []
         self.loops = LoopWriter(plan.width, cold=plan.unrolled)
         self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, self.stages))]
@@ -89,7 +93,7 @@ class Module(Running):
         p = self.places = Layout(plan.width, plan.vector)
         for name in (*LANE_NUMBERS, *(FORMULATION_SETTINGS if plan.formulation else ())):
             p.add(name)
-        p.add("constants", self.constants)
+        p.add("constants", -(-self.constants // SPARE) * SPARE)
         p.add("state t")
         for name in (
             "state q",

@@ -8,7 +8,7 @@ from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.memory import Memory, ThreadCode
-from udkjax.native.base.text import ALLOCATION, text_of_module
+from udkjax.native.base.text import ALLOCATION, apart, text_of_module
 
 Repeat = Callable[[Callable[[], Value], Callable[[], None]], None]  # repeats a step while a condition holds: (goes_on, step)
 
@@ -26,6 +26,8 @@ class Running(Memory):
     """Where the memory of directions begins, relative to `work`; None if it is a block of its own."""
 
     functions: list[Function]
+    apart: set[str]
+    """The names of functions that are compiled apart from others, since only this module has them."""
     loops: LoopWriter
 
     def text(self) -> str:
@@ -33,7 +35,9 @@ class Running(Memory):
         self.write_functions()
         self._write_run()
         pointers = leaving.GLOBALS if self.plan.leaves else []
-        return text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION)
+        text = text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION)
+        has_both = self.plan.leaves or self.plan.stiff is not None
+        return f"{apart(self.apart | leaving.DIFFERENT)}\n{text}" if has_both else text
 
     def thread_code(self) -> ThreadCode:
         self.write_functions()

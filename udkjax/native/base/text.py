@@ -57,6 +57,17 @@ def text_of_module(
     return "\n".join([*heads, *globals, *texts])
 
 
+def apart(names: Iterable[str]) -> str:
+    """Return the line of a module that names functions which are compiled apart from others (machine.py)."""
+    return f"; apart {' '.join(sorted(names))}"
+
+
+def named_apart(text: str) -> frozenset[str]:
+    """Return the names of such functions, from the text of a module."""
+    found = re.search(r"^; apart (.*)$", text, re.MULTILINE)
+    return frozenset(found[1].split()) if found else frozenset()
+
+
 def external_functions(declarations: str) -> frozenset[str]:
     """Return the names of functions outside a module, from its text or its declarations; instructions are not functions.
 

@@ -46,7 +46,8 @@ class Trajectory(Module):
         super().__init__(plan, differentiated, active)
         self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
         self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
-        self.stage_equations = StageEquations(self, bool(differentiated)) if plan.steps and plan.implicit else None
+        self.stage_equations: StageEquations | None = None
+        self._is_differentiated = bool(differentiated)
 
     def write_programs(self):
         super().write_programs()
@@ -85,8 +86,10 @@ class Trajectory(Module):
 
     def write_functions(self):
         self.write_programs()
-        if self.stage_equations:
-            self.stage_equations.write()
+        if self.falls_back:
+            write_fallback(self)
+        if self.plan.steps and self.plan.implicit:
+            self._write_stage_equations()
         write_attempt(self)
         if self.pieces:
             write_leave(self)
@@ -94,13 +97,18 @@ class Trajectory(Module):
         write_differences(self)
         write_between(self)
         write_outputs(self)
-        if self.falls_back:
-            write_fallback(self)
         if self.plan.breaks:
             write_next_breakpoint(self)
         write_begin(self)
         write_finish(self)
         self.write_derivatives()
+
+    def _write_stage_equations(self):
+        """Lay out and write the stage equations, after all else: a module without them has the same functions otherwise."""
+        self.stage_equations = StageEquations(self, self._is_differentiated)
+        first = len(self.functions)
+        self.stage_equations.write()
+        self.apart |= {f.name for f in self.functions[first:]}
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Take one step in all lanes, and finish completed members."""
