@@ -146,6 +146,11 @@ class ConstrainedRows(AbstractSystem):
     def row_weights(self) -> Float[Array, "m"]:
         """The weights that make rows comparable."""
 
+    @property
+    @abstractmethod
+    def rank_tol(self) -> Float[Array, ""]:
+        """The default threshold of dependence among rows."""
+
     @abstractmethod
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """Return D and Psi of all rows of positions, weighted, and the units of coordinates: M^(-1/2) if M is diagonal."""

@@ -276,6 +276,10 @@ class GeneralEquations(ConstrainedRows):
     def row_weights(self) -> Float[Array, "m"]:
         return jnp.ones(())  # rows are of order one
 
+    @property
+    def rank_tol(self) -> Float[Array, ""]:
+        return self.scales.rank_tol
+
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """Return Psi_q and Psi with coordinates in units of M_ii^(-1/2), and these units."""
         root = self._units(q)

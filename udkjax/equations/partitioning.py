@@ -127,7 +127,7 @@ class PartitionedSystem(WrappedSystem):
     @property
     def _tol(self) -> Float[Array, ""]:
         tol = self.formulation.rank_tol
-        return self.equations.scales.rank_tol if tol is None else tol
+        return self.equations.rank_tol if tol is None else tol
 
     def plus(self, D: Float[Array, "m n"], columns: Bool[Array, "n"]) -> Plus:
         """Return D^+ of some columns, zero for the others."""

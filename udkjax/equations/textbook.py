@@ -223,6 +223,10 @@ class TextbookEquations(MechanismSystem):
     def row_weights(self) -> Float[Array, "m"]:
         return self.scales.weights
 
+    @property
+    def rank_tol(self) -> Float[Array, ""]:
+        return self.scales.rank_tol
+
 
 def prepare(
     mechanism: Mechanism,
