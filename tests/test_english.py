@@ -90,6 +90,7 @@ PHRASES = [
     (r"\bless (that|those|the)\b", "total energy, less that of the start", "no less than the load"),
     (r"\bof the user's own\b", "a system of the user's own", "the user's own system"),
     (r"\bnone to (see|be)\b", "no cause, if there is none to see", "there is none"),
+    (r"\bwritten out\b", "small matrices, written out", "The loops are unrolled."),
     (r"\bis said by\b", "A wrong threshold is said by its result.", "It is said to be exact."),
     (r"\bcounts? as (it is|they are) drawn\b", "Angles count as they are drawn.", "Angles are those of the drawing."),
 ]

@@ -27,7 +27,7 @@ def _scan(x, y):
 
 
 FUNCTIONS = {
-    # written out: scalar operations only
+    # expanded: scalar operations only
     "arithmetic": lambda x, y: (x[0] - y[0]) / (1.0 + x[1] ** 2) - (y[1] - x[0]) * -x[2],
     "powers": lambda x, y: jnp.stack([x[0] ** 3, y[0] ** -2, x[1] ** 0, jnp.square(x[1])]),
     "real power": lambda x, y: jnp.abs(y) ** 1.5,

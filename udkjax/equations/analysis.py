@@ -194,7 +194,7 @@ def _rows_of(mechanism: Mechanism, kind: Hashable) -> FoundRows:
 
 
 class Holding(NamedTuple):
-    """A mechanism whose pins that do not turn are held by angles, and these pins."""
+    """A mechanism in which the angles of pins that do not turn are held, and these pins."""
 
     mechanism: Mechanism
     pins: tuple[HeldPin, ...]
@@ -202,7 +202,7 @@ class Holding(NamedTuple):
 
 @cached_by_identity
 def hold_pins(mechanism: Mechanism) -> Holding:
-    """Hold the pins that constraints hold to second order only (stationary_rows.py), as far as concrete numbers tell."""
+    """Hold the pins that constraints hold only to second order (stationary_rows.py), if concrete numbers show this."""
     source = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     pins = () if source is None else _held_pins(source)
     with jax.ensure_compile_time_eval() if mechanism.is_concrete else nullcontext():

@@ -218,7 +218,7 @@ class SceneTerms:
             yield self.over_group("potential", group, write_potential)
 
     def friction_power(self, solution: int) -> ProgramParts:
-        """Compute the power of all friction (W), with the loads of joints by the x of a linear system."""
+        """Compute the power of all friction (W), with the loads of joints from the solution x of a linear system."""
         yield Reset("friction_power", 0, 1)
 
         def writer(programs: ElementPrograms) -> Write:

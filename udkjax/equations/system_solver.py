@@ -1,4 +1,4 @@
-"""The linear systems of a user-defined system as scalars: M = L diag(p) L^T, and elimination of A M^(-1) A^T, both written out.
+"""The linear systems of a user-defined system as scalars: M = L diag(p) L^T, and elimination of A M^(-1) A^T, both unrolled.
 
 With A the rows (Psi_q; phi_v), B = A L^(-T) and C = diag(1 / p), a change of coordinates w is M^(-1) A^T x = L^(-T) C B^T x, and
 

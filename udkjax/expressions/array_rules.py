@@ -1,4 +1,4 @@
-"""Primitives of whole arrays, written out as operations on their elements: reductions, sorting, branches, unknown indices.
+"""Primitives of whole arrays, expanded into operations on their elements: reductions, sorting, branches, unknown indices.
 
 A rule gets the graph, the inputs as arrays of Scalars and the equation, and returns the outputs, or None where it does not apply:
 the primitive then stays one opaque node. Elements are chosen by comparisons, and ties and NaN are treated as JAX treats them.

@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices, written out as operations on their elements: LU decomposition and triangular systems.
+"""Linear algebra of small matrices, expanded into operations on their elements: LU decomposition and triangular systems.
 
 `jnp.linalg.solve`, `inv`, `det` and `slogdet` consist of these. Rows are exchanged by choices between scalars, with the pivots of
 LAPACK. Beyond `MOST_ROWS` rows the choices are too many, and the primitive stays one opaque node.
@@ -16,7 +16,7 @@ MOST_ROWS = 6  # a decomposition of n rows takes about n^3 operations
 
 
 def is_small(*arrays: np.ndarray) -> bool:
-    """Return whether the matrices in arrays are small enough to be written out."""
+    """Return whether the matrices in arrays are small enough to be expanded."""
     return all(max(a.shape, default=0) <= MOST_ROWS for a in arrays)
 
 

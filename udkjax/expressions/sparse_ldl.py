@@ -1,4 +1,4 @@
-"""A = L diag(p) L^T of a symmetric matrix of scalars, written out: entries that are zero by structure are never computed."""
+"""A = L diag(p) L^T of a symmetric matrix of scalars, unrolled: structural zeros are never computed."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

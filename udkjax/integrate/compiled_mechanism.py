@@ -45,7 +45,9 @@ class RunPlan:
     why_not_native: str  # the reason why machine code does not integrate; empty if it does
     independent_rows: int = 0  # the number of rows that the method uses
     most_rank: int = 0  # the number of rows not known to be redundant: a larger rank is due to rounding or violated rows
-    orders_by_diffrax: float = np.inf  # the highest order of derivatives that diffrax, which does not locate pieces, has right
+    orders_by_diffrax: float = (
+        np.inf
+    )  # the highest order of derivatives that are right with diffrax, which does not locate pieces
 
     @cached_property
     def is_native(self) -> bool:

@@ -32,8 +32,8 @@ from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.wording import join_names
 
 AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
-# Largest floor, relative to the least one, of steps whose differences count, too: noise grows four times from a step to the next
-# finer one, by which truncation is estimated, and up to whose noise it is therefore unknown.
+# Steps with floors up to this factor above the smallest are used as well. Truncation is estimated from the next finer step, whose
+# noise is four times as large, so smaller truncation errors are unknown.
 ALIKE = 4.5
 USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which agreement is meaningful
 RANDOM_DIRECTIONS = 3  # number of directions in which all unknowns change
