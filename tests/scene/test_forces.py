@@ -85,6 +85,31 @@ def test_torsion_spring_and_friction(everything, at):
     assert_allclose(total_loads(everything, "rub", at, everything.q0, V)["b"], [0.0, 0.0, -0.5 * np.tanh(1.1 / 0.3)])
 
 
+def test_a_joint_sticks_up_to_its_static_coefficient():
+    """By the load of a pin at its radius; by the forces at both ends of a guide, which also carry a torque of 0.6 N m."""
+    numbers: dict[str, Any] = {"coefficient": 0.2, "static_coefficient": 0.3, "law": "set-valued"}
+    pin, guide = udk.Revolute(["ground", "b"], [[0, 0], [0, 0]]), udk.Prismatic(["ground", "b"], [[0, 0], [0, 0]], 0.0)
+    assert_allclose(udk.Friction("A", torque=1.0, radius=0.5, **numbers).largest_force(pin, [3.0, 4.0]), 1.0 + 0.3 * 0.5 * 5.0)
+    assert_allclose(udk.Friction("A", **numbers).largest_force(guide, [-4.0, 0.6]), 0.3 * 4.0)
+    for couple, load in ((0.6, 6.0), (0.1, 4.0)):  # 2 N at each end, and the torque over 0.2 m
+        assert_allclose(udk.Friction("A", length=0.2, **numbers).largest_force(guide, [-4.0, couple]), 0.3 * load)
+
+
+def test_the_sliding_speed_is_the_rate_of_the_place_on_the_guide(at):
+    """The guide turns with its body."""
+    joint = udk.Prismatic(["a", "b"], [[0.1, -0.2], [0.3, 0.4]], 0.7)
+    mechanism = udk.Mechanism({name: udk.Body(1.0, 0.1) for name in "ab"}, {"S": joint})
+    q, v = jnp.array([[0.2, 0.5, 0.9], [1.1, -0.3, 0.4]]), V[:2]
+
+    def place(q):
+        frames = at(mechanism, q, v)
+        seen, axis = frames["b"].point(joint.points[1]), frames["a"].vector((jnp.cos(joint.axis), jnp.sin(joint.axis)))
+        return axis.x * (seen.x - frames["a"].x) + axis.y * (seen.y - frames["a"].y)
+
+    frames = at(mechanism, q, v)
+    assert_allclose(udk.Friction.sliding_speed(joint, frames["a"], frames["b"]), jax.jvp(place, (q,), (v,))[1], rtol=1e-12)
+
+
 def test_numbers_of_friction_have_their_units():
     numbers: dict[str, Any] = {
         "torque": 1.0,
