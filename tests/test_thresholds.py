@@ -18,6 +18,7 @@ from tests.integrate.test_matrices_in_forces import SolvedSpring
 from tests.integrate.test_own_system_events import coupled, swung
 from tests.integrate.test_sticking import block, oscillator, sticking
 from tests.native.test_implicit_stages import damped
+from tests.statics.test_holding import clamp, wedge
 from tests.synthesis.test_design import FOUR_BAR
 from tests.ten_times import multiplied
 from udkjax.equations.redundancy import examine_rows
@@ -83,6 +84,18 @@ def jams() -> dict[str, Any]:
     return {name: udk.simulate(x, [0.0, 1.0], throw=False).cause.partition(" at ")[0] for name, x in scenes.items()}
 
 
+def held_mechanisms() -> dict[str, Any]:
+    """Efforts that hold mechanisms against friction, in units of the weight or of the push, near locking and at a dead point."""
+    steep = np.pi / 2 - np.arctan(0.5)
+    wedges = {name: wedge(angle, coefficient=0.5) for name, angle in (("flat", 0.2), ("steep", steep - 1e-6), ("locked", 1.4))}
+    found = {name: udk.holding_efforts(x, "body.load.x", [0.0, 0.1]) for name, x in wedges.items()}
+    limit = 2 * 0.1 * 0.01 / 0.2
+    found["clamp"] = udk.holding_efforts(clamp(2.5 * limit), "body.lever.angle", np.arcsin(limit * np.array([2.5, 1.001, 0.5])))
+    found["dead point"] = udk.holding_efforts(pendulum(coefficient=0.3, radius=0.05), "body.bob.y", [-0.3, -0.49, -0.5])
+    units = {"steep": 1e6, "locked": 20.0, "flat": 20.0, "clamp": 10.0}
+    return {name: [x / units.get(name, 10.0) for x in (e.lower, e.upper, e.without_friction)] for name, e in found.items()}
+
+
 def designs() -> dict[str, Any]:
     """Four-bars through places of a circle and of a bow: the sums of squares that they leave, in lengths of 10."""
     places = {"circle": [[2.0, 8.0], [5.0, 11.0], [8.0, 8.0], [5.0, 5.0]], "bow": [[0.0, 8.0], [2.0, 12.0], [9.0, 14.0]]}
@@ -113,10 +126,13 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     "BLOCK_STEPS": (sticking_joints, ("integrate.events.sticking.BLOCK_STEPS",), 1e-9),
     "SINGLE_STEPS": (sticking_joints, ("integrate.events.sticking.SINGLE_STEPS",), 1e-9),
     "SETTLED": (rubbing_joints, ("equations.friction_elimination.SETTLED",), 1e-8),
-    "LAST_CHANGE": (rubbing_joints, ("equations.rubbing.LAST_CHANGE",), 1e-8),
+    "LAST_CHANGE": (rubbing_joints, ("transforms.newton_steps.LAST_CHANGE",), 1e-8),
     "ROUNDS": (rubbing_joints, ("equations.friction_elimination.ROUNDS",), 1e-8),
     "SETTLING_ROUNDS": (rubbing_joints, ("native.base.steps.SETTLING_ROUNDS",), 1e-8),
-    "MOST_STEPS": (rubbing_joints, ("equations.rubbing.MOST_STEPS",), 1e-8),
+    "MOST_STEPS": (rubbing_joints, ("transforms.newton_steps.MOST_STEPS",), 1e-8),
+    "LAST_CHANGE, of efforts": (held_mechanisms, ("transforms.newton_steps.LAST_CHANGE",), 1e-9),
+    "MOST_STEPS, of efforts": (held_mechanisms, ("transforms.newton_steps.MOST_STEPS",), 1e-9),
+    "LOCKED, STILL, STOPPED": (held_mechanisms, tuple(f"statics.holding.{x}" for x in ("LOCKED", "STILL", "STOPPED")), 1e-9),
     "ROUNDS, of starts": (designs, ("synthesis.starts.ROUNDS",), 1e-6),
     "LEAST_FALL": (designs, ("synthesis.search.LEAST_FALL",), 1e-6),
     "JAMMING_TIMES": (jams, ("integrate.causes.jamming.JAMMING_TIMES",), 0.0),

@@ -34,15 +34,16 @@ class LooseFriction(NamedTuple):
 
 @deferred
 def loose_friction(
-    mechanism: Mechanism, t: Time, q: Vector, v: Vector, N: Float[Array, "m k"], scales: Scales, method: Pseudoinverse
+    mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m k"], scales: Scales, method: Pseudoinverse
 ) -> LooseFriction:
     """Return which joints with friction have a load that equilibrium leaves open if the friction of all others is given.
+
+    The marks are those of a random motion, in which all joints slide that can.
 
     Args:
         mechanism: The scene.
         t: Time (s).
         q: Coordinates (m, rad), (n,).
-        v: Velocities (m/s, rad/s), (n,), of a motion in which all joints slide that can.
         N: Basis of the null space of Psi_q^T, for multipliers in units of one over their rows' scales.
         scales: Scales of the scene.
         method: The pseudoinverse.
@@ -52,8 +53,11 @@ def loose_friction(
     """
     random, unit = np.random.default_rng(0), jnp.asarray(scales.coordinates(q.size))
     some_load, some_mix = (jnp.asarray(random.normal(size=size)) for size in N.shape)
-    rate = jnp.where(jnp.asarray(scales.rate) > 0, scales.rate, 1.0)
+    rate = jnp.where(jnp.asarray(scales.rate) > 0, scales.rate, 1.0)  # without loads and velocities, there is no time
     everywhere = jnp.asarray(random.normal(size=q.size)) * unit * rate  # all joints slide
+    D, root = uk.D(mechanism, t, q, scales.weights), uk.inverse_sqrt_mass(mechanism)
+    plus = uk.pseudoinverse(method, D)
+    v = everywhere - root * (plus @ (D @ (everywhere / root)))
 
     def frictions(speeds: Array, multipliers: Array) -> Array:
         """Return the loads of friction of each joint (j, n), as forces."""
@@ -67,9 +71,6 @@ def loose_friction(
     loose = sizes(everywhere, N @ some_mix) > UNIQUE_TOL * usual
     drags = frictions(v, some_load)
     slides = jnp.linalg.norm(drags, axis=1) > UNIQUE_TOL * usual
-
-    D, root = uk.D(mechanism, t, q, scales.weights), uk.inverse_sqrt_mass(mechanism)
-    plus = uk.pseudoinverse(method, D)
 
     def response(drag: Array) -> Array:
         """Return the friction that the multipliers in answer to a load cause, if all joints slide."""

@@ -30,10 +30,9 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.forces import Wrench
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.newton_steps import repeated_newton
 
-MOST_STEPS = 50  # of Newton's method, which needs three to five
 STAGES = 8  # of equal shares; fewer may do, but most mechanisms need none
-LAST_CHANGE = 1e-13  # change of the loads of friction by a step, relative to these loads
 
 
 def rubbing_names(mechanism: Mechanism) -> list[str]:
@@ -201,17 +200,12 @@ def settle(
     def newton(start: Array, share: Array | float, begins: Array) -> tuple[Array, Array]:
         """Return the solution with a share of friction, and whether it is not found; the start itself unless this `begins`."""
 
-        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            x, _, count = state
+        def step(x: Array) -> tuple[Array, Array, Array]:
             new = x - jnp.linalg.solve(jax.jacfwd(remainder)(x, share), remainder(x, share))
             before, after = root * friction(x), root * friction(new)
-            return new, jnp.linalg.norm(after - before) > LAST_CHANGE * jnp.linalg.norm(after), count + 1
+            return new, jnp.linalg.norm(after - before), jnp.linalg.norm(after)
 
-        def goes_on(state: tuple[Array, Array, Array]) -> Array:
-            return state[1] & (state[2] < MOST_STEPS)
-
-        x, is_open, _ = jax.lax.while_loop(goes_on, step, (start, begins, jnp.asarray(0)))
-        return x, is_open
+        return repeated_newton(step, start, begins)
 
     def solve(_: Callable[[Array], Array], start: Array) -> Array:
         x, fails = newton(start, 1.0, jnp.asarray(True))

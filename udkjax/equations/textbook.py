@@ -108,9 +108,9 @@ class TextbookEquations(MechanismSystem):
         drags = rubbing.single_rubbing_loads(self.mechanism, t, q, v, multipliers)
         return {joint: v @ drag for joint, drag in drags.items()}
 
-    def loose_friction(self, t: Time, q: Vector, v: Vector, N: Float[Array, "m k"]) -> LooseFriction:
+    def loose_friction(self, t: Time, q: Vector, N: Float[Array, "m k"]) -> LooseFriction:
         """Return which joints with friction have a load that is not unique: see `loose_friction`."""
-        return loose_friction(self.mechanism, t, q, v, N, self.scales, self.method)
+        return loose_friction(self.mechanism, t, q, N, self.scales, self.method)
 
     @property
     def rubbing_joints(self) -> list[str]:

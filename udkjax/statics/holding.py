@@ -33,11 +33,13 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.newton_steps import repeated_newton
 
-MOST_STEPS = 50  # Newton's method needs three to six
-LAST_STEP = 1e-12  # relative change of an effort by its last step
 LOCKED = 1e-9  # smaller derivatives of the acceleration by the effort, relative to that without friction, are rounding errors
 STILL = 1e-9  # smaller sliding speeds in a motion, relative to the fastest coordinate, are rounding errors
+# Missing part of the unit speed along the coordinate. Where the coordinate moves, rounding errors are below 1e-8, as the rank
+# tolerance leaves eight digits; at dead points other rows take a good share of the speed.
+STOPPED = 1e-5
 
 
 class HoldingEfforts(PrintsTable):
@@ -133,16 +135,16 @@ def _efforts(mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], r
         def acceleration(effort: Array, sign: float) -> Array:
             """Return C a where all joints resist a motion in the direction `sign`."""
             sides = jnp.stack([sign * forwards, jnp.ones(count)], axis=-1)
-            rubbing = directed.with_sides(sides)
+            scene = directed.with_sides(sides)
 
             def b(load: Array) -> Array:
-                return -free * (A @ uk.a_F(rubbing, 0.0, q, still, load))
+                return -free * (A @ uk.a_F(scene, 0.0, q, still, load))
 
             def multipliers(friction: Array) -> Array:
                 return -free * (plus.T @ (plus @ b(friction + effort * C)))
 
             load = directed.friction(sides, multipliers, 0.0, q, still) + effort * C
-            return C @ (uk.a_F(rubbing, 0.0, q, still, load) + root * (plus @ b(load)))
+            return C @ (uk.a_F(scene, 0.0, q, still, load) + root * (plus @ b(load)))
 
         one = jnp.ones(())
         value, slope = jax.jvp(lambda f: acceleration(f, 0.0), (0.0 * one,), (one,))
@@ -152,23 +154,18 @@ def _efforts(mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], r
             def along(x: Array) -> tuple[Array, Array]:
                 return jax.jvp(lambda x: sign * acceleration(sign * x, sign), (x,), (one,))
 
-            def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-                x, _, k = state
+            def step(x: Array) -> tuple[Array, Array, Array]:
                 value, growth = along(x)
                 new = jnp.where(growth > LOCKED * slope, x - value / growth, jnp.inf)  # also for NaN: it jams
-                return new, new - x, k + 1
-
-            def goes_on(state: tuple[Array, Array, Array]) -> Array:
-                x, change, k = state
-                return jnp.isfinite(x) & (jnp.abs(change) > LAST_STEP * jnp.abs(x)) & (k < MOST_STEPS)
+                return new, jnp.abs(new - x), jnp.abs(new)
 
             start = jax.lax.stop_gradient(sign * exact)
-            x, _, _ = jax.lax.while_loop(goes_on, step, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))
+            x, _ = repeated_newton(step, start)
             x = jax.lax.stop_gradient(x)
             value, growth = along(jnp.where(jnp.isfinite(x), x, start))
             return sign * jnp.where(jnp.isfinite(x), x - value / jax.lax.stop_gradient(growth), jnp.inf)
 
-        known = jnp.abs(C @ u - 1) < STILL**0.5
+        known = jnp.abs(C @ u - 1) < STOPPED
         return [jnp.where(known, x, jnp.nan) for x in (bound(-1.0), bound(1.0), exact)]
 
     reached = jnp.all(jnp.isfinite(q), axis=1)

@@ -1,4 +1,4 @@
-"""Linear maps, tangents and cotangents of trees of numbers."""
+"""Linear maps, tangents and cotangents of trees of numbers, and repeated steps of Newton's method."""
 
 from udkjax.lazy_names import lazy_names
 

@@ -168,12 +168,7 @@ def _friction(mechanism: Mechanism, here: Configuration) -> dict[str, JointFrict
     equations = prepare(mechanism, SVD())
     if not equations.rubbing_joints:
         return {}
-    scales, q = equations.scales, jnp.asarray(here.q)
-    unit = np.asarray(scales.coordinates(q.size))
-    rate = float(scales.rate) or 1.0  # without loads and velocities, there is no time
-    any_motion = jnp.asarray(np.random.default_rng(0).normal(size=q.size) * unit * rate)
-    v = equations.tangent_part(here.t, q, q, q, any_motion).dv
-    found = equations.loose_friction(here.t, q, v, jnp.asarray(here.left))
+    found = equations.loose_friction(here.t, jnp.asarray(here.q), jnp.asarray(here.left))
     slides, loads = np.asarray(found.slides), np.asarray(found.loads)
     sources = loose = np.asarray(found.loose)
     while np.any(sources := sources & slides) and np.any(new := loads[sources].any(0) & ~loose):
