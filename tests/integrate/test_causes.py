@@ -13,6 +13,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from udkjax import Result
+from udkjax.integrate.causes.system_causes import cause_of
 
 CRANK, COUPLER, ROCKER, GROUND = 1.0, 1.5, 1.2, 2.2  # not Grashof's: the crank has limits
 START = np.pi / 3
@@ -191,3 +192,18 @@ def test_a_run_does_not_follow_the_positions_nearest_to_a_dead_point(tol, end):
     assert solution.result in (Result.drift, Result.step_too_small)
     assert float(solution.time) == pytest.approx(0.12112, abs=1e-4 if tol < 1e-5 else 1e-2)
     assert "dead point: pins B, D, E in line" in solution.cause
+
+
+@pytest.mark.parametrize(
+    ("values", "cause"),
+    [
+        ({"mass": np.diag([1.0, 1e-11])}, ""),
+        ({"mass": 1e-9 * np.diag([1.0, 1e-11])}, ""),  # small in every unit, but not singular
+        ({"mass": np.diag([1.0, 1e-13])}, "the mass matrix is not positive definite: its eigenvalues are 1e-13 to 1"),
+        ({"mass": np.diag([1.0, np.nan]), "force": np.zeros(2)}, "mass of the system is not finite"),
+        ({"mass": np.diag([np.inf, 1.0]), "force": [np.nan, 0.0]}, "mass and force of the system are not finite"),
+    ],
+)
+def test_causes_of_systems(values, cause):
+    found = cause_of(values)
+    assert found.startswith(cause) and bool(found) is bool(cause)

@@ -1,11 +1,12 @@
 """The causes of failed runs of user-defined systems: a singular mass matrix, or a function that is not finite."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from udkjax.integrate.causes.find import FoundCause
 from udkjax.integrate.solution import Solution
@@ -18,7 +19,7 @@ def explained_system(solution: Solution, system: Any, end: tuple[Any, Any]) -> S
     """Return a failed solution with its cause, found at the last state of the integrator; unchanged if there is no cause."""
     t, (q, v) = np.asarray(end[0]), np.split(np.asarray(end[1]), 2)
     with jax.ensure_compile_time_eval():
-        text = _cause(_values(system, t, q, v))
+        text = cause_of(_values(system, t, q, v))
     return replace(solution, found_cause=FoundCause.of(solution, text)) if text else solution
 
 
@@ -31,7 +32,8 @@ def _values(system: Any, t: Any, q: Any, v: Any) -> dict[str, Array]:
     return values | {name: function(t, q, v) for name in names if (function := getattr(system, name)) is not None}
 
 
-def _cause(values: dict[str, Array]) -> str:
+def cause_of(values: Mapping[str, ArrayLike]) -> str:
+    """Return the cause that the values of the functions of a system at a state show; empty if they show none."""
     broken = [name for name, value in values.items() if not np.all(np.isfinite(np.asarray(value)))]
     if broken:
         return f"{' and '.join(broken)} of the system {'is' if len(broken) == 1 else 'are'} not finite"
