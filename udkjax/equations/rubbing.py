@@ -197,25 +197,29 @@ def settle(
     def remainder(x: Array, share: Array | float = 1.0) -> Array:
         return x - multipliers(share * friction(x))
 
-    def newton(start: Array, share: Array | float, begins: Array) -> tuple[Array, Array]:
-        """Return the solution with a share of friction, and whether it is not found; the start itself unless this `begins`."""
-
-        def step(x: Array) -> tuple[Array, Array, Array]:
-            new = x - jnp.linalg.solve(jax.jacfwd(remainder)(x, share), remainder(x, share))
-            before, after = root * friction(x), root * friction(new)
-            return new, jnp.linalg.norm(after - before), jnp.linalg.norm(after)
-
-        return repeated_newton(step, start, begins)
-
     def solve(_: Callable[[Array], Array], start: Array) -> Array:
-        x, fails = newton(start, 1.0, jnp.asarray(True))
+        def stage(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            """Solve with all friction in stage 0; where this fails, with growing shares of it, each from the last solution."""
+            x, fails, lost = state
+            share = jnp.where(k == 0, 1.0, k / STAGES)
 
-        def stage(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            found, is_open = newton(state[0], (k + 1) / STAGES, fails & ~state[1])
-            return found, is_open | state[1]
+            def step(x: Array) -> tuple[Array, Array, Array]:
+                def parts(x: Array) -> tuple[Array, tuple[Array, Array]]:
+                    loads = friction(x)
+                    left = x - multipliers(share * loads)
+                    return left, (left, loads)
 
-        followed, is_open = jax.lax.fori_loop(0, STAGES, stage, (start, jnp.asarray(False)))
-        return jnp.where(fails, jnp.where(is_open, jnp.nan, followed), x)
+                slope, (left, before) = jax.jacfwd(parts, has_aux=True)(x)
+                new = x - jnp.linalg.solve(slope, left)
+                after = friction(new)
+                return new, jnp.linalg.norm(root * (after - before)), jnp.linalg.norm(root * after)
+
+            found, is_open = repeated_newton(step, jnp.where(k > 1, x, start), (k == 0) | (fails & ~lost))
+            found = jnp.where((k == 0) | fails, found, x)
+            return found, jnp.where(k == 0, is_open, fails), (k > 0) & (lost | is_open)
+
+        x, fails, lost = jax.lax.fori_loop(0, STAGES + 1, stage, (start, jnp.asarray(False), jnp.asarray(False)))
+        return jnp.where(fails & lost, jnp.nan, x)
 
     def solve_for_tangent(linear: Callable[[Array], Array], y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(y), y)
