@@ -24,6 +24,7 @@ NAMES = (
     "dwell_cam",
     "planetary_gear",
     "hammer",
+    "toggle_clamp",
     "identification",
     "double_pendulum_map",
     "neural_friction",

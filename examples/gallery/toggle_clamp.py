@@ -1,0 +1,69 @@
+"""A toggle clamp that locks itself by friction, and the same clamp with grease, which springs open.
+
+A hand closes both until their knees stand half a millimetre above the line of their ends, and lets go. The workpiece pushes them
+open. As long as a line touches the circles of friction of all three pins, that is, up to a height of 2 mu r, friction holds the
+clamp, however strong the workpiece is. Joints that stick have a ring.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+import udkjax as udk
+
+ARM, OPEN, CLOSED, RADIUS = 200.0, 30.0, 0.5, 10.0  # mm: arms, heights of the knee, and radius of the pins
+CLOSING, TURN = 1.0, np.arcsin(CLOSED / ARM) - np.arcsin(OPEN / ARM)  # s, rad: of the hand
+RUBS = {"dry, mu = 0.1": 0.1, "greased, mu = 0.02": 0.02}
+MOMENT = 0.9  # fraction of the motion at which its picture is taken
+
+
+def clamp(coefficient, motors):
+    """Return the open clamp, with a workpiece of rubber between its jaw and a wall."""
+    x = np.sqrt(ARM**2 - OPEN**2)
+    bar = {"density": 7850, "width": 24, "thickness": 20}
+    return udk.Drawing(
+        pins={"A": (0, 0), "B": (x, OPEN), "C": (2 * x, 0), "W": (2 * x + 90, 0)},  # mm
+        links={
+            "lever": {"pins": ["A", "B"], **bar},
+            "rod": {"pins": ["B", "C"], **bar},
+            "jaw": {"pins": ["C"], "mass": 0.5, "width": 30},
+        },
+        slides=[{"link": "jaw", "direction": (1, 0)}],
+        ground=["A", "W"],
+        springs=[{"between": ["C", "W"], "stiffness": "100 N/mm", "damping": "4 N s/mm"}],
+        friction=[{"pin": pin, "coefficient": coefficient, "radius": RADIUS, "law": "set-valued"} for pin in "ABC"],
+        motors=motors,
+        gravity=(0, 0),
+        units={"length": "mm"},
+        name="toggle clamp",
+    ).mechanism()
+
+
+def close_and_release(coefficient):
+    """Return the clamp without a hand, its motion, and the height of its knee over time (mm)."""
+    hand = {"pin": "A", "motion": udk.Polynomial([0.0, 0.0, 3 * TURN / CLOSING**2, -2 * TURN / CLOSING**3])}
+    closing = udk.simulate(clamp(coefficient, [hand]), np.linspace(0.0, CLOSING, 51))
+    free = clamp(coefficient, [])
+    state = udk.State(closing.q[-1], np.zeros_like(closing.q[-1]))
+    after = udk.simulate(free, np.linspace(0.0, 1.0, 201), state)
+    q, v = (np.concatenate([np.asarray(x)[:-1], np.asarray(y)]) for x, y in ((closing.q, after.q), (closing.v, after.v)))
+    assert after.sticking is not None  # as its friction is set-valued
+    sticking = {joint: np.concatenate([np.zeros(50, bool), np.asarray(stuck)]) for joint, stuck in after.sticking.items()}
+    motion = SimpleNamespace(ts=np.concatenate([closing.ts[:-1], CLOSING + after.ts]), q=q, v=v, sticking=sticking)
+    return free, motion, 1e3 * udk.path(free, motion, "B")[:, 1]
+
+
+def make():
+    """Return the heights of the knees after the hand has let go, and the player."""
+    found = {label: close_and_release(coefficient) for label, coefficient in RUBS.items()}
+    mechanisms, motions, heights = ({label: one[k] for label, one in found.items()} for k in range(3))
+    facts = {f"height of the knee at the end, {label} (mm)": float(height[-1]) for label, height in heights.items()}
+    facts = {"height up to which it locks, dry (mm)": 2 * RUBS["dry, mu = 0.1"] * RADIUS, **facts}
+    measures = {"height of the knee (mm)": heights}
+    return facts, {"motion": udk.animate(mechanisms, motions, measures=measures, traces=["B"])}
+
+
+if __name__ == "__main__":
+    facts, shown = make()
+    print(facts)
+    shown["motion"].save("toggle_clamp.html")
