@@ -5,8 +5,10 @@ open. As long as a line touches the circles of friction of all three pins, that 
 clamp, however strong the workpiece is. Joints that stick have a ring.
 """
 
-from types import SimpleNamespace
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
@@ -15,6 +17,15 @@ ARM, OPEN, CLOSED, RADIUS = 200.0, 30.0, 0.5, 10.0  # mm: arms, heights of the k
 CLOSING, TURN = 1.0, np.arcsin(CLOSED / ARM) - np.arcsin(OPEN / ARM)  # s, rad: of the hand
 RUBS = {"dry, mu = 0.1": 0.1, "greased, mu = 0.02": 0.02}
 MOMENT = 0.9  # fraction of the motion at which its picture is taken
+
+
+class Motion(NamedTuple):
+    """What a player shows: a run after the motion of the hand, and which joints stick."""
+
+    ts: jax.Array
+    q: jax.Array
+    v: jax.Array
+    sticking: dict[str, np.ndarray]
 
 
 def clamp(coefficient, motors):
@@ -40,23 +51,22 @@ def clamp(coefficient, motors):
 
 
 def close_and_release(coefficient):
-    """Return the clamp without a hand, its motion, and the height of its knee over time (mm)."""
+    """Return the motion of a clamp: closed by a hand, then without it."""
     hand = {"pin": "A", "motion": udk.Polynomial([0.0, 0.0, 3 * TURN / CLOSING**2, -2 * TURN / CLOSING**3])}
     closing = udk.simulate(clamp(coefficient, [hand]), np.linspace(0.0, CLOSING, 51))
-    free = clamp(coefficient, [])
     state = udk.State(closing.q[-1], np.zeros_like(closing.q[-1]))
-    after = udk.simulate(free, np.linspace(0.0, 1.0, 201), state)
-    q, v = (np.concatenate([np.asarray(x)[:-1], np.asarray(y)]) for x, y in ((closing.q, after.q), (closing.v, after.v)))
+    after = udk.simulate(clamp(coefficient, []), np.linspace(0.0, 1.0, 201), state)
+    q, v = (jnp.concatenate([x[:-1], y]) for x, y in ((closing.q, after.q), (closing.v, after.v)))
     assert after.sticking is not None  # as its friction is set-valued
     sticking = {joint: np.concatenate([np.zeros(50, bool), np.asarray(stuck)]) for joint, stuck in after.sticking.items()}
-    motion = SimpleNamespace(ts=np.concatenate([closing.ts[:-1], CLOSING + after.ts]), q=q, v=v, sticking=sticking)
-    return free, motion, 1e3 * udk.path(free, motion, "B")[:, 1]
+    return Motion(jnp.concatenate([closing.ts[:-1], CLOSING + after.ts]), q, v, sticking)
 
 
 def make():
     """Return the heights of the knees after the hand has let go, and the player."""
-    found = {label: close_and_release(coefficient) for label, coefficient in RUBS.items()}
-    mechanisms, motions, heights = ({label: one[k] for label, one in found.items()} for k in range(3))
+    mechanisms = {label: clamp(coefficient, []) for label, coefficient in RUBS.items()}
+    motions = {label: close_and_release(coefficient) for label, coefficient in RUBS.items()}
+    heights = {label: 1e3 * np.asarray(udk.path(mechanisms[label], motion, "B"))[:, 1] for label, motion in motions.items()}
     facts = {f"height of the knee at the end, {label} (mm)": float(height[-1]) for label, height in heights.items()}
     facts = {"height up to which it locks, dry (mm)": 2 * RUBS["dry, mu = 0.1"] * RADIUS, **facts}
     measures = {"height of the knee (mm)": heights}
