@@ -12,6 +12,7 @@ import {button, make} from "./player/elements.js";
 import {Painter, THEMES, contextOf} from "./player/painter.js";
 
 const ROUNDING = 1e-10;  // relative to the scale of a quantity: values that vary less are constant
+const FIRST_CURVES = 4;  // among which one that is not constant is looked for: those of a pin
 const VIOLATION = "constraint violation";
 
 // The requests that each panel offers: subject, label of the button, tooltip.
@@ -107,15 +108,24 @@ export class CurvesPanel {
   follow() {
     if (this.isKept && this.names().includes(this.name)) return;
     this.isKept = false;
-    const first = this.names().find(name => name.startsWith(this.selectedName()));
+    const first = this.firstOf(this.names().filter(name => name.startsWith(this.selectedName())));
     if (first && !this.name.startsWith(this.selectedName())) this.chosen[this.panel] = first;
     this.select.value = this.name;
+  }
+
+  /** The first of some curves, or, if it is constant, the first of the next ones that is not. */
+  firstOf(names) {
+    const varies = ({values}) => {
+      const [low, high] = [Math.min, Math.max].map(end => values.reduce((found, x) => (Number.isFinite(x) ? end(found, x) : found), values[0]));
+      return high - low > ROUNDING * (Math.abs(low) + Math.abs(high));
+    };
+    return names.slice(0, FIRST_CURVES).find(name => varies(this.values(name))) ?? names[0];
   }
 
   /** Offer the available curves. */
   list() {
     const names = this.names(), groups = names.filter(name => name.startsWith(this.selectedName()));
-    if (!names.includes(this.name)) this.chosen[this.panel] = groups[0] ?? names[0] ?? "";
+    if (!names.includes(this.name)) this.chosen[this.panel] = this.firstOf(groups) ?? this.firstOf(names) ?? "";
     this.select.replaceChildren(...names.map(name => make("option", {value: name}, name)));
     this.select.value = this.name;
     const motors = this.studio.motion.pageEngine && names.length ? turningMotors(this.studio.motion.pageEngine.scene).map(({name}) => name) : [], {value} = this.over;
