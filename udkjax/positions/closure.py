@@ -18,6 +18,7 @@ from udkjax.pinv import SVD
 from udkjax.positions import native_closing
 from udkjax.scene.drivers import Motion
 from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.linear_map import DifferentiableFunction, Linear
 from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
 
@@ -79,8 +80,17 @@ def close_by_machine_code(
     mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
 ) -> Closed:
     """Return the results of `close_by_jax`, by machine code."""
-    guess, inputs = split_numbers((mechanism, analysis, t, q, v))
+    guess, inputs = split_numbers((_with_fixed_loads(mechanism), analysis, t, q, v))
     return _close_by_code(AssemblyFunction(guess), inputs)
+
+
+def _with_fixed_loads(mechanism: Mechanism) -> Mechanism:
+    """Return the mechanism without derivatives with respect to its loads, on which a closed state does not depend.
+
+    Derivatives with respect to these alone then need no machine code for closing.
+    """
+    loads = lambda m: [m.gravity, *m.forces.values()]  # noqa: E731
+    return eqx.tree_at(loads, mechanism, stop_gradients(loads(mechanism)))
 
 
 class AssemblyFunction(DifferentiableFunction):
@@ -158,6 +168,8 @@ def _(primals, tangents):
     function, inputs = primals
     found = _close_by_code(function, inputs)
     has_tangent = tuple(dx is not None for dx in tangents[1])
+    if not any(has_tangent):
+        return found, (None,) * len(found)
     linear = Linear(function=function, inputs=inputs, run=(), active=has_tangent)
     return found, (*linear.applied(select(tangents[1], has_tangent)), None, None, None)
 
