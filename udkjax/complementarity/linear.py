@@ -18,6 +18,7 @@ from udkjax.transforms.gradients import stop_gradients
 
 # Tolerance on y >= 0, relative to max |b|, for rows of unit size. Rounding errors are some 1e-15, more for nearly dependent rows.
 TIGHT = 1e-12
+LEMKE_STEPS = 10  # for each row; Lemke's method takes about as many steps as rows
 STEPS_PER_ROW = 6  # Lawson and Hanson observed half a step per row; the limit stops cycles caused by rounding
 
 
@@ -62,10 +63,123 @@ def solve_complementarity(
     return Complementary(x, times(W, x) + b, passive)
 
 
+def solve_general_complementarity(
+    M: Float[Any, "*m n n"], q: Float[Any, "*m n"], takes_part: Bool[Any, "*m n"], xp: ModuleType = jnp
+) -> Complementary:
+    """Solve 0 <= x, y = M x + q >= 0, x y = 0, by Lemke's method, which finds a solution for copositive M (Cottle et al. 1992).
+
+    Args:
+        M: need not be symmetric.
+        q: y for x = 0.
+        takes_part: mask of the x that may be positive; all others are zero, whatever y is.
+        xp: jax.numpy, or NumPy.
+
+    Returns:
+        x and y, with derivatives for the final passive set; NaN where the method ends without a solution.
+    """
+    pairs = takes_part[..., None, :] & takes_part[..., :, None]
+    reduced, right = xp.where(pairs, M, np.eye(q.shape[-1])), xp.where(takes_part, q, 1.0)
+    if xp is np:
+        found = [_lemke(*one, np) for one in zip(reduced.reshape(-1, *M.shape[-2:]), right.reshape(-1, q.shape[-1]), strict=True)]
+        passive, solved = (
+            np.array(x).reshape(shape) for x, shape in zip(zip(*found, strict=True), (q.shape, q.shape[:-1]), strict=True)
+        )
+    else:
+        passive, solved = jnp.vectorize(lambda M, q: _lemke(M, q, jnp), signature="(n,n),(n)->(n),()")(
+            *stop_gradients((reduced, right))
+        )
+    x = xp.where(passive, _solve_passive(reduced, right, passive, xp), 0.0)
+    x = xp.where(solved[..., None], x, xp.nan)
+    return Complementary(x, times(M, x) + q, passive)
+
+
+class _Tableau(NamedTuple):
+    """The equations y - M x - x0 = q, solved for the basic variables: y, x and x0, in this order."""
+
+    table: Any  # (n, 2 n + 2), the last column is the right-hand side
+    basic: Any  # (n,)
+    enters: Any
+    steps: Any
+    done: Any
+    fails: Any
+
+
+def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bool[Any, "n"], Bool[Any, ""]]:
+    """Return the set of positive x, and whether there is a solution."""
+    n = len(q)
+
+    def pivot(state: _Tableau, row: Any) -> _Tableau:
+        is_row = np.arange(n) == row
+        new = state.table[row] / state.table[row, state.enters]
+        table = xp.where(is_row[:, None], new, state.table - state.table[:, state.enters][:, None] * new)
+        leaves = state.basic[row]
+        return _Tableau(
+            table=table,
+            basic=xp.where(is_row, state.enters, state.basic),
+            enters=xp.where(leaves < n, leaves + n, leaves - n),
+            steps=state.steps + 1,
+            done=leaves == 2 * n,
+            fails=state.fails,
+        )
+
+    def step(state: _Tableau) -> _Tableau:
+        column = state.table[:, state.enters]
+        candidates = column > TIGHT * xp.max(xp.abs(column))
+        fails = ~xp.any(candidates)
+        divisor = xp.where(candidates, column, 1.0)
+        # The smallest ratio; of equal ones that of x0, else the first in lexicographic order, which excludes cycles.
+        for values in (state.table[:, -1], xp.where(state.basic == 2 * n, -1.0, 0.0) * divisor, *state.table[:, :n].T):
+            ratio = xp.where(candidates, values / divisor, xp.inf)
+            least = xp.min(ratio)
+            candidates = candidates & (ratio <= least + TIGHT * xp.maximum(1.0, xp.abs(least)))
+        new = pivot(state, xp.argmax(candidates))
+        return new._replace(fails=fails)
+
+    def goes_on(state: _Tableau) -> Any:
+        return ~(state.done | state.fails) & (state.steps < LEMKE_STEPS * n)
+
+    right = q / xp.maximum(xp.max(xp.abs(q)), np.finfo(float).tiny)
+    table = xp.concatenate([np.eye(n) + 0 * M, -M, xp.zeros_like(q)[:, None] - 1, right[:, None]], axis=1)
+    state = _Tableau(table, np.arange(n) + 0, xp.asarray(2 * n), xp.asarray(0), xp.all(right >= 0), xp.asarray(False))
+    if xp is np:
+        if not state.done:
+            state = pivot(state, np.argmin(right))
+        while goes_on(state):
+            state = step(state)
+    else:
+        state = state._replace(basic=jnp.asarray(state.basic))
+        first = pivot(state, xp.argmin(right))
+        state = jax.tree.map(lambda x, y: xp.where(state.done, x, y), state, first)
+        state = jax.lax.while_loop(goes_on, step, state)
+    passive = xp.any(state.basic[:, None] == n + np.arange(n), axis=0)
+    return passive, state.done
+
+
 def solve_rows(W: Float[Any, "*m E E"], b: Float[Any, "*m E"], rows: Bool[Any, "*m E"], xp: ModuleType) -> Float[Any, "*m E"]:
     """Return x with W x + b = 0 in the given independent rows, and x = 0 elsewhere."""
     size, scaled, rhs = _unit_rows(W, b, rows, xp)
     return _solve_passive(scaled, rhs, rows, xp) / size
+
+
+def eliminate(
+    W: Float[Any, "*m E E"], rows: Bool[Any, "*m E"], least: Float[Any, "*m E"], xp: ModuleType = jnp
+) -> tuple[Float[Any, "*m E E"], Bool[Any, "*m E"]]:
+    """Return the remainder of W when given rows are held, and a mask of those that are independent.
+
+    Args:
+        W: symmetric, and positive semidefinite.
+        rows: mask of the rows to hold, in this order as far as they are independent.
+        least: bound on the diagonal of the remainder, above which a row is independent of those before.
+        xp: jax.numpy, or NumPy.
+    """
+    taken, E = rows & False, W.shape[-1]
+    for i in range(E) if xp is not np else np.flatnonzero(rows.reshape(-1, E).any(axis=0)):
+        takes = rows[..., i] & (W[..., i, i] > least[..., i])
+        column = W[..., :, i]
+        part = column[..., :, None] * column[..., None, :] / xp.where(takes, W[..., i, i], 1.0)[..., None, None]
+        W = xp.where(takes[..., None, None], W - part, W)
+        taken = taken | (takes[..., None] & (np.arange(E) == i))
+    return W, taken
 
 
 def _unit_rows(W: Any, b: Any, rows: Any, xp: ModuleType) -> tuple[Any, Any, Any]:

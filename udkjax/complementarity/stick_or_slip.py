@@ -16,16 +16,25 @@ Where the joints of a mechanism at rest lock each other, their forces are not un
 locked; they keep the others at rest, whose forces stay as they were. If a locked joint reaches its limit, another one is locked
 instead. The mechanism moves once no joint is left that could be locked.
 
+A contact with friction is such a joint, too, while it is closed. Its normal force N >= 0 is its load, and depends on the friction
+of all. Contacts at rest then take part in the pivots, with their second rates g'':
+
+    N >= 0,        g'' >= 0,        one of them zero:
+
+one that would pull opens, and one that would be penetrated is held. Where no set obeys both laws, it is Painleve's paradox.
+
 Arrays are JAX's, for one member, or NumPy's, for several (*m).
 """
 
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+
+from udkjax.complementarity.linear import eliminate
 
 # Iterations for the limits, sweeps of a projected Gauss-Seidel method in each, and the change of the forces, as shares of their
 # limits, at which iterations end. They decide with which modes pivots begin, and so only the number of pivots.
@@ -35,6 +44,7 @@ BLOCK_STEPS, SINGLE_STEPS = 2, 8
 
 
 SIDES = 2  # numbers that represent the mode of a joint
+NO_CONTACTS = np.zeros(0)
 
 
 class RestTolerances(NamedTuple):
@@ -58,7 +68,48 @@ class RestTolerances(NamedTuple):
 AT_REST = RestTolerances()
 
 
-Response: TypeAlias = tuple[Any, Any, Any]  # accelerations along the joints; limit minus force, in both directions (*m, F)
+class Response(NamedTuple):
+    """The motion of the joints in given modes, and their forces."""
+
+    accelerations: Float[Any, "*m F"]  # along the joints
+    forwards: Float[Any, "*m F"]  # limits less the forces in the positive direction
+    backwards: Float[Any, "*m F"]  # limits plus these forces
+    normal: Any = NO_CONTACTS  # forces of the contacts (*m, E)
+    rates: Any = NO_CONTACTS  # second rates of the contacts (*m, E)
+
+
+class ContactsAtRest(NamedTuple):
+    """The contacts at one instant, E, which may be those of joints."""
+
+    of_joints: Int[np.ndarray, "F"]  # the contact of each joint; -1: it is no contact
+    held: Bool[Any, "*m E"]  # at first
+    may_change: Bool[Any, "*m E"]  # contacts that do not separate, which may be held or not
+    unit: Any  # size of second rates that are not zero (*m, E)
+    most: int  # the largest number of contacts that may change
+
+    @classmethod
+    def none(cls, count: int) -> "ContactsAtRest":
+        """Return no contacts, beside `count` joints."""
+        nothing = NO_CONTACTS.astype(bool)
+        return cls(np.full(count, -1), nothing, nothing, NO_CONTACTS, 0)
+
+    def active(self, held: Bool[Any, "*m E"]) -> Bool[Any, "*m F"]:
+        """Return a mask of the joints that may rub while some contacts are held."""
+        if (self.of_joints < 0).all():
+            return np.ones(len(self.of_joints), bool)
+        return (self.of_joints < 0) | held[..., np.maximum(self.of_joints, 0)]
+
+    def wrong(self, held: Bool[Any, "*m E"], found: Response, xp: ModuleType) -> Bool[Any, "*m E"]:
+        """Return a mask of the contacts that are held and pull, or are not held and would be penetrated."""
+
+        def negative(x: Any, mask: Any, floor: Any) -> Any:
+            size = xp.max(xp.where(mask, xp.abs(x), 0.0), axis=-1, keepdims=True)
+            return mask & ~(x >= -xp.maximum(floor, AT_REST.still * size))
+
+        if not self.most:
+            return self.may_change
+        pull = negative(found.normal, self.may_change & held, 0.0)
+        return pull | negative(found.rates, self.may_change & ~held, self.unit)
 
 
 class FrictionModes(NamedTuple):
@@ -68,6 +119,7 @@ class FrictionModes(NamedTuple):
     direction: Float[Any, "*m F"]  # of sliding, or of the limit that is reached; 0: within the limit
     at_rest: Bool[Any, "*m F"]  # joints that others keep at rest
     driven: Bool[Any, "*m F"]  # joints at rest without a motion of their own, which wait for drivers
+    held: Bool[Any, "*m E"] = NO_CONTACTS.astype(bool)  # contacts at rest
 
     def sides(self, xp: ModuleType) -> Float[Any, "*m F 2"]:
         """Return the modes as numbers: the direction, and one for a joint at rest, two for one that waits for drivers."""
@@ -75,12 +127,22 @@ class FrictionModes(NamedTuple):
         return xp.stack([direction, xp.where(self.locked, 0.0, 1.0 * self.at_rest + self.driven)], axis=-1)
 
 
+class Decision(NamedTuple):
+    """The modes that joints have."""
+
+    modes: FrictionModes
+    failed: Bool[Any, "*m"]  # whether no modes were found that obey the law
+    by_contacts: Bool[Any, "*m"]  # whether contacts violated their law in the last ones
+
+
 class _Pivot(NamedTuple):
+    held: Any  # contacts
     within: Any  # whether the force of a joint at rest is within its limit
     departs: Any  # whether others move a joint that is at rest only at this instant
     direction: Any
     steps: Any
     done: Any
+    by_contacts: Any  # whether a contact is held wrongly, or not
 
 
 class JointsAtRest(NamedTuple):
@@ -92,15 +154,26 @@ class JointsAtRest(NamedTuple):
     size: Float[Any, "*m F"]  # roots of the accelerations at unit forces: the units of W
     locked: Bool[Any, "*m F"]  # before
     unit: Float[Any, "*m F"]  # size of accelerations that are not zero
+    contacts: ContactsAtRest
 
     @classmethod
-    def of(cls, rest: Any, sliding: Any, W: Any, mobility: Any, locked: Any, unit: Any, xp: ModuleType) -> "JointsAtRest":
+    def of(
+        cls,
+        rest: Any,
+        sliding: Any,
+        W: Any,
+        mobility: Any,
+        locked: Any,
+        unit: Any,
+        xp: ModuleType,
+        contacts: ContactsAtRest | None = None,
+    ) -> "JointsAtRest":
         """Return the joints, from W and from the accelerations (*m, F) at unit forces without constraints."""
         diagonal = xp.diagonal(W, axis1=-2, axis2=-1)
         moves = diagonal > AT_REST.blocked * mobility
         size = xp.sqrt(xp.where(moves, diagonal, 1.0))
         W = xp.where(moves[..., None, :] & moves[..., :, None], W / size[..., None, :] / size[..., :, None], 0.0)
-        return cls(rest, sliding, W, size, locked, unit)
+        return cls(rest, sliding, W, size, locked, unit, ContactsAtRest.none(rest.shape[-1]) if contacts is None else contacts)
 
     def decide(
         self,
@@ -109,8 +182,8 @@ class JointsAtRest(NamedTuple):
         departs: Bool[Any, "*m F"],
         is_given: Bool[Any, "*m F"],
         xp: ModuleType,
-    ) -> tuple[FrictionModes, Bool[Any, "*m"]]:
-        """Return modes that obey the law, and a mask of the members for which none are found.
+    ) -> Decision:
+        """Return modes that obey the law.
 
         Args:
             respond: evaluates the equations of motion in given modes.
@@ -119,33 +192,40 @@ class JointsAtRest(NamedTuple):
             is_given: whether the first direction is known to be right.
             xp: jax.numpy, or NumPy.
         """
-        F = self.rest.shape[-1]
+        F, contacts = self.rest.shape[-1], self.contacts
+        E, count = contacts.held.shape[-1], F + contacts.most
         if F > 1 and (xp is not np or (self.rest.sum(axis=-1) > 1).any()):
             direction = xp.where(is_given, direction, self._guess(respond, direction, xp))
-        start = _Pivot(self.rest & (direction == 0), departs, direction, xp.asarray(0), ~xp.any(self.rest, axis=-1))
-        most = (BLOCK_STEPS + SINGLE_STEPS) * F + 8
+        done = ~(xp.any(self.rest, axis=-1) | xp.any(contacts.may_change, axis=-1))
+        start = _Pivot(contacts.held, self.rest & (direction == 0), departs, direction, xp.asarray(0), done, done & False)
+        most = (BLOCK_STEPS + SINGLE_STEPS) * count + 8
 
         def step(pivot: _Pivot) -> _Pivot:
             modes = self._modes(pivot, xp)
-            a, *reserves = respond(modes)
+            found, active = respond(modes), contacts.active(modes.held)
+            a, reserves = found.accelerations, (found.forwards, found.backwards)
             floor = AT_REST.still * xp.maximum(xp.abs(reserves[0]), xp.abs(reserves[1]))
             beyond = [modes.locked & (x < -floor) for x in reserves]
             least = AT_REST.still * xp.maximum(xp.max(xp.abs(a), axis=-1, keepdims=True), self.unit)
             departs = modes.at_rest & (xp.abs(a) > least)
-            returns = self.rest & ~pivot.within & ~modes.at_rest & (modes.direction * a < -least)
-            violates = beyond[0] | beyond[1] | departs | returns
+            returns = self.rest & active & ~pivot.within & ~modes.at_rest & (modes.direction * a < -least)
+            of_contacts, of_joints = contacts.wrong(modes.held, found, xp), beyond[0] | beyond[1] | departs | returns
+            violates = xp.concatenate([of_contacts, of_joints & active], axis=-1)
             first = xp.cumsum(violates, axis=-1) == 1
-            violates_now = xp.where(pivot.steps < BLOCK_STEPS * F, violates, violates & first)
+            violates_now = xp.where(pivot.steps < BLOCK_STEPS * count, violates, violates & first)
             is_known = xp.all(xp.isfinite(a), axis=-1)
             done = pivot.done | (is_known & ~xp.any(violates, axis=-1))
             changes = violates_now & ~done[..., None]
+            flips, changes = changes[..., :E], changes[..., E:]
             new = xp.where(departs, xp.sign(a), xp.where(beyond[0], 1.0, xp.where(beyond[1], -1.0, 0.0)))
             return _Pivot(
+                held=pivot.held ^ flips,
                 within=xp.where(changes, returns, pivot.within),
                 departs=xp.where(changes, departs, pivot.departs),
                 direction=xp.where(changes, new, pivot.direction),
                 steps=pivot.steps + 1,
                 done=done,
+                by_contacts=xp.any(of_contacts, axis=-1),
             )
 
         def goes_on(pivot: _Pivot) -> Any:
@@ -157,23 +237,26 @@ class JointsAtRest(NamedTuple):
                 pivot = step(pivot)
         else:
             pivot = jax.lax.while_loop(goes_on, step, start)
-        return self._modes(pivot, xp), ~pivot.done
+        return Decision(self._modes(pivot, xp), ~pivot.done, pivot.by_contacts)
 
     def _guess(
         self, respond: Callable[[FrictionModes], Response], direction: Float[Any, "*m F"], xp: ModuleType
     ) -> Float[Any, "*m F"]:
         """Return the direction of each joint at rest at its limit, 0 within it, for approximate limits."""
         F, none, mobile = self.rest.shape[-1], self.rest & False, xp.diagonal(self.W, axis1=-2, axis2=-1) > 0
+        held, active = self.contacts.held, self.contacts.active(self.contacts.held)
+        rest = self.rest & active
 
         def improve(share: Any) -> Any:
             """Return the next iterate of the forces, as shares of the limits."""
-            a, limit, _ = respond(FrictionModes(none, xp.where(self.rest, share, self.sliding), self.rest, none))
-            a, limit = a / self.size, self.size * limit
+            direction = xp.where(self.rest, share, self.sliding) * active
+            found = respond(FrictionModes(none, direction, rest, none, held))
+            a, limit = found.accelerations / self.size, self.size * found.forwards
             force = share * limit
             for _ in range(SWEEPS):
                 for i in range(F):
                     new = xp.clip(force[..., i] + a[..., i], -limit[..., i], limit[..., i])
-                    change = xp.where(self.rest[..., i] & mobile[..., i], new - force[..., i], 0.0)
+                    change = xp.where(rest[..., i] & mobile[..., i], new - force[..., i], 0.0)
                     force = force + xp.where(np.arange(F) == i, change[..., None], 0.0)
                     a = a - self.W[..., :, i] * change[..., None]
             new = force / xp.where(limit > 0, limit, 1.0)
@@ -191,19 +274,14 @@ class JointsAtRest(NamedTuple):
 
     def _modes(self, pivot: _Pivot, xp: ModuleType) -> FrictionModes:
         """Return the modes for given joints within their limits; of these, joints with independent rows are locked."""
-        locked, remainder = xp.zeros_like(self.rest), self.W
-        F = self.W.shape[-1]
-        wanted = self.rest & pivot.within
+        active, remainder, locked = self.contacts.active(pivot.held), self.W, self.rest & False
+        rest = self.rest & active
+        wanted, least = rest & pivot.within, xp.full(self.W.shape[:-1], AT_REST.carried)
         for preferred in (wanted & self.locked, wanted & ~self.locked):
-            for i in range(F):
-                size = remainder[..., i, i]
-                takes = preferred[..., i] & (size > AT_REST.carried)
-                column = remainder[..., :, i]
-                part = column[..., :, None] * column[..., None, :] / xp.where(takes, size, 1.0)[..., None, None]
-                remainder = xp.where(takes[..., None, None], remainder - part, remainder)
-                locked = locked | (takes[..., None] & (np.arange(F) == i))
+            remainder, taken = eliminate(remainder, preferred, least, xp)
+            locked = locked | taken
         moves = xp.diagonal(remainder, axis1=-2, axis2=-1) > AT_REST.carried
-        at_rest = self.rest & ~locked & ~moves & ~pivot.departs
+        at_rest = rest & ~locked & ~moves & ~pivot.departs
         driven = at_rest & (xp.diagonal(self.W, axis1=-2, axis2=-1) == 0)
-        direction = xp.where(self.rest, xp.where(pivot.within, 0.0, pivot.direction), self.sliding)
-        return FrictionModes(locked, direction, at_rest, driven)
+        direction = xp.where(self.rest, xp.where(pivot.within, 0.0, pivot.direction), self.sliding) * active
+        return FrictionModes(locked, direction, at_rest, driven, pivot.held)

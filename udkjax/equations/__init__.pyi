@@ -15,7 +15,7 @@ from udkjax.equations.dense_rows import KinematicRows as KinematicRows
 from udkjax.equations.dense_rows import TruncatedPseudoinverse as TruncatedPseudoinverse
 from udkjax.equations.determinacy import Uniqueness as Uniqueness
 from udkjax.equations.differentiable_programs import DifferentiableProgram as DifferentiableProgram
-from udkjax.equations.directed_friction import with_directed_friction as with_directed_friction
+from udkjax.equations.directed_friction import DirectedFriction as DirectedFriction
 from udkjax.equations.effort_arrays import efforts_by_numpy as efforts_by_numpy
 from udkjax.equations.element_programs import has_rheonomic_joints as has_rheonomic_joints
 from udkjax.equations.elements import has_pieces as has_pieces

@@ -45,6 +45,27 @@ class DirectedFriction(Friction):
         total = self.sides[0] * jnp.where(self.sides[1] > 0.5, static, self.coefficient)
         return total if self.viscous is None else total + self.viscous * speed
 
+    @staticmethod
+    def put_in(mechanism: Mechanism, every: bool = False) -> "DirectedMechanism":
+        """Return a mechanism with directed friction in place of set-valued friction.
+
+        Args:
+            mechanism: The scene.
+            every: Whether smooth friction becomes directed, too.
+
+        Returns:
+            The mechanism, and the joints whose friction is set-valued, in the order of the forces.
+        """
+        mechanism = mechanism.without_origin
+        forces, joints = list(mechanism._forces), []
+        for k, force in enumerate(forces):
+            if isinstance(force, Friction) and (force.sticks or every):
+                forces[k] = make_module(DirectedFriction, **vars(force), sides=jnp.zeros(SIDES))
+                joints.append((force.joint, k))
+        return DirectedMechanism(
+            eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces)) if joints else mechanism, tuple(joints)
+        )
+
 
 class DirectedMechanism(NamedTuple):
     """A mechanism whose set-valued friction is directed, and its joints with such friction, F."""
@@ -76,22 +97,3 @@ class DirectedMechanism(NamedTuple):
         """Return the units of displacements of the joints: one radian, or a length."""
         turns = np.array([isinstance(self.mechanism.joints[name], Revolute) for name, _ in self.joints], bool)
         return jnp.where(turns, 1.0, length)
-
-
-def with_directed_friction(mechanism: Mechanism, every: bool = False) -> DirectedMechanism:
-    """Return a mechanism with directed friction in place of set-valued friction.
-
-    Args:
-        mechanism: The scene.
-        every: Whether smooth friction becomes directed, too.
-
-    Returns:
-        The mechanism, and the joints whose friction is set-valued, in the order of the forces.
-    """
-    mechanism = mechanism.without_origin
-    forces, joints = list(mechanism._forces), []
-    for k, force in enumerate(forces):
-        if isinstance(force, Friction) and (force.sticks or every):
-            forces[k] = make_module(DirectedFriction, **vars(force), sides=jnp.zeros(SIDES))
-            joints.append((force.joint, k))
-    return DirectedMechanism(eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces)) if joints else mechanism, tuple(joints))

@@ -22,7 +22,7 @@ from udkjax.complementarity.stick_or_slip import AT_REST, FrictionModes, JointsA
 from udkjax.equations import constraints, loads, rubbing
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.compliance import sharing
-from udkjax.equations.directed_friction import DirectedMechanism, with_directed_friction
+from udkjax.equations.directed_friction import DirectedFriction, DirectedMechanism
 from udkjax.equations.scales import Scales
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import Pseudoinverse
@@ -62,7 +62,7 @@ class StickingState(eqx.Module):
     def loads(self, t: Time, q: Vector, v: Vector) -> StickingLoads:
         """Return the multipliers and the friction at a state; NaN where friction admits no motion."""
         modes, failed = self.modes(t, q, v)
-        found, _ = self._respond(with_directed_friction(self.mechanism), modes, t, q, v)
+        found, _ = self._respond(DirectedFriction.put_in(self.mechanism), modes, t, q, v)
         return jax.tree.map(lambda x: jnp.where(failed, jnp.nan, x), found)
 
     def modes(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
@@ -70,7 +70,7 @@ class StickingState(eqx.Module):
         return stop_gradients(self)._decide(*stop_gradients((t, q, v)))
 
     def _decide(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
-        directed = with_directed_friction(self.mechanism)
+        directed = DirectedFriction.put_in(self.mechanism)
         unit, (speed, A, _) = directed.units(self.scales.length), self._rows(directed, q, v)
         sticking = jnp.zeros(len(unit), bool) if self.sticking is None else self.sticking
         rest = sticking | (jnp.abs(speed) <= AT_REST.closed * unit * self.scales.rate)
@@ -82,7 +82,7 @@ class StickingState(eqx.Module):
         joints = JointsAtRest.of(rest, jnp.sign(speed), u @ u.T, mobility, sticking, accelerations, jnp)
         none = jnp.zeros_like(rest)
         respond = lambda modes: self._respond(directed, modes, t, q, v)[1]  # noqa: E731
-        found, failed = joints.decide(respond, jnp.zeros(len(unit)), none, none, jnp)
+        found, failed, _ = joints.decide(respond, jnp.zeros(len(unit)), none, none, jnp)
         if self.sticking is None:
             return found, failed
         known = FrictionModes(sticking, jnp.where(rest, 0.0, joints.sliding), none, none)
@@ -112,7 +112,7 @@ class StickingState(eqx.Module):
         a = uk.a_F(mechanism, t, q, v, friction) + root * (plus @ b(friction))
         total = loads.force(mechanism, t, q, v) + friction - A.T @ found[rows:]
         limits, of_locks = self._limits(directed, found), found[rows:]
-        response = A @ a + rate, limits - of_locks, limits + of_locks
+        response = Response(A @ a + rate, limits - of_locks, limits + of_locks)
         by_name = rubbing.loads_of_friction(mechanism, t, q, v, found)
         for (_, k), row, multiplier in zip(directed.joints, A, of_locks, strict=True):
             by_name[mechanism.force_names[k]] = by_name[mechanism.force_names[k]] - row * multiplier
@@ -139,7 +139,7 @@ class StickingState(eqx.Module):
 
 def sticking_joints(mechanism: Mechanism) -> tuple[str, ...]:
     """Return the joints with set-valued friction, in the order of the forces."""
-    return tuple(name for name, _ in with_directed_friction(mechanism).joints)
+    return tuple(name for name, _ in DirectedFriction.put_in(mechanism).joints)
 
 
 def known_sticking(mechanism: Any, solution: Any) -> Bool[Array, "T F"] | None:
@@ -156,4 +156,6 @@ def known_sticking(mechanism: Any, solution: Any) -> Bool[Array, "T F"] | None:
     if not sticking or not isinstance(mechanism, Mechanism):
         return None
     names = sticking_joints(mechanism)
-    return jnp.stack([jnp.asarray(sticking[name]) for name in names], axis=-1) if set(names) <= set(sticking) else None
+    if not names or not set(names) <= set(sticking):  # only contacts stick, or it is a run of another mechanism
+        return None
+    return jnp.stack([jnp.asarray(sticking[name]) for name in names], axis=-1)

@@ -44,6 +44,7 @@ class Result(PrintsWords):
     singular = 14
     spurious_rank = 15
     missing_rank = 16
+    painleve_paradox = 17
 
     @property
     def is_success(self) -> bool:
@@ -85,6 +86,9 @@ CAUSES = {
     "raise it or use `Auto()`",
     Result.missing_rank: "rows that are independent counted as dependent near a singular configuration, and the motion violates "
     "them: the method's `rank_tol` is too large; lower it or use `Auto()`",
+    Result.painleve_paradox: "friction leaves a contact no force (Painleve's paradox): the harder it presses, the more its "
+    "friction turns it into its line, and without a force it would be penetrated; rigid bodies with Coulomb's friction have no "
+    "accelerations here: make the coefficient smaller, or the contact compliant (a spring)",
     Result.undefined_condition: "the condition of an event is not a number: look at what it divides by, or takes the root of",
 }
 

@@ -23,7 +23,7 @@ from udkjax.annotations import NumberLike
 from udkjax.equations import constraints
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.directed_friction import with_directed_friction
+from udkjax.equations.directed_friction import DirectedFriction
 from udkjax.pinv import SVD
 from udkjax.positions.assembly import State
 from udkjax.positions.coordinates import Coordinate
@@ -117,7 +117,7 @@ def holding_efforts(
 
 @deferred
 def _efforts(mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], row: int) -> list[Array]:
-    directed, scales = with_directed_friction(mechanism, every=True), analysis.scales
+    directed, scales = DirectedFriction.put_in(mechanism, every=True), analysis.scales
     method, root = SVD(scales.rank_tol), uk.inverse_sqrt_mass(mechanism)
     free = scales.weights.at[row].set(0.0)  # the coordinate moves
     count = len(directed.joints)

@@ -12,7 +12,7 @@ from udkjax.arrays import is_traced
 from udkjax.complementarity.stick_or_slip import AT_REST
 from udkjax.equations import constraints, loads
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.directed_friction import with_directed_friction
+from udkjax.equations.directed_friction import DirectedFriction
 from udkjax.equations.effort_arrays import efforts_by_numpy
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD
@@ -66,7 +66,7 @@ def _by_jax(
     scales = analysis.scales
     units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
     coordinates = [value_of(mechanism, element) for element in values]
-    directed = with_directed_friction(mechanism)
+    directed = DirectedFriction.put_in(mechanism)
     fastest = jax.lax.stop_gradient(scales.size(jnp.where(jnp.isfinite(v), v, 0.0)))
 
     def at(t: Array, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:

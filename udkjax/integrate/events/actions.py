@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.arrays import number, optional_number
-from udkjax.integrate.events.checks import number_if_any, require_joint, require_name_text, require_restitution
+from udkjax.integrate.events.checks import number_if_any, require_friction, require_joint, require_name_text, require_restitution
 from udkjax.integrate.events.conditions import JointCoordinate, joint_coordinate, require_name
 from udkjax.printing import PrintsLine
 from udkjax.requirements import describe
@@ -41,6 +41,11 @@ class Action(PrintsLine):
     def rebound(self) -> Any:
         """The ratio of the rebound speed to the approach speed."""
         return 0.0
+
+    @property
+    def friction(self) -> Any:
+        """The coefficient of friction of an impact; None: it has no friction."""
+        return None
 
     @property
     def rest(self) -> Literal["", "hold", "stop"]:
@@ -134,6 +139,30 @@ class Impact(Action):
 
     def has_usable_numbers(self):
         return (self.restitution >= 0) & (self.restitution <= 1)
+
+
+class RubbingImpact(Impact):
+    """An impact of a contact with friction: see `Contact`.
+
+    The impulse along the line is within the cone of friction, and the law of restitution is Poisson's (`rubbing_impacts`).
+    """
+
+    coefficient: Float[Array, ""] = eqx.field(converter=number_if_any, default=0.0)
+    static_coefficient: Float[Array, ""] | None = eqx.field(converter=number_if_any, default=None)
+
+    on_page = False
+
+    @property
+    def friction(self):
+        return self.coefficient
+
+    def check(self, mechanism, where):
+        super().check(mechanism, where)
+        require_friction(where, self.coefficient, self.static_coefficient, self.at_rest)
+
+    def has_usable_numbers(self):
+        given = [x for x in (self.coefficient, self.static_coefficient) if x is not None]
+        return super().has_usable_numbers() & jnp.all(jnp.stack([(x >= 0) & jnp.isfinite(x) for x in given]))
 
 
 class Release(Action):

@@ -49,6 +49,18 @@ def require_restitution(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be from 0 to 1, not {float(value):g}")
 
 
+def require_friction(where: str, coefficient: Any, static_coefficient: Any, at_rest: str) -> None:
+    """Raise unless the coefficients of friction of a contact are numbers that are not negative, and it rests."""
+    for name, value in (("coefficient", coefficient), ("static_coefficient", static_coefficient)):
+        if value is None:
+            continue
+        require_number(f"{where}: {name}", value)
+        if not isinstance(value, Tracer) and float(value) < 0:
+            raise ValueError(f"{where}: {name} must not be negative, not {float(value):g}")
+    if at_rest != "hold":
+        raise ValueError(f'{where}: a contact with a coefficient of friction rests: at_rest="hold"')
+
+
 def require_limits(where: str, lower: Any, upper: Any) -> None:
     """Raise if the limits of a joint's travel are not finite, missing or in the wrong order."""
     for name, limit in (("lower", lower), ("upper", upper)):

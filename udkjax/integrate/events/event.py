@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.annotations import NumberLike
 from udkjax.arrays import is_traced, number
-from udkjax.integrate.events.actions import Action, Impact, Stop
+from udkjax.integrate.events.actions import Action, Impact, RubbingImpact, Stop
 from udkjax.integrate.events.checks import (
     number_if_any,
     require_limits,
@@ -110,10 +110,15 @@ class JointLimit(PrintsLine):
 
 
 class Contact(PrintsLine):
-    """A point of a body hits a line fixed to the ground or to another body, and cannot pass it: an `Impact` without friction.
+    """A point of a body hits a line fixed to the ground or to another body, and cannot pass it: an `Impact`.
 
     The line goes through the point `through` of the body `on`; the `normal`, of any length, points to the allowed side. Both
     are in that body's own frame (m).
+
+    With a `coefficient` the contact has Coulomb's friction along the line. While the point rests on the line with the normal
+    force N, it slides with the force `coefficient` N, or it sticks, as a constraint, with at most `static_coefficient` N.
+    In an impact the impulse along the line is at most `coefficient` times the normal one, and the restitution is Poisson's
+    instead of Newton's: the ratio of the normal impulses after and before the largest compression. Energy never grows.
 
     Args:
         body: the name of the body that hits.
@@ -124,6 +129,8 @@ class Contact(PrintsLine):
         on: the body with the line, or "ground".
         at_rest: "hold": rest in contact; "stop": end the run.
         name: name in lists.
+        coefficient: coefficient of friction while sliding, not negative; by default there is no friction.
+        static_coefficient: coefficient of friction while sticking, not negative; by default `coefficient`.
     """
 
     body: str = eqx.field(static=True)
@@ -134,6 +141,8 @@ class Contact(PrintsLine):
     on: str = eqx.field(static=True, default=GROUND)
     at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
     name: str = eqx.field(static=True, default="")
+    coefficient: Float[Array, ""] | None = eqx.field(converter=number_if_any, default=None)
+    static_coefficient: Float[Array, ""] | None = eqx.field(converter=number_if_any, default=None)
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """Return the event, as a list."""
@@ -149,7 +158,12 @@ class Contact(PrintsLine):
         require_vector(f"{where}: through", self.through)
         require_normal(f"{where}: normal", self.normal)
         gap = Gap((self.body, self.on), self.point, self.through, self.normal)
-        return [Event(gap, Impact(self.restitution, self.at_rest), -1, name)]
+        if self.coefficient is None and self.static_coefficient is not None:
+            raise ValueError(f"{where}: the static_coefficient belongs to a coefficient, which is missing")
+        if self.coefficient is None:
+            return [Event(gap, Impact(self.restitution, self.at_rest), -1, name)]
+        numbers = self.restitution, self.at_rest, self.coefficient, self.static_coefficient
+        return [Event(gap, RubbingImpact(*numbers), -1, name)]
 
 
 class Events(PrintsTable):

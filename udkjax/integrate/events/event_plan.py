@@ -154,6 +154,30 @@ class EventPlan:
         return np.array([x.first for x in self.sticking], int)
 
     @cached_property
+    def contacts_that_rub(self) -> Int[np.ndarray, "F"]:
+        """The event of the contact of each joint that may stick; -1: it is no contact."""
+        return np.array([x.contact for x in self.sticking], int)
+
+    @cached_property
+    def tangents(self) -> Int[np.ndarray, "E"]:
+        """The event of sliding in the positive direction of each contact with friction; -1 for all other events."""
+        found = np.full(self.count, -1)
+        for x in self.sticking:
+            if x.contact >= 0:
+                found[x.contact] = x.event
+        return found
+
+    @property
+    def has_rubbing_contacts(self) -> bool:
+        """True if there is a contact with friction."""
+        return bool(np.any(self.contacts_that_rub >= 0))
+
+    @property
+    def has_sticking_joints(self) -> bool:
+        """True if a joint of the scene may stick."""
+        return bool(np.any(self.contacts_that_rub < 0))
+
+    @cached_property
     def locks(self) -> Int[np.ndarray, "F"]:
         """The switch of each joint by which it sticks."""
         return np.array(self.switches.contacts, int)[self.forwards]
@@ -201,7 +225,8 @@ class EventPlan:
 
     def without_contacts(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m C"]:
         """Return the phase that follows when all contacts at rest open."""
-        return phase & ~(self._switches_of_contacts & ~self._switches_of_locks)
+        of_joints = np.isin(np.arange(len(self.first)), self.locks[self.contacts_that_rub < 0])
+        return phase & ~(self._switches_of_contacts & ~of_joints)
 
     def with_contacts(self, phase: Bool[Any, "*m C"], held: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m C"]:
         """Return the phase that follows when contacts come to rest, or joints stick."""

@@ -109,11 +109,11 @@ class HostRun:
         joints = [np.full((B, len(joint.program.outputs)), np.nan) for joint in plan.added]
         joints.append(np.full((B, plan.events.side_count), FREE))
         shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED])
-        ts, q, v, code, units, _, restitution, inverse_mass, of_joints = shared
+        ts, q, v, code, units, _, of_impacts, inverse_mass, of_joints = shared
         for phase in plan.phases:
             phases.append(PhaseCode(phase, plan.events.switches, further[: phase.count], numbers, inverse_mass, B, joints))
             further = further[phase.count :]
-        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), restitution, inverse_mass, of_joints, numbers)
+        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), of_impacts, inverse_mass, of_joints, numbers)
         state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.tile(plan.events.first, (B, 1)), joints)
         joints[-1][:] = system.first_sides(state)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))
@@ -196,7 +196,9 @@ def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
     )
     model = phases.mechanisms[SCENE]
     inverse_mass = inverse_mass_of(model, coordinate_count(model), xp)
-    return [x[None] for x in (of_conditions, _stack([e.action.rebound for e in events], xp), inverse_mass, of_joints)]
+    friction = [0.0 if e.action.friction is None else e.action.friction for e in events]
+    of_impacts = xp.stack([_stack([e.action.rebound for e in events], xp), _stack(friction, xp)])
+    return [x[None] for x in (of_conditions, of_impacts, inverse_mass, of_joints)]
 
 
 _concrete_numbers = cached_by_identity(_numbers)

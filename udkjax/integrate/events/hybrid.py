@@ -213,7 +213,7 @@ class Hybrid(eqx.Module):
         switches, ones = self.plan.switches, jnp.ones(self.count)
 
         def of_mechanism(which: int, at: RunState) -> Array:
-            if max(switches.rows, default=-1) < 0 or (which == SCENE and not self.plan.sticking):
+            if max(switches.rows, default=-1) < 0 or (which == SCENE and not self.plan.has_sticking_joints):
                 return ones
             multipliers = self.textbook(which, at).multipliers(*at[:3])
             forces = forces_of(self.events, switches.rows, switches.joint_rows, multipliers)

@@ -21,6 +21,20 @@ part are closed and do not separate, g_dot- <= 0; others that the impact penetra
 energy never grows, even with different restitutions. (It could grow if a separating contact were pushed back.) The law treats
 all contacts of one instant as one impact: the first of three equal balls in a row, e = 1, bounces off the other two.
 
+If one of the contacts has friction, the rows of its sliding along its line, s_dot, are among the n, with impulses
+
+    |Lambda_s| <= mu Lambda_i,        s_dot+ = 0 within this limit, else opposite to Lambda_s,
+
+and the law is Poisson's (Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 8): a phase of
+compression without restitution, with the impulses L, and one of expansion with P, whose normal parts have P_i >= s e_i L_i and
+g_dot+ >= 0, one of them an equality. Each is a linear complementarity problem (Stewart and Trinkle 1996). In the metric W, and
+with e L the impulses L, normal and along the line, each times the e of its contact,
+
+    T+ - T- <= <P, s e L> - |P|^2 / 2 - |L|^2 / 2 <= (|s e L|^2 - |L|^2) / 2 <= 0,        s = min(1, |L| / |e L|).
+
+s is one unless contacts with different e act on each other strongly; without s energy could grow. If the sliding keeps its
+direction in each phase, the result is Routh's.
+
 Contacts whose g_dot stays zero are in complementarity in accelerations: 0 <= lambda, g_ddot = g_ddot(lambda = 0) + W lambda >= 0,
 one of them zero. Those with lambda > 0 are held, as constraints.
 
@@ -36,7 +50,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.complementarity.linear import diagonal, solve_complementarity, solve_rows, times
+from udkjax.complementarity.linear import (
+    diagonal,
+    eliminate,
+    solve_complementarity,
+    solve_general_complementarity,
+    solve_rows,
+    times,
+)
 from udkjax.complementarity.stick_or_slip import AT_REST
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.textbook import TextbookEquations
@@ -63,7 +84,9 @@ class Contacts(NamedTuple):
     impacts: Bool[np.ndarray, "E"]  # events that are contacts
     hold: Bool[np.ndarray, "E"]  # contacts that are held at rest
     stop: Bool[np.ndarray, "E"]  # contacts that end the run at rest
+    tangents: Int[np.ndarray, "E"]  # the row of the speed along the line of each contact with friction; -1: it has none
     restitution: Float[Any, "*m E"]
+    friction: Float[Any, "*m E"]  # coefficients
     rate: Float[Any, "*m"]  # characteristic rate of the system and the run (1/s)
 
 
@@ -90,6 +113,7 @@ class ContactChanges(NamedTuple):
     closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
     hits: Bool[Any, "*m E"]
     held: Bool[Any, "*m E"]  # after the event
+    rests: Bool[Any, "*m E"]  # contacts that do not separate after the event, held or not
     ends: Bool[Any, "*m E"]  # contacts whose rest ends the run
     carried: Bool[Any, "*m E"]  # contacts kept at zero by other held contacts
     blocked: Bool[Any, "*m"]  # whether constraints block an approaching contact
@@ -148,6 +172,62 @@ def impulses_of_impact(
     return Impulses(solution.x, after, xp.any(closed & (after < -limit), -1))
 
 
+def impulses_with_friction(
+    contacts: Contacts,
+    rows: ContactRows,
+    rate: Float[Any, "*m E"],
+    restitution: Float[Any, "*m E"],
+    closed: Bool[Any, "*m E"],
+    floor: Float[Any, "*m E"],
+    xp: ModuleType = jnp,
+) -> Impulses:
+    """Return the impulses of an impact with friction by Poisson's law of restitution: see the module."""
+    normals = np.flatnonzero(contacts.impacts)
+    rubbing = np.flatnonzero(contacts.tangents[normals] >= 0)  # among the normals
+    along = contacts.tangents[normals[rubbing]]
+    N, F = len(normals), len(rubbing)
+    size = xp.sqrt(xp.where(diagonal(rows.W, xp) > 0, diagonal(rows.W, xp), 1.0))
+    W = rows.W / size[..., None, :] / size[..., :, None]
+    columns = np.concatenate([normals, along, along])
+    signs = np.concatenate([np.ones(N + F), -np.ones(F)])
+    coefficient = contacts.friction[..., normals[rubbing]] * size[..., along] / size[..., normals[rubbing]]
+    takes_part = (closed & rows.free)[..., normals]
+    takes_part = xp.concatenate([takes_part, *[takes_part[..., rubbing]] * 3], axis=-1)
+
+    of_impulses = W[..., columns, :][..., :, columns] * signs * signs[:, None]
+    pairs = np.arange(N)[rubbing, None] == np.arange(N)
+    bounds = xp.concatenate([coefficient[..., None] * pairs, *[xp.zeros_like(of_impulses[..., :F, :F]) - np.eye(F)] * 2], axis=-1)
+    along_both = np.concatenate([np.zeros((N, F)), np.eye(F), np.eye(F)]) + xp.zeros_like(of_impulses[..., :F])
+    M = xp.concatenate(
+        [
+            xp.concatenate([of_impulses, along_both], axis=-1),
+            xp.concatenate([bounds, xp.zeros_like(bounds[..., :F])], axis=-1),
+        ],
+        axis=-2,
+    )
+
+    def solve(rates: Any, least: Any) -> Any:
+        """Return the impulses (*m, E) in units of unit rows, if normal ones are at least `least` (*m, N)."""
+        known = xp.concatenate([least, xp.zeros_like(M[..., 0, N:])], axis=-1)
+        given = xp.concatenate([rates[..., columns] * signs, xp.zeros_like(coefficient)], axis=-1) + times(M, known)
+        x = solve_general_complementarity(M, given, takes_part, xp).x + known
+        spread = np.eye(rows.W.shape[-1])[columns] * signs[:, None]
+        return x[..., : len(columns)] @ spread
+
+    rates = rate / size
+    compression = solve(rates, xp.zeros_like(rates[..., normals]))
+    owner = np.arange(rows.W.shape[-1])
+    owner[along] = normals[rubbing]
+    rest = xp.where(closed, restitution, 0.0)[..., owner] * compression
+    energies = [xp.sum(x * times(W, x), axis=-1, keepdims=True) for x in (compression, rest)]
+    is_less = energies[1] <= energies[0]
+    share = xp.sqrt(xp.where(is_less, 1.0, energies[0] / xp.where(is_less, 1.0, energies[1])))
+    impulse = (compression + solve(rates + times(W, compression), (share * rest)[..., normals])) / size
+    after = rate + times(rows.W, impulse)
+    limit = floor + STILL * _largest(rate, closed, xp)
+    return Impulses(impulse, after, xp.any(closed & ~(after >= -limit), -1))  # NaN: there is no solution
+
+
 def _largest(x: Any, mask: Any, xp: ModuleType) -> Any:
     return xp.max(xp.where(mask, xp.abs(x), 0.0), axis=-1, keepdims=True)
 
@@ -201,7 +281,7 @@ def hit_contacts(
         held: mask of the contacts that were held before.
         before: the conditions before the event.
         rows: the rows of the conditions in that phase.
-        rate: the first rates of all conditions at v.
+        rate: the first rates of all conditions at v; of sliding along a line, the speeds.
         second_rates: maps velocities to the second rates of all conditions in that phase.
         closed: the contacts, as in `ContactChanges`; None: not known yet.
         xp: jax.numpy, or NumPy.
@@ -213,6 +293,10 @@ def hit_contacts(
     assert closed is not None
     restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
     impact = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
+    rubs = (closed > OPEN) & (contacts.tangents >= 0)
+    if np.any(contacts.tangents >= 0) and (xp is not np or rubs.any()):
+        rubbing = impulses_with_friction(contacts, rows, rate, restitution, closed > OPEN, floor, xp)
+        impact = Impulses(*(_where_any(rubs, x, y, xp) for x, y in zip(rubbing, impact, strict=True)))
     v = v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
 
     # The set of held contacts is discrete, and has no derivatives.
@@ -234,15 +318,23 @@ def hit_contacts(
             v = v + (caught[..., None, :] @ rows.directions)[..., 0, :]
         is_held = xp.where(closed > OPEN, presses & contacts.hold, held)
         resting = stays & ~is_held & (xp.abs(solution.y) <= xp.maximum(pressed, STILL * _largest(pull, stays, xp)))
-        ends, carried = presses & contacts.stop, resting & _depends(W, is_held, xp)
+        ends, carried = presses & contacts.stop, resting & _depends(W, is_held, contacts.impacts, xp)
     hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
-    return ContactChanges(v, closed, hits, is_held, ends, carried, impact.remaining)
+    return ContactChanges(v, closed, hits, is_held, stays, ends, carried, impact.remaining)
 
 
-def _depends(W: Float[Any, "*m E E"], basis: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m E"]:
-    """Return a mask of the rows that depend on the `basis` rows, which are independent."""
-    basis_columns = xp.where(basis[..., :, None], W, 0.0)
-    basis_pairs = basis[..., None, :] & basis[..., :, None]
-    solved = xp.linalg.solve(xp.where(basis_pairs, W, xp.eye(W.shape[-1])), basis_columns)
-    remainder = diagonal(W, xp) - xp.sum(basis_columns * solved, -2)
-    return ~basis & (remainder <= CARRIED * diagonal(W, xp))
+def _where_any(mask: Bool[Any, "*m E"], x: Any, y: Any, xp: ModuleType) -> Any:
+    """Return x of members with a masked event, y of all others."""
+    chosen = xp.any(mask, axis=-1)
+    return xp.where(chosen.reshape(*chosen.shape, *[1] * (x.ndim - chosen.ndim)), x, y)
+
+
+def _depends(
+    W: Float[Any, "*m E E"], held: Bool[Any, "*m E"], impacts: Bool[np.ndarray, "E"], xp: ModuleType
+) -> Bool[Any, "*m E"]:
+    """Return a mask of the contacts that depend on the held ones."""
+    among = np.flatnonzero(impacts)
+    W, basis, places = W[..., among, :][..., among], held[..., among], np.eye(len(impacts), dtype=bool)[among]
+    least = CARRIED * diagonal(W, xp)
+    remainder, _ = eliminate(W, basis, least, xp)
+    return xp.any((~basis & (diagonal(remainder, xp) <= least))[..., None] & places, axis=-2)

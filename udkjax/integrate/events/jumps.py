@@ -4,6 +4,7 @@ The action of the event is applied first. The complementarity of all closed cont
 except `Log` and `Stop` can push or lift them.
 """
 
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hi
 from udkjax.integrate.events.runs import MemberIndices, RunState, take
 from udkjax.integrate.events.sticking import settle_friction
 from udkjax.integrate.events.system import StateValues, System
+from udkjax.integrate.solution import Result
 from udkjax.transforms.gradients import stop_gradients
 
 
@@ -23,7 +25,7 @@ class JumpResult(NamedTuple):
 
     state: RunState
     contacts: ContactChanges | None  # None if no event is an impact
-    blocked: Bool[Any, "b"]  # whether constraints block an impact, or an attached joint is open
+    code: Int[Any, "b"]  # not successful if constraints block an impact, an attached joint is open, or friction has no solution
 
 
 def apply_event(
@@ -51,9 +53,13 @@ def apply_event(
     found = _apply_event(system, members, k, before, values, state_values, closed)
     if not system.plan.sticking:
         return found
-    stopped = system.xp.where(system.xp.asarray(system.plan.slides)[k % system.plan.count], k, NO_EVENT)
-    state, failed = settle_friction(system, members, found.state, stopped, modes)
-    return found._replace(state=state, blocked=found.blocked | failed)
+    plan, xp, contacts = system.plan, system.xp, found.contacts
+    stopped = xp.where(xp.asarray(plan.slides)[k % plan.count], k, NO_EVENT)
+    resting = None if contacts is None else contacts.rests
+    state, code = settle_friction(system, members, found.state, stopped, modes, resting)
+    if contacts is not None:
+        contacts = contacts._replace(held=xp.where(plan.impacts, plan.held(state.phase, xp), contacts.held))
+    return JumpResult(state, contacts, xp.where(found.code == Result.successful, code, found.code))
 
 
 def _apply_event(
@@ -85,7 +91,7 @@ def _apply_event(
     acts = ((releases | xp.asarray(plan.changes)[e]) & ~xp.asarray(plan.slides)[e])[:, None]
     state = RunState(t, q, v, after, joints)
     if not plan.impacts.any() or (xp is np and not acts.any()):
-        return JumpResult(state, None, blocked)
+        return JumpResult(state, None, _code(blocked, xp))
 
     free, held = state._replace(phase=plan.free(after)), plan.held(phase, xp)
     is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
@@ -93,18 +99,26 @@ def _apply_event(
     if plan.of_system:
         rows = rows_of_system(state_values.by_q, state_values.directions, state_values.mobilities)
     else:
-        rows = rows_of_directions(state_values.by_q, state_values.directions, take(system.inverse_mass, members))
+        normals = xp.where(plan.slides[:, None], state_values.by_v, state_values.by_q)
+        rows = rows_of_directions(normals, state_values.directions, take(system.inverse_mass, members))
+    rate = xp.where(plan.slides, state_values.g, state_values.rate)  # of contacts with friction, also along their lines
 
     def second_rates(v: Any) -> Any:
         after = state._replace(v=v, phase=plan.without_contacts(state.phase))
         return system.look(members, after if xp is np else stop_gradients(after), is_free=not plan.sticking).rate_2
 
-    hit = hit_contacts(system.contacts(members), k, v, held, values, rows, state_values.rate, second_rates, closed, xp)
+    hit = hit_contacts(system.contacts(members), k, v, held, values, rows, rate, second_rates, closed, xp)
     contacts = hit._replace(
         closed=xp.where(acts, hit.closed, OPEN),
         hits=hit.hits & acts,
         held=xp.where(acts, hit.held, held),
+        rests=xp.where(acts, hit.rests, held & plan.impacts),
         ends=hit.ends & acts,
     )
     phase = plan.with_contacts(free.phase, contacts.held, xp)
-    return JumpResult(state._replace(v=xp.where(acts, hit.v, v), phase=phase), contacts, blocked | (acts[:, 0] & hit.blocked))
+    code = _code(blocked | (acts[:, 0] & hit.blocked), xp)
+    return JumpResult(state._replace(v=xp.where(acts, hit.v, v), phase=phase), contacts, code)
+
+
+def _code(blocked: Bool[Any, "b"], xp: ModuleType) -> Int[Any, "b"]:
+    return xp.where(blocked, int(Result.event_impossible), int(Result.successful))

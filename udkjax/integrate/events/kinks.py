@@ -216,6 +216,11 @@ def sides_in(model: Any, force: int | None) -> Float[Array, "k"]:
     return model.numbers[-1] if force is None else model._forces[force].sides
 
 
+def has_sides(model: Any, force: int | None) -> bool:
+    """Return whether a model has the force: the mechanism of the scene lacks the friction of contacts."""
+    return force is None or force < len(model._forces)
+
+
 def renewed_sides(elements: Sequence[HeldElement], model: Any, t: Any, q: Any, v: Any, sides: Any) -> Array:
     """Return all sides at a state, with those of kinks that are not known yet or depend on others."""
     if not elements:
@@ -250,9 +255,14 @@ def places_of_kinks(events: Sequence[Event], held: Sequence[HeldElement]) -> Kin
 
 
 def places_of_sides(model: Any, held: Sequence[Any]) -> tuple[int, ...]:
-    """Return the places of all sides among all numbers of a model; `held` has all loads with sides, in order."""
-    sides = [np.arange(x.sides.start, x.sides.stop) + 1.0 for x in held]
+    """Return the places of all sides among all numbers of a model, -1 for those of forces that it lacks.
+
+    `held` has all loads with sides, in order.
+    """
+    here, count = [x for x in held if has_sides(model, x.force)], max(x.sides.stop for x in held)
+    sides = [np.arange(x.sides.start, x.sides.stop) + 1.0 for x in here]
     zeros = jax.tree.map(lambda x: np.zeros(np.shape(x)), model)
-    marked = eqx.tree_at(lambda m: [sides_in(m, x.force) for x in held], zeros, sides)
+    marked = eqx.tree_at(lambda m: [sides_in(m, x.force) for x in here], zeros, sides) if here else zeros
     numbers = np.concatenate([np.ravel(x) for x in jax.tree.leaves(marked)])
-    return tuple(int(np.flatnonzero(numbers == k + 1.0)[0]) for k in range(int(numbers.max())))
+    places = {int(x) - 1: int(place) for place, x in enumerate(numbers) if x}
+    return tuple(places.get(k, -1) for k in range(count))

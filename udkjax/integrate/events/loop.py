@@ -108,7 +108,7 @@ def _jump(
     sides, carried = take(runs.sides, members), take(runs.carried, members)
     releases, e = k >= E, k % E
     held, acts = plan.held(before.phase, xp), releases | xp.asarray(plan.changes)[e]
-    after, contacts, blocked = apply_event(system, members, k, before, values, state_values)
+    after, contacts, result = apply_event(system, members, k, before, values, state_values)
     code = xp.where(xp.asarray(plan.stops)[e] & ~releases, Result.event_stop, Result.successful)
     is_current = np.arange(2 * E) == e[:, None]
     falls = xp.asarray(plan.impacts | plan.kinks | plan.slides)[e] | releases
@@ -128,7 +128,8 @@ def _jump(
         turned_back = ~plan.impacts & (xp.abs(values.h) <= ZERO * values.scale) & xp.any(closed > OPEN, -1)[:, None]
         is_closed = xp.concatenate([closed, closed], axis=1) > OPEN
         sides = xp.where(is_closed, 1, xp.where(xp.concatenate([turned_back, xp.zeros_like(turned_back)], axis=1), 0, sides))
-    code = xp.where(blocked, Result.event_impossible, code)
+    blocked = result != Result.successful
+    code = xp.where(blocked, result, code)
     if plan.sticking:  # joints slide, and forces stay, on the allowed side of zero
         sides = xp.where(np.append(plan.slides, plan.slides), 1, sides)
 

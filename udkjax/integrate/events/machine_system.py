@@ -55,7 +55,7 @@ class MachineSystem:
         phases: the machine code of the phases of each mechanism.
         ts: output times (B, T).
         units: numbers of each member.
-        restitution: of all events (B, E).
+        of_impacts: restitutions and coefficients of friction of all events (B, 2, E).
         inverse_mass: of all coordinates (B, n).
         joint_numbers: the numbers of joints that events add, except those that depend on the state (B, k).
         event_numbers: the numbers of all events (1 or B, K).
@@ -69,7 +69,7 @@ class MachineSystem:
         phases: list[PhaseCode],
         ts: np.ndarray,
         units: MemberUnits,
-        restitution: np.ndarray,
+        of_impacts: np.ndarray,
         inverse_mass: np.ndarray,
         joint_numbers: np.ndarray,
         event_numbers: np.ndarray,
@@ -77,7 +77,7 @@ class MachineSystem:
         self._event_numbers, self._held = event_numbers, plan.held
         self.lost_kinks = np.full(len(ts), np.inf)  # times (s) from which sides are no longer held
         self.plan, self._added, self._is_projected = plan.events, plan.added, [x.projected for x in plan.phases]
-        self._phases, self.ts, self._units, self._restitution = phases, ts, units, restitution
+        self._phases, self.ts, self._units, self._of_impacts = phases, ts, units, of_impacts
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
         (B, _), n = ts.shape, inverse_mass.shape[1]
         self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
@@ -92,8 +92,9 @@ class MachineSystem:
     def contacts(self, members: MemberIndices) -> Contacts:
         """Return the contacts of members."""
         plan = self.plan
-        numbers = take(self._restitution, members), take(self.rate, members)
-        return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, *numbers)
+        restitution, friction = take(self._of_impacts, members).swapaxes(0, 1)
+        numbers = restitution, friction, take(self.rate, members)
+        return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, plan.tangents, *numbers)
 
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False

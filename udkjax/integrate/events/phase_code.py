@@ -75,11 +75,12 @@ def phase_plan(
     assert run is not None  # checked by the caller
     mechanism, joints = compiled.samples.stand_in(compiled.textbook.mechanism), [()] * len(added)
     without = replace(conditions, forces=None, force_key="")
+    has_forces = any(which == SWITCHED or x.contact < 0 for x in phases.sticking)
     if which == SWITCHED:
         active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, added)
     return PhasePlan(
         run=run.watching(conditions if which == SWITCHED else without),  # nothing is held that could let go
-        states=run.accelerations.of_events(conditions if phases.sticking else without, tuple(directed)),
+        states=run.accelerations.of_events(conditions if has_forces else without, tuple(directed)),
         marking=_marking(compiled.textbook) if run.code.marks_rows else None,
         projected=compiled.plan.projected,
         project=run.accelerations.projection if added else None,
@@ -230,8 +231,9 @@ class PhaseCode:
         if any(self.plan.joints) or self.plan.active:
             numbers = _spread(numbers, len(members)).copy()
             for places, joint in zip(self.plan.joints, self._joints, strict=True):
-                if places:
-                    numbers[:, list(places)] = joint[members]
+                here = np.array(places, int) >= 0
+                if here.any():
+                    numbers[:, np.array(places)[here]] = joint[members][:, here]
             for place, k in self.plan.active:
                 numbers[:, place] = phase[:, k]
         return numbers

@@ -23,8 +23,8 @@ from udkjax.arrays import is_traced, number
 from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.event import Event
-from udkjax.integrate.events.kinks import HeldElement, sides_in
-from udkjax.integrate.events.sticking_joints import StickingJoint, lock_of
+from udkjax.integrate.events.kinks import HeldElement, has_sides, sides_in
+from udkjax.integrate.events.sticking_joints import StickingJoint, friction_of, line_of, lock_of
 from udkjax.integrate.events.switched import switch, switched, with_switched_friction
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.joints import Constraint, Joint
@@ -82,8 +82,9 @@ class Phases(eqx.Module):
         """
         mechanism, (*joints, sides) = self.mechanisms[which], added
         for sided in self.sided:
-            at = partial(sides_in, force=sided.force)
-            mechanism = eqx.tree_at(at, mechanism, sides[sided.sides])
+            if has_sides(mechanism, sided.force):
+                at = partial(sides_in, force=sided.force)
+                mechanism = eqx.tree_at(at, mechanism, sides[sided.sides])
         if which == SCENE:
             return mechanism
         for (_, name), joint in zip(self.added_by, joints, strict=True):
@@ -135,7 +136,7 @@ def phases_of(
         return Phases((mechanism.without_origin,), (analysis,), (), (), none)
     assert isinstance(mechanism, Mechanism)
     assert analysis is not None  # a mechanism has one
-    whole = _with(mechanism, switches)
+    whole = _with(mechanism, switches, events)
     # A joint that an event adds may depend on others.
     adds_any = any(x.public and x.event >= 0 for x in switches)
     with_all = analysis.with_rows_of(whole, only_switched=analysis.redundant_rows == () and not adds_any)
@@ -193,13 +194,17 @@ def _switches(mechanism: Mechanism, events: Sequence[Event], sticking: Sequence[
 
     found += [_Switch(unique(name), name, joint, k) for k, name, joint in added]
     contacts = [(k, e) for k, e in enumerate(events) if e.action.rest == "hold"]
-    found += [_Switch(unique(f"{e.name}.contact"), "", HeldContact.of(e, mechanism), k) for k, e in contacts]
-    joints = mechanism.joints
-    return found + [_Switch(unique(f"{x.name}.stick"), "", lock_of(joints[x.name]), x.event, x.name) for x in sticking]
+    rubbing = {x.contact: line_of(events[x.contact]) for x in sticking if x.contact >= 0}
+    lines = {k: _Switch(unique(f"{e.name}.contact"), "", rubbing.get(k) or HeldContact.of(e, mechanism), k) for k, e in contacts}
+    found += lines.values()
+    joints = {
+        x: (lines[x.contact].name, rubbing[x.contact]) if x.contact >= 0 else (x.name, mechanism.joints[x.name]) for x in sticking
+    }
+    return found + [_Switch(unique(f"{x.name}.stick"), "", lock_of(j), x.event, name) for x, (name, j) in joints.items()]
 
 
-def _with(mechanism: Mechanism, switches: Sequence[_Switch]) -> Mechanism:
-    """Return the mechanism with all switches, switched on."""
+def _with(mechanism: Mechanism, switches: Sequence[_Switch], events: Sequence[Event]) -> Mechanism:
+    """Return the mechanism with all switches, switched on, and the friction of contacts."""
     of_scene: dict[str, Any] = {x.name: switched(x.constraint) for x in switches if x.event < 0}
     others: dict[str, Any] = {x.name: x.constraint for x in switches if x.event >= 0}
     is_concrete = mechanism.is_concrete and not is_traced(list(others.values()))
@@ -208,6 +213,10 @@ def _with(mechanism: Mechanism, switches: Sequence[_Switch]) -> Mechanism:
             {k: of_scene.get(k, x) for k, x in elements.items()} for elements in (mechanism.joints, mechanism.drivers)
         )
         forces = with_switched_friction(dict(mechanism.forces), list(of_scene))
+        for x in switches:
+            if not x.public and not x.locks and events[x.event].action.friction is not None:
+                name = next(y for k in range(len(forces) + 1) if (y := f"{x.name} friction{' ' * k}") not in forces)
+                forces[name] = friction_of(events[x.event], x.name)
         whole = Mechanism(mechanism.bodies, joints | others, drivers, forces, mechanism.gravity, mechanism.name).without_origin
         completed = [switched(whole.joints[name]) for name in others]
         return eqx.tree_at(lambda m: [m._joints[m.joint_names.index(name)] for name in others], whole, completed)

@@ -81,7 +81,9 @@ class PlainSystem:
         """Return the contacts."""
         plan = self.plan
         e = [jnp.asarray(e.action.rebound, float) for e in self.hybrid.events]
-        return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, jnp.stack(e)[None], self.rate)
+        friction = [jnp.asarray(0.0 if e.action.friction is None else e.action.friction, float) for e in self.hybrid.events]
+        numbers = jnp.stack(e)[None], jnp.stack(friction)[None], self.rate
+        return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, plan.tangents, *numbers)
 
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False

@@ -154,7 +154,7 @@ def _expand_concrete(mechanism: Any, analysis: Analysis | None, has_none: bool, 
 
 def _expand(mechanism: Any, events: Sequence[ExpandsToEvents] | None, analysis: Analysis | None) -> Prepared:
     found = () if events is None else expand_events(events, mechanism)
-    scene = with_sticking_joints(mechanism, len(found))
+    scene = with_sticking_joints(mechanism, found)
     found = (*found, *scene.events)
     phases = phases_of(scene.mechanism, found, analysis, scene.joints)
     smooth, held, kinks = with_held_forces(scene.mechanism, SIDES * len(scene.joints))

@@ -3,6 +3,8 @@
 A friction with the set-valued law becomes a `DirectedFriction`: the direction of sliding is a number, with which its loads are
 smooth. A sticking joint is locked by a constraint, whose multiplier is its force. Each direction of sliding has an event: its
 speed falls to zero while the joint slides in that direction; its force reaches the limit while the joint sticks.
+
+A contact with friction is such a joint, too, while it rests: a slot, whose normal force is that of the contact.
 """
 
 from collections.abc import Sequence
@@ -15,13 +17,20 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Number
 from udkjax.arrays import make_module, number
 from udkjax.complementarity.stick_or_slip import SIDES
-from udkjax.equations.directed_friction import with_directed_friction
+from udkjax.equations.directed_friction import DirectedFriction
 from udkjax.integrate.events.actions import Action, Displacement
 from udkjax.integrate.events.conditions import BodyCondition, Frames
 from udkjax.integrate.events.event import Event
 from udkjax.scene.friction import Friction
-from udkjax.scene.joints import Angle, Joint, Revolute
+from udkjax.scene.joints import Angle, Joint, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
+
+
+class ContactFriction(DirectedFriction):
+    """Friction of a contact, in the slot that holds it at rest: its load has a sign, and is negative where the contact pulls."""
+
+    def _load_of(self, joint, multipliers):
+        return -multipliers[0]
 
 
 class SlidingSpeed(BodyCondition):
@@ -55,10 +64,11 @@ class StickOrSlip(Action):
 class StickingJoint(NamedTuple):
     """A joint with set-valued friction; hashable."""
 
-    name: str  # of the joint
-    force: int  # index of the friction among the forces
+    name: str  # of the joint, or of the contact
+    force: int  # index of the friction among the forces; those of contacts come last, beyond the forces of the scene
     event: int  # index of the event of sliding in the positive direction; that of the other direction follows
     first: int  # index of its first side
+    contact: int = -1  # index of the event of the contact; -1: it is a joint
 
     @property
     def events(self) -> tuple[int, int]:
@@ -77,23 +87,47 @@ class Sticking(NamedTuple):
     events: tuple[Event, ...]  # two for each joint
 
 
-def with_sticking_joints(mechanism: Any, first_event: int) -> Sticking:
+def with_sticking_joints(mechanism: Any, others: Sequence[Event]) -> Sticking:
     """Return a mechanism with directed frictions, and their events.
 
     Args:
         mechanism: The scene.
-        first_event: The number of other events, which come first.
+        others: All other events, which come first, contacts with friction among them.
     """
-    if not isinstance(mechanism, Mechanism) or not Friction.may_stick(mechanism._forces):
+    contacts = [k for k, e in enumerate(others) if e.action.friction is not None]
+    if not isinstance(mechanism, Mechanism) or not (contacts or Friction.may_stick(mechanism._forces)):
         return Sticking(mechanism, (), ())
-    directed, joints, events = with_directed_friction(mechanism), [], []
-    for name, k in directed.joints:
-        joint, friction = mechanism.joints[name], cast(Friction, mechanism._forces[k])
-        joints.append(StickingJoint(name, k, first_event + len(events), SIDES * len(joints)))
+    directed, joints, events = DirectedFriction.put_in(mechanism), [], []
+
+    def add(name: str, joint: Joint, friction: Friction, force: int, contact: int = -1) -> None:
+        joints.append(StickingJoint(name, force, len(others) + len(events), SIDES * len(joints), contact))
         for sign, text in ((1.0, "forwards"), (-1.0, "backwards")):
             condition = SlidingSpeed(joint.bodies, joint, friction, number(sign))
             events.append(Event(condition, StickOrSlip(), -1, f"{name} slides {text}"))
+
+    for name, k in directed.joints:
+        add(name, mechanism.joints[name], cast(Friction, mechanism._forces[k]), k)
+    for k, contact in enumerate(contacts, start=len(mechanism._forces)):
+        name = others[contact].name
+        name = f"{name} (contact)" if name in mechanism.joints else name
+        add(name, line_of(others[contact]), friction_of(others[contact], name), k, contact)
     return Sticking(directed.mechanism, tuple(joints), tuple(events))
+
+
+def line_of(contact: Event) -> Slot:
+    """Return the joint that holds a contact at rest: a slot along its line, whose coordinate is the gap."""
+    gap: Any = contact.condition
+    body, on = gap.bodies
+    axis = jnp.arctan2(-gap.normal[0], gap.normal[1])  # the normal is to its left
+    return make_module(Slot, bodies=(on, body), points=jnp.stack([gap.through, gap.point]), axis=axis)
+
+
+def friction_of(contact: Event, joint: str) -> ContactFriction:
+    """Return the friction of a contact, in the joint that holds it."""
+    action: Any = contact.action
+    return ContactFriction(
+        joint=joint, coefficient=action.coefficient, static_coefficient=action.static_coefficient, law="set-valued"
+    )
 
 
 def lock_of(joint: Any) -> Joint:
@@ -117,9 +151,9 @@ def forces_of(
         if row < 0:
             continue
         condition: Any = events[k].condition
-        of_joint, is_held = [multipliers[r] for r in joint_rows[k]], row < len(multipliers)
-        if of_joint:
-            found[k] = condition.reserve(of_joint, multipliers[row] if is_held else 0.0)
+        is_held = row < len(multipliers)
+        if joint_rows[k] and max(joint_rows[k]) < len(multipliers):
+            found[k] = condition.reserve([multipliers[r] for r in joint_rows[k]], multipliers[row] if is_held else 0.0)
         else:
             found[k] = -multipliers[row] if is_held else jnp.ones(())
     return found
