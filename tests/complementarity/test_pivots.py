@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from udkjax.complementarity.linear import solve_complementarity
-from udkjax.complementarity.stick_or_slip import JointsAtRest
+from udkjax.complementarity.stick_or_slip import JointsAtRest, Response
 
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
@@ -22,10 +22,10 @@ def test_one_joint_at_a_time_changes_its_mode_if_two_alternate():
     def respond(modes):
         other_sticks = modes.locked[::-1]
         a = np.where(modes.locked, 0.0, np.where(other_sticks, 1.0, -1.0))
-        return a, np.where(other_sticks, -1.0, 1.0), np.ones(2)
+        return Response(a, np.where(other_sticks, -1.0, 1.0), np.ones(2))
 
     no, yes = np.zeros(2, bool), np.ones(2, bool)
     joints = JointsAtRest.of(yes, np.zeros(2), np.eye(2), np.ones(2), no, np.full(2, 1e-9), np)
-    modes, has_failed = joints.decide(respond, np.zeros(2), no, yes, np)
+    modes, has_failed, _ = joints.decide(respond, np.zeros(2), no, yes, np)
     assert not has_failed and sorted(modes.locked) == [False, True]
     assert modes.direction[~modes.locked] == 1.0

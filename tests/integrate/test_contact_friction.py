@@ -13,6 +13,7 @@ import udkjax as udk
 from tests.friction import G
 from udkjax.complementarity.linear import solve_general_complementarity
 from udkjax.integrate.events.impacts import ContactRows, Contacts, impulses_with_friction
+from udkjax.show.player.measure_curves import sticking_spans
 
 TOL: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-10}
 
@@ -311,3 +312,4 @@ def test_beside_joints_that_stick_and_answers_about_the_run():
     still = udk.simulate(resting, [0.0, 1.0], events=feet)
     assert udk.reactions(resting, still) == {}
     assert udk.power_balance(resting, still).kinetic.shape == (2,)
+    assert sticking_spans(resting, still) == []

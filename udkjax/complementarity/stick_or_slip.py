@@ -72,8 +72,8 @@ class Response(NamedTuple):
     """The motion of the joints in given modes, and their forces."""
 
     accelerations: Float[Any, "*m F"]  # along the joints
-    forwards: Float[Any, "*m F"]  # limits less the forces in the positive direction
-    backwards: Float[Any, "*m F"]  # limits plus these forces
+    forwards: Float[Any, "*m F"]  # limits minus forces in the positive direction
+    backwards: Float[Any, "*m F"]  # limits plus forces
     normal: Any = NO_CONTACTS  # forces of the contacts (*m, E)
     rates: Any = NO_CONTACTS  # second rates of the contacts (*m, E)
 

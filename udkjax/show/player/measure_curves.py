@@ -152,12 +152,14 @@ MEASURES = {
 def sticking_spans(mechanism: Mechanism, solution: ShownMotion) -> list[JsonObject]:
     """Return when each joint with set-valued friction sticks: its name, its place as [body, x, y], and spans of time (s).
 
-    A span begins and ends at the events of its joint, or else at output times.
+    A span begins and ends at the events of its joint, or else at output times. Contacts with friction are left out.
     """
     ts, events = np.asarray(solution.ts, float), getattr(solution, "events", None)
     happened = {} if events is None else {name: events.of(name) for name in events.names}
     found: list[JsonObject] = []
     for name, sticks in (getattr(solution, "sticking", None) or {}).items():
+        if name not in mechanism.joints:
+            continue
         joint, states = mechanism.joints[name], np.asarray(sticks)
         side = 0 if joint.bodies[1] == GROUND else 1
         place = [mechanism.body_names.index(joint.bodies[side]), *np.asarray(joint.points, float)[side].tolist()]
