@@ -266,3 +266,12 @@ def test_what_takes_nothing_from_the_guess_is_not_completed_again(monkeypatch):
     assert_allclose(changed.joints["rod"].length, mechanism.joints["rod"].length)
     with pytest.raises(AttributeError):
         udk.Mechanism(bodies, {"rod": udk.Distance(pair, P)})
+
+
+def test_numbers_do_not_change_with_the_arrays_they_were_given_as():
+    """JAX may use the memory of an array that lies at a multiple of 64 bytes."""
+    memory = np.zeros(64)
+    position = memory[(-memory.ctypes.data % 64) // 8 :][:2]
+    body = udk.Body(1.0, 0.1, position)
+    position[...] = 7.0
+    assert np.array_equal(body.position, [0.0, 0.0])

@@ -169,7 +169,7 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberL
 
 def with_halted_drivers(mechanism: Mechanism, t: NumberLike) -> Mechanism:
     """Return the mechanism with its drivers halted at time t (s)."""
-    return with_drivers(mechanism, _halted(mechanism, t))
+    return mechanism.with_drivers(_halted(mechanism, t))
 
 
 def _halted(mechanism: Mechanism, t: NumberLike) -> dict[str, Driver]:
@@ -198,6 +198,8 @@ def with_drivers(
     origin: Origin | None = None,
 ) -> Mechanism:
     """Return the mechanism with these drivers, and with these forces instead of its own if any are given."""
+    if forces is None and not drivers:
+        return mechanism.with_drivers({}, origin)
     forces = dict(mechanism.forces) if forces is None else forces
     bodies, joints = dict(mechanism.bodies), dict(mechanism.joints)
     return Mechanism(bodies, joints, drivers, forces, mechanism.gravity, mechanism.name, origin)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, make_module, number
 from udkjax.printing import PrintedTable, PrintsTable
-from udkjax.programs.identity_cache import cached_by_identity, cached_within_trace
+from udkjax.programs.identity_cache import cached_within_trace
 from udkjax.scene.bodies import Body, stack_coordinates
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import mechanism_table
@@ -25,14 +25,13 @@ from udkjax.scene.element_setup import (
     check_elements,
     complete,
     completion_mistakes,
-    constants_of,
     name_elements,
-    without_constants,
 )
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.joints import Constraint, Joint
+from udkjax.scene.mechanism_fields import fields_of, is_concrete
 from udkjax.scene.number_fields import (
     SECTIONS,
     ElementGroups,
@@ -43,7 +42,7 @@ from udkjax.scene.number_fields import (
     split_index,
 )
 from udkjax.scene.origin import Origin
-from udkjax.scene.sources import AbstractDrawing, Drawn, Elements, ElementsWithConstants, Source, names_of
+from udkjax.scene.sources import AbstractDrawing, Drawn, Elements, Source, names_of
 
 Element = TypeVar("Element", bound=eqx.Module)
 Module = TypeVar("Module", bound=eqx.Module)
@@ -99,16 +98,13 @@ class Mechanism(PrintsTable):
         completed = {section: [(key, complete(c, known)) for key, c in checked[section]] for section in ("joint", "driver")}
         if mistakes := completion_mistakes(checked, completed):
             raise SceneError(mistakes, name)
-        independent = {section: [(key, without_constants(c)) for key, c in items] for section, items in completed.items()}
-        sections = checked | independent
-        self.name = name
-        names = tuple(tuple(key for key, _ in sections[section]) for section in SECTIONS)
-        self.body_names, self.joint_names, self.driver_names, self.force_names = names
-        elements = [[element for _, element in sections[section]] for section in SECTIONS]
-        has_constants = any(constants_of(type(c)) for items in independent.values() for _, c in items)
-        more: Any = {"names": names} if has_constants else {}
-        self._source = (ElementsWithConstants if has_constants else Elements).of(number(gravity), elements, **more)
-        self.origin = None if self.is_concrete else origin
+        for field, value in fields_of(checked | completed, number(gravity), name, origin).items():
+            setattr(self, field, value)
+
+    def with_drivers(self, drivers: Mapping[str, Driver], origin: Origin | None = None) -> "Mechanism":
+        """For internal use: return the mechanism with other drivers, which are complete; nothing is checked."""
+        sections = {section: list(group.items()) for section, group in (self.groups | {"driver": drivers}).items()}
+        return make_module(type(self), **fields_of(sections, self.gravity, self.name, origin))
 
     @classmethod
     def of_drawing(cls, source: Drawn, name: str, origin: Origin | None = None) -> "Mechanism":
@@ -124,7 +120,7 @@ class Mechanism(PrintsTable):
         if mistakes := completion_mistakes(given, {section: found[section] for section in ("joint", "driver")}):
             raise SceneError(mistakes, name)
         static = dict(zip((f"{section}_names" for section in SECTIONS), names, strict=True))
-        return make_module(cls, name=name, **static, origin=None if _is_concrete(source) else origin, _source=source)
+        return make_module(cls, name=name, **static, origin=None if is_concrete(source) else origin, _source=source)
 
     @property
     def gravity(self) -> Float[Array, "2"]:
@@ -259,7 +255,7 @@ class Mechanism(PrintsTable):
     @property
     def is_concrete(self) -> bool:
         """True if no number is traced."""
-        return _is_concrete(self)
+        return is_concrete(self)
 
     @property
     def numbers(self) -> list[Array]:
@@ -338,11 +334,6 @@ def _copy(module: Module, changes: dict[str, object]) -> Module:
 
 def _by_name(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[str, Element]:
     return MappingProxyType(dict(zip(names, elements, strict=True)))
-
-
-@cached_by_identity
-def _is_concrete(tree: Any) -> bool:
-    return not is_traced(tree)
 
 
 @cached_within_trace
