@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.friction import pendulum, rubbing
 
 G = 9.81
 
@@ -110,6 +111,33 @@ def test_a_free_body_falls():
     found = udk.explain(udk.Mechanism({"stone": udk.Body(2.0, 1.0)}))
     assert_allclose(found.a, [0, -G, 0])
     assert found.gauss.at_a == 0.0 and "Gauss" in str(found)
+
+
+def test_friction_of_joints_is_among_the_loads():
+    """The accelerations and multipliers are those of `accelerations`, whose loads contain friction."""
+    mechanism = pendulum(coefficient=0.3, radius=0.05, speed=0.01)
+    v = np.array([[0.0, 1.0, 2.0]])
+    found = udk.explain(mechanism, state=udk.State(mechanism.q0, v))
+    a, multipliers = udk.accelerations(mechanism, 0.0, mechanism.q0, v, multipliers=True)
+    assert_allclose(found.a, np.ravel(a), rtol=1e-12)
+    assert_allclose(found.multipliers, multipliers, rtol=1e-12)
+    assert max(found.checks.values()) < 1e-13 and found.gauss.slope < 1e-12
+    rub = found.friction["rub"]
+    assert rub.joint == "A" and rub.is_unique
+    assert_allclose([rub.speed, rub.coefficient, rub.load], [0.1, 0.3 * np.tanh(40.0), np.hypot(*multipliers)], rtol=1e-12)
+    assert_allclose(found.force, [0.0, -2 * G, -0.3 * 0.05 * rub.load], rtol=1e-12)
+    assert "rub in A" in str(found) and json.loads(json.dumps(found.to_dict()))["friction"]["rub"]["is_unique"] is True
+
+
+@pytest.mark.slow
+def test_loads_of_friction_that_are_not_unique_are_marked():
+    mechanism = rubbing(udk.library.parallelogram(), 0.2, 0.03)
+    state = udk.assemble(mechanism)
+    found = udk.explain(mechanism, state=state)
+    verdict = udk.diagnose(mechanism, fixes=False, walk=False).friction
+    assert {x.joint: x.is_unique for x in found.friction.values()} == {joint: x.load for joint, x in verdict.items()}
+    assert "not unique: that of the minimum-norm solution" in str(found)
+    assert_allclose(found.a, np.ravel(udk.accelerations(mechanism, 0.0, state.q, state.v)), rtol=1e-9, atol=1e-12)
 
 
 def test_traced_numbers_are_refused():

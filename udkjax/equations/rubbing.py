@@ -23,7 +23,7 @@ from udkjax.equations import constraints
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.compliance import sharing
 from udkjax.equations.constraints import BodyArray, bodies
-from udkjax.equations.structure import rubbing_joints
+from udkjax.equations.structure import RubbingJoint, rubbing_joints
 from udkjax.equations.udwadia_kalaba import Baumgarte, Weights
 from udkjax.pinv import Pseudoinverse
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
@@ -70,15 +70,31 @@ def single_rubbing_loads(
 ) -> dict[str, Float[Array, "n"]]:
     """Return the loads of each friction that depends on the load of a joint, by the name of the joint; see `rubbing_loads`."""
     time, places = jnp.asarray(t, jnp.result_type(float)), frames(mechanism, q, v)
-    rows: dict[str, list[int]] = {}
-    for k, (owner, _) in enumerate(constraints.row_names(mechanism)):
-        rows.setdefault(owner, []).append(k)
     found: dict[str, Array] = {}
-    for name, joint in zip(mechanism.constraints, rubbing_joints(mechanism), strict=True):
-        if joint is not None:
-            wrenches = joint.loads([multipliers[k] for k in rows[name]], time, *(places[b] for b in joint.bodies))
-            found[name] = _on_bodies(mechanism, joint.bodies, wrenches)
+    for name, (joint, own) in _with_multipliers(mechanism, multipliers).items():
+        wrenches = joint.loads(own, time, *(places[b] for b in joint.bodies))
+        found[name] = _on_bodies(mechanism, joint.bodies, wrenches)
     return found
+
+
+def terms_of_rubbing(
+    mechanism: Mechanism, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
+) -> dict[str, Float[Array, "3"]]:
+    """Return the speed of sliding s (m/s), mu(s) and the load (N) of the joints with friction that depends on it, by joint."""
+    places = frames(mechanism, q, v)
+    return {
+        name: jnp.stack([jnp.asarray(x) for x in joint.friction.terms(joint.joint, own, *(places[b] for b in joint.bodies))])
+        for name, (joint, own) in _with_multipliers(mechanism, multipliers).items()
+    }
+
+
+def _with_multipliers(mechanism: Mechanism, multipliers: Float[Array, "m"]) -> dict[str, tuple[RubbingJoint, list[Array]]]:
+    """Return the joints with friction that depends on their load, and the multipliers of each, by name."""
+    rows: dict[str, list[Array]] = {}
+    for k, (owner, _) in enumerate(constraints.row_names(mechanism)):
+        rows.setdefault(owner, []).append(multipliers[k])
+    joints = zip(mechanism.constraints, rubbing_joints(mechanism), strict=True)
+    return {name: (joint, rows[name]) for name, joint in joints if joint is not None}
 
 
 def loads_of_friction(

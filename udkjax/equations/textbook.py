@@ -108,6 +108,10 @@ class TextbookEquations(MechanismSystem):
         drags = rubbing.single_rubbing_loads(self.mechanism, t, q, v, multipliers)
         return {joint: v @ drag for joint, drag in drags.items()}
 
+    def rubbing_terms(self, q: Vector, v: Vector, multipliers: Float[Array, "m"]) -> dict[str, Float[Array, "3"]]:
+        """Return the speed of sliding s (m/s), mu(s) and the load (N) of each friction that depends on it, by joint."""
+        return rubbing.terms_of_rubbing(self.mechanism, q, v, multipliers)
+
     def loose_friction(self, t: Time, q: Vector, N: Float[Array, "m k"]) -> LooseFriction:
         """Return which joints with friction have a load that is not unique: see `loose_friction`."""
         return loose_friction(self.mechanism, t, q, N, self.scales, self.method)

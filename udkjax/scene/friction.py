@@ -130,15 +130,23 @@ class Friction(ForceElement):
             frames: The frames of its bodies.
         """
         frame1, frame2 = frames
-        speed, size = self.sliding_speed(joint, *frames), self._load_of(joint, multipliers)
+        _, coefficient, size = self.terms(joint, multipliers, *frames)
         if isinstance(joint, Revolute):
             assert self.radius is not None  # a mistake
-            return couple(-self._coefficient_at(self.radius * speed) * self.radius * size)
+            return couple(-coefficient * self.radius * size)
         assert isinstance(joint, Slot | Prismatic)
         point, axis = frame2.point(joint.points[1]), frame1.vector((jnp.cos(joint.axis), jnp.sin(joint.axis)))
-        pull = -self._coefficient_at(speed) * size
+        pull = -coefficient * size
         force = Point(pull * axis.x, pull * axis.y)  # on body 2
         return [load_at(frame1, point, Point(-force.x, -force.y)), load_at(frame2, point, force)]
+
+    def terms(self, joint: Joint, multipliers: Sequence[Number], *frames: Frame) -> tuple[Number, Number, Number]:
+        """Return the speed of sliding s (m/s), mu(s), and the load (N) that mu(s) multiplies."""
+        speed = self.sliding_speed(joint, *frames)
+        if isinstance(joint, Revolute):
+            assert self.radius is not None  # a mistake
+            speed = self.radius * speed
+        return speed, self._coefficient_at(speed), self._load_of(joint, multipliers)
 
     @staticmethod
     def sliding_speed(joint: Joint, frame1: Frame, frame2: Frame) -> Number:

@@ -1,24 +1,29 @@
 """The derivation of the accelerations for one state, with the paper's symbols and numbers: `explain`.
 
-Each symbol is computed by a textbook function (equations/constraints.py, loads.py, udwadia_kalaba.py). The
+Each symbol is computed by a textbook function (equations/constraints.py, textbook.py, udwadia_kalaba.py). The
 equations of motion, the constraints, Penrose's four conditions and Gauss's principle are checked.
 """
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from udkjax.arrays import number
-from udkjax.equations import constraints, determinacy, loads
+from udkjax.equations import constraints, determinacy
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD
 from udkjax.positions.assembly import State, assemble
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.explanation import Explanation, Gauss
+from udkjax.study.diagnosis.joint_friction import joint_friction
+from udkjax.study.explanation import Explanation, Gauss, RubbingTerms
 
 N_RIVALS = 200  # number of random feasible accelerations to compare a with
 
@@ -28,6 +33,8 @@ def explain(
     mechanism: Mechanism, t: float = 0.0, state: State | None = None, stabilization: Baumgarte | None = None
 ) -> Explanation:
     """Derive the accelerations and multipliers of one state, step by step, with numbers; print the result.
+
+    F contains friction that depends on the loads of joints, as it is at the result.
 
     Args:
         mechanism: mechanism with concrete numbers.
@@ -51,8 +58,13 @@ def explain(
     analysis = analyse(mechanism)
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)
     symbols = _symbols(mechanism.without_origin, analysis, number(t), q, v, stabilization, analysis.scales.rank_tol)
+    terms: dict[str, Array] = symbols.pop("friction")
     s = {name: np.asarray(value) for name, value in symbols.items()}
     rank, null_rows = int(s.pop("rank")), s.pop("null_rows")
+    marks = joint_friction(
+        prepare(mechanism, SVD(), analysis=analysis), t, q, null_rows * np.asarray(analysis.scales.rows)[:, None]
+    )
+    names = {f.joint: name for name, f in mechanism.forces.items() if isinstance(f, Friction) and f.rubs}
     return Explanation(
         mechanism=mechanism,
         t=float(t),
@@ -62,6 +74,7 @@ def explain(
         rank=rank,
         null_rows=null_rows[:, np.linalg.norm(null_rows, axis=0) > 0],
         constraint_force=-s["psi_q"].T @ s["multipliers"],
+        friction={names[joint]: RubbingTerms(joint, *map(float, x), marks[joint].load) for joint, x in terms.items()},
         gauss=_gauss(s, rank),
         checks=_checks(s),
         **s,
@@ -71,27 +84,30 @@ def explain(
 @deferred
 def _symbols(
     mechanism: Mechanism, analysis: Analysis, t: Array, q: Array, v: Array, baumgarte: Baumgarte | None, tol: ArrayLike
-) -> dict[str, Array]:
+) -> dict[str, Any]:
     w, method = analysis.scales.weights, SVD(rank_tol=tol)
-    psi_q = constraints.psi_q(mechanism, t, q)
+    equations = prepare(mechanism, method, baumgarte, analysis)
+    M, F, psi_q, required = equations.matrices(t, q, v)
+    a, multipliers = equations.motion(t, q, v)
     rows, columns = psi_q.shape
-    D = uk.D(mechanism, t, q, w)
+    D, mass = uk.D(mechanism, t, q, w), jnp.diagonal(M)
     return {
         "psi": constraints.psi(mechanism, t, q),
         "psi_dot": constraints.psi_dot(mechanism, t, q, v),
         "psi_q": psi_q,
         "gamma": constraints.gamma(mechanism, t, q, v),
-        "mass": loads.mass(mechanism),
-        "force": loads.force(mechanism, t, q, v),
+        "mass": mass,
+        "force": F,
+        "friction": equations.rubbing_terms(q, v, multipliers),
         "weights": w,
         "D": D,
         "singular_values": jnp.linalg.svd(D, compute_uv=False) if rows else jnp.zeros(0),
         "rank": method.rank(D) if rows else jnp.zeros((), int),
         "D_plus": method(D) if rows else jnp.zeros((columns, 0)),
-        "a_F": uk.a_F(mechanism, t, q, v),
-        "b": uk.b(mechanism, t, q, v, baumgarte, w),
-        "a": uk.accelerations(mechanism, t, q, v, method, baumgarte, w),
-        "multipliers": uk.multipliers(mechanism, t, q, v, method, baumgarte, w),
+        "a_F": F / mass,
+        "b": w * (required - psi_q @ (F / mass)),
+        "a": a,
+        "multipliers": multipliers,
         "unique": determinacy.uniqueness(mechanism, t, q, analysis).unique,
         "null_rows": determinacy.left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None],
     }

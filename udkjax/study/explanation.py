@@ -34,6 +34,16 @@ class Gauss(NamedTuple):
     rivals: int  # number of random accelerations
 
 
+class RubbingTerms(NamedTuple):
+    """Terms of friction that depends on the load of its joint: mu(s) times this load, which may not be unique."""
+
+    joint: str
+    speed: float  # of sliding, s (m/s)
+    coefficient: float  # mu(s)
+    load: float  # N
+    is_unique: bool  # the load; otherwise it is that of least norm
+
+
 class Explanation(NamedTuple):
     """Every symbol of section 3 of the paper for one state. Rows are those of Psi, columns x, y, angle of each body.
 
@@ -54,6 +64,7 @@ class Explanation(NamedTuple):
         b: gamma - Psi_q a_F, with weighted rows.
         a: accelerations.
         multipliers: lambda.
+        friction: the terms of each friction that depends on the load of its joint; F contains it.
         gauss: the check of Gauss's principle.
     """
 
@@ -80,6 +91,7 @@ class Explanation(NamedTuple):
     unique: Bool[np.ndarray, "m"]  # mask of the unique multipliers
     null_rows: Float[np.ndarray, "m k"]  # N, whose columns are combinations of rows of Psi_q that vanish
     constraint_force: Float[np.ndarray, "n"]  # -Psi_q^T lambda
+    friction: dict[str, RubbingTerms]
     gauss: Gauss
     checks: dict[str, float]  # residuals of the identities, relative to their terms
 
@@ -157,7 +169,20 @@ def _rank(e: Explanation, rows: list[str]) -> list[str]:
 
 def _masses(e: Explanation, columns: list[str]) -> list[str]:
     title = "3. Masses M (diagonal), loads F, and the unconstrained accelerations a_F = M^(-1) F"
-    return [title, *_table(["M", "F", "a_F"], columns, np.stack([e.mass, e.force, e.a_F]))]
+    return [title, *_table(["M", "F", "a_F"], columns, np.stack([e.mass, e.force, e.a_F])), *_friction(e)]
+
+
+def _friction(e: Explanation) -> list[str]:
+    if not e.friction:
+        return []
+    values = np.array([[x.speed, x.coefficient, x.load] for x in e.friction.values()])
+    lines = _table([f"{name} in {x.joint}" for name, x in e.friction.items()], ["s", "mu(s)", "load"], values)
+    marks = ["", *("unique" if x.is_unique else "not unique: that of the minimum-norm solution" for x in e.friction.values())]
+    return [
+        "",
+        "  F contains friction: mu(s) times the load of a joint (N), which follows from lambda; s is the speed of sliding (m/s).",
+        *(f"{line}   {mark}".rstrip() for line, mark in zip(lines, [*marks, *[""] * len(lines)], strict=False)),
+    ]
 
 
 def _right_hand_side(e: Explanation, rows: list[str]) -> list[str]:

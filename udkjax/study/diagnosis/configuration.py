@@ -235,13 +235,6 @@ class RankedPositions:
         return neighbours
 
 
-class JointFriction(NamedTuple):
-    """Marks of uniqueness: of the load on which the friction of a joint depends, and of the accelerations that it causes."""
-
-    load: bool
-    accelerations: bool
-
-
 class JointForces(NamedTuple):
     """Uniqueness of the multipliers of a constraint."""
 

@@ -2,7 +2,6 @@
 
 from typing import Any, overload
 
-import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations import determinacy
@@ -17,10 +16,11 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import clearance
-from udkjax.study.diagnosis.configuration import Configuration, JointForces, JointFriction, RankedPositions
+from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions
 from udkjax.study.diagnosis.dependence import Dependency, dependencies_at
 from udkjax.study.diagnosis.diagnosis import Diagnosis
 from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fix_of_held_pin, fixes_of
+from udkjax.study.diagnosis.joint_friction import joint_friction
 from udkjax.study.diagnosis.second_order import branches
 from udkjax.study.diagnosis.system_diagnosis import SystemDiagnosis, diagnose_system
 from udkjax.study.diagnosis.timeline import timeline
@@ -118,7 +118,7 @@ def diagnose(
         clearance=clearance(positions, current, generic_rank, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
         held=tuple(pin.name for pin in held),
-        friction=_friction(mechanism, current),
+        friction=joint_friction(prepare(mechanism, SVD()), current.t, current.q, current.left),
     )
 
 
@@ -158,25 +158,6 @@ def _cure(
         order = sorted(configurations, key=lambda c: -c.smallest)  # the first position determines the stress of a set
         best = best_fix(best.mechanism, ranked, order, owners, left)
     return ()
-
-
-def _friction(mechanism: Mechanism, here: Configuration) -> dict[str, JointFriction]:
-    """Return for friction that depends on loads whether these, and the accelerations that it causes, are unique, by joint.
-
-    Accelerations are those of a motion that slides in all joints that can.
-    """
-    equations = prepare(mechanism, SVD())
-    if not equations.rubbing_joints:
-        return {}
-    found = equations.loose_friction(here.t, jnp.asarray(here.q), jnp.asarray(here.left))
-    slides, loads = np.asarray(found.slides), np.asarray(found.loads)
-    sources = loose = np.asarray(found.loose)
-    while np.any(sources := sources & slides) and np.any(new := loads[sources].any(0) & ~loose):
-        loose, sources = loose | new, new
-    return {
-        joint: JointFriction(not is_loose, not is_loose or not does_slide)
-        for joint, is_loose, does_slide in zip(equations.rubbing_joints, loose, slides, strict=True)
-    }
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:

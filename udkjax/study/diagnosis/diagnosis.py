@@ -7,8 +7,9 @@ import numpy as np
 from udkjax.printing import PrintedTable, html_table
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import Clearance, RankChange
-from udkjax.study.diagnosis.configuration import JointForces, JointFriction
+from udkjax.study.diagnosis.configuration import JointForces
 from udkjax.study.diagnosis.fixes import Fix, Redundancy
+from udkjax.study.diagnosis.joint_friction import JointFriction
 from udkjax.study.diagnosis.second_order import Branch
 from udkjax.study.diagnosis.timeline import Timeline
 from udkjax.study.report import plain, row_label
