@@ -1,6 +1,7 @@
-"""A thousand random gestures on drawings with motors: the page always answers, and undo restores everything."""
+"""Random gestures on drawings with motors: the page always answers, and undo restores everything."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -8,6 +9,7 @@ from tests.studio.gestures import RandomGestures
 
 TEMPLATES = ("crank_rocker", "quick_return", "toggle_press", "cam_follower", "six_bar", "jansen_leg")
 GESTURES = 170  # on each of them
+SEEDS, EACH = 10, 100  # a thousand gestures on a six-bar whose motor runs into a dead point
 TOO_LONG = "504 (Gateway Timeout)"  # the server gives up a diagnosis that takes too long, and the page says so
 FRAME = 0.2  # s: the longest time for which the page may be busy
 
@@ -16,20 +18,32 @@ FRAME = 0.2  # s: the longest time for which the page may be busy
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_random_gestures_are_answered_and_undone(studio, template):
     studio.js(f"studio.files.openTemplate({json.dumps(template)})")
+    gesticulate(studio, template, TEMPLATES.index(template), GESTURES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(len(TEMPLATES), len(TEMPLATES) + SEEDS))
+def test_gestures_on_a_motor_that_runs_into_a_dead_point(studio, seed):
+    studio.open("dead_point.toml", (Path(__file__).parent / "dead_point.toml").read_text())
+    gesticulate(studio, "dead point", seed, EACH)
+
+
+def gesticulate(studio, name, seed, count):
+    """Make random gestures on the drawing that is opened; each must be answered in time, and all are undone and redone."""
     studio.until("studio.motion.pageEngine !== null")
     studio.settle()
     studio.watch()
-    first, gestures = studio.js("studio.state"), RandomGestures(studio, TEMPLATES.index(template))
+    first, gestures = studio.js("studio.state"), RandomGestures(studio, seed)
     longest: list[tuple[float, str]] = []
     moves = 0
-    for k in range(GESTURES):
+    for k in range(count):
         studio.js("watched.longest = 0")
         done = gestures()
         studio.problems[:] = [said for said in studio.problems if TOO_LONG not in said]
         assert studio.problems == [], (k, done, studio.problems)
         moves += studio.js("Boolean(studio.motion.pageEngine) && studio.motion.run?.count > 1")
         longest.append((studio.watched()[1], f"{k}: {done}"))
-    print(f"{template}: moved after {moves} of {GESTURES} gestures; longest tasks of the page (s):", sorted(longest)[-5:])
+    print(f"{name}: moved after {moves} of {count} gestures; longest tasks of the page (s):", sorted(longest)[-5:])
     assert moves > 0
     slow = [one for one in longest if one[0] > FRAME]
     studio.page.keyboard.press("Escape")

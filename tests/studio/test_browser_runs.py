@@ -1,33 +1,12 @@
 """Runs in the studio's page: another thread computes them, they can be stopped, and they end where a motor cannot go on."""
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-# A six-bar with a loose link; the motor runs into a dead point after a nineteenth of a turn.
-DEAD_POINT = """format = 2
-units = {length = "mm", angle = "deg"}
-ground = ["A", "E", "G"]
-link = [
-  {name = "link1", pins = ["A", "B"], density = 7850, width = 10, thickness = 2},
-  {name = "link2", pins = ["B", "C", "D"], density = 7850, thickness = 2},
-  {name = "link3", pins = ["D", "E"], density = 7850, width = 10, thickness = 2},
-  {name = "link4", pins = ["C", "F"], density = 7850, width = 10, thickness = 2},
-  {name = "link5", pins = ["F", "G"], density = 7850, width = 10, thickness = 2},
-  {name = "link6", pins = ["F", "H"], density = 7850, width = 10, thickness = 2},
-]
-motor = [{pin = "A", speed = "60 rpm"}]
-[pins]
-A = [-10, 40]
-B = [10, 80]
-C = [75, 165]
-D = [115, 85]
-E = [140, 20]
-F = [190, 165]
-G = [220, 40]
-H = [275, 210]
-"""
+DEAD_POINT = (Path(__file__).parent / "dead_point.toml").read_text()
 CAUSE = "the linkage reaches 1.86816 rad, at 0.121119 s (dead point: pins B, D, E in line)"  # as the command line says
 ANSWER = 0.1  # s: a page that answers later feels slow
 BUSY = 5.0  # factor by which a busy machine may delay single answers
