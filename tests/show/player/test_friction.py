@@ -1,6 +1,7 @@
 """Friction in the player: rings around joints that stick, and the power of friction."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def rings(picture):
 def test_a_ring_is_around_a_joint_while_it_sticks():
     ts, hangs = np.arange(4.0), np.tile([0.0, -0.5, -np.pi / 2], (4, 1, 1))
     events = SimpleNamespace(names=["pin sticks"], time=np.array([0.25]), index=np.array([0]), of=lambda name: np.array([0.25]))
-    motion = SimpleNamespace(ts=ts, q=hangs, v=0 * hangs, events=events, sticking={"pin": ts % 3 > 0})
+    motion: Any = SimpleNamespace(ts=ts, q=hangs, v=0 * hangs, events=events, sticking={"pin": ts % 3 > 0})
     shown = udk.animate(STICKY, motion, measures=())
     assert shown.data["runs"][0]["sticking"] == [{"name": "pin", "at": [0, -0.5, 0.0], "spans": [[0.25, 3.0]]}]
     assert [len(shown.sticking(t)[0]) for t in (0.0, 0.3, 2.9)] == [0, 1, 1]

@@ -1,5 +1,7 @@
 """Speeds of pins and transmission angles below a motion, also those that a live page computes again."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -15,7 +17,7 @@ def test_speeds_and_transmission_angles_are_those_of_closed_forms(slider_crank, 
     assert_allclose(speeds["speed of P"], CRANK * OMEGA, rtol=1e-12)
     assert_allclose(speeds["speed of B"], np.abs(run.v[:, 2, 0]), rtol=1e-9, atol=1e-12)
     four_bar = udk.library.four_bar()
-    still = Motion(np.zeros(1), np.asarray(four_bar.q0)[None], np.zeros((1, 3, 3)))
+    still: Any = Motion(np.zeros(1), np.asarray(four_bar.q0)[None], np.zeros((1, 3, 3)))
     angle = np.degrees(np.asarray(udk.transmission_angle(four_bar, still, "C"))[0])
     found = {m.name: m for m in measures_of(four_bar, still, ["transmission"], "")}["transmission angle at C"]
     assert_allclose(found.values, min(angle, 180 - angle), rtol=1e-12)

@@ -1,7 +1,7 @@
 """Curves over time below the motion, and arrows of reactions."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,6 +12,7 @@ from udkjax.equations import determinacy
 from udkjax.equations.analysis import analyse
 from udkjax.equations.quantities import efforts, energy, violation
 from udkjax.equations.reactions import reactions, unique_reactions
+from udkjax.positions import StateHistory
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
@@ -124,7 +125,7 @@ def _friction(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]
     names = [name for name, force in mechanism.forces.items() if isinstance(force, Friction)]
     if not names:
         return []
-    powers = power_balance(mechanism, solution).forces
+    powers = power_balance(mechanism, cast(StateHistory, solution)).forces  # NumPy's arrays will do
     return [MeasureCurve("power of friction", "W", np.sum([np.asarray(powers[name]) for name in names], axis=0))]
 
 
