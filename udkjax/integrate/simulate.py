@@ -228,7 +228,7 @@ def simulate(
     if missed:
         analysis = analyse(mechanism)  # with the numbers of the given analysis more rows were redundant
         solution, _, end, code = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
-    if _has_failed(code):
+    if int(code) not in SUCCESSES:
         found = solution if located is None else located
         return _required(explained(found, mechanism, analysis, choices.drift_tol, solver, end), throw)
     return solution if located is None else _as_located(solution, located)
