@@ -309,7 +309,7 @@ def test_beside_joints_that_stick_and_answers_about_the_run():
     assert solution.sticking["S"].tolist() == [True, True, True]
     assert solution.events.counts["one"] == 1
     resting, feet = plate(0.0, coefficient=0.3)
-    still = udk.simulate(resting, [0.0, 1.0], events=feet)
+    still: Any = udk.simulate(resting, [0.0, 1.0], events=feet)
     assert udk.reactions(resting, still) == {}
     assert udk.power_balance(resting, still).kinetic.shape == (2,)
     assert sticking_spans(resting, still) == []
