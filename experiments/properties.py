@@ -4,15 +4,16 @@ Claim: random mechanisms have loops, redundant copies of joints, joints implied 
 forces, and sizes from a micrometre to a kilometre. For all of them, the terms of the equations agree with an independent
 implementation (reference_equations.py), all methods, formulations and engines agree, and accelerations do not depend on names,
 orders, axes, units or copies of constraints. Power is balanced, a is nearest to a_F in the metric of M, impulses are
-reciprocal, impacts neither pull nor add energy, and derivatives are limits of differences. Wrong scene files, arguments and
-command lines neither hang nor abort a process. Each has to end in a documented error that names the place, without a traceback
-and without writing part of a file; any other result is a fault, which the page lists.
+reciprocal, impacts neither pull nor add energy, and derivatives are limits of differences. With friction in all joints the same
+holds of runs, friction takes power, loads are those of repeated substitution, and `diagnose` knows which of them are unique.
+Wrong scene files, arguments and command lines neither hang nor abort a process. Each has to end in a documented error that
+names the place, without a traceback and without writing part of a file; any other result is a fault, which the page lists.
 
 Most properties need no compilation: NumPy runs the scalar programs of a structure on many mechanisms at once. Runs are
 compiled, and so there are fewer of them. The page properties.md lists the results. For a longer run, or an additional one:
 
     python -m experiments properties --set mechanisms=20000 --set seed=1 --set minutes=60
-    python -m experiments properties --set mechanisms=0 --set runs=0 --set first=88000 --set add=1     # more input
+    python -m experiments properties --set first=400 --set add=1 --set files=0     # more mechanisms, and no more files
 """
 
 import json
@@ -26,11 +27,12 @@ import xarray
 from matplotlib.figure import Figure
 
 from experiments.common import data_file, described, load, panels
-from experiments.parts import contact_properties, run_properties, state_properties
+from experiments.parts import contact_properties, friction_properties, run_properties, state_properties
 from experiments.parts.fuzz import KINDS, Fault, cases_of, run, verdict
 from experiments.parts.tally import Found, Tally
 
 PROPERTIES = state_properties.PROPERTIES | run_properties.PROPERTIES | contact_properties.PROPERTIES
+PROPERTIES |= friction_properties.PROPERTIES
 MARGINS = 50.0, 10_000.0  # tolerance over worst error: below the first it is nearly exceeded, above the second it tests little
 MEMBERS = 100  # mechanisms of each structure
 LISTED, SHOWN = 100, 60  # faults that the data list, and kinds of faults that the page lists
@@ -44,6 +46,9 @@ def study(
     commands: int = 500,
     runs: int = 8,
     contacts: int = 64,
+    rubbing: int = 1000,
+    redundant: int = 1000,
+    rubbing_runs: int = 8,
     seed: int = 0,
     first: int = 0,
     minutes: float = 60.0,
@@ -59,15 +64,20 @@ def study(
         commands: Number of wrong command lines.
         runs: Number of structures to integrate; every other one also by diffrax, every third with derivatives.
         contacts: Number of plates and wheels to throw, of each of four kinds.
+        rubbing: Number of mechanisms with friction in all joints whose equations are checked at single states.
+        redundant: Number of redundant mechanisms with friction in all joints of which `diagnose` says what is unique.
+        rubbing_runs: Number of structures with friction to integrate; every third also by diffrax, with derivatives.
         seed: Seed of all random numbers.
         first: The number of the first structure and of the first input.
         minutes: Time limit.
         add: Whether to add the results to the existing data.
     """
     if smoke:
-        mechanisms, files, arguments, commands, runs, contacts, minutes = 20, 30, 10, 0, 0, 0, 5.0
+        mechanisms, files, arguments, rubbing, redundant, minutes = 20, 30, 10, 2, 2, 5.0
+        commands = runs = contacts = rubbing_runs = 0
     members = 5 if smoke else MEMBERS
-    end, tally, count = time.time() + 60 * minutes, Tally(), {"mechanisms": 0, "large": 0, "runs": 0, "contacts": 0}
+    sets = "mechanisms", "large", "runs", "contacts", "rubbing", "redundant", "rubbing runs"
+    end, tally, count = time.time() + 60 * minutes, Tally(), dict.fromkeys(sets, 0)
     for structure in _until(end, first, mechanisms // members, "structures"):
         count["mechanisms"] += state_properties.check_states(tally, seed, [structure], members, structure % 4 == 0)
     for structure in _until(end, first, min(mechanisms // 250, 40), "large scenes"):
@@ -77,6 +87,19 @@ def study(
         count["runs"] += run_properties.check_runs(tally, seed, [structure], *choices)
     if contacts and time.time() < end:
         count["contacts"] += contact_properties.check_contacts(tally, seed + first, contacts)
+    for structure in _until(end, first, 8 * max(rubbing, redundant), "structures with friction"):
+        if count["rubbing"] >= rubbing and count["redundant"] >= redundant:
+            break
+        if count["rubbing"] < rubbing:
+            count["rubbing"] += friction_properties.check_friction(tally, seed, [structure], -(-members // 4))
+        if count["redundant"] < redundant:
+            count["redundant"] += friction_properties.check_uniqueness(tally, seed, [structure], -(-members // 10))
+    integrated = 0
+    for structure in _until(end, first, 8 * rubbing_runs, "structures of runs with friction"):
+        if integrated < rubbing_runs:
+            tried = friction_properties.check_friction_runs(tally, seed, structure, 24, integrated % 3 == 0)
+            count["rubbing runs"] += tried
+            integrated += tried > 0
     faults: list[Fault] = []
     done = dict.fromkeys(KINDS, 0)
     for kind, wanted in {"commands": commands, "arguments": arguments, "files": files}.items():  # the quickest last
@@ -120,11 +143,12 @@ def _dataset(tally: Tally, count: dict[str, int], done: dict[str, int], faults: 
 
 
 def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
-    """Return the combined results of two runs; properties that the older one did not check have no cases in it."""
+    """Return the combined results of two runs; properties and sets that the older one did not have are empty in it."""
     at = dict(zip(old.property.values, json.loads(old.worst_at), strict=True))
     old = (
         old.assign_coords(property=old.property.astype(object))
-        .reindex(property=new.property, fill_value=0)
+        .assign_coords(set=old["set"].astype(object))
+        .reindex({"property": new.property, "set": new["set"]}, fill_value=0)
         .assign_attrs(worst_at=json.dumps([at.get(name, "") for name in new.property.values]))
     )
     both = new.copy()
@@ -189,6 +213,16 @@ def figure(data: xarray.Dataset) -> Figure:
     return picture
 
 
+def _about_friction(sets: dict[str, int]) -> str:
+    if not sets.get("rubbing"):
+        return ""
+    return (
+        f"With friction in all joints, the equations of {sets['rubbing']:,} mechanisms are evaluated, {sets['rubbing runs']} "
+        f"mechanisms are integrated, and a linear program decides for {sets['redundant']:,} redundant mechanisms whether their "
+        "accelerations are unique. "
+    )
+
+
 def page(data: xarray.Dataset) -> str:
     """Return properties.md: the result for each property, and each remaining fault."""
     at, margins = json.loads(data.worst_at), _margins(data)
@@ -202,8 +236,10 @@ def page(data: xarray.Dataset) -> str:
         "",
         f"The equations of {sets['mechanisms']:,} mechanisms are evaluated by NumPy at single states, those of "
         f"{sets['large']} large mechanisms by loops. {sets['runs']} mechanisms are integrated by machine code, a part of them "
-        f"also by diffrax and with derivatives; {sets['contacts']} bodies are thrown onto a floor and onto other bodies. The "
-        "call next to an error reproduces the case: `random_scene(seed, structure, numbers)` of "
+        f"also by diffrax and with derivatives; {sets['contacts']} bodies are thrown onto a floor and onto other bodies. "
+        f"{_about_friction(sets)}The "
+        "call next to an error reproduces the case: "
+        "`random_scene(seed, structure, numbers)` of "
         "experiments/parts/random_scenes.py. The margin is the tolerance divided by the worst error, marked `!` below 50 and "
         "`?` above 10,000. Errors are relative, in the scene's own units; if the condition number of the rows exceeds "
         f"{state_properties.ORDINARY:g}, they are also divided by its amplification of rounding.",

@@ -274,7 +274,7 @@ def _loads(table: Table, q: np.ndarray, v: np.ndarray, index: dict[str, int]) ->
                 couple(lost, entry["bodies"], -entry.get("damping", 0.0) * rate)
             case "torque":
                 couple(lost, entry["bodies"], entry["value"])
-            case "friction":
+            case "friction" if "torque" in entry:  # with a coefficient: friction_properties.py
                 _, rate = turning(pins[entry["joint"]])
                 couple(lost, pins[entry["joint"]], -entry["torque"] * np.tanh(rate / entry["velocity"]))
             case "force":

@@ -18,6 +18,7 @@ from udkjax.equations.scales import traced_scales
 
 TOL = 1e-10  # of integration
 SPAN = 0.5  # of the scene's own time
+RUN_BODIES = 1, 3  # least and largest number
 STEPS = 5e-4, 2.5e-4  # relative changes of the numbers, of differences
 PROPERTIES = {
     "engines": Property(
@@ -71,12 +72,31 @@ def _runner(first: udk.Analysis, engine: Any, formulation: Any = None) -> Callab
     return run
 
 
-def check_runs(tally: Tally, seed: int, structures: Iterable[int], members: int, by_diffrax: bool, derivatives: bool) -> int:
-    """Check all properties of runs on some mechanisms of each structure; return how many there were."""
+def check_runs(
+    tally: Tally,
+    seed: int,
+    structures: Iterable[int],
+    members: int,
+    by_diffrax: bool,
+    derivatives: bool,
+    alter: Callable[[RandomScene], RandomScene] | None = None,
+) -> int:
+    """Check all properties of runs on some mechanisms of each structure; return how many there were.
+
+    Args:
+        tally: The results.
+        seed: Seed of all random numbers.
+        structures: Numbers of the structures.
+        members: Number of mechanisms of each.
+        by_diffrax: Whether runs are repeated by diffrax.
+        derivatives: Whether runs are differentiated.
+        alter: Adds friction to a scene; without it, the equations of the reference are those of the scene.
+    """
     count = 0
     for structure in structures:
-        scenes = [random_scene(seed, structure, number, bodies=(1, 3)) for number in range(members)]
+        scenes = [random_scene(seed, structure, number, bodies=RUN_BODIES) for number in range(members)]
         scenes = [scene for scene in scenes if (s := solve(scene)).is_clear and s.condition < 1e3]
+        scenes = scenes if alter is None else [alter(scene) for scene in scenes]
         if not scenes:
             continue
         first = udk.analyse(build(scenes[0].table))
@@ -102,7 +122,8 @@ def check_runs(tally: Tally, seed: int, structures: Iterable[int], members: int,
                 tally.add("engines", np.max(abs(np.asarray(other.q)[k] / unit[k] - q[k])) / size[k], scenes[k].label)
         _check_single(tally, scenes, batch, first, q, size, ended, unit)
         _check_energy(tally, scenes, batch, found, ended)
-        _check_partitioning(tally, scenes, batch, first, q, size, ended, unit, by_diffrax)
+        if alter is None:
+            _check_partitioning(tally, scenes, batch, first, q, size, ended, unit, by_diffrax)
         for k in np.flatnonzero(ended)[:2]:
             _check_power(tally, scenes[k])
         if derivatives:
@@ -185,6 +206,10 @@ def _check_power(tally: Tally, scene: RandomScene) -> None:
         return
     found = udk.power_balance(mechanism, run)
     tally.add("power balance", float(found.relative), scene.label)
+    rubs = [name for name, force in mechanism.forces.items() if isinstance(force, udk.Friction) and force.rubs]
+    if rubs:
+        takes = np.array([found.forces[name] for name in rubs])
+        tally.add("friction power of a run", max(np.max(takes), 0.0) / (np.max(abs(takes)) or 1.0), scene.label)
     power = np.asarray(found.supplied)
     fine, coarse = (0.5 * span * _integral(x[::k], power[::k]) for k in (1, 2))
     ends = [(evaluate(scene.table, *(np.asarray(y)[k] for y in (run.ts, run.q, run.v))), np.asarray(run.v)[k]) for k in (0, -1)]

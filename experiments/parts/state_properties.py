@@ -125,10 +125,16 @@ def growth(solved: Solved, power: int = 2, without: Sequence[int] = ()) -> float
 class Programs:
     """The programs of mechanisms of one structure with their numbers in, run by NumPy on all of them at once."""
 
-    def __init__(self, mechanism: udk.Mechanism, redundant: Sequence[int], tables: Sequence[Table] = ()):
-        """Evaluators of one mechanism, or of `tables` of its structure, whose numbers replace its own."""
+    def __init__(
+        self,
+        mechanism: udk.Mechanism,
+        redundant: Sequence[int],
+        tables: Sequence[Table] = (),
+        names: Sequence[str] = ("accelerations", "tangent_part", "rows_and_loads"),
+    ):
+        """Evaluators by programs of one mechanism, or of `tables` of its structure, whose numbers replace its own."""
         programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
-        self._unrolled = Unrolled(programs, ["accelerations", "tangent_part", "rows_and_loads"])
+        self._unrolled = Unrolled(programs, names)
         self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
         own = np.concatenate([np.ravel(x) for x in mechanism.numbers])
         rows = _at_start(mechanism.without_origin, numbers_of(mechanism, tables) if tables else own[None])
@@ -139,7 +145,8 @@ class Programs:
         """Return the results (members, ...) of a program at q and v (members, n), t = 0, by array."""
         given = {"constants": self._constants, "t": np.zeros((len(q), 1)), "q": q, "v": v, "dq": 0.0 * q, "dv": dv + 0.0 * v}
         program, inputs, outputs = self._unrolled.program(name)
-        values = _run(program, np.stack([given[x][:, k] for x, k in inputs], 1))
+        unused = np.zeros(len(q))  # loads of friction that other programs begin with
+        values = _run(program, np.stack([given[x][:, k] if x in given else unused for x, k in inputs], 1))
         return {x: values[:, [i for i, (y, _) in enumerate(outputs) if y == x]] for x in dict.fromkeys(y for y, _ in outputs)}
 
     def accelerations(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,12 +11,13 @@ pytest.importorskip("experiments", reason="not in a source tree")
 import udkjax as udk
 from experiments.common import HERE, load
 from experiments.parts import fuzz_arguments, state_properties
+from experiments.parts.friction_properties import check_friction, check_friction_runs, check_uniqueness
 from experiments.parts.fuzz import Case, cases_of, run, verdict
 from experiments.parts.random_scenes import build, random_scene, shrunk, state_of
 from experiments.parts.reference_equations import evaluate
-from experiments.parts.state_properties import PROPERTIES, check_large, check_states
+from experiments.parts.state_properties import check_large, check_states
 from experiments.parts.tally import Tally
-from experiments.properties import page
+from experiments.properties import PROPERTIES, page
 from udkjax.cli import main
 
 SEED = 3
@@ -43,6 +44,17 @@ def test_states_by_all_methods():
     check_states(tally, SEED, range(4, 12), 8)
     check_large(tally, SEED, range(2))
     check(tally)
+
+
+@pytest.mark.slow
+def test_friction_in_all_joints():
+    """Accelerations, loads and runs with friction, and which of them are unique."""
+    tally = Tally()
+    assert check_friction(tally, SEED, range(8), 5) > 0
+    assert check_uniqueness(tally, SEED, range(4), 1) > 0
+    assert any(check_friction_runs(tally, SEED, structure, 4, False) for structure in range(8))
+    check(tally)
+    assert {"friction", "friction power", "unique loads", "unique accelerations", "batch with friction"} <= set(tally.found)
 
 
 def test_random_scenes_are_closed_and_drawn_again():
