@@ -77,3 +77,14 @@ def test_the_pictures_of_the_page_are_there_and_small():
     assert sum(path.stat().st_size for path in folder.glob("*.png")) < 1_000_000
     titles = [str(import_module(f"examples.gallery.{name}").__doc__).splitlines()[0] for name in gallery.NAMES]
     assert all(f"## {title}\n" in text for title in titles)
+
+
+@pytest.mark.slow
+def test_live_pages_of_the_gallery_simulate(browser):
+    player, loaded = "document.getElementById('player').player", {}
+    for path in sorted((ROOT / "docs" / "gallery").glob("*.html")):
+        page = browser.new_page()
+        page.goto(path.as_uri())
+        loaded[path.stem] = page.evaluate(f"(async () => !{player}.live || await {player}.live.ready)()")
+        page.close()
+    assert [name for name, works in loaded.items() if not works] == []  # else make them anew
