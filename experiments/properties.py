@@ -77,7 +77,8 @@ def study(
         commands = runs = contacts = rubbing_runs = 0
     members = 5 if smoke else MEMBERS
     sets = "mechanisms", "large", "runs", "contacts", "rubbing", "redundant", "rubbing runs"
-    end, tally, count = time.time() + 60 * minutes, Tally(), dict.fromkeys(sets, 0)
+    end, tally = time.time() + 60 * minutes, Tally()
+    count: dict[str, int] = dict.fromkeys(sets, 0)
     for structure in _until(end, first, mechanisms // members, "structures"):
         count["mechanisms"] += state_properties.check_states(tally, seed, [structure], members, structure % 4 == 0)
     for structure in _until(end, first, min(mechanisms // 250, 40), "large scenes"):

@@ -20,7 +20,7 @@ MOMENT = 0.9  # fraction of the motion at which its picture is taken
 
 
 class Motion(NamedTuple):
-    """What a player shows: a run after the motion of the hand, and which joints stick."""
+    """A run after the motion of the hand, and which joints stick, as a player shows them."""
 
     ts: jax.Array
     q: jax.Array

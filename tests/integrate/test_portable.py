@@ -104,7 +104,7 @@ def test_accelerations_energies_and_efforts_are_those_of_the_textbook(evaluated,
     assert_allclose(found["energy"], [energy.kinetic[1], energy.potential[1]], rtol=1e-12)
     frictions = [name for name, force in mechanism.forces.items() if isinstance(force, udk.Friction)]
     powers = udk.power_balance(mechanism, run).forces if frictions else {}
-    assert_allclose(found["friction_power"], [sum(powers[name][1] for name in frictions)], rtol=1e-9)
+    assert_allclose(found["friction_power"], [sum(float(powers[name][1]) for name in frictions)], rtol=1e-9)
     for place, effort in zip(found["places"], udk.efforts(mechanism, run).values(), strict=True):
         assert found["x0"][place] == pytest.approx(float(effort[1]), rel=1e-9)
 

@@ -124,7 +124,7 @@ def test_friction_of_joints_is_among_the_loads():
     assert max(found.checks.values()) < 1e-13 and found.gauss.slope < 1e-12
     rub = found.friction["rub"]
     assert rub.joint == "A" and rub.is_unique
-    assert_allclose([rub.speed, rub.coefficient, rub.load], [0.1, 0.3 * np.tanh(40.0), np.hypot(*multipliers)], rtol=1e-12)
+    assert_allclose([rub.speed, rub.coefficient, rub.load], [0.1, 0.3 * np.tanh(40.0), np.linalg.norm(multipliers)], rtol=1e-12)
     assert_allclose(found.force, [0.0, -2 * G, -0.3 * 0.05 * rub.load], rtol=1e-12)
     assert "rub in A" in str(found) and json.loads(json.dumps(found.to_dict()))["friction"]["rub"]["is_unique"] is True
 

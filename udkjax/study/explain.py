@@ -74,7 +74,10 @@ def explain(
         rank=rank,
         null_rows=null_rows[:, np.linalg.norm(null_rows, axis=0) > 0],
         constraint_force=-s["psi_q"].T @ s["multipliers"],
-        friction={names[joint]: RubbingTerms(joint, *map(float, x), marks[joint].load) for joint, x in terms.items()},
+        friction={
+            names[joint]: RubbingTerms(joint, float(x[0]), float(x[1]), float(x[2]), marks[joint].load)
+            for joint, x in terms.items()
+        },
         gauss=_gauss(s, rank),
         checks=_checks(s),
         **s,
