@@ -47,6 +47,12 @@ def test_results_are_put_on_a_graphics_card_in_one_copy(monkeypatch):
         assert np.asarray(found[name]).tobytes() == x.tobytes()
 
 
+def test_numbers_are_arrays_of_jax_also_without_programs(monkeypatch):
+    monkeypatch.setattr(arrays, "_WORTH_A_PROGRAM", 0)
+    with jax.disable_jit():
+        assert all(isinstance(x, jax.Array) for x in (arrays.number(1.0), *arrays.put_arrays([np.ones(2), 1.0])))
+
+
 def test_a_run_reads_nothing_back_from_a_graphics_card(monkeypatch):
     put = []
 

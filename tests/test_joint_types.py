@@ -129,7 +129,7 @@ def kinds_of_marks(joint: udk.Joint) -> Counter:
 def follows_radius(joint: udk.Joint) -> bool:
     mechanism = udk.Mechanism(BODIES, {"J": joint})
     symbols = symbols_of(marks(mechanism, mechanism.q0[None]), 0.1)
-    record = {"marks": [], "traces": [], "reactions": None}
+    record = {"marks": [], "traces": [], "reactions": None, "measures": []}
     return bool(symbol_updates(mechanism, record, symbols, 0)["sizes"])
 
 

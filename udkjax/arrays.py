@@ -56,7 +56,8 @@ def stored(x: Any) -> Any:
     return jax.device_put(x) if isinstance(x, np.ndarray | np.generic) else x
 
 
-_put_together, _put_alone = jax.jit(lambda *arrays: arrays), jax.jit(lambda array: array)
+# Without `jit`, as `jax.disable_jit` has it, they convert.
+_put_together, _put_alone = jax.jit(lambda *arrays: [jnp.asarray(x) for x in arrays]), jax.jit(jnp.asarray)
 _WORTH_A_PROGRAM = 60  # calls after which a program is compiled, in 15 ms; it saves 0.3 ms per call
 _calls: Counter[tuple[tuple[int, ...], ...]] = Counter()  # number of calls by the shapes of the arrays
 

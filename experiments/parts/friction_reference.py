@@ -68,14 +68,13 @@ def rubs_of(table: Table, q: np.ndarray, v: np.ndarray) -> dict[str, Rub]:
             speed, size, forms = rub["radius"] * (v2[2] - v1[2]), np.linalg.norm, _circle(32)
             wrenches = [np.array([0.0, 0.0, sign * rub["radius"]]) for sign in (-1.0, 1.0)]
         else:
-            turn, angle = np.exp(1j * q2[2]), q1[2] + joint["axis"]
-            arm = turn * complex(*joint["points"][1])
-            x, axis = complex(*q2[:2]) + arm, np.exp(1j * angle)
-            arms = x - complex(*q1[:2]), arm
-            rates = [complex(*w[:2]) + 1j * w[2] * r for w, r in zip((v1, v2), arms, strict=True)]
-            speed = float(((rates[1] - rates[0]) * np.conj(axis)).real)
+            axis = complex(np.exp(1j * (q1[2] + joint["axis"])))
+            arm = complex(np.exp(1j * q2[2])) * complex(*joint["points"][1])
+            arms = complex(*q2[:2]) + arm - complex(*q1[:2]), arm
+            rates = [complex(*w[:2]) + 1j * float(w[2]) * r for w, r in zip((v1, v2), arms, strict=True)]
+            speed = ((rates[1] - rates[0]) * axis.conjugate()).real
             wrenches = [
-                s * np.array([axis.real, axis.imag, (np.conj(r) * axis).imag]) for s, r in zip((-1, 1), arms, strict=True)
+                s * np.array([axis.real, axis.imag, (r.conjugate() * axis).imag]) for s, r in zip((-1, 1), arms, strict=True)
             ]
             size, forms = _edges(rub.get("length")), _forms(joint["type"], rub.get("length"))
         for body, wrench in zip(joint["bodies"], wrenches, strict=True):

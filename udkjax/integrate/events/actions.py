@@ -144,7 +144,7 @@ class Impact(Action):
 class RubbingImpact(Impact):
     """An impact of a contact with friction: see `Contact`.
 
-    The impulse along the line is within the cone of friction, and the law of restitution is Poisson's (`rubbing_impacts`).
+    The impulse along the line is within the cone of friction, and the law of restitution is Poisson's (`impulses_with_friction`).
     """
 
     coefficient: Float[Array, ""] = eqx.field(converter=number_if_any, default=0.0)
