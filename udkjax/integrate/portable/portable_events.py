@@ -47,7 +47,8 @@ class PortableEvents:
         self._events = expand_events(events, mechanism) if events else ()
         for event in self._events:
             if not event.action.on_page:
-                kind, cure = type(event.action).__name__, "a page knows Log, Stop and Impact; leave out live"
+                kind = type(event.action).__name__ if event.action.friction is None else "an impact with friction"
+                cure = "a page knows Log, Stop and Impact without friction; leave out live"
                 raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) cannot run in a page yet: {cure}")
         self._conditions = watched_conditions(self._events, mechanism) if events else None
         if self._conditions is None and events:
