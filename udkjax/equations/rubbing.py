@@ -230,8 +230,8 @@ def settle(
                 after = friction(new)
                 return new, jnp.linalg.norm(root * (after - before)), jnp.linalg.norm(root * after)
 
-            found, is_open = repeated_newton(step, jnp.where(k > 1, x, start), (k == 0) | (fails & ~lost))
-            found = jnp.where((k == 0) | fails, found, x)
+            x = jnp.where((k == 1) & fails, start, x)
+            found, is_open = repeated_newton(step, x, (k == 0) | (fails & ~lost))
             return found, jnp.where(k == 0, is_open, fails), (k > 0) & (lost | is_open)
 
         x, fails, lost = jax.lax.fori_loop(0, STAGES + 1, stage, (start, jnp.asarray(False), jnp.asarray(False)))
