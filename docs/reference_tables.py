@@ -95,7 +95,7 @@ def table(cls: type) -> str:
 
 def described(cls: type) -> Iterator[tuple[str, str, str, str]]:
     """Iterate over name, type, default and meaning of the arguments of a class's constructor."""
-    if cls.__init__ is object.__init__ and not hasattr(cls, "_fields"):
+    if issubclass(cls, Enum) or (cls.__init__ is object.__init__ and not hasattr(cls, "_fields")):
         return
     mentioned = set(re.findall(r"`(\w+)`", inspect.getdoc(cls) or ""))
     meanings = dict.fromkeys(mentioned, "see above") | comments(cls) | sections(cls)

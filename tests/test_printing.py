@@ -203,7 +203,8 @@ def test_signatures_name_their_types():
         found = getattr(udk, name)
         has_one = not inspect.isclass(found) or not issubclass(found, Exception | int)
         for argument in inspect.signature(found).parameters.values() if has_one else ():
-            assert "numpy.bool" not in str(argument) and len(str(argument)) < 300, (name, argument)
+            text = str(argument).replace("typing.Union", "")  # by which older Python versions write |
+            assert "numpy.bool" not in text and len(text) < 330, (name, argument)
 
 
 def test_the_help_of_a_body_begins_on_one_screen():

@@ -14,11 +14,11 @@ import pytest
 from jax.interpreters import mlir
 
 import udkjax as udk
-from tests.choices import fast
+from tests.choices import fast, needs_deferred
 from udkjax.native import primitive
 from udkjax.native.base import host_function, host_program, machine
 from udkjax.native.base.host_function import call_seldom
-from udkjax.programs.deferred import deferred, deferred_p
+from udkjax.programs.deferred import deferred
 
 TS = np.array([0.0, 0.1, 0.2])
 PENDULUM, LINKAGE = udk.library.compound_pendulum(), udk.library.four_bar(np.pi / 3)
@@ -78,8 +78,7 @@ PROGRAMS = {
     "closing, reverse mode": jax.grad(closed),
     "rarely reached": lambda x: call_seldom(_eigenvalues, x),
 }
-
-
+ON_HOST = [name for name in PROGRAMS if name != "rarely reached"]
 EXPECTED = {"run": 1, "batch of runs": 1, "forward mode": 1, "second order": 1, "reverse mode": 2, "rarely reached": 1}
 
 
@@ -93,7 +92,11 @@ def targets(text):
 
 
 @pytest.mark.parametrize(
-    "name", fast(set(PROGRAMS) - {"second order", "run by SVD", "run by Householder", "reverse mode"}, PROGRAMS)
+    "name",
+    [
+        *fast(set(ON_HOST) - {"second order", "run by SVD", "run by Householder", "reverse mode"}, ON_HOST),
+        pytest.param("rarely reached", marks=needs_deferred),
+    ],
 )
 def test_the_host_computes_for_a_graphics_card(name):
     """There are as many operations as on the CPU, with handlers that copy, and no other integrator is used."""
@@ -118,7 +121,7 @@ SOLVES = {  # with the numbers of calls: the scales, the assembly, and the solve
 FAST = {"kinematics", "equilibrium"}
 
 
-@pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
+@needs_deferred
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in FAST)) for x in SOLVES])
 def test_a_solve_for_a_graphics_card_is_one_call(name):
     """There are no loops or factorizations on the card. On the CPU the solve is a part of the program."""
@@ -130,7 +133,7 @@ def test_a_solve_for_a_graphics_card_is_one_call(name):
     assert len(targets(card)) == calls and all(x.endswith("_copied") for x in targets(card))
 
 
-@pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
+@needs_deferred
 @pytest.mark.parametrize(
     ("solve", "most", "word"), [(_eigenvalues, host_program.FEW_MATRICES, "cusolver"), (_root, host_program.SMALL, "while")]
 )
@@ -141,14 +144,16 @@ def test_large_batches_stay_on_the_card(solve, most, word):
         assert bool(targets(card)) == is_called and (word in card) != is_called
 
 
-@pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
+@needs_deferred
 def test_batches_of_loops_one_after_another_do_not():
     one_by_one = deferred(lambda xs: jax.lax.map(_root, xs))
     card = jax.jit(one_by_one).trace(jnp.ones(host_program.SMALL + 1)).lower(lowering_platforms=("cuda",)).as_text()
     assert len(targets(card)) == 1 and "while" not in card
 
 
-@pytest.mark.parametrize("name", ["run", "reverse mode", "closing", "rarely reached", "deferred"])
+@pytest.mark.parametrize(
+    "name", ["run", "reverse mode", "closing", *(pytest.param(x, marks=needs_deferred) for x in ("rarely reached", "deferred"))]
+)
 def test_programs_are_exported_for_graphics_cards(name):
     """A program for both platforms also runs here."""
     program, x = jax.jit(deferred(_eigenvalues) if name == "deferred" else PROGRAMS[name]), given(name)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose
 
+from tests.choices import needs_deferred
 from udkjax.native.base.host_function import call_seldom
 
 
@@ -24,6 +25,7 @@ def _reach(x):
     return jax.lax.cond(x[0] > 0, seldom, lambda: {"root": jnp.zeros_like(x), "positive": jnp.asarray(False)})
 
 
+@needs_deferred
 def test_what_is_seldom_reached_is_right_and_not_compiled():
     x = jnp.array([[4.0, 2e6, 1e-6], [-1.0, 1.0, 1.0], [9.0, 1.0, 3.0]])
     found = jax.jit(_reach)(x[0])

@@ -9,9 +9,9 @@ from udkjax.cli.common import load, refuse
 if TYPE_CHECKING:
     import numpy as np
     import xarray
-    from numpy.typing import ArrayLike
 
     from udkjax import Mechanism
+    from udkjax.annotations import Numbers
 
 DATASET_SUFFIXES = (".nc", ".h5", ".csv", ".npz")  # .h5 is also NetCDF, which is based on HDF5
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf", ".jpg")
@@ -51,8 +51,8 @@ def check_folder(out: Path) -> None:
 def write(
     out: Path | None,
     scene: str,
-    variables: Mapping[str, "tuple[Sequence[str], ArrayLike, str]"],
-    coordinates: Mapping[str, "ArrayLike"],
+    variables: Mapping[str, "tuple[Sequence[str], Numbers, str]"],
+    coordinates: Mapping[str, "Numbers"],
     settings: Mapping[str, object],
 ) -> None:
     """Write variables (dimensions, values, unit) with the scene, settings and versions to a file, unless `out` is None."""

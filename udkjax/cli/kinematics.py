@@ -9,9 +9,8 @@ from udkjax.cli.datasets import load_to_write, write
 from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from udkjax import Mechanism
+    from udkjax.annotations import Numbers
     from udkjax.positions.counting import Count
     from udkjax.positions.kinematics import Kinematics, Travel
 
@@ -130,7 +129,7 @@ def kinematics(
     if assembly_modes is not None:
         results["branches"] = assembly_modes
     dims = ("value", "body", "coordinate")
-    variables: "dict[str, tuple[tuple[str, ...], ArrayLike, str]]" = {
+    variables: "dict[str, tuple[tuple[str, ...], Numbers, str]]" = {
         "q": (dims, motion.q, "m, m, rad"),
         "v": (dims, motion.v, "m/s, m/s, rad/s"),
         "a": (dims, motion.a, "m/s2, m/s2, rad/s2"),

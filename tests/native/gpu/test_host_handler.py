@@ -21,11 +21,12 @@ from jax.interpreters import mlir
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.choices import needs_deferred
 from udkjax.native import primitive, records
 from udkjax.native.base import ffi, host_function, host_program
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.driver import CudaError
-from udkjax.programs.deferred import deferred, deferred_p
+from udkjax.programs.deferred import deferred
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")
 STREAM, CONTEXT, ERROR = 0x5EED, 0xC0DE, 700
@@ -310,7 +311,6 @@ def test_calls_of_several_threads_do_not_mix(card):
             assert_array_equal(found, np.linalg.norm(x, axis=1))
 
 
-needs_deferred = pytest.mark.skipif(deferred_p is None, reason="this JAX has no programs that can be deferred")
 FOUR = udk.library.four_bar(np.pi / 3)
 TABLE = jnp.array([2, 3, 5])
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from udkjax.annotations import JsonObject
+from udkjax.annotations import JsonObject, Numbers
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
@@ -161,7 +160,7 @@ def animate(
     reactions: bool = False,
     traces: Traces | None = None,
     shapes: BodyPoints | None = None,
-    targets: ArrayLike | None = None,
+    targets: Numbers | None = None,
     title: str | None = None,
     live: Live = False,
     events: ExpandsToEvents | Sequence[ExpandsToEvents] = (),
@@ -258,8 +257,8 @@ def _live_runs(
 @checked
 def animate_modes(
     mechanism: Mechanism,
-    q: ArrayLike,
-    shapes: ArrayLike,
+    q: Numbers,
+    shapes: Numbers,
     frequencies: Sequence[float] | None = None,
     labels: Sequence[str] | None = None,
     title: str | None = None,

@@ -2,8 +2,8 @@
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.forces import Spring
 from udkjax.scene.mechanism import Mechanism
@@ -37,7 +37,7 @@ def distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"]
     return np.array(found).reshape(-1, 2)
 
 
-def to_ground(point: ArrayLike, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
+def to_ground(point: Numbers, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
     """Return a point of a body in ground coordinates (m) for each of its frames x, y, angle; or several points for one frame."""
     x, y = np.asarray(point, float).T
     cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from udkjax.annotations import JsonObject
+from udkjax.annotations import JsonObject, Numbers
 from udkjax.integrate.events.conditions import Gap
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drivers import Driver
@@ -34,7 +33,7 @@ from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.mark_places import SAME_PLACE, body_points, corners_of, distinct, in_frame, to_ground
 
 Mark = JsonObject
-BodyPoints = Mapping[str, ArrayLike]  # points (n, 2) by body
+BodyPoints = Mapping[str, Numbers]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # number of points of a cam's outline
 TOUCHING = 0.02  # relative to their distance: wheels with a larger gap are joined by a belt
@@ -44,10 +43,10 @@ MARGIN = 0.08  # length of a rail beyond the used range, relative to the mechani
 
 def marks(
     mechanism: Mechanism,
-    poses: ArrayLike,
+    poses: Numbers,
     shapes: BodyPoints | None = None,
     gaps: Sequence[Gap] = (),
-    targets: ArrayLike | None = None,
+    targets: Numbers | None = None,
 ) -> list[Mark]:
     """Return the marks of a mechanism, from back to front.
 
@@ -279,7 +278,7 @@ class _Drawing:
         self.wheels.append({"kind": MarkKind.WHEEL, **self._at(second, (0.0, 0.0)), **wheel})
         self.shaped.add(second)
 
-    def _travel(self, one: str, at: ArrayLike, axis: float, two: str, point: ArrayLike) -> tuple[float, float]:
+    def _travel(self, one: str, at: Numbers, axis: float, two: str, point: Numbers) -> tuple[float, float]:
         """Return the range (m) of a point of body `two` along an axis of body `one`, measured from the point `at` of `one`."""
         gap = self._path(two, point) - self._path(one, at)
         direction = axis + self._frames(one)[:, 2]
@@ -289,18 +288,18 @@ class _Drawing:
     def _frames(self, body: str) -> Float[np.ndarray, "T 3"]:
         return np.zeros((len(self.poses), 3)) if body == GROUND else self.poses[:, self.number[body]]
 
-    def _path(self, body: str, point: ArrayLike) -> Float[np.ndarray, "T 2"]:
+    def _path(self, body: str, point: Numbers) -> Float[np.ndarray, "T 2"]:
         return to_ground(point, self._frames(body))
 
-    def _at(self, body: str, point: ArrayLike) -> Mark:
+    def _at(self, body: str, point: Numbers) -> Mark:
         return {"body": self.number[body], "at": np.asarray(point, float).tolist()}
 
-    def _held(self, bodies: Sequence[str], points: ArrayLike) -> Mark:
+    def _held(self, bodies: Sequence[str], points: Numbers) -> Mark:
         """Return the place of a joint: on the ground if the ground is one of its bodies, else on its first body."""
         side = 1 if bodies[1] == GROUND else 0
         return self._at(bodies[side], np.asarray(points)[side])
 
-    def _anchors(self, bodies: Sequence[str], points: ArrayLike | None) -> list[list[float]]:
+    def _anchors(self, bodies: Sequence[str], points: Numbers | None) -> list[list[float]]:
         return [[self.number[body], x, y] for body, (x, y) in zip(bodies, np.asarray(points, float).tolist(), strict=True)]
 
     def _held_by(self, body: str, other: str) -> Mark:

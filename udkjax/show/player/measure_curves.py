@@ -5,9 +5,8 @@ from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
-from udkjax.annotations import JsonObject
+from udkjax.annotations import JsonObject, Numbers
 from udkjax.equations import determinacy
 from udkjax.equations.analysis import analyse
 from udkjax.equations.quantities import efforts, energy, violation
@@ -25,7 +24,7 @@ SMALLEST_POSITIVE = 1e-17  # drawn instead of zero on a logarithmic axis; less t
 
 
 # Names of measures; or values over time by name, and for several runs also by label.
-Measures = Sequence[str] | Mapping[str, ArrayLike | Mapping[str, ArrayLike] | None]
+Measures = Sequence[str] | Mapping[str, Numbers | Mapping[str, Numbers] | None]
 
 
 ReactionArrows = tuple[

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from udkjax.annotations import JsonObject
+from udkjax.annotations import JsonObject, Numbers
 
 
-def pack(table: Float[np.ndarray, "T n"], step: ArrayLike) -> JsonObject:
+def pack(table: Float[np.ndarray, "T n"], step: Numbers) -> JsonObject:
     """Return a table of finite numbers, rounded to the `step` of each column (or of all), as plain data."""
     table = np.asarray(table, float)
     steps = np.broadcast_to(np.asarray(step, float), table.shape[1:])
@@ -39,7 +38,7 @@ def unpack(data: Mapping[str, Any]) -> Float[np.ndarray, "T n"]:
     return columns.cumsum(axis=1).cumsum(axis=1).T * np.asarray(data["steps"])
 
 
-def floats(values: ArrayLike) -> str:
+def floats(values: Numbers) -> str:
     """Return numbers, finite or not, in single precision, as base64."""
     return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()
 

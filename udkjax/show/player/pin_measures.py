@@ -1,9 +1,11 @@
 """Measures of pins: speeds and transmission angles, which a page computes again from the places of their anchors."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.equations.analysis import analyse
 from udkjax.positions import pins_with_bodies, transmission_pins
 from udkjax.scene.bodies import GROUND
@@ -38,17 +40,17 @@ def transmission_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"]
     return found
 
 
-def _moving_pins(mechanism: Mechanism) -> dict[str, tuple[str, ArrayLike]]:
+def _moving_pins(mechanism: Mechanism) -> Mapping[str, tuple[str, Numbers]]:
     """Return a body of each pin that is not on the ground, and the place of the pin in its frame (m)."""
     joined = {name: next(iter(at.items())) for name, at in pins_with_bodies(mechanism).items() if GROUND not in at}
     return joined | ({} if mechanism.drawing is None else dict(mechanism.drawing.free_pins()))
 
 
-def _anchor(mechanism: Mechanism, body: str, place: ArrayLike) -> PinAnchor:
+def _anchor(mechanism: Mechanism, body: str, place: Numbers) -> PinAnchor:
     return [mechanism.body_names.index(body), *np.asarray(place, float).tolist()]
 
 
-def _speed(place: ArrayLike, frames: Float[np.ndarray, "T 3"], rates: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T"]:
+def _speed(place: Numbers, frames: Float[np.ndarray, "T 3"], rates: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T"]:
     arm = to_ground(place, frames) - frames[:, :2]
     return np.hypot(rates[:, 0] - rates[:, 2] * arm[:, 1], rates[:, 1] + rates[:, 2] * arm[:, 0])
 

@@ -28,9 +28,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from udkjax.annotations import JsonObject
+from udkjax.annotations import JsonObject, Numbers
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.solution import Result
@@ -51,7 +50,7 @@ from udkjax.show.player.sketch import POINT, ForceArrow, TracedPath, view_of
 from udkjax.show.player.symbols import symbols_of
 
 Record = JsonObject
-Traces = Sequence[str | tuple[str, ArrayLike]]  # joints, bodies, or points of bodies
+Traces = Sequence[str | tuple[str, Numbers]]  # joints, bodies, or points of bodies
 PRECISION = 1e-5  # resolution of positions (characteristic lengths) and angles (rad): a hundredth of a pixel in 1000 pixels
 TIME_PRECISION = 1e-9  # resolution of times, as a fraction of the timeline
 FORCE_PRECISION = 1e-3  # resolution of forces, as a fraction of the usual force
@@ -75,7 +74,7 @@ def run_record(
     traces: Traces | None,
     shapes: BodyPoints | None = None,
     gaps: Sequence[Gap] = (),
-    targets: ArrayLike | None = None,
+    targets: Numbers | None = None,
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return a run as plain data, and its poses; a failed run is shown up to its failure."""
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
@@ -120,7 +119,7 @@ def run_record(
 
 
 def mode_record(
-    mechanism: Mechanism, q: ArrayLike, shape: ArrayLike, frequency: float | None, label: str
+    mechanism: Mechanism, q: Numbers, shape: Numbers, frequency: float | None, label: str
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
     """Return a mode q + amplitude shape sin(phase), scaled to a visible amplitude, as plain data, and its poses."""
     q, shape = np.asarray(q, float), np.asarray(shape, float).reshape(np.shape(q))
@@ -258,7 +257,7 @@ def trace_anchors(
     return [anchor for _, anchor in found[:MOST_TRACES]]
 
 
-def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, ArrayLike]) -> list[float]:
+def _anchor(mechanism: Mechanism, bodies: list[str], wanted: str | tuple[str, Numbers]) -> list[float]:
     name, point = (wanted, None) if isinstance(wanted, str) else wanted
     try:
         body, local = locate(mechanism, name, None if point is None else np.asarray(point, float))
@@ -273,7 +272,7 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
     """Return the rectangle around everything drawn in any pose: left, bottom, right, top (m)."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
 
-    def hold(body: int, at: ArrayLike, radius: float = 0.0) -> None:
+    def hold(body: int, at: Numbers, radius: float = 0.0) -> None:
         nonlocal low, high
         path = to_ground(at, np.zeros((1, 3)) if body < 0 else poses[:, body])
         low, high = np.minimum(low, path.min(axis=0) - radius), np.maximum(high, path.max(axis=0) + radius)

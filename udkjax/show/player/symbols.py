@@ -12,8 +12,8 @@ of symbols, which does not depend on the size of the scene. A radius is
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.marks import Mark
 
@@ -34,7 +34,7 @@ def symbols_of(marks: Sequence[Mark], unit: float) -> list[Symbol]:
     return [{"layer": mark["kind"]} | symbol for mark in marks for symbol in SYMBOLS[mark["kind"]](mark, unit)]
 
 
-def _line(frame: list, points: ArrayLike, stroke: str, width: float, fill: str = "", closed: bool = False) -> Symbol:
+def _line(frame: list, points: Numbers, stroke: str, width: float, fill: str = "", closed: bool = False) -> Symbol:
     rows = [[float(f"{x:.7g}") for x in row] for row in np.asarray(points, float)]
     return {"frame": frame, "points": rows, "stroke": stroke, "width": width, "fill": fill, "closed": closed}
 
@@ -43,13 +43,13 @@ def _circle(frame: list, radius: Sequence[float], fill: str = "", stroke: str = 
     return {"frame": frame, "radius": [float(r) for r in (*radius, 0.0, 0.0)[:3]], "stroke": stroke, "width": width, "fill": fill}
 
 
-def _offsets(points: ArrayLike) -> np.ndarray:
+def _offsets(points: Numbers) -> np.ndarray:
     """Return points given only in the unit of symbols."""
     points = np.asarray(points, float)
     return np.hstack([np.zeros_like(points), points])
 
 
-def _round(angles: ArrayLike) -> np.ndarray:
+def _round(angles: Numbers) -> np.ndarray:
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
@@ -65,7 +65,7 @@ def _tint(body: int) -> str:
     return f"tint:{body}"
 
 
-def _hatch(frame: list, places: ArrayLike, y: float, in_units: bool = False) -> Iterator[Symbol]:
+def _hatch(frame: list, places: Numbers, y: float, in_units: bool = False) -> Iterator[Symbol]:
     """Draw the hatching of the ground: short strokes to the lower left of a line at height y."""
     for x in np.asarray(places, float):
         start = [0.0, 0.0, x, y] if in_units else [x, 0.0, 0.0, y]

@@ -13,8 +13,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, prints_table
 from udkjax.scene.arguments import checked
@@ -42,7 +42,7 @@ class Candidate:
         name: its name in tables.
     """
 
-    conditions: Mapping[str, ArrayLike] = field(default_factory=dict)
+    conditions: Mapping[str, Numbers] = field(default_factory=dict)
     initial_state: Start | State | None = None
     name: str = ""
 
@@ -86,10 +86,10 @@ class Design(NamedTuple):
 @checked
 def design_experiment(
     mechanism: Mechanism,
-    candidates: Sequence[Candidate | Mapping[str, ArrayLike] | Start | State],
+    candidates: Sequence[Candidate | Mapping[str, Numbers] | Start | State],
     parameters: ParametersLike,
     channels: Sequence[ChannelKey],
-    ts: ArrayLike,
+    ts: Numbers,
     noise: Noise,
     criterion: Criterion = "D",
     pick: int = 1,
@@ -162,7 +162,7 @@ def design_experiment(
     )
 
 
-def _candidate(given: Candidate | Mapping[str, ArrayLike] | Start | State, k: int) -> Candidate:
+def _candidate(given: Candidate | Mapping[str, Numbers] | Start | State, k: int) -> Candidate:
     candidate = given if isinstance(given, Candidate) else None
     if isinstance(given, Mapping):
         candidate = Candidate(given, name=", ".join(f"{name} = {value}" for name, value in given.items()))

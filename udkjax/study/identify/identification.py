@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.scene.arguments import checked
@@ -50,7 +50,7 @@ def identify(
     noise: Noise = None,
     initial_state: Start | Estimated | None = None,
     n_starts: int = N_STARTS,
-    guesses: ArrayLike | None = None,
+    guesses: Numbers | None = None,
     loss: str | UserLoss = "least_squares",
     optimizer: Optimizer = None,
     strategy: Strategy = "auto",
@@ -114,7 +114,7 @@ def identify(
 MOST_STARTS = 10**6  # largest number of first guesses; more would not fit into memory
 
 
-def _first_guesses(problem: FitProblem, n_starts: int, guesses: ArrayLike | None) -> Float[np.ndarray, "B K"]:
+def _first_guesses(problem: FitProblem, n_starts: int, guesses: Numbers | None) -> Float[np.ndarray, "B K"]:
     """Return first guesses of all unknowns; those of initial states are zero."""
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
     if not 0 <= n_starts <= MOST_STARTS:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.positions.channels import Channel, Quantity, channel_of
 from udkjax.scene.units import conversion_factor
 from udkjax.study.identify.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
@@ -49,7 +49,7 @@ def records_of(
     if not found and not reader.problems:
         reader.problems.append("data: contains no records")
     measured = {channel for record in found for channel in record.values}
-    given: dict[ChannelKey, ArrayLike | None] = dict.fromkeys(measured)
+    given: dict[ChannelKey, Numbers | None] = dict.fromkeys(measured)
     if isinstance(noise, Mapping):
         given = reader.by_channel(noise, "noise")
     elif noise is not None:
@@ -254,7 +254,7 @@ class _DataReader:
         noise = dict(zip(values, record.noise.values(), strict=True))
         return record.changed(values=values, noise=noise)
 
-    def with_noise(self, record: Record, given: dict[ChannelKey, ArrayLike | None]) -> Record:
+    def with_noise(self, record: Record, given: dict[ChannelKey, Numbers | None]) -> Record:
         """Return the record with the `given` standard deviations for channels that have none."""
         if all(own is not None or given.get(channel) is None for channel, own in record.noise.items()):
             return record

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 from typing_extensions import TypeAliasType
 
+from udkjax.annotations import Numbers
 from udkjax.extras import OptionalImport
 from udkjax.positions.assembly import State
 from udkjax.positions.channels import Channel, Quantity
@@ -26,7 +26,7 @@ ChannelKey: TypeAlias = str | Quantity  # the name of a channel, or a user-defin
 T = TypeVar("T")
 ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[ChannelKey, T]
 Noise = TypeAliasType(
-    "Noise", ByChannel[ArrayLike] | ByChannel[ArrayLike | None] | float | None
+    "Noise", ByChannel[Numbers] | ByChannel[Numbers | None] | float | None
 )  # standard deviations, by channel or one for all
 
 
@@ -84,12 +84,12 @@ class Record:
 
     def __init__(
         self,
-        times: ArrayLike | Sequence[float],
-        values: ByChannel[ArrayLike],
+        times: Numbers | Sequence[float],
+        values: ByChannel[Numbers],
         noise: Noise = None,
         initial_state: Start | State | None = None,
         t0: float | None = None,
-        conditions: Mapping[str, ArrayLike | Held] | None = None,
+        conditions: Mapping[str, Numbers | Held] | None = None,
         name: str = "",
     ):
         problems: list[str] = []
@@ -224,7 +224,7 @@ def key_of(channel: ChannelKey | Channel) -> ChannelKey:
     return channel if isinstance(channel, Quantity) else str(getattr(channel, "name", channel))
 
 
-def _numbers(name: str, given: ArrayLike | Sequence[float], shape: tuple[int, ...] | None, problems: list[str]) -> np.ndarray:
+def _numbers(name: str, given: Numbers | Sequence[float], shape: tuple[int, ...] | None, problems: list[str]) -> np.ndarray:
     try:
         array = np.asarray(given, float)
     except (TypeError, ValueError):

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.extras import OptionalImport
 from udkjax.positions.channels import RATES
 from udkjax.scene.bodies import COORDINATES
@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # imported only if their tables are given
     import pandas
     import xarray
 
-TableData: TypeAlias = "ByChannel[ArrayLike] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
+TableData: TypeAlias = "ByChannel[Numbers] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
 TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings of times and record names, and the suffix of a channel's noise
 _DELIMITERS = (";", "\t", ",")
 # Coordinates in files written by `Solution.to_xarray`, as channels of bodies.
@@ -56,7 +56,8 @@ def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: l
     elif hasattr(data, "columns") and hasattr(data, "index"):
         yield _table_of_frame(cast("pandas.DataFrame", data), source, problems)
     elif isinstance(data, Mapping):
-        yield _table_of_columns(source, [(str(key), value) for key, value in data.items()], problems)
+        columns = cast(Mapping[object, Numbers], data)
+        yield _table_of_columns(source, [(str(key), value) for key, value in columns.items()], problems)
     else:
         kinds = "a Record, a mapping, a pandas DataFrame, an xarray Dataset, the path of a .csv or .nc file, or a list of these"
         problems.append(f"{source}: must be {kinds}, not {type(data).__name__}")
@@ -126,7 +127,7 @@ def _table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) 
 
 
 def _table_of_columns(
-    source: str, given: Sequence[tuple[str, ArrayLike]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
+    source: str, given: Sequence[tuple[str, Numbers]], problems: list[str], rows: Sequence[str] | None = None, name: str = ""
 ) -> Table:
     """Return a table from columns whose headings may name units; a single value applies to all rows."""
     columns: dict[str, TableColumn] = {}
@@ -138,7 +139,7 @@ def _table_of_columns(
         else:
             cells = np.asarray(values) if hasattr(values, "dtype") else cast("Sequence[str | float | None]", values)
             columns[heading] = TableColumn(cells, units)
-    alone = {h for h, c in columns.items() if isinstance(c.values, str) or np.ndim(cast(ArrayLike, c.values)) == 0}
+    alone = {h for h, c in columns.items() if isinstance(c.values, str) or np.ndim(cast(Numbers, c.values)) == 0}
     if rows is None:
         rows = [f"entry {k}" for k in range(max((len(c.values) for h, c in columns.items() if h not in alone), default=0))]
     columns = {h: c._replace(values=[c.values] * len(rows)) if h in alone else c for h, c in columns.items()}

@@ -11,8 +11,8 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Int, PyTree
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.equations.analysis import analyse
 from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -164,7 +164,7 @@ class SweepPlan:
 def make_plan(
     mechanism: StudyModel,
     axes: Mapping[str, AxisValues],
-    ts: ArrayLike,
+    ts: Numbers,
     measure: MeasureChoice = "final",
     *,
     design: SweepDesign | None = None,

@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from udkjax.annotations import Numbers
 from udkjax.extras import require
 from udkjax.integrate.solution import Result
 from udkjax.progress import Progress, ProgressOption, report_progress
@@ -37,7 +37,7 @@ Engine = Literal["auto", "devices", "dask"]
 def sweep(
     mechanism: StudyModel,
     axes: Mapping[str, AxisValues],
-    ts: ArrayLike,
+    ts: Numbers,
     measure: MeasureChoice = "final",
     *,
     design: SweepDesign | None = None,
@@ -156,7 +156,7 @@ class Watch:
     `show` is called with the `SweepProgress` at the start and after each chunk.
     """
 
-    def __init__(self, members: int, done: int, show: Callable[[SweepProgress], object], codes: ArrayLike = ()):
+    def __init__(self, members: int, done: int, show: Callable[[SweepProgress], object], codes: Numbers = ()):
         self.show, self.new = show, 0
         self.begun = time.monotonic()
         self.since, self.work, self.work_done = self.begun, 0.0, 0.0  # start, amount and completed part of the known work
@@ -200,7 +200,7 @@ def _message(
     return "; ".join(remarks)
 
 
-def _count_failures(previous: Mapping[str, int], codes: ArrayLike) -> dict[str, int]:
+def _count_failures(previous: Mapping[str, int], codes: Numbers) -> dict[str, int]:
     """Add members to the counts of each `Result` other than success."""
     counts = Counter(previous)
     for code, count in zip(*np.unique(np.asarray(codes, int), return_counts=True), strict=True):
@@ -209,7 +209,7 @@ def _count_failures(previous: Mapping[str, int], codes: ArrayLike) -> dict[str, 
     return dict(counts)
 
 
-def _find_slowest(previous: tuple[int, T] | None, indices: ArrayLike, values: ArrayLike | None) -> tuple[int, T] | None:
+def _find_slowest(previous: tuple[int, T] | None, indices: Numbers, values: Numbers | None) -> tuple[int, T] | None:
     """Return the index and value of the largest value, or the previous maximum if that is at least as large."""
     if values is None:
         return previous
