@@ -30,9 +30,14 @@ def frame(data: xarray.Dataset) -> Runs:
     return pandas.DataFrame({name: np.full(size, np.nan) for name in ("beta", "slower")} | found)
 
 
+def _default(runs: Runs) -> Runs:
+    """Return the runs with the default settings."""
+    return runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)]
+
+
 def silent(runs: Runs) -> Runs:
     """Return which runs with a tolerance of 1e-6 or less ended as successful and are wrong by far more than it explains."""
-    default = runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)]
+    default = _default(runs)
     usual = default.set_index(["problem", "tol", "start"]).error
     keys = pandas.MultiIndex.from_frame(runs[["problem", "tol", "start"]])
     explained = TIMES_DEFAULT * usual.reindex(keys).to_numpy()
@@ -96,7 +101,7 @@ def gains(runs: Runs) -> dict[str, float]:
     several = runs.part.isin(["gains", "two gains"]) & (runs.method == "Auto")
     chosen = runs[several & runs.problem.isin(["hanging", "four-bar", "scissors"])]
     key = ["problem", "tol", "start"]
-    default = runs[(runs.part == "methods") & (runs[CELL] == pandas.Series(DEFAULT)).all(axis=1)].set_index(key)
+    default = _default(runs).set_index(key)
     beside = default.reindex(pandas.MultiIndex.from_frame(chosen[key]))
     error = chosen.error.to_numpy() / np.maximum(beside.error.to_numpy(), 1e-12)
     work = chosen.right_hand_sides.to_numpy() / beside.right_hand_sides.to_numpy()
@@ -193,16 +198,25 @@ def uncertainty(runs: Runs) -> float:
     return float((runs.slower / runs.seconds).median()) - 1
 
 
+def needed(runs: Runs, target: float) -> dict[str, float]:
+    """Return, by mechanism, the largest tolerance at which the default has at most an error."""
+    curves = geometric(_default(runs), "problem").reset_index()
+    return curves[curves.error <= target].groupby("problem", sort=False).tol.max().to_dict()
+
+
 def table(data: xarray.Dataset) -> str:
-    """Return as JSON, for each mechanism, the tolerances at which the default has the errors that somebody may want."""
-    titles = json.loads(data.titles)
-    rows: dict[str, dict[str, Any]] = {}
-    for row in recommendations(frame(data)):
-        name = row["problem"]
-        one = rows.setdefault(name, {"name": str(PROBLEMS[name].mechanism.name), "title": titles[name], "tolerances": {}})
-        if np.isfinite(row["tol"]):
-            one["tolerances"][f"{row['error']:.0e}"] = float(f"{row['tol']:.0e}")
-    return json.dumps(list(rows.values()), indent=1) + "\n"
+    """Return as JSON, for each mechanism, the tolerances that the default needs for errors that somebody may want."""
+    runs, titles = frame(data), json.loads(data.titles)
+    of_error = {f"{target:.0e}": needed(runs, target) for target in TARGETS}
+    rows = [
+        {
+            "name": str(PROBLEMS[name].mechanism.name),
+            "title": titles[name],
+            "tolerances": {error: float(f"{tols[name]:.0e}") for error, tols in of_error.items() if name in tols},
+        }
+        for name in runs.problem.unique()
+    ]
+    return json.dumps(rows, indent=1) + "\n"
 
 
 def _row(cells: tuple[Any, ...]) -> str:

@@ -13,7 +13,7 @@ from experiments.common import PACKAGE_DATA, load
 from experiments.parts.atlas_problems import PROBLEMS
 from experiments.parts.atlas_reference import reference
 from experiments.parts.atlas_runs import compare, parts, run
-from experiments.parts.atlas_tables import DEFAULT, price, silent, table, words
+from experiments.parts.atlas_tables import DEFAULT, needed, price, silent, table, words
 from experiments.parts.reference_equations import evaluate, evaluate_all
 
 
@@ -46,6 +46,7 @@ def test_the_price_of_an_error_is_the_least_of_the_tolerances_that_reach_it():
     table = runs(tol=[1e-4, 1e-6, 1e-8], error=[1e-3, 1e-5, 1e-7], right_hand_sides=[100.0, 200.0, 300.0])
     assert price(table, 2e-5) == (200.0, 1e-6) and price(table, 1e-7) == (300.0, 1e-8)
     assert np.isinf(price(table, 1e-9)[0])
+    assert needed(table, 2e-5) == {"p": 1e-6} and needed(table.assign(error=1e-9), 1e-7) == {"p": 1e-4}
     failed = table.assign(error=[1e-3, np.nan, 1e-7])
     assert price(failed, 2e-5) == (300.0, 1e-8)
 
