@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,10 +68,17 @@ def test_both_engines_and_the_equation_of_udwadia_and_kalaba(name, copies, coupl
 def test_partitions_of_coordinates_and_velocities(copies, rolls):
     """A nonholonomic row makes a velocity dependent, but no coordinate; all rows hold at each stage."""
     found = system(copies, rolls=rolls)
-    partitioned, reference = run(found, udk.CoordinatePartitioning(), "auto", stabilization=None), run(found)
-    assert_allclose(partitioned.q, reference.q, rtol=0, atol=1e-8)
-    assert_allclose(partitioned.v, reference.v, rtol=0, atol=1e-7)
-    assert_allclose(udk.violation(found, partitioned), 0.0, atol=1e-14)
+    reference = run(found)
+    for engine in ("native", "jax")[:copies]:
+        partitioned = run(found, udk.CoordinatePartitioning(), engine, stabilization=None)
+        assert_allclose(partitioned.q, reference.q, rtol=0, atol=1e-8)
+        assert_allclose(partitioned.v, reference.v, rtol=0, atol=1e-7)
+        assert_allclose(udk.violation(found, partitioned), 0.0, atol=1e-14)
+
+
+def test_implicit_methods_integrate_all_coordinates():
+    with pytest.raises(ValueError, match="partitions coordinates with explicit methods only, and Kvaerno5 is implicit"):
+        run(system(), udk.CoordinatePartitioning(), solver=diffrax.Kvaerno5())
 
 
 @pytest.mark.slow
@@ -86,13 +94,27 @@ def test_a_rolling_disc_by_independent_velocities():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FORMULATIONS)
-def test_derivatives_and_members(name):
+@pytest.mark.parametrize("formulation", [*FORMULATIONS.values(), udk.CoordinatePartitioning()], ids=str)
+def test_derivatives_and_members(formulation):
     def end(a, formulation):
         found = system()
         return run(udk.ConstrainedSystem(lambda q: a * found.mass(q), found.force, found.constraint), formulation).q[-1]
 
     a = jnp.array([0.9, 1.2])
-    members = jax.vmap(lambda a: end(a, FORMULATIONS[name]))(a)
+    members = jax.vmap(lambda a: end(a, formulation))(a)
     assert_allclose(members, [end(x, None) for x in np.asarray(a)], rtol=0, atol=1e-8)
-    assert_allclose(jax.jacfwd(end)(a[0], FORMULATIONS[name]), jax.jacfwd(end)(a[0], None), rtol=0, atol=1e-7)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        assert_allclose(derivative(end)(a[0], formulation), derivative(end)(a[0], None), rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_values_with_derivatives_are_those_without():
+    """Derivatives of a run by partitions are those of another run, but its values are its own."""
+
+    def end(pull):
+        found = system()
+        pulled = udk.ConstrainedSystem(found.mass, lambda t, q, v: pull * jnp.array([0.0, 0.2, -9.81, 0.5]), found.constraint)
+        return udk.simulate(pulled, TS, START, rtol=1e-5, atol=1e-5, formulation=udk.CoordinatePartitioning()).q[-1, 0]
+
+    alone = float(end(1.0))
+    assert float(jax.value_and_grad(end)(1.0)[0]) == float(jax.jvp(end, (1.0,), (1.0,))[0]) == alone

@@ -1,5 +1,6 @@
 """User-defined systems by machine code: the same functions, motions and derivatives as in plain JAX."""
 
+from dataclasses import replace
 from typing import Any
 
 import diffrax
@@ -13,6 +14,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.fresh_process import python
 from tests.integrate.own_systems import G, pendulum
+from udkjax.equations import equations_of
 from udkjax.equations.general import prepare_general
 from udkjax.equations.traced_system import trace_system
 from udkjax.integrate.compiled_mechanism import compile_mechanism
@@ -78,6 +80,30 @@ def test_functions_of_a_state(kind, method):
         tangent = [x.tangent_part(t, q, v, dq, dv) for x in (by_code, plain)]
         near = q + 1e-4 * dq, v + 1e-4 * dv
         return a, tangent, [by_code.project(t, *near), plain.project(t, *plain.project(t, *near))]
+
+    for found, expected in of_both(q, v, dq, dv):
+        for x, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            assert_allclose(x, wanted, rtol=0, atol=1e-12 * max(1.0, float(jnp.abs(wanted).max())))
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[1:])], ids=str)
+def test_partitions_of_a_state(kind):
+    """Accelerations of closed random states, and states that are closed by other dependent coordinates and velocities."""
+    system, n, t = random_system(1, **kind), kind.get("n", 5), 0.3
+    q, v, dq, dv = np.random.default_rng(2).normal(size=(4, n)) * 0.5
+    compiled = compile_mechanism(trace_system(system, n), None, udk.Auto(), None, udk.CoordinatePartitioning())
+    operation = compiled.plan.operation
+    assert operation is not None
+    compiled = replace(compiled, plan=replace(compiled.plan, evaluation=operation.accelerations))
+    by_code = native_equations(compiled, mark_rows(compiled, jnp.array(t), q, v, None, 1.0))
+    plain = equations_of(system, udk.SVD(), None, udk.CoordinatePartitioning())
+
+    @deferred
+    def of_both(q, v, dq, dv):
+        for _ in range(4):
+            q, v = prepare_general(system, udk.SVD(), None).project(t, q, v)
+        near = q + 1e-3 * dq, v + 1e-3 * dv
+        return [x.accelerations(t, q, v) for x in (by_code, plain)], [x.project(t, *near) for x in (by_code, plain)]
 
     for found, expected in of_both(q, v, dq, dv):
         for x, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):

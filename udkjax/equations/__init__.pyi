@@ -30,7 +30,6 @@ from udkjax.equations.evaluate import psi_q as psi_q
 from udkjax.equations.evaluate import singular_values as singular_values
 from udkjax.equations.evaluate import uniqueness as uniqueness
 from udkjax.equations.formulations import Augmented as Augmented
-from udkjax.equations.formulations import FormulatedSystem as FormulatedSystem
 from udkjax.equations.formulations import Formulation as Formulation
 from udkjax.equations.formulations import NullSpaceQR as NullSpaceQR
 from udkjax.equations.formulations import NullSpaceSVD as NullSpaceSVD
@@ -39,6 +38,7 @@ from udkjax.equations.formulations import WrappedSystem as WrappedSystem
 from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations.loads import mass_of as mass_of
 from udkjax.equations.motion_measures import MotionModel as MotionModel
+from udkjax.equations.partitioning import PARTITION_NEWTON_STEPS as PARTITION_NEWTON_STEPS
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
 from udkjax.equations.position_closure import CLOSURE as CLOSURE
 from udkjax.equations.position_closure import Assembly as Assembly

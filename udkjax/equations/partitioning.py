@@ -15,6 +15,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
@@ -24,6 +25,7 @@ from udkjax.equations.formulations import Formulation, WrappedSystem, null_space
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
+from udkjax.transforms.newton_steps import repeated_newton
 
 PARTITION_NEWTON_STEPS = 10  # maximum number of steps from the predicted state; three or four are usual
 
@@ -41,6 +43,9 @@ class CoordinatePartitioning(Formulation):
     shorter than `rank_tol` times the longest, a step has more independent coordinates, which later steps constrain again: runs of
     the paper's linkage cross such configurations (20 s at a tolerance of 1e-9 from each of the initial states in
     tests/integrate/test_accuracy.py: errors up to 9e-7).
+
+    Machine code integrates with explicit Runge-Kutta methods. Derivatives are those of a run by the Udwadia-Kalaba equation with
+    the same tolerances, which has the same motion.
 
     Args:
         rank_tol: threshold of dependence, relative to the longest row or the largest singular value; None: `Scales.rank_tol`.
@@ -150,19 +155,14 @@ def _solve_dependent(fixed: PartitionedSystem, t: Time, q: Vector, v: Vector) ->
 
 def _solve(fixed: PartitionedSystem, newton: Callable[[Vector], Vector], x: Vector) -> Vector:
     """Return the limit of Newton steps; NaN if they do not converge."""
-    tol = jnp.sqrt(jnp.finfo(x.dtype).eps)  # the error after this step is of the order of tol^2
 
-    def goes_on(state):
-        _, change, k = state
-        return (k < PARTITION_NEWTON_STEPS) & (change > tol)
-
-    def step(state):
-        x, _, k = state
+    def step(x: Vector) -> tuple[Vector, Array, Array]:
         corrected = newton(x)
-        return corrected, fixed.equations.size(corrected - x), k + 1
+        return corrected, fixed.equations.size(corrected - x), jnp.ones((), x.dtype)
 
-    x, change, _ = jax.lax.while_loop(goes_on, step, (x, jnp.array(jnp.inf, x.dtype), 0))
-    return jnp.where(change <= tol, x, jnp.nan)
+    tol = float(np.sqrt(jnp.finfo(x.dtype).eps))  # the error after this step is of the order of tol^2
+    x, is_open = repeated_newton(step, x, most_steps=PARTITION_NEWTON_STEPS, last_change=tol)
+    return jnp.where(is_open, jnp.nan, x)
 
 
 @_solve_dependent.def_jvp

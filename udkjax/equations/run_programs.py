@@ -47,6 +47,16 @@ class RunPrograms:
         return self.accelerations
 
     @property
+    def rows_of_positions(self) -> Any:
+        """The program of Psi_q, root, M_ii^(-1/2), and psi, in the coordinates themselves, where `couples` makes others."""
+        return self.dense_newton_q
+
+    @property
+    def rows_of_velocities(self) -> Any:
+        """The same of A, with Psi_dot and phi, stored as psi."""
+        return self.dense_newton_v
+
+    @property
     def position_rows(self) -> int:
         """The number of rows that restrict positions, which come first; by default all."""
         return self.row_count

@@ -176,6 +176,20 @@ class SystemPrograms(SystemTerms):
         """Compute the inputs of a Newton step to Psi_dot = 0 and phi = 0, whose residuals are stored as psi."""
         return self._program(self._dense_rows, {"psi": self._rate})
 
+    @property
+    def _rows_of_coordinates(self) -> WrittenScalars:
+        zero, one, nan = map(self._graph.constant, (0.0, 1.0, np.nan))
+        entries = [row.get(k, zero) for row, B in zip(self._A, self._rows.B, strict=True) for k in B]
+        return {"psi_q": entries, "root": [one / self._graph.sqrt(row.get(k, nan)) for k, row in enumerate(self.functions.mass)]}
+
+    @cached_property
+    def rows_of_positions(self) -> LoopProgram:
+        return self._program(self._rows_of_coordinates, {"psi": self._psi})
+
+    @cached_property
+    def rows_of_velocities(self) -> LoopProgram:
+        return self._program(self._rows_of_coordinates, {"psi": self._rate})
+
     @cached_property
     def independent_rows(self) -> LoopProgram:
         """Compute independent: one for each row that elimination retains, zero for dependent rows."""

@@ -110,7 +110,9 @@ def factorize_mass(graph: Graph, mass: Sequence[SparseRow], A: Sequence[SparseRo
     factors = factorize(graph, mass, range(len(mass)), invert)
     zero = graph.constant(0.0)
     solved = [factors.forward([row.get(k, zero) for k in range(len(mass))]) for row in A]
-    return MassFactors(factors, [{k: s for k, s in enumerate(row) if not s.is_zero} for row in solved])
+    # An entry of A that the elimination of M cancels keeps its place, in which programs write that of A.
+    entries = [{k: s for k, s in enumerate(row) if not s.is_zero or k in given} for row, given in zip(solved, A, strict=True)]
+    return MassFactors(factors, entries)
 
 
 @dataclass(frozen=True)

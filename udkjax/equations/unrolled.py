@@ -16,7 +16,10 @@ from udkjax.expressions.loop_derivative import COTANGENT, FORWARD, OTHER, PREFIX
 from udkjax.expressions.loop_program import LoopProgram
 from udkjax.expressions.unroll import ArrayPlace, Arrays, unroll
 
-WITH_ENTRIES = ("rows_and_loads", "dense_accelerations", "dense_newton_q", "dense_newton_v")  # programs that return Psi_q
+WITH_ENTRIES = (  # programs that return Psi_q
+    *("rows_and_loads", "dense_accelerations", "dense_newton_q", "dense_newton_v"),
+    *("rows_of_positions", "rows_of_velocities"),
+)
 ENTRIES = "psi_q", "couplings"  # the arrays that only these return
 
 

@@ -12,18 +12,18 @@ from jaxtyping import Array, Float
 from udkjax.equations.abstract_system import AbstractSystem
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.elements import has_pieces
-from udkjax.equations.formulations import FormulatedSystem, Formulation, WrappedSystem
+from udkjax.equations.formulations import Formulation, WrappedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.textbook import TextbookEquations
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.solvers import has_method, method_of
+from udkjax.integrate.solvers import has_method, is_explicit, method_of
 from udkjax.integrate.stabilization import Stabilization
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
-from udkjax.native.run.formulations import MethodCode
+from udkjax.native.run.method_code import MethodCode
 from udkjax.native.runs import RunStates
 from udkjax.native.unsupported import unsupported
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
@@ -172,15 +172,14 @@ def _reason_for_diffrax(
         return f"{type(stepper).__name__} is a step size controller of diffrax"
     if not has_method(solver):
         return f"{type(solver).__name__} is not a Runge-Kutta method with one tableau, explicit or singly diagonally implicit"
+    if equations.solves_constraints and not is_explicit(solver):
+        return f"it partitions coordinates with explicit methods only, and {type(solver).__name__} is implicit"
     return _reason_for_equations(equations)
 
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
     """Return why machine code cannot evaluate such equations, whatever the scene; empty if it can."""
-    plain: Any = equations
-    formulation = None
-    if isinstance(equations, FormulatedSystem):
-        plain, formulation = equations.equations, equations.formulation
+    plain, formulation = textbook_of(equations), formulation_of(equations)
     if plain.programs is None and jax.config.jax_enable_x64:
         return f"it does not know {type(plain).__name__}"
     if isinstance(plain, TextbookEquations) and plain.rubs:
@@ -215,6 +214,11 @@ def textbook_of(equations: AbstractSystem) -> Any:
     return equations.equations if isinstance(equations, WrappedSystem) else equations
 
 
+def formulation_of(equations: AbstractSystem) -> Formulation | None:
+    """Return the formulation that contains equations; None for the Udwadia-Kalaba equation."""
+    return getattr(equations, "formulation", None)  # a field of the equations that formulations wrap
+
+
 def eliminates(method: Pseudoinverse) -> bool:
     """Return whether a method eliminates rows and leaves out the redundant ones."""
     return isinstance(method, Auto | Elimination)
@@ -230,19 +234,18 @@ def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, brea
         breaks=breakpoints is not None or _is_piecewise(mechanism),
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
         **_method_code(equations)._asdict(),
-        changes=solver is None,
+        changes=solver is None and not equations.solves_constraints,
     )
 
 
 def _method_code(equations: AbstractSystem) -> MethodCode:
     """Return the machine code of the method and the formulation of equations."""
-    formulation = equations.formulation if isinstance(equations, FormulatedSystem) else None
-    return MethodCode.of(textbook_of(equations).method, formulation)
+    return MethodCode.of(textbook_of(equations).method, formulation_of(equations))
 
 
 def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
     """Return the operation that evaluates equations at single states; None if there is no machine code for them."""
-    if not equations.constrained or _reason_for_equations(equations):
+    if not equations.constrained or equations.solves_constraints or _reason_for_equations(equations):
         return None
     inner = textbook_of(equations)
     operation = Accelerate(inner.programs, *_method_code(equations))

@@ -161,7 +161,7 @@ class DifferentiableRun(DifferentiableFunction):
         if self._is_native(inputs, active):
             change = self.problem.changes(active, tangents)
             raw, changes = native_engine.jvp(self.problem(inputs), self.problem.marks(active), change)
-            return raw, list(changes)
+            return self._own(inputs, raw), list(changes)
         raw, change = change_along(lambda inputs: integrate_by_diffrax(self.problem(inputs)), inputs, active, tangents)
         return raw, [change[k] for k in SMOOTH]
 
@@ -171,8 +171,14 @@ class DifferentiableRun(DifferentiableFunction):
         Only the machine code of reverse mode is compiled.
         """
         if self._is_native(inputs, active):
-            return native_engine.integrate_for_vjp(self.problem(inputs), self.problem.marks(active))
+            raw, run = native_engine.integrate_for_vjp(self.problem(inputs), self.problem.marks(active))
+            return self._own(inputs, raw), run
         return integrate_by_diffrax(self.problem(inputs)), ()
+
+    def _own(self, inputs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
+        """Return the output of a run, given that of the run that has its derivatives."""
+        operation = self.problem.rest.compiled.plan.operation
+        return self.fast(inputs) if operation is not None and operation.closes else raw
 
     def _is_native(self, inputs: list[Array], active: Mask) -> bool:
         return self.native and native_engine.serves_derivatives(self.problem.marks(active))

@@ -11,16 +11,15 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.equations.formulations import FormulatedSystem
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, textbook_of
+from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, formulation_of, textbook_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.base.steps import Status
 from udkjax.native.operations import MarkRows
 from udkjax.native.packing import ActiveNumbers
 from udkjax.native.primitive import call_concrete, native_p
-from udkjax.native.run.formulations import MethodCode
+from udkjax.native.run.method_code import MethodCode
 from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, OneOf
 from udkjax.pinv.rank_policy import RankPolicy
@@ -193,8 +192,9 @@ def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPo
     drop_tol = fallback_tol**2 if policy is RankPolicy.FALL_BACK else safe_tol
     method_index = xp.clip(method.number, 0, len(method.methods) - 1) if isinstance(method, OneOf) else 0.0
     settings = {"length": textbook.scales.length, "fallback_tol": fallback_tol, "method": method_index}
-    if isinstance(equations, FormulatedSystem):
-        settings |= MethodCode.formulation_settings(equations.formulation, textbook.scales.mass)
+    formulation = formulation_of(equations)
+    if formulation is not None:
+        settings |= MethodCode.formulation_settings(formulation, textbook.scales)
     numbers = jax.tree.leaves((mechanism, textbook.baumgarte))
     return SceneInputs(numbers, [drop_tol, safe_tol], textbook.scales.rows, settings)
 

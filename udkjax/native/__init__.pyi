@@ -31,7 +31,7 @@ from udkjax.native.primitive import call_concrete as call_concrete
 from udkjax.native.primitive import call_members as call_members
 from udkjax.native.primitive import machine_code as machine_code
 from udkjax.native.primitive import native_p as native_p
-from udkjax.native.run.formulations import MethodCode as MethodCode
+from udkjax.native.run.method_code import MethodCode as MethodCode
 from udkjax.native.run.state_functions import Evaluation as Evaluation
 from udkjax.native.runs import RunStates as RunStates
 from udkjax.native.runs import RunWatched as RunWatched

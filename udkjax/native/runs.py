@@ -38,6 +38,11 @@ class RunStates(Operation):
     def all_settings(self) -> tuple[str, ...]:
         return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
 
+    @property
+    def closes(self) -> bool:
+        """True if the formulation closes each stage: derivatives are those of a run by the equation of Udwadia and Kalaba."""
+        return self.formulation is not None and self.formulation.closes
+
     def plan(self, width: int, vector: int) -> Plan:
         """Return the plan of the module's code."""
         return Plan(
@@ -93,8 +98,9 @@ class RunStates(Operation):
 
     @property
     def _for_derivatives(self) -> dict[str, Any]:
-        """The fields of the same operation with derivatives."""
-        return {item.name: getattr(self, item.name) for item in fields(self)} | {"code": self.code.for_derivatives}
+        """The fields of the same operation with derivatives, which are those of another run if this one `closes`."""
+        changed = {"code": self.code.for_derivatives} | ({"formulation": None} if self.closes else {})
+        return {item.name: getattr(self, item.name) for item in fields(self)} | changed
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         return Trajectory(self.plan(width, vector))

@@ -11,22 +11,28 @@ LAST_CHANGE = 1e-13  # by the last step, relative: the digits of the step before
 
 
 def repeated_newton(
-    step: Callable[[Array], tuple[Array, Array, Array]], start: Array, begins: Bool[ArrayLike, ""] = True
+    step: Callable[[Array], tuple[Array, Array, Array]],
+    start: Array,
+    begins: Bool[ArrayLike, ""] = True,
+    most_steps: int = MOST_STEPS,
+    last_change: float = LAST_CHANGE,
 ) -> tuple[Array, Bool[Array, ""]]:
-    """Return the last of at most `MOST_STEPS` iterates, and whether the last step still changed it.
+    """Return the last of at most `most_steps` iterates, and whether the last step still changed it.
 
     Args:
-        step: Returns the next iterate, the size of its change and its own; the change counts beyond `LAST_CHANGE` of the size.
+        step: Returns the next iterate, the size of its change and its own; the change counts beyond `last_change` of the size.
         start: The first iterate.
         begins: Whether there are any steps.
+        most_steps: The maximum number of steps.
+        last_change: The largest relative change by a last step.
     """
 
     def again(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, change, size = step(state[0])
-        return x, change > LAST_CHANGE * size, state[2] + 1
+        return x, change > last_change * size, state[2] + 1
 
     def goes_on(state: tuple[Array, Array, Array]) -> Array:
-        return state[1] & (state[2] < MOST_STEPS)
+        return state[1] & (state[2] < most_steps)
 
     x, is_open, _ = jax.lax.while_loop(goes_on, again, (start, jnp.asarray(begins), jnp.asarray(0)))
     return x, is_open

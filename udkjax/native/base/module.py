@@ -50,6 +50,7 @@ class Module(Running):
     """
 
     mode = FORWARD  # mode of differentiation
+    closes = False  # whether the module returns states to the constraints, by the formulation if that does so
     shares_constants = False  # whether the members of a block of threads have the same constants, in its shared memory
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
@@ -61,12 +62,13 @@ class Module(Running):
             self.inputs = ("samples", *self.inputs)
         if plan.formulation is not None:
             self.settings = (*self.settings, *FORMULATION_SETTINGS)
-        self.falls_back = plan.steps and code.policy.reports and m > 0  # pivots may be too small
-        self.is_dense = plan.pseudoinverse is not None and m > 0
+        self.partitions = self.closes and plan.formulation is not None and plan.formulation.closes and m > 0
+        self.falls_back = plan.steps and code.policy.reports and m > 0 and not self.partitions  # pivots may be too small
+        self.is_dense = plan.pseudoinverse is not None and m > 0 and not self.partitions
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
         self.measures_drift = plan.steps and m > 0 and not plan.projected
-        self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports
+        self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports and not self.partitions
         self.pieces = code.piece_count if plan.breaks else 0
         names = self.program_names()
         self.settles = code.rubs and any(name in SETTLING for name in names)  # friction may need further rounds

@@ -54,23 +54,32 @@ class RowEntries:
 class WeightedRows(RowEntries):
     """The rows of a module, and their solution by a dense method in all lanes, or lane by lane.
 
-    If `by_lane`, functions that use it have one lane, whose index is their argument `lane`.
+    If `by_lane`, functions that use it have one lane, whose index is their argument `lane`. `prefix` and `tol` are those of the
+    layout of the matrices.
     """
 
-    def __init__(self, module: Module, method: DenseMethod, by_lane: bool = False, chosen: Sequence[int] | None = None):
+    def __init__(
+        self,
+        module: Module,
+        method: DenseMethod,
+        by_lane: bool = False,
+        chosen: Sequence[int] | None = None,
+        prefix: str = "dense",
+        tol: str = "fallback_tol",
+    ):
         super().__init__(module, chosen)
-        self._method = method
+        self._method, self._prefix = method, prefix
         is_position = module.code.psi_q_entries[0] < module.code.position_rows
         self.splits, self._position_entries = module.code.position_rows < module.m, int(np.sum(is_position))
         shape, width = (len(self._chosen), module.n), 1 if by_lane else module.plan.width
-        self._layout = DenseLayout(module, method.matrices(*shape), shape, width=width)
+        self._layout = DenseLayout(module, method.matrices(*shape), shape, prefix, tol, width)
         self._arguments = [(POINTER, "work"), *([(INT, "lane")] if by_lane else [])]
         module.weigh_rows()
 
     def write(self):
         """Write the functions that factorize and solve."""
         for name in ("factor", "solve"):
-            f = self._module.new_function(f"{name}_rows", self._arguments, self._layout.width)
+            f = self._module.new_function(f"{name}_{self._prefix}_rows", self._arguments, self._layout.width)
             getattr(self._method, name)(self.matrices(f))
 
     def matrices(self, f: Function) -> DenseMatrices:
@@ -92,14 +101,21 @@ class WeightedRows(RowEntries):
         for row, column, place, factor in self.entries(f, count):
             yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", self.row_of_psi(f, row))
 
-    def factor(self, f: Function, of_positions: bool = False):
-        """Factorize D, from the current entries of Psi_q; `of_positions`: only of the rows that restrict positions."""
+    def factor(self, f: Function, of_positions: bool = False, columns: str | None = None):
+        """Factorize D, from the current entries of Psi_q.
+
+        Args:
+            f: The function.
+            of_positions: Whether only of the rows that restrict positions.
+            columns: The array of factors of the columns; None: all are one.
+        """
         d = self.matrices(f)
         with f.each(d.m) as i:
             d.row("D", i).clear()
         for row, column, value in self.weighted_entries(f, self._position_entries if of_positions and self.splits else None):
-            d.row("D", row).put(column, value * self.array(f, "root", column))
-        self._call(f, "factor_rows")
+            entry = value * self.array(f, "root", column)
+            d.row("D", row).put(column, entry if columns is None else entry * self.array(f, columns, column))
+        self._call(f, "factor")
 
     def solve(self, f: Function, right: str, start: int = 0) -> MatrixRow:
         """Return D^+ W b, with b in an array."""
@@ -113,7 +129,7 @@ class WeightedRows(RowEntries):
 
     def solve_right(self, f: Function) -> MatrixRow:
         """Return D^+ b, with b in its row."""
-        self._call(f, "solve_rows")
+        self._call(f, "solve")
         return self.matrices(f).row("x")
 
     def solve_transposed(self, f: Function) -> MatrixRow:
@@ -131,5 +147,19 @@ class WeightedRows(RowEntries):
             b.put(row, f.fma(value, self.array(f, change, column), b.entry(row)))
         return self.solve_right(f)
 
+    def correct(self, f: Function, x: MatrixRow, start: str, to: str, sign: float = -1.0):
+        """Write `start` plus or minus M^(-1/2) x; `to` is an array, or `out`."""
+        module = self._module
+        place, couples = 0 if to == "out" else module.start(to, "work"), module.code.couples
+        if couples:
+            with f.each(module.n) as i:
+                self.put(f, "change", i, self.array(f, "root", i) * x.entry(i))
+            module.invoke(f, "spread", "change")
+        with f.each(module.n) as i:
+            change = self.array(f, "change", i) if couples else self.array(f, "root", i) * x.entry(i)
+            old = self.array(f, start, i)
+            pointer = f.given["out" if to == "out" else "work"]
+            f.store(old + change if sign > 0 else old - change, pointer, i * f.width + place, f.width)
+
     def _call(self, f: Function, name: str):
-        f.call(name, *(f.given[argument] for _, argument in self._arguments))
+        f.call(f"{name}_{self._prefix}_rows", *(f.given[argument] for _, argument in self._arguments))

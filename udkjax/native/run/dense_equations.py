@@ -13,7 +13,7 @@ from collections.abc import Callable
 from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.base.module import Module
 from udkjax.native.base.weighted_rows import WeightedRows
-from udkjax.native.pseudoinverses.dense import DenseMethod, MatrixRow
+from udkjax.native.pseudoinverses.dense import DenseMethod
 
 
 class DenseEquations:
@@ -50,36 +50,23 @@ class DenseEquations:
             "tangent_part": self._tangent_part,
         }
 
-    def _correct(self, f: Function, x: MatrixRow, start: str, to: str, sign: float = -1.0):
-        """Write `start` plus or minus M^(-1/2) x; `to` is an array, or `out`."""
-        place, couples = 0 if to == "out" else self._in.start(to, "work"), self._in.code.couples
-        if couples:
-            with f.each(self._in.n) as i:
-                self._rows.put(f, "change", i, self._rows.array(f, "root", i) * x.entry(i))
-            self._in.invoke(f, "spread", "change")
-        with f.each(self._in.n) as i:
-            change = self._rows.array(f, "change", i) if couples else self._rows.array(f, "root", i) * x.entry(i)
-            old = self._rows.array(f, start, i)
-            pointer = f.given["out" if to == "out" else "work"]
-            f.store(old + change if sign > 0 else old - change, pointer, i * f.width + place, f.width)
-
     # --- the programs
 
     def _accelerate(self, f: Function):
         self._in.invoke(f, "dense_accelerations")
         self._rows.factor(f)
-        self._correct(f, self._rows.solve(f, "terms", self._in.n), "terms", "out", 1.0)
+        self._rows.correct(f, self._rows.solve(f, "terms", self._in.n), "terms", "out", 1.0)
 
     def _correct_position(self, f: Function):
         self._in.invoke(f, "dense_newton_q")
         self._rows.factor(f, of_positions=True)
-        self._correct(f, self._rows.solve(f, "psi"), "state q", "corrected q")
+        self._rows.correct(f, self._rows.solve(f, "psi"), "state q", "corrected q")
 
     def _factor_and_correct_velocity(self, f: Function):
         def correct():
             self._in.invoke(f, "dense_newton_v")
             self._rows.factor(f)
-            self._correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+            self._rows.correct(f, self._rows.solve(f, "psi"), "state v", "result v")
 
         correct()
         if not self._in.code.is_linear:  # a second step of Newton's method
@@ -107,7 +94,7 @@ class DenseEquations:
                 module.invoke(f, "psi")
                 return
             module.invoke(f, "psi_dot")
-            self._correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+            self._rows.correct(f, self._rows.solve(f, "psi"), "state v", "result v")
             module.invoke(f, "psi")
 
         self._at(f, "state q", "corrected q", correct_velocity)
@@ -122,7 +109,7 @@ class DenseEquations:
                 self._rows.factor(f)
 
         self._at(f, "state v", "result v", terms)
-        self._correct(f, self._rows.solve(f, "terms", module.n), "terms", "result a", 1.0)
+        self._rows.correct(f, self._rows.solve(f, "terms", module.n), "terms", "result a", 1.0)
 
     def _end_step(self, f: Function):
         self._project_and_accelerate(f)
@@ -143,4 +130,4 @@ class DenseEquations:
                 self._in.copy(f, change, "change")
                 self._in.invoke(f, "gather", "change")
             rates = self._rows.solve_rates(f, "change" if self._in.code.couples else change)
-            self._correct(f, rates, change, f"result {x}")
+            self._rows.correct(f, rates, change, f"result {x}")

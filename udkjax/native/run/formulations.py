@@ -12,22 +12,15 @@ there the rows are A L^(-T), and the program `spread` leads back.
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import ClassVar
 
-from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
-from udkjax.equations.scale_program import RANK_TOL
 from udkjax.native.base.ir import INT, POINTER, Function, Operand, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS
 from udkjax.native.base.module import Module
-from udkjax.native.base.program import UnsupportedError
 from udkjax.native.base.weighted_rows import RowEntries
-from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
-from udkjax.native.pseudoinverses.lu import LUCode
-from udkjax.native.pseudoinverses.one_of import OneOfCode
 from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
 from udkjax.native.pseudoinverses.svd import SVDCode
-from udkjax.pinv import Auto, Elimination, Pseudoinverse
 
 TOL, MASS = FORMULATION_SETTINGS
 FORMULATE = "formulate"
@@ -37,6 +30,8 @@ FORMULATE = "formulate"
 class FormulationCode(ABC):
     """A formulation as machine code."""
 
+    closes: ClassVar[bool] = False  # whether the constraints are satisfied wherever a run evaluates accelerations
+
     @abstractmethod
     def prepare(self, module: Module) -> "FormulatedAccelerations":
         """Lay out the matrices in a module; return the writer of its code."""
@@ -45,11 +40,18 @@ class FormulationCode(ABC):
 class FormulatedAccelerations(ABC):
     """The accelerations of a module by a formulation."""
 
+    @abstractmethod
+    def write(self):
+        """Write `formulate(work, out)`: the accelerations of the state."""
+
+
+class ScaledAccelerations(FormulatedAccelerations):
+    """Accelerations by a linear system in the scene's own units."""
+
     def __init__(self, module: Module, layout: DenseLayout):
         self._in, self._layout, self._entries = module, layout, RowEntries(module)
 
     def write(self):
-        """Write `formulate(work, out)`: the accelerations of the state."""
         module = self._in
         f, _ = module.function(FORMULATE, [(POINTER, "work"), (POINTER, "out")])
         module.invoke(f, "dense_accelerations")
@@ -101,7 +103,7 @@ class AugmentedCode(FormulationCode):
         return AugmentedAccelerations(module, self.method)
 
 
-class AugmentedAccelerations(FormulatedAccelerations):
+class AugmentedAccelerations(ScaledAccelerations):
     """Accelerations from [M A^T; A 0] [x; lambda] = [0; b]."""
 
     def __init__(self, module: Module, method: DenseMethod):
@@ -135,7 +137,7 @@ class NullSpaceCode(FormulationCode):
         return (NullSpaceSVDAccelerations if self.by_singular_values else NullSpaceQRAccelerations)(module)
 
 
-class NullSpaceAccelerations(FormulatedAccelerations):
+class NullSpaceAccelerations(ScaledAccelerations):
     """Accelerations by pivoted QR of columns that span the rows of A; the remaining columns of Q are N.
 
     The columns of N are made orthonormal in the metric of M, n_k, and x = x_p - sum_k n_k (n_k^T M x_p).
@@ -242,44 +244,3 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
         d.row("b").clear()
         with f.each(d.m) as i:
             d.row("b").put(i, svd.row("x").entry(i))
-
-
-def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
-    """Return the machine code of a formulation; None if it has none."""
-    if isinstance(formulation, NullSpaceQR | NullSpaceSVD):
-        return NullSpaceCode(isinstance(formulation, NullSpaceSVD))
-    if not isinstance(formulation, Augmented):
-        return None
-    method = LUCode(relative=True, refuses_singular=True) if formulation.method is None else dense_method(formulation.method)
-    return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one method number
-
-
-class MethodCode(NamedTuple):
-    """The machine code of a method and of a formulation."""
-
-    pseudoinverse: DenseMethod | None  # None: elimination
-    formulation: FormulationCode | None  # None: the Udwadia-Kalaba equation
-
-    @classmethod
-    def of(cls, method: Pseudoinverse, formulation: Formulation | None = None) -> "MethodCode":
-        """Return the machine code of a method and a formulation.
-
-        Raises:
-            UnsupportedError: machine code does not support one of them.
-        """
-        code = cls(dense_method(method), None if formulation is None else formulation_code(formulation))
-        if formulation is not None and code.formulation is None:
-            raise UnsupportedError(f"the formulation {formulation}")
-        if code.pseudoinverse is None and not isinstance(method, Auto | Elimination):
-            raise UnsupportedError(f"the pseudoinverse {type(method).__name__}")
-        return code
-
-    @staticmethod
-    def formulation_settings(formulation: Any, mass: Any) -> dict[str, Any]:
-        """Return the settings of a formulation by name: its rank tolerance, and the characteristic mass (kg)."""
-        if isinstance(formulation, Augmented):
-            tol = None if formulation.method is None else formulation.method.rank_tol
-            tol = RANK_TOL**2 if tol is None else tol
-        else:
-            tol = formulation.rank_tol
-        return dict(zip(FORMULATION_SETTINGS, (tol, mass), strict=True))

@@ -19,25 +19,31 @@ def newton(module: Module, f: Function, s: Lane):
 
 
 def iterate_newton(
-    module: Module, f: Function, s: Lane, mask: Value, correct: Callable[[Value], None], steps: int = NEWTON_STEPS
+    module: Module,
+    f: Function,
+    s: Lane,
+    mask: Value,
+    correct: Callable[[Value], None],
+    steps: int = NEWTON_STEPS,
+    tol: float = NEWTON_TOL,
 ):
-    """Take Newton steps in some lanes: `correct` computes `corrected q` from `state q`."""
+    """Take Newton steps in some lanes, up to a change of at most `tol`: `correct` computes `corrected q` from `state q`."""
     s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
         active = s.iterating > 0.5
         correct(active)
         change = take_newton_step(module, f, active)
-        s.iterating = f.select(active & ~(change <= NEWTON_TOL), f.const(1.0, DOUBLE, f.width), 0.0)
+        s.iterating = f.select(active & ~(change <= tol), f.const(1.0, DOUBLE, f.width), 0.0)
         k.value = k.value + 1
 
 
-def take_newton_step(module: Module, f: Function, active: Value) -> Value:
-    """Set `state q` to `corrected q` in active lanes; return the largest change, in the scene's own units."""
+def take_newton_step(module: Module, f: Function, active: Value, at: str = "state q", corrected: str = "corrected q") -> Value:
+    """Set the array `at` to `corrected` in active lanes; return the largest change, in the scene's own units."""
 
     def change(r: Value) -> list[Value]:
-        old, new = module.vector(f, "state q", r), module.vector(f, "corrected q", r)
-        module.put(f, "state q", r, f.select(active, new, old))
+        old, new = module.vector(f, at, r), module.vector(f, corrected, r)
+        module.put(f, at, r, f.select(active, new, old))
         return [f.abs(new - old) * module.vector(f, "inverse unit", r)]
 
     return module.largest(f, change)
@@ -85,6 +91,14 @@ def project_output(module: Module, f: Function, s: Lane, which: str):
                 f.call("close_output", f.given["work"])
                 s.where(s.open > 0.5, violated=largest_violation(module, f))
 
+    if module.partitions:
+        f.call("choose_partition", f.given["work"])
+        s.closing = getattr(s, which)
+        f.call("close_state", f.given["work"])
+        module.copy(f, "state v", "result v", mask)
+        module.invoke(f, "psi")
+        s.violated = largest_violation(module, f)
+        return
     if module.plan.projected:
         threshold = f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width)
         with_threshold(f, module.drop_tol_place if module.falls_back else None, threshold, project)

@@ -8,6 +8,7 @@ from udkjax.native.base.module import Module
 from udkjax.native.base.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
 from udkjax.native.base.tableau import Method
 from udkjax.native.run.manifold import newton, with_threshold
+from udkjax.native.run.partitioning import begin_step, close, close_end, judge_independent
 
 
 def write_attempt(module: Module):
@@ -27,6 +28,8 @@ def write_attempt(module: Module):
     def take_stages():
         for i in range(1, stages):
             stage_state(module, f, s, i)
+            if module.partitions:
+                close(f, s, s.stepping > 0.5)
             module.accelerate_stage(f, i)
             check_pivots(module, f, s, f"stage{i} a")
             module.record_stage(f, s, i)
@@ -54,11 +57,17 @@ def write_attempt(module: Module):
                 module.put(f, f"stage{i} a", r, f.const(0.0, DOUBLE, module.plan.vector))
 
     implicit = s.begin < -0.5
+    if module.partitions:
+        begin_step(module, f, s)
     f.choose(begins, clear_stages, take_stages_by_method)
     for each_method, mask in module.methods(f, s):
         stage_state(module, f, s, each_method.stages, method=each_method, mask=mask)
     setattr(s, "state t", s.t1)
-    if not module.plan.projected:
+    if module.partitions:
+        close_end(module, f, s)
+        _estimate_errors(module, f, s, "result a" if method.ends else None, "state dq", "state dv")
+        judge_independent(module, f)
+    elif not module.plan.projected:
         module.accelerate_and_measure(f)
         check_pivots(module, f, s, "result a")
         with f.each(module.rowcount) as r:

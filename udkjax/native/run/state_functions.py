@@ -30,6 +30,7 @@ from udkjax.native.run.trajectory import Trajectory
 class StateFunction(Trajectory):
     """The text of a module whose `run` evaluates members at their states q and v at the time ts[0]."""
 
+    closes = False
     settings = ("length", "fallback_tol", "method")
     results = ("found",)
     found: ClassVar[tuple[str, ...]]  # arrays of coordinates that are returned, concatenated
@@ -104,11 +105,12 @@ class StateAccelerations(StateFunction):
 class StateProjection(StateFunction):
     """The projection of states."""
 
+    closes = True
     found = ("state q", "result v")
 
     @property
     def solving(self) -> list[str]:
-        return ["newton_q", "newton_v_and_psi", "project"]
+        return [] if self.partitions else ["newton_q", "newton_v_and_psi", "project"]
 
     def _evaluate(self, f: Function, s: Lane):
         s.due = s.active

@@ -42,12 +42,21 @@ from udkjax.native.run.stage_equations import StageEquations
 class Trajectory(Module):
     """The code of whole trajectories."""
 
+    closes = True
+
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
         super().__init__(plan, differentiated, active)
         self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
         self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
         self.stage_equations: StageEquations | None = None
         self._is_differentiated = bool(differentiated)
+
+    @property
+    def solving(self) -> list[str]:
+        return [] if self.partitions else super().solving
+
+    def program_names(self) -> list[str]:
+        return [*super().program_names(), *(("rows_of_positions", "rows_of_velocities") if self.partitions else ())]
 
     def write_programs(self):
         super().write_programs()

@@ -1,0 +1,60 @@
+"""The machine code of a method and of a formulation, or the reason why there is none."""
+
+from typing import Any, NamedTuple
+
+from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
+from udkjax.equations.partitioning import CoordinatePartitioning
+from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.scales import Scales
+from udkjax.native.base.layout import FORMULATION_SETTINGS
+from udkjax.native.base.program import UnsupportedError
+from udkjax.native.pseudoinverses import dense_method
+from udkjax.native.pseudoinverses.dense import DenseMethod
+from udkjax.native.pseudoinverses.lu import LUCode
+from udkjax.native.pseudoinverses.one_of import OneOfCode
+from udkjax.native.run.formulations import AugmentedCode, FormulationCode, NullSpaceCode
+from udkjax.native.run.partitioning import PartitioningCode
+from udkjax.pinv import Auto, Elimination, Pseudoinverse
+
+
+def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
+    """Return the machine code of a formulation; None if it has none."""
+    if isinstance(formulation, CoordinatePartitioning):
+        return PartitioningCode()
+    if isinstance(formulation, NullSpaceQR | NullSpaceSVD):
+        return NullSpaceCode(isinstance(formulation, NullSpaceSVD))
+    if not isinstance(formulation, Augmented):
+        return None
+    method = LUCode(relative=True, refuses_singular=True) if formulation.method is None else dense_method(formulation.method)
+    return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one method number
+
+
+class MethodCode(NamedTuple):
+    """The machine code of a method and of a formulation."""
+
+    pseudoinverse: DenseMethod | None  # None: elimination
+    formulation: FormulationCode | None  # None: the Udwadia-Kalaba equation
+
+    @classmethod
+    def of(cls, method: Pseudoinverse, formulation: Formulation | None = None) -> "MethodCode":
+        """Return the machine code of a method and a formulation.
+
+        Raises:
+            UnsupportedError: machine code does not support one of them.
+        """
+        code = cls(dense_method(method), None if formulation is None else formulation_code(formulation))
+        if formulation is not None and code.formulation is None:
+            raise UnsupportedError(f"the formulation {formulation}")
+        if code.pseudoinverse is None and not isinstance(method, Auto | Elimination):
+            raise UnsupportedError(f"the pseudoinverse {type(method).__name__}")
+        return code
+
+    @staticmethod
+    def formulation_settings(formulation: Any, scales: Scales) -> dict[str, Any]:
+        """Return the settings of a formulation by name: its rank tolerance, and the characteristic mass (kg)."""
+        if isinstance(formulation, Augmented):
+            tol = None if formulation.method is None else formulation.method.rank_tol
+            tol = RANK_TOL**2 if tol is None else tol
+        else:
+            tol = scales.rank_tol if formulation.rank_tol is None else formulation.rank_tol
+        return dict(zip(FORMULATION_SETTINGS, (tol, scales.mass), strict=True))

@@ -1,0 +1,150 @@
+"""Coordinate partitioning (equations/partitioning.py) as machine code: steps in the independent coordinates alone.
+
+The partition of a step follows from its first state, by the pivots of D, and is two arrays of zeros and ones, `dependent q` and
+`dependent v`. At each stage, at the end of the step and at each output,
+
+    choose_partition(work)    the partition at the state
+    close_state(work)         the state, with the dependent coordinates and velocities that satisfy the constraints, in lanes that
+                              are `closing`; velocities are NaN where Newton's method fails, so that the step is repeated
+
+The accelerations of such a state are those of the Udwadia-Kalaba equation, a_F + M^(-1/2) D^+ b: only the choice of the state
+differs. A Nystroem method, which has stages of coordinates from accelerations alone, is the same in the independent coordinates
+as if it integrated only these; the dependent ones are the first guess of Newton's method.
+"""
+
+import numpy as np
+
+from udkjax.equations.partitioning import PARTITION_NEWTON_STEPS
+from udkjax.equations.position_closure import CLOSURE
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.layout import FORMULATION_SETTINGS, Lane
+from udkjax.native.base.module import Module
+from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.native.pseudoinverses.householder import HouseholderCode
+from udkjax.native.run.formulations import FORMULATE, FormulatedAccelerations, FormulationCode
+from udkjax.native.run.manifold import iterate_newton, take_newton_step
+
+NEWTON_TOL = float(np.sqrt(np.finfo(float).eps))  # the error after the last step is of the order of its square
+
+
+class PartitioningCode(FormulationCode):
+    """Steps in independent coordinates (`CoordinatePartitioning`)."""
+
+    closes = True
+
+    def prepare(self, module: Module) -> "PartitionedAccelerations":
+        return PartitionedAccelerations(module)
+
+
+class PartitionedAccelerations(FormulatedAccelerations):
+    """Accelerations by pivoted QR of D, which finds the dependent columns as well, and the solution for these."""
+
+    def __init__(self, module: Module):
+        self._in = module
+        self._rows = WeightedRows(module, HouseholderCode(relative=True), prefix="partition", tol=FORMULATION_SETTINGS[0])
+        if module.partitions:
+            module.places.add("closing")
+            for name in ("dependent q", "dependent v", "predicted q"):
+                module.places.add(name, module.n)
+
+    def write(self):
+        module, rows = self._in, self._rows
+        rows.write()
+        f, _ = module.function(FORMULATE, [(POINTER, "work"), (POINTER, "out")])
+        module.invoke(f, "dense_accelerations")
+        rows.factor(f)
+        rows.correct(f, rows.solve(f, "terms", module.n), "terms", "out", 1.0)
+        if module.partitions:
+            self._write_choice()
+            self._write_closure()
+
+    def _write_choice(self):
+        """Write `choose_partition(work)`."""
+        module, rows = self._in, self._rows
+        f, _ = module.function("choose_partition")
+
+        def choose(of: str):
+            free = rows.matrices(f).row("unused")
+            with f.each(module.n) as i:
+                module.put_entry(f, f"dependent {of}", i, 1.0 - free.entry(i))
+
+        module.invoke(f, "rows_of_positions")
+        rows.factor(f, of_positions=True)
+        choose("q")
+        if rows.splits:
+            module.invoke(f, "rows_of_velocities")
+            rows.factor(f)
+        choose("v")
+
+    def _write_closure(self):
+        """Write `close_state(work)`."""
+        module, steps = self._in, PARTITION_NEWTON_STEPS
+        f, s = module.function("close_state")
+        closing = s.closing > 0.5
+        module.copy(f, "state q", "predicted q")
+        s.iterating = f.const(0.0, DOUBLE, f.width)
+        if module.code.position_rows:
+            iterate_newton(module, f, s, closing, lambda _: self._newton(f, "q", "corrected q"), steps, NEWTON_TOL)
+        # A solution farther from the predicted state might be another assembly mode.
+        moved = module.largest(
+            f,
+            lambda r: [
+                f.abs(module.vector(f, "state q", r) - module.vector(f, "predicted q", r)) * module.vector(f, "inverse unit", r)
+            ],
+        )
+        lost = (s.iterating > 0.5) | ~(moved <= CLOSURE.longest_step)
+        s.iterating = f.select(closing & ~lost, f.const(1.0, DOUBLE, f.width), 0.0)
+        k = f.variable(0, INT, 1)
+        steps_of_velocities = 1 if module.code.is_linear else steps
+        with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps_of_velocities)):
+            active = s.iterating > 0.5
+            self._newton(f, "v", "result v")
+            change = take_newton_step(module, f, active, "state v", "result v")
+            if not module.code.is_linear:
+                s.iterating = f.select(active & ~(change <= NEWTON_TOL), f.const(1.0, DOUBLE, f.width), 0.0)
+            k.value = k.value + 1
+        if not module.code.is_linear:
+            lost = lost | (s.iterating > 0.5)
+        with f.each(module.rowcount) as r:
+            module.put(f, "state v", r, f.select(closing & lost, np.nan, module.vector(f, "state v", r)))
+
+    def _newton(self, f: Function, x: str, to: str):
+        """Write a Newton step in the dependent coordinates, or velocities, from the state."""
+        module, rows, columns = self._in, self._rows, f"dependent {x}"
+        module.invoke(f, "rows_of_positions" if x == "q" else "rows_of_velocities")
+        rows.factor(f, of_positions=x == "q", columns=columns)
+        change = rows.solve(f, "psi")
+        with f.each(module.n) as i:
+            step = module.entry(f, "root", i) * module.entry(f, columns, i) * change.entry(i)
+            module.put_entry(f, to, i, module.entry(f, f"state {x}", i) - step)
+
+
+def begin_step(module: Module, f: Function, s: Lane):
+    """Choose the partition of a step, at point 3."""
+    setattr(s, "state t", s.point3_t)
+    with f.each(module.rowcount) as r:
+        for x in "qv":
+            module.put(f, f"state {x}", r, module.vector(f, f"point3 {x}", r))
+    f.call("choose_partition", f.given["work"])
+
+
+def close(f: Function, s: Lane, mask: Value):
+    """Close the state in some lanes."""
+    s.closing = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
+    f.call("close_state", f.given["work"])
+
+
+def close_end(module: Module, f: Function, s: Lane):
+    """Close the end of a step, with its accelerations."""
+    close(f, s, s.stepping > 0.5)
+    module.copy(f, "state v", "result v")
+    module.invoke(f, FORMULATE, "result a")
+
+
+def judge_independent(module: Module, f: Function):
+    """Make the estimated errors of dependent coordinates and velocities zero, as they are not integrated."""
+    with f.each(module.rowcount) as r:
+        for x in "qv":
+            error = module.vector(f, f"state d{x}", r) * (1.0 - module.vector(f, f"dependent {x}", r))
+            for name in ("state", "result"):
+                module.put(f, f"{name} d{x}", r, error)
