@@ -155,9 +155,6 @@ def run(problem: Problem, expected: Reference, part: Part, out: Path | None) -> 
         name = one["method"] if part.timed else ""
         twice = part.repeats and one["stabilization"] == "projection" and one["method"] not in DENSE
         groups.setdefault(f"{name}, projection" if twice else name, []).append(one)
-    if part.steps:  # of which a sweep takes one
-        parts = [part._replace(tolerances=(step,)) for step in part.tolerances]
-        return [(one.cells, _sweep(problem, expected, one, one.cells, out and out / str(k))) for k, one in enumerate(parts)]
     found = []
     for name, cells in groups.items():
         data = _sweep(problem, expected, part, cells, out and out / name)
@@ -177,10 +174,12 @@ def _sweep(problem: Problem, expected: Reference, part: Part, cells: list[dict[s
         shared: dict[str, Any] = {}
     else:
         varied, shared = {}, chosen[0]
+    chosen_numbers = {"rtol": tolerances, "atol": tolerances}
     if part.steps:
-        shared = shared | {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": tolerances[0] * problem.end}
+        shared = shared | {"stepsize_controller": diffrax.ConstantStepSize()}
+        chosen_numbers["dt0"] = tolerances * problem.end
     axes = varied | {
-        "tol": udk.Zipped({"rtol": tolerances, "atol": tolerances}),
+        "tol": udk.Zipped(chosen_numbers),
         "start": udk.Axis(problem.states(len(expected.q))[: part.starts], of="state"),
     }
     measures = {"wrong": compare(problem, expected), "closure": "violation", "energy": "energy_drift"}

@@ -36,21 +36,26 @@ class Series:
         self.a, self.b, self.c = a, b, c
 
     def __add__(self, other: Any) -> "Series":
-        o = _series(other)
-        return Series(self.a + o.a, self.b + o.b, self.c + o.c)
+        if not isinstance(other, Series):
+            return Series(self.a + other, self.b, self.c)
+        return Series(self.a + other.a, self.b + other.b, self.c + other.c)
 
     def __neg__(self) -> "Series":
         return Series(-self.a, -self.b, -self.c)
 
     def __sub__(self, other: Any) -> "Series":
-        return self + -_series(other)
+        if not isinstance(other, Series):
+            return Series(self.a - other, self.b, self.c)
+        return Series(self.a - other.a, self.b - other.b, self.c - other.c)
 
     def __rsub__(self, other: Any) -> "Series":
-        return _series(other) - self
+        return Series(other - self.a, -self.b, -self.c)
 
     def __mul__(self, other: Any) -> "Series":
-        o = _series(other)
-        return Series(self.a * o.a, self.a * o.b + self.b * o.a, self.a * o.c + self.b * o.b + self.c * o.a)
+        if not isinstance(other, Series):
+            return Series(self.a * other, self.b * other, self.c * other)
+        a, b, c = other.a, other.b, other.c
+        return Series(self.a * a, self.a * b + self.b * a, self.a * c + self.b * b + self.c * a)
 
     __radd__, __rmul__ = __add__, __mul__
 
@@ -59,16 +64,12 @@ class Series:
         return Series(value, slope * self.b, slope * self.c + 0.5 * curvature * self.b**2)
 
 
-def _series(x: Any) -> Series:
-    return x if isinstance(x, Series) else Series(x)
-
-
 def _sin(x: Series) -> Series:
-    return x.of(np.sin(x.a), np.cos(x.a), -np.sin(x.a))
+    return x.of(value := np.sin(x.a), np.cos(x.a), -value)
 
 
 def _cos(x: Series) -> Series:
-    return x.of(np.cos(x.a), -np.sin(x.a), -np.cos(x.a))
+    return x.of(value := np.cos(x.a), -np.sin(x.a), -value)
 
 
 def _sqrt(x: Series) -> Series:
@@ -115,7 +116,10 @@ class _Frame(NamedTuple):
     sin: Any
 
     def point(self, p: Any) -> tuple[Any, Any]:
-        return self.x + self.cos * p[0] - self.sin * p[1], self.y + self.sin * p[0] + self.cos * p[1]
+        x, y = p
+        if x == y == 0.0:
+            return self.x, self.y
+        return self.x + self.cos * x - self.sin * y, self.y + self.sin * x + self.cos * y
 
 
 def _residual(entry: Table, t: Series, frames: Callable[[str], _Frame], guess: Callable[[str], _Frame]) -> list[Any]:
@@ -129,6 +133,8 @@ def _residual(entry: Table, t: Series, frames: Callable[[str], _Frame], guess: C
         return qx - px, qy - py
 
     x, y = gap(one, two)
+    if entry.get("type") == "revolute":
+        return [x, y]
     turn = two.angle - one.angle
     if "coordinate" in entry:
         law = _law(entry["motion"], t)
@@ -145,8 +151,6 @@ def _residual(entry: Table, t: Series, frames: Callable[[str], _Frame], guess: C
     side = np.cos(entry.get("axis", 0.0)), np.sin(entry.get("axis", 0.0))
     across = (one.cos * side[1] + one.sin * side[0]) * -1.0 * x + (one.cos * side[0] - one.sin * side[1]) * y
     match entry["type"]:
-        case "revolute":
-            return [x, y]
         case "weld":
             return [x, y, fixed]
         case "prismatic":
@@ -190,14 +194,16 @@ def evaluate_all(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> list[T
     states, bodies = q.shape[:2]
     n, index = 3 * bodies, {body["name"]: k for k, body in enumerate(table["body"])}
     # Directions of all states, one after another; the last of each is the motion itself.
-    directions = np.concatenate([np.vstack([np.eye(n), one.reshape(1, -1)]) for one in v])
+    directions = np.tile(np.eye(n + 1, n), (states, 1))
+    directions[n :: n + 1] = v.reshape(states, n)
     placed = np.repeat(q.reshape(states, n), n + 1, axis=0)
-    time = Series(np.full(len(placed), float(t)), np.tile(np.append(np.zeros(n), 1.0), states))
+    time = Series(float(t), np.zeros(len(placed)))
+    time.b[n :: n + 1] = 1.0
 
     def frame(x: Any, y: Any, angle: Any) -> _Frame:
         return _Frame(x, y, angle, _cos(angle), _sin(angle))
 
-    ground = frame(Series(0.0), Series(0.0), Series(0.0))
+    ground = _Frame(Series(0.0), Series(0.0), Series(0.0), Series(1.0), Series(0.0))
     along = lambda k: [Series(placed[:, 3 * k + i], directions[:, 3 * k + i]) for i in range(3)]  # noqa: E731
     moving = [frame(*along(k)) for k in range(bodies)]
     still = {"ground": _Frame(0.0, 0.0, 0.0, 1.0, 0.0)}
@@ -209,8 +215,10 @@ def evaluate_all(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> list[T
         for entry in (*table["joint"], *table["driver"])
         for r in _residual(entry, time, lambda b: ground if b == "ground" else moving[index[b]], still.__getitem__)
     ]
-    parts = [[np.broadcast_to(x, (len(placed),)) for x in (r.a, r.b, r.c)] for r in rows]
-    blocks = np.array(parts).reshape(len(rows), 3, states, n + 1)
+    parts = np.empty((len(rows), 3, len(placed)))
+    for row, of in zip(parts, rows, strict=True):
+        row[0], row[1], row[2] = of.a, of.b, of.c
+    blocks = parts.reshape(len(rows), 3, states, n + 1)
     mass = np.array([m for body in table["body"] for m in (body["mass"], body["mass"], body["inertia"])])
     weight = mass * np.tile([*table["gravity"], 0.0], bodies)
     found = []
@@ -233,7 +241,7 @@ def evaluate_all(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> list[T
 
 def _loads(table: Table, q: np.ndarray, v: np.ndarray, index: dict[str, int]) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the loads of the elements: those that have a potential, the others, and the potential energy."""
-    kept, lost, energy = np.zeros_like(q), np.zeros_like(q), 0.0
+    kept, lost, energy = np.zeros(q.shape), np.zeros(q.shape), 0.0
     pins = {joint["name"]: joint["bodies"] for joint in table["joint"]}
 
     def at(name: str, point: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -72,9 +72,8 @@ def test_the_oldest_make_room(counted, monkeypatch):
     assert len(calls) == 4
 
 
-@pytest.mark.slow
 def test_results_of_traced_trees_hold_within_their_trace():
-    """One computation for concrete numbers, and one in each trace. A trace within another one stores nothing."""
+    """One computation for concrete numbers, and one in each trace. A trace within another one stores nothing of its own."""
     calls = []
 
     @cached_within_trace
@@ -90,7 +89,12 @@ def test_results_of_traced_trees_hold_within_their_trace():
         assert doubled(tree) is doubled(tree)
         inner = jax.vmap(lambda y: doubled(tree).x.sum() + y)(tree.x)
         other = Tree(tree.x + 1)
+        before = len(calls)
         again = jax.vmap(lambda y: doubled(other).x.sum() * y)(tree.x)
+        doubled(other)
+        assert len(calls) == before + 1  # what is not batched is computed once
+        third = Tree(tree.x + 2)
+        assert jax.jit(lambda: doubled(third).x)() is not doubled(third).x and len(calls) == before + 3
         return inner + again + doubled(other).x + doubled(tree).x
 
     with jax.checking_leaks():

@@ -15,13 +15,14 @@ from threading import RLock
 from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import jax
-import jax.extend.core
 import numpy as np
 from jax.core import Tracer
 
 Arguments = ParamSpec("Arguments")
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
+Argument_contra = TypeVar("Argument_contra", contravariant=True)
+Known = TypeVar("Known")
 Produced_co = TypeVar("Produced_co", covariant=True)
 
 MOST_BYTES = 2**26  # of all results of functions that are `cached_by_size` together, by the estimates of these functions
@@ -67,47 +68,55 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
     return call
 
 
-def cached_within_trace(function: Callable[[Argument], Result]) -> Callable[[Argument], Result]:
+class FunctionOfTree(Protocol[Argument_contra, Known]):
+    """A function of one tree, with a cache."""
+
+    def __call__(self, argument: Argument_contra, /) -> Known: ...
+
+    def know(self, argument: Argument_contra, result: Known) -> None:
+        """Store a result that is known without being computed."""
+        ...
+
+
+def cached_within_trace(function: Callable[[Argument], Result]) -> FunctionOfTree[Argument, Result]:
     """Cache the results of a function of one tree by its identity, like `cached_by_identity`, also while numbers are traced.
 
-    The result must not contain the tree itself. With traced numbers it is stored if some of them belong to the current trace, so
-    that it lives no longer than this trace, and is used in this trace only.
+    The result must not contain the tree itself. It is stored if each traced number of it belongs to a trace of the argument's
+    numbers, so that it can be used wherever the argument can.
     """
-    cache: OrderedDict[int, tuple[Any, Any, Result]] = OrderedDict()  # a reference, the trace (None if concrete), the result
+    cache: OrderedDict[int, tuple[Any, Result]] = OrderedDict()  # references and results
     lock = RLock()
 
     def forget(key: int) -> None:
         with lock:
             cache.pop(key, None)
 
+    def know(argument: Argument, result: Result) -> None:
+        key = id(argument)
+        with lock:
+            cache[key] = _reference(argument, lambda _: forget(key)), result
+            while len(cache) > CACHE_SIZE:
+                cache.popitem(last=False)
+
     @wraps(function)
     def call(argument: Argument) -> Result:
-        key = id(argument)
-        stored = cache.get(key)
-        if stored is not None and (stored[1] is None or stored[1] is _current_trace()):
-            return stored[2]
+        stored = cache.get(id(argument))
+        if stored is not None:
+            return stored[1]
         result = function(argument)
-        traces = [getattr(x, "_trace", None) for x in jax.tree.leaves(argument) if isinstance(x, Tracer)]
-        trace = _current_trace() if traces else None
-        if not traces or any(trace is x for x in traces):
-            with lock:
-                cache[key] = _reference(argument, lambda _: forget(key)), trace, result
-                while len(cache) > CACHE_SIZE:
-                    cache.popitem(last=False)
+        given = _traces(argument)
+        if not given or _traces(result) <= given:
+            know(argument, result)
         return result
 
-    return call
+    found: Any = call
+    found.know = know
+    return found
 
 
-_take_trace = getattr(jax.extend.core, "take_current_trace", None)
-
-
-def _current_trace() -> Any:
-    """Return the trace of operations that are called now; a new object if JAX does not provide it."""
-    if _take_trace is None:
-        return object()
-    with _take_trace() as trace:
-        return trace
+def _traces(tree: Any) -> set[int]:
+    """Return the traces of the numbers of a tree, which exist as long as it."""
+    return {id(getattr(x, "_trace", x)) for x in jax.tree.leaves(tree) if isinstance(x, Tracer)}
 
 
 def _reference(x: object, forget: Callable[[Any], None]) -> Any:

@@ -42,7 +42,7 @@ from udkjax.scene.number_fields import (
     split_index,
 )
 from udkjax.scene.origin import Origin
-from udkjax.scene.sources import AbstractDrawing, Drawn, Elements, Source, names_of
+from udkjax.scene.sources import AbstractDrawing, Drawn, Elements, Source, elements_of, names_of
 
 Element = TypeVar("Element", bound=eqx.Module)
 Module = TypeVar("Module", bound=eqx.Module)
@@ -251,6 +251,11 @@ class Mechanism(PrintsTable):
         All numbers of the equations are leaves of it, also those that follow from others.
         """
         return self if type(self._source) is Elements and self.origin is None else _without_origin(self)
+
+    def know_elements(self, known: "Mechanism") -> None:
+        """Take for `without_origin` what it returned for the same numbers, so that a program does not compute it again."""
+        elements_of.know(self._source, known._source.elements)
+        _without_origin.know(self, known)
 
     @property
     def is_concrete(self) -> bool:

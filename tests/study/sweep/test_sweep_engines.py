@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.study.sweep.chunks import members_to_compute
 from udkjax.study.sweep.executors import other_redundant_rows, run
-from udkjax.study.sweep.groups import group_run
+from udkjax.study.sweep.groups import GroupRun, group_run
 from udkjax.study.sweep.plan import Chunk, make_plan
 
 LINKS = ("link1", "link2", "link3")
@@ -193,3 +193,15 @@ def test_a_program_is_traced_once(linkage):
         linkage, axes, np.linspace(0, 0.1, 2), {"end": lambda mechanism, run: traced.append(1) or run.q[-1, 0, 0]}, progress=False
     )
     assert len(traced) == 1
+
+
+@pytest.mark.parametrize("mechanism", [udk.library.peaucellier(), udk.library.planetary_gear()], ids=["drawing", "gears"])
+def test_elements_of_a_fixed_mechanism_are_not_computed_by_the_program(mechanism):
+    """Its program is that of the elements alone, in which nothing follows from a drawing."""
+    plan = make_plan(mechanism, {"rtol": [1e-4, 1e-6]}, [0.0, 0.1], "final")
+    plain = make_plan(mechanism.without_origin, {"rtol": [1e-4, 1e-6]}, [0.0, 0.1], "final")
+    sizes = []
+    for each in (plan, plain):
+        group = GroupRun(each, 0)
+        sizes.append(len(group.program._trace(group.shared, group.own(group.members[:1])).jaxpr.eqns))
+    assert sizes[0] == sizes[1]

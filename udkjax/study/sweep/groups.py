@@ -44,10 +44,11 @@ STRAIGHT_METHODS = (type(None), Auto, Elimination)  # without branches: fast in 
 
 
 class Shared(NamedTuple):
-    """The numbers that all members of a group share: those of settings, and the closed initial state, if it is the same."""
+    """The numbers that all members of a group share: those of settings, and what follows from them, if it is the same."""
 
     settings: Mapping[str, PyTree]
-    closure: Closure | None
+    closure: Closure | None  # the closed initial state
+    elements: PyTree  # of the mechanism, which may follow from a drawing
 
 
 class Own(NamedTuple):
@@ -102,7 +103,10 @@ class GroupRun:
         moving = any(name not in {column.name for column in plan.columns} for name in self.names)
         self.assembled = fixed.get("state") is None
         closure = close(fixed["mechanism"], plan.ts[0]) if self.assembled and not self.varied and not moving else None
-        self.shared = jax.tree.map(np.asarray, Shared(arrays, closure))
+        shared = None if "mechanism" in self._own else fixed["mechanism"]
+        plain = shared.without_origin if isinstance(shared, Mechanism) else shared
+        elements, self._elements = eqx.partition(None if plain is shared else plain, eqx.is_array)
+        self.shared = jax.tree.map(np.asarray, Shared(arrays, closure, elements))
         method, formulation = fixed.get("method"), fixed.get("formulation")
         is_straight = isinstance(method, STRAIGHT_METHODS) and formulation is None
         in_lanes = (
@@ -133,6 +137,8 @@ class GroupRun:
     def mechanism(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> StudyModel:
         """Return the mechanism of one member, with `shift` added to the variables of differentiation."""
         mechanism: Any = self._setting("mechanism", shared, own)
+        if self._elements is not None:
+            mechanism.know_elements(eqx.combine(shared.elements, self._elements))
         values: dict[str, np.ndarray | Array] = {}
         kind = Mechanism if isinstance(mechanism, Mechanism) else ConstrainedSystem
         for column in self.numbers:
