@@ -92,7 +92,7 @@ def test_results_of_traced_trees_hold_within_their_trace():
         before = len(calls)
         again = jax.vmap(lambda y: doubled(other).x.sum() * y)(tree.x)
         doubled(other)
-        assert len(calls) == before + 1  # what is not batched is computed once
+        assert len(calls) == before + 1  # numbers without a batch axis are computed once
         third = Tree(tree.x + 2)
         assert jax.jit(lambda: doubled(third).x)() is not doubled(third).x and len(calls) == before + 3
         return inner + again + doubled(other).x + doubled(tree).x
