@@ -254,6 +254,51 @@ def test_derivatives_of_a_stick_slip_cycle():
     np.testing.assert_allclose(gradient, differences, rtol=1e-5)
 
 
+def test_a_held_force_that_grows_past_the_limit():
+    """A block rests under 3 N, slides under 7 N, and stops without a force: its samples are those of the state's time."""
+    steps = udk.Held([[3.0, 0.0], [7.0, 0.0], [0.0, 0.0]], 0.5)
+    base = block(0.0, coefficient=0.5)
+    mechanism = udk.Mechanism(base.bodies, base.joints, {}, {**base.forces, "pull": udk.Force("block", steps)})
+    a, drag = 7.0 - 0.5 * G, 0.5 * G
+    solution = udk.simulate(mechanism, [0.0, 0.5, 1.0, 5.0], **TOL)
+    np.testing.assert_allclose(solution.q[:, 0, 0], [0.0, 0.0, a / 8, a / 8 + (a / 2) ** 2 / (2 * drag)], atol=1e-11)
+    assert solution.settings["engine"] == "native"
+    assert solution.events.of("S slips") == pytest.approx([0.5], abs=1e-11)
+    assert solution.events.of("S sticks") == pytest.approx([1.0 + a / 2 / drag], abs=1e-11)
+
+
+@pytest.mark.slow
+def test_a_joint_that_an_event_locks_under_a_held_force():
+    base = udk.Mechanism({"block": udk.Body(1.0, 0.01)}, {"S": udk.Prismatic(["ground", "block"], [[0.0, 0.0], [0.0, 0.0]], 0.0)})
+    pull = udk.Force("block", udk.Held([[1.0, 0.0], [2.0, 0.0]], 0.5))
+    mechanism = udk.Mechanism(base.bodies, base.joints, {}, {"pull": pull})
+    lock = udk.Event(lambda t, at: t - 0.75, udk.Lock("S"), name="lock")
+    solution = udk.simulate(mechanism, [0.0, 0.75, 1.0], events=lock, **TOL)
+    assert solution.settings["engine"] == "native"
+    np.testing.assert_allclose(solution.q[:, 0, 0], [0.0, 0.125 + 0.125 + 0.0625, 0.3125], atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["four_bar", "double_pendulum"])
+def test_a_held_force_on_joints_that_stick(name):
+    """As a torque of the same values between the same times, by pieces of a run each with a constant torque."""
+    still = sticking(getattr(udk.library, name)())
+    body = still.body_names[0]
+
+    def with_torque(value) -> udk.Mechanism:
+        forces = {**still.forces, "motor": udk.Torque(["ground", body], value)}
+        return udk.Mechanism(still.bodies, still.joints, {}, forces, still.gravity, still.name)
+
+    values, state = np.random.default_rng(1).normal(0.0, 20.0, 6), None
+    ts = np.linspace(0.0, 3.0, 31)
+    found = udk.simulate(with_torque(udk.Held(values, 0.5)), ts, **TOL)
+    assert found.settings["engine"] == "native"
+    for k, value in enumerate(values):
+        part = udk.simulate(with_torque(value), ts[5 * k : 5 * k + 6], state, **TOL)
+        np.testing.assert_allclose(found.q[5 * k : 5 * k + 6], part.q, atol=1e-8)
+        state = udk.State(part.q[-1], part.v[-1])
+
+
 @pytest.mark.slow
 def test_with_events():
     """A joint limit throws the block back; a released joint takes its friction with it."""

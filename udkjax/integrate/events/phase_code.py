@@ -186,11 +186,7 @@ class PhaseCode:
         t, q, v, *_ = state
         operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
         assert conditions is not None  # this code has conditions
-        numbers = self._with_marks(members, state)
-        if self._samples:
-            numbers = _spread(numbers, b).copy()
-            row = np.sum(_of(self._breaks, members) <= t[:, None], axis=1)
-            numbers[:, list(self.plan.run.sampled)] = _spread(_of(self._samples[0], members), b)[np.arange(b), row]
+        numbers = self._with_samples(members, t, self._with_marks(members, state))
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
         inputs = numbers, np.stack([t, t], axis=1), q, v, *further
         of_states = _of(self._numbers_of_states, members)
@@ -216,7 +212,8 @@ class PhaseCode:
         operation, n = self.plan.project, q.shape[1]
         assert operation is not None  # events add joints
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
-        inputs = self._with_marks(members, state), np.stack([t, t], axis=1), q, v
+        numbers = self._with_samples(members, t, self._with_marks(members, state))
+        inputs = numbers, np.stack([t, t], axis=1), q, v
         (results,) = call_members(*inputs, *further, operation=operation, times=2)
         return results[:, :n], results[:, n:]
 
@@ -238,6 +235,15 @@ class PhaseCode:
                 numbers[:, place] = phase[:, k]
         return numbers
 
+    def _with_samples(self, members: Int[np.ndarray, "b"], t: Float[np.ndarray, "b"], numbers: np.ndarray) -> np.ndarray:
+        """Return the numbers of members with the samples of their times; a run takes all samples instead."""
+        if not self._samples:
+            return numbers
+        numbers, b = _spread(numbers, len(t)).copy(), len(t)
+        row = np.sum(_of(self._breaks, members) <= t[:, None], axis=1)
+        numbers[:, list(self.plan.run.sampled)] = _spread(_of(self._samples[0], members), b)[np.arange(b), row]
+        return numbers
+
     def _with_marks(self, members: Int[np.ndarray, "b"], state: RunState) -> np.ndarray:
         """Return the numbers of members, with marks of independent rows, determined where each member enters its phase first."""
         numbers, m = self._numbers_of(members, state.phase), self.plan.run.code.row_count
@@ -257,6 +263,7 @@ class PhaseCode:
         """Return the marks of independent rows of members at their states."""
         marking, (t, q, v, phase, _), m = self.plan.marking, state, self.plan.run.code.row_count
         assert marking is not None  # checked by the caller
+        numbers = self._with_samples(members, t, numbers)
         scene_numbers, tol = numbers[:, : marking.code.number_count - 2 - m], _spread(_of(self._tol, members), len(numbers))
         among = np.ones((len(numbers), m))
         if self.plan.active:

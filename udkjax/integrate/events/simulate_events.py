@@ -90,8 +90,7 @@ def simulate_events(
         ValueError: the events do not fit the mechanism, or machine code was requested but cannot run the system.
     """
     listed, phases = _prepare(mechanism, events, analysis)
-    has_code = not (phases.added and mechanism.samples) and not choices.take_diffrax
-    conditions = watched_conditions(listed, phases.mechanisms[SCENE]) if has_code else None
+    conditions = None if choices.take_diffrax else watched_conditions(listed, phases.mechanisms[SCENE])
     if conditions is not None:
         listed = with_cached_functions(listed, conditions)
     ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
