@@ -12,6 +12,7 @@ import udkjax as udk
 from experiments.common import HERE, load
 from experiments.parts import fuzz_arguments, state_properties
 from experiments.parts.friction_properties import check_friction, check_friction_runs, check_uniqueness
+from experiments.parts.friction_reference import with_friction
 from experiments.parts.fuzz import Case, cases_of, run, verdict
 from experiments.parts.random_scenes import build, random_scene, shrunk, state_of
 from experiments.parts.reference_equations import evaluate
@@ -55,6 +56,21 @@ def test_friction_in_all_joints():
     assert any(check_friction_runs(tally, SEED, structure, 4, False) for structure in range(8))
     check(tally)
     assert {"friction", "friction power", "unique loads", "unique accelerations", "batch with friction"} <= set(tally.found)
+
+
+@pytest.mark.slow
+def test_loads_that_rounds_do_not_settle_are_followed_from_those_without_friction():
+    """Newton's steps go back and forth between two sets of signs; still a run begins with the accelerations of the textbook."""
+    scene = with_friction(random_scene(0, 161, 5))
+    state, mechanism = state_of(scene.table), build(scene.table)
+    h = 1e-4 * scene.time
+    run = udk.simulate(mechanism, h * np.arange(3), udk.State(*state), rtol=1e-12, atol=1e-12)
+    assert run.settings["engine"] == "native"
+    first, second, third = np.asarray(run.v)
+    right = np.asarray(udk.accelerations(mechanism, 0.0, *state))
+    unit = np.array([scene.length, scene.length, 1.0])
+    error = np.max(abs((4 * second - 3 * first - third) / (2 * h) - right) / unit)
+    assert error < 1e-6 * np.max(abs(right) / unit)
 
 
 def test_random_scenes_are_closed_and_drawn_again():

@@ -253,12 +253,23 @@ class JointsAtRest(NamedTuple):
             found = respond(FrictionModes(none, direction, rest, none, held))
             a, limit = found.accelerations / self.size, self.size * found.forwards
             force = share * limit
-            for _ in range(SWEEPS):
+
+            def sweep(_: Any, state: tuple[Any, Any]) -> tuple[Any, Any]:
+                force, a = state
                 for i in range(F):
                     new = xp.clip(force[..., i] + a[..., i], -limit[..., i], limit[..., i])
                     change = xp.where(rest[..., i] & mobile[..., i], new - force[..., i], 0.0)
                     force = force + xp.where(np.arange(F) == i, change[..., None], 0.0)
                     a = a - self.W[..., :, i] * change[..., None]
+                return force, a
+
+            state = force, a
+            if xp is np:
+                for k in range(SWEEPS):
+                    state = sweep(k, state)
+            else:
+                state = jax.lax.fori_loop(0, SWEEPS, sweep, state)
+            force = state[0]
             new = force / xp.where(limit > 0, limit, 1.0)
             return xp.where(xp.isfinite(new), new, 0.0)
 

@@ -17,8 +17,9 @@ direction, such as those of slides, are exact once their signs are.
 
 One round leaves an error of s^8: it suffices if the coefficients are below about a thirtieth of those that jam the mechanism, as
 in most machines. Programs that a run evaluates often take one round, and report loads that have not settled; machine code then
-takes as many further rounds as are needed (`further`). Other programs take `ROUNDS`. If the loads do not settle, friction admits
-no motion (the mechanism jams), and the accelerations are NaN.
+takes as many further rounds as are needed (`further`). Where rounds go back and forth between two sets of signs of the loads, it
+follows the solution from that without friction on, with a growing `friction_share` of G. Other programs take `ROUNDS`. If the
+loads do not settle, friction admits no motion (the mechanism jams), and the accelerations are NaN.
 """
 
 from collections.abc import Callable
@@ -50,6 +51,7 @@ class FrictionElimination:
         layout.sizes |= {"misfit": 1, "rubbing": 1, "drag": layout.coordinate_count, "new_drag": layout.coordinate_count}
         layout.add_solve(CORRECTION)
         layout.sizes["settled"] = layout.sizes[f"x{CORRECTION}"]
+        layout.sizes["friction_share"] = 1
         self.substitute = self._skew.substitute
 
     # --- programs
@@ -66,20 +68,20 @@ class FrictionElimination:
         yield from self._finish(solve, v, reports)
 
     def further(self, solve: int, v: str = "v") -> ProgramParts:
-        """Compute the results of `settle` by a round that begins at x = `settled`."""
+        """Compute the results of `settle`, with `friction_share` times all friction, by a round that begins at x = `settled`."""
         yield from self._skew.form_symmetric
         yield from self._copy_solution("settled", f"x{solve}")
-        yield from self._round(solve, v)
-        yield from self._finish(solve, v, reports=True)
+        yield from self._round(solve, v, in_part=True)
+        yield from self._finish(solve, v, reports=True, in_part=True)
 
-    def _round(self, solve: int, v: str) -> ProgramParts:
-        yield from self._slopes(solve, v)
+    def _round(self, solve: int, v: str, in_part: bool = False) -> ProgramParts:
+        yield from self._slopes(solve, v, in_part)
         yield from self._skew.factorize()
         yield from self._skew.substitute(solve)
-        yield from self._correct(solve, v, self._skew.substitute)
+        yield from self._correct(solve, v, self._skew.substitute, in_part=in_part)
 
-    def _finish(self, solve: int, v: str, reports: bool) -> ProgramParts:
-        yield from self._measure(solve, v)
+    def _finish(self, solve: int, v: str, reports: bool, in_part: bool = False) -> ProgramParts:
+        yield from self._measure(solve, v, in_part)
         if reports:
             yield self.terms.single_iteration("unsettled", lambda w: w.write(_unsettled(w), "unsettled", None))
             yield from self._copy_solution(f"x{solve}", "settled")
@@ -112,10 +114,12 @@ class FrictionElimination:
             named = {"x": f"x{solution}", "jt_x": f"jt_x{solution}"}
             yield self.terms.over_rubbing("loads", group, write, **named, **names)
 
-    def _correct(self, solve: int, v: str, substitute: Callable[..., ProgramParts], has_slopes: bool = True) -> ProgramParts:
+    def _correct(
+        self, solve: int, v: str, substitute: Callable[..., ProgramParts], has_slopes: bool = True, in_part: bool = False
+    ) -> ProgramParts:
         """Replace x by the solution with the last factors and the loads G(x) - S x, or G(x) where the factors have no slopes."""
         terms = self.terms
-        yield from self._drag(solve, v, "drag", has_slopes)
+        yield from self._drag(solve, v, "drag", has_slopes, in_part)
         for group in terms.layout.eliminated:
 
             def rest(w: KernelWriter, group: ConstraintGroup = group):
@@ -128,34 +132,36 @@ class FrictionElimination:
             yield KernelLoop(terms.kernel(("rest of right", group), rest), group.table, names)
         yield from substitute(CORRECTION, x=f"x{solve}")
 
-    def _drag(self, solve: int, v: str, to: str, has_slopes: bool = True) -> ProgramParts:
+    def _drag(self, solve: int, v: str, to: str, has_slopes: bool = True, in_part: bool = False) -> ProgramParts:
         """Compute G(x) - S x on each body, or G(x)."""
         yield Reset(to, 0, self.terms.layout.coordinate_count)
         for group in self.terms.layout.rubbing:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 slopes = [group.slopes(w, row) for row in group.rows] if has_slopes else []
-                for k, load in enumerate(_programs(group).outputs["loads"]):
+                for k, whole in enumerate(_programs(group).outputs["loads"]):
+                    load = _in_part(w, whole) if in_part else whole
                     if not load.is_zero:
                         known = dot(w.graph, _programs(group).x, [row[k] for row in slopes]) if slopes else w.graph.constant(0.0)
                         w.write(load - known, "drag", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
 
-            yield self.terms.over_rubbing(("drag", has_slopes), group, write, x=f"x{solve}", v=v, drag=to)
+            yield self.terms.over_rubbing(("drag", has_slopes, in_part), group, write, x=f"x{solve}", v=v, drag=to)
 
-    def _slopes(self, solve: int, v: str) -> ProgramParts:
+    def _slopes(self, solve: int, v: str, in_part: bool = False) -> ProgramParts:
         for group in self.terms.layout.rubbing:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 for index, offset in group.slope_index.items():
-                    w.write(Scalar(_programs(group).graph, index), "slopes", group.column(SLOPES), offset)
+                    slope = Scalar(_programs(group).graph, index)
+                    w.write(_in_part(w, slope) if in_part else slope, "slopes", group.column(SLOPES), offset)
 
-            yield self.terms.over_rubbing("slopes", group, write, x=f"x{solve}", v=v)
+            yield self.terms.over_rubbing(("slopes", in_part), group, write, x=f"x{solve}", v=v)
 
-    def _measure(self, solve: int, v: str) -> ProgramParts:
+    def _measure(self, solve: int, v: str, in_part: bool) -> ProgramParts:
         """Compute `misfit` and `rubbing`, squares of the change of G(x) by another correction and of G(x), in the metric of C."""
         yield Reset("misfit", 0, 1)
         yield Reset("rubbing", 0, 1)
-        yield from self._drag(solve, v, "new_drag")
+        yield from self._drag(solve, v, "new_drag", in_part=in_part)
         for group in self.terms.layout.rubbing:
 
             def measure_size(w: KernelWriter, group: ConstraintGroup = group):
@@ -197,6 +203,12 @@ class FrictionElimination:
                 w.write(w.read("drag", BODY_COORDINATES, k) + failed, "jt_x", BODY_COORDINATES, k, ADD)
 
         yield self.terms.over_bodies("jt drag", complete, jt_x=f"jt_x{solve}")
+
+
+def _in_part(w: KernelWriter, x: Scalar) -> Scalar:
+    """Return `friction_share` times x; zero without friction, also where x, at loads that ran away, is not finite."""
+    share, zero = w.read("friction_share", None), w.graph.constant(0.0)
+    return where(greater(share, zero), share * x, zero)
 
 
 def _unsettled(w: KernelWriter) -> Scalar:

@@ -69,8 +69,12 @@ class Unrolled:
         state = {x: {k: graph.input((x, k), group) for k in range(size)} for x, (size, group) in sizes.items()}
         layout = unroll(programs.prologue, {"numbers": dict(enumerate(self.numbers))}, graph)["constants"]
         self._arrays: Arrays = {"constants": layout, **state}
-        settled = {k: graph.input(("settled", k), "loads") for k in range(programs.scratch["settled"])} if programs.rubs else {}
-        given: dict[str, Arrays] = {programs.FURTHER: {"settled": settled}}
+        begins = {
+            x: {k: graph.input((x, k), "loads") for k in range(programs.scratch[x])}
+            for x in ("settled", "friction_share")
+            if programs.rubs
+        }
+        given: dict[str, Arrays] = {programs.FURTHER: begins}
         self._results = {
             name: _entries(
                 self._unroll(getattr(programs, name), given.get(name)), RESULTS + (ENTRIES if name in WITH_ENTRIES else ())
@@ -96,7 +100,7 @@ class Unrolled:
         self.drop_tol_index = next((k for k, s in enumerate(self.constants) if s.index == drop_tol.index), None)
         self.prologue = ScalarProgram(graph, self.numbers, self.constants)
         self._inputs = {s: ("constants", k) for k, s in enumerate(self.constants)}
-        self._inputs |= {s: (x, k) for x, scalars in (state | {"settled": settled}).items() for k, s in scalars.items()}
+        self._inputs |= {s: (x, k) for x, scalars in (state | begins).items() for k, s in scalars.items()}
 
     def program(self, name: str) -> UnrolledProgram:
         """Return a program by its name."""

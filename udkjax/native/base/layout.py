@@ -125,6 +125,8 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "ok": "whether all pivots of the attempted step were safe",
     "safe": "whether all pivots of the latest program were safe",
     "unsettled": "whether the loads of joints with friction need further rounds of Newton's method",
+    "friction_share": "share of the friction that counts in further rounds",
+    "staged": "whether the loads are followed from those without friction on",
     "fallback": "whether this attempt is made by the fallback",
     "fallback_due": "whether the next attempt must be made by the fallback",
     "retries": "number of successive attempts that were shortened because of a pivot",

@@ -203,7 +203,7 @@ class Module(Running):
         if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}
         if self.settles:
-            named["settled"] = "settled"
+            named |= {x: x for x in ("settled", "friction_share")}
         if "couplings" in self.places.places:
             named["couplings"] = "couplings"
         return {x: ("work", self.places[place]) for x, place in named.items()}

@@ -1,17 +1,18 @@
 """Further rounds of Newton's method for friction that depends on the loads of joints.
 
 The programs `SETTLING` take one round. They set `unsettled` to one where it does not suffice, and leave the solution of their
-linear system as `settled`. Two functions then take as many more rounds as such lanes need, and leave other lanes as they are:
+linear system as `settled`. Two functions then take as many more rounds as such lanes need, and leave other lanes as they are.
+Lanes that still do not settle follow the solution from that without friction on, in `SETTLING_STAGES` of growing friction:
 
     settle_state(work, out)    at `state v`; the accelerations are at `out`
     settle_end(work, out)      the same at `result v`, the velocities at the end of a step
 """
 
 from udkjax.equations.run_programs import RunPrograms
-from udkjax.native.base.ir import INT, Function
+from udkjax.native.base.ir import DOUBLE, INT, Function
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.memory import Memory
-from udkjax.native.base.steps import SETTLING_ROUNDS
+from udkjax.native.base.steps import SETTLING_ROUNDS, SETTLING_STAGES
 
 AT_STATE = ("accelerations", "accelerations_and_drift")
 AT_END = ("project_and_accelerate", "end_of_step")
@@ -20,6 +21,21 @@ SETTLING = (*AT_STATE, *AT_END)
 
 def write_settle_state(module: Memory, f: Function, s: Lane):
     """Write `settle_state`."""
+    s.friction_share = f.const(1.0, DOUBLE, f.width)
+    s.staged = f.const(0.0, DOUBLE, f.width)
+    _write_rounds(module, f, s)
+    with f.if_(f.any_of(s.unsettled > 0.5)):
+        s.staged = s.unsettled
+        stage = f.variable(0, INT, 1)
+        with f.while_(lambda: f.any_of(s.staged > 0.5) & (stage.value <= SETTLING_STAGES)):
+            s.where(s.staged > 0.5, unsettled=1.0, friction_share=f.like(stage.value, DOUBLE, f.width) * (1 / SETTLING_STAGES))
+            _write_rounds(module, f, s)
+            s.where(s.unsettled > 0.5, staged=0.0)  # it jams already with a part of the friction
+            stage.value = stage.value + 1
+
+
+def _write_rounds(module: Memory, f: Function, s: Lane):
+    """Take rounds until all lanes are settled; those that are not have NaN at `out` after the last one."""
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.unsettled > 0.5) & (k.value < SETTLING_ROUNDS)):
         open_ = s.unsettled > 0.5

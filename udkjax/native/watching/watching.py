@@ -104,8 +104,16 @@ class Watching(WatchMemory):
         work, following = f.given["work"], s.next
         s.next = s.look
         f.call("between", work)
-        if any(program.uses(x) for x in program.inputs[1 + 2 * self.n : 1 + 3 * self.n]):
+        accelerates = any(program.uses(x) for x in program.inputs[1 + 2 * self.n : 1 + 3 * self.n])
+        if accelerates:
             self._accelerate_between(f, s)
+        # At a point the polynomial has nothing but its rounding errors, and a condition may begin at zero there.
+        for k in range(POINTS):
+            is_point = getattr(s, f"point{k}_t").is_(s.look)
+            with f.if_(f.any_of(is_point)):
+                self.copy_state(f, is_point, (f"point{k} q", f"point{k} v"), "state")
+                if accelerates:
+                    self.copy(f, f"point{k} a", "node a", is_point)
         s.next = following
         project_output(self, f, s, "due")
         f.call("conditions", work)
