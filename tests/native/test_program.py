@@ -8,7 +8,8 @@ from jax import lax
 from numpy.testing import assert_allclose, assert_array_equal
 
 from udkjax.expressions import Graph, ScalarProgram, cotangents, tangents, trace
-from udkjax.native.base.program import UnsupportedError, write
+from udkjax.native.base.ir import Function
+from udkjax.native.base.program import UnsupportedError, Writer, write
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 2.0, 1e-9, -1e-9, 1e-300, 700.0, -700.0, 1e200, np.inf, -np.inf, np.nan])
 RNG = np.random.default_rng(0)
@@ -171,6 +172,23 @@ def test_derivatives_of_expressions_are_programs_too(on_machine, width):
 def test_what_there_is_no_instruction_for_is_said(on_machine, function):
     with pytest.raises(UnsupportedError):
         on_machine(function, 1, 0.5)
+
+
+def program_of(function):
+    graph = Graph()
+    given = np.empty((), object)
+    given[()] = x = graph.input("x", "state", np.dtype(float))
+    return ScalarProgram(graph, [x], list(trace(function, 0.5)(graph, given)[0].flat))
+
+
+def test_a_check_writes_no_arithmetic():
+    f = Function("check", [], 1)
+    Writer(f, program_of(lambda x: x * (x + 2.0) / (1.0 - x * x))).check()
+    assert "  %" not in f.text()
+    Writer(f, program_of(lambda x: jnp.where(x > 0.0, jnp.sin(x), lax.sqrt(-x)) * x)).check()
+    assert "  %" in f.text()
+    with pytest.raises(UnsupportedError, match="erf_inv"):
+        Writer(f, program_of(lambda x: 3.0 * lax.erf_inv(-x) + x)).check()
 
 
 SLOPED = {name: f for name, f in ONE.items() if name not in ("is_finite", "of conditions")} | {

@@ -1,10 +1,9 @@
 """Operations that machine code cannot compute."""
 
-from collections import defaultdict
-
 from udkjax.equations.run_programs import RunPrograms
-from udkjax.native.base.loops import LoopWriter
-from udkjax.native.base.program import UnsupportedError
+from udkjax.expressions.loop_program import Reset
+from udkjax.native.base.ir import Function
+from udkjax.native.base.program import UnsupportedError, Writer
 from udkjax.programs.identity_cache import cached_by_identity
 
 
@@ -12,12 +11,13 @@ from udkjax.programs.identity_cache import cached_by_identity
 def unsupported(code: RunPrograms) -> str:
     """Return the unsupported operations of a scene; empty if there are none.
 
-    For this check each kernel is written once, in loops; the text that is compiled may be unrolled and much longer.
+    Only operations that are not arithmetic are looked at, once for each kernel: nothing is written that is written again later.
     """
-    loops, at = LoopWriter(1), defaultdict(lambda: ("work", 0))
+    names = ("prologue", "accelerations", "newton_v_and_psi", *(["pieces"] if code.piece_count else []))
+    parts = [part for name in names for part in getattr(code, name).parts if not isinstance(part, Reset)]
     try:
-        for name in ("prologue", "accelerations", "newton_v_and_psi", *(["pieces"] if code.piece_count else [])):
-            loops.write(getattr(code, name), name, ("work",), at)
+        for program in {id(part.kernel): part.kernel.program for part in parts}.values():
+            Writer(Function("check", [], 1), program).check()
     except UnsupportedError as error:
         return str(error)
     return ""

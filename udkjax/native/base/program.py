@@ -18,6 +18,7 @@ SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
 COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
 HALF_PI = (math.pi / 2, 6.123233995736766e-17)  # in two parts: their sum is exact to 107 binary digits
 ROUND = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
+_ARITHMETIC = ("add", "sub", "mul", "div")
 _COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
 _INTRINSIC = {"abs": "fabs", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum"}
 
@@ -91,6 +92,19 @@ class Writer:
                 result.product = None
         return [self._with_sign(s) for s in self.program.outputs]
 
+    def check(self):
+        """Write each operation that is not arithmetic, of any numbers: raise `UnsupportedError` if one is not supported."""
+        nodes = self.program.graph.nodes
+        for index in self.program.order:
+            node = nodes[index]
+            if node.kind in _ARITHMETIC:
+                continue
+            for s in node.arguments:
+                base = {"b": BOOL, "f": DOUBLE}.get(s.node.dtype.kind, INT)
+                self.values[s.index] = Value(self.f, "undef", base, self.f.width)
+            self._negative.clear()
+            self._operation(node)
+
     def _with_sign(self, s: Any) -> Value:
         if s.sign > 0:
             return self.values[s.index]
@@ -106,7 +120,7 @@ class Writer:
         if node.kind in ("call", "pick"):
             raise UnsupportedError(f"{node.detail} of arrays")
         a = [self._with_sign(s) for s in node.arguments]
-        if node.kind in ("add", "sub", "mul", "div"):
+        if node.kind in _ARITHMETIC:
             return f.arithmetic(node.kind, *a)
         name = node.kind if node.kind != "apply" else node.detail.primitive.name
         parameters: Mapping[str, Any] = node.detail.parameters if node.kind == "apply" else {}
