@@ -102,7 +102,7 @@ QUANTITIES = [
 def wrong_problem():
     mech = pendulum(*FIRST)
     parameters = [udk.Parameter(_inertia, "mine", guess=FIRST[0], transform="positive"), NAMES[1]]
-    return FitProblem(mech, unknowns_of(mech, parameters), [udk.Record(TS, dict.fromkeys([ANGLE, *QUANTITIES], DATA[ANGLE]))])
+    return FitProblem(mech, unknowns_of(mech, parameters), [udk.Record(TS, {key: DATA[ANGLE] for key in (ANGLE, *QUANTITIES)})])
 
 
 def test_wrong_derivatives_are_found(wrong_problem):
