@@ -1,5 +1,7 @@
 """Derivatives compared with differences: right ones agree at any tolerance; wrong ones are found and located."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -102,7 +104,8 @@ QUANTITIES = [
 def wrong_problem():
     mech = pendulum(*FIRST)
     parameters = [udk.Parameter(_inertia, "mine", guess=FIRST[0], transform="positive"), NAMES[1]]
-    return FitProblem(mech, unknowns_of(mech, parameters), [udk.Record(TS, {key: DATA[ANGLE] for key in (ANGLE, *QUANTITIES)})])
+    values: dict[str | udk.Quantity, Any] = dict.fromkeys([ANGLE, *QUANTITIES], DATA[ANGLE])
+    return FitProblem(mech, unknowns_of(mech, parameters), [udk.Record(TS, values)])
 
 
 def test_wrong_derivatives_are_found(wrong_problem):
