@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from tests.friction import G
+from tests.friction import G, pendulum
 
 LAWS: dict[str, dict[str, Any]] = {"smooth": {"law": "smooth"}, "set-valued": {"law": "set-valued"}}
 
@@ -59,6 +59,13 @@ def test_a_wedge_locks_itself_up_to_the_angle_of_friction():
         np.testing.assert_allclose(found.lower, weight * np.tan(angle - phi), atol=1e-12)
         np.testing.assert_allclose(found.without_friction, weight * np.tan(angle), rtol=1e-12)
         assert bool(found.rests[0]) is rests
+
+
+def test_an_equilibrium_names_the_friction_around_it():
+    rest = udk.equilibrium(pendulum(coefficient=0.3, radius=0.1), stable=True)
+    assert bool(rest.stable) and rest.left_out == ("rub",)
+    assert "friction rub, with which it rests in all positions around, see holding_efforts" in str(rest)
+    assert udk.equilibrium(udk.library.simple_pendulum()).left_out == ()
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from udkjax.integrate.events.event import expand_events as expand_events
 from udkjax.integrate.portable import drawn_points as drawn_points
 from udkjax.integrate.portable import portable_engine as portable_engine
 from udkjax.integrate.portable import scalar_parameters as scalar_parameters
+from udkjax.integrate.portable import unknown_friction as unknown_friction
 from udkjax.integrate.projection import Projection as Projection
 from udkjax.integrate.simulate import simulate as simulate
 from udkjax.integrate.solution import CAUSES as CAUSES

@@ -86,6 +86,11 @@ class Friction(ForceElement):
         return any(isinstance(force, Friction) and force.sticks for force in forces)
 
     @staticmethod
+    def names_in(forces: Mapping[str, ForceElement]) -> tuple[str, ...]:
+        """Return the names of the friction among some force elements."""
+        return tuple(name for name, force in forces.items() if isinstance(force, Friction))
+
+    @staticmethod
     def mistakes(given: Mapping[str, object], joint: type | None) -> Iterator[str]:
         """Iterate over the numbers that are missing or do not fit, each as "name: what is wrong".
 

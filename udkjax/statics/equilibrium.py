@@ -22,6 +22,7 @@ from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequenti
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.linearization import Linearization, Linearizer, TracedLinearizer, linearizer, with_unit_mass
 from udkjax.statics.load_scale import LoadScale
@@ -45,6 +46,7 @@ class Equilibrium(PrintsTable):
         q: x, y (m) and angle (rad) of each body.
         balanced: whether loads and constraint forces cancel.
         bodies: the names of the bodies, in the order of q.
+        left_out: the names of all friction: at rest it holds the mechanism in all positions around this one.
     """
 
     q: Float[Array, "bodies 3"]
@@ -54,6 +56,7 @@ class Equilibrium(PrintsTable):
     balanced: Bool[Array, ""]
     neutral: Float[Array, ""]  # (rad/s)^2: a smaller |omega2| is rounding
     bodies: tuple[str, ...] = eqx.field(static=True, default=())
+    left_out: tuple[str, ...] = eqx.field(static=True, default=())
 
     _units = units(q="m, m, rad", multipliers="N or N m", omega2="(rad/s)²")
 
@@ -67,6 +70,9 @@ class Equilibrium(PrintsTable):
             ("frequency", frequencies or "no degree of freedom is left"),
             ("unbalanced loads", f"{format_number(self.residual, scale=1.0)} of the scale of forces"),
         ]
+        if self.left_out and self.balanced:
+            around = "it rests in all positions around, see holding_efforts"
+            rows.append(("left out", f"friction {', '.join(self.left_out)}, with which {around}"))
         poses = [format_pose(pose, size_of(self.q)) for pose in np.asarray(self.q)]
         rows += zip(self.bodies or map(str, range(len(poses))), poses, strict=True)
         return PrintedTable(f"position of rest, {self.kind}", rows)
@@ -109,7 +115,8 @@ def equilibrium(
 ) -> Equilibrium:
     """Return a position of rest near a given position: N^T F = 0 on Psi = 0, where N spans the free directions.
 
-    Friction is left out: it holds the mechanism in all positions around, which `holding_efforts` finds.
+    Friction is left out, and named in `left_out`: with it the mechanism rests in all positions around, a set whose bounds
+    `holding_efforts` finds.
 
     Newton's method with K = -F_q + (lambda^T Psi)_qq; steps are limited in length, and halved until the unbalanced loads
     decrease. Pure, jittable and batched by `vmap` (`balanced` marks the members at rest); differentiable with respect to
@@ -198,8 +205,17 @@ def _equilibrium(
     xp, scale, at = by.xp, near.scale(t, q), near.linearize(t, q)
     unbalanced = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
     balanced = curve.is_closed(xp.append(q, t) / curve.units) & (unbalanced <= FORCE_TOL)
-    neutral, bodies = SMALLEST_STIFFNESS * scale.stiffness, mechanism.body_names
-    return Equilibrium(q.reshape(-1, 3), at.multipliers, _omega2(at, by), unbalanced, balanced, neutral, bodies)
+    neutral, friction = SMALLEST_STIFFNESS * scale.stiffness, Friction.names_in(mechanism.forces)
+    return Equilibrium(
+        q=q.reshape(-1, 3),
+        multipliers=at.multipliers,
+        omega2=_omega2(at, by),
+        residual=unbalanced,
+        balanced=balanced,
+        neutral=neutral,
+        bodies=mechanism.body_names,
+        left_out=friction,
+    )
 
 
 def _settle(

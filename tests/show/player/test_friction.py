@@ -38,6 +38,21 @@ def test_a_ring_is_around_a_joint_while_it_sticks():
     assert [rings(svg(shown, t)) for t in (0.0, 0.3)] == [0, 1]
 
 
+def test_a_live_page_refuses_what_sticks_and_names_the_cure():
+    ts, still = np.arange(3.0), np.zeros((3, 1, 3))
+    motion: Any = SimpleNamespace(ts=ts, q=still, v=still, events=None, sticking={})
+    with pytest.raises(
+        ValueError, match=r'joints that stick \("pin"\) yet: give their friction law="smooth", or leave out `live`'
+    ):
+        udk.animate(STICKY, motion, measures=(), live=True)
+    body = udk.Mechanism({"box": udk.Body(1.0, 0.1)})
+    contact = udk.Contact("box", coefficient=0.3, name="foot")
+    with pytest.raises(
+        ValueError, match=r'friction of contacts \("foot"\) yet: leave out their coefficients, or leave out `live`'
+    ):
+        udk.animate(body, motion, measures=(), live=["gravity"], events=contact)
+
+
 @pytest.mark.slow
 def test_a_run_that_sticks_is_shown_with_its_rings_and_the_power_of_friction(opened):
     ts = np.linspace(0.0, 8.0, 161)

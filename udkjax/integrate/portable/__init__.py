@@ -40,5 +40,6 @@ udkjax/show/player/engine.js runs it: `loadEngine(data)` returns an object with 
 
 from udkjax.integrate.portable.engine import PortableEngine, drawn_points, portable_engine
 from udkjax.integrate.portable.parameters import scalar_parameters
+from udkjax.integrate.portable.portable_events import unknown_friction
 
-__all__ = ["PortableEngine", "drawn_points", "portable_engine", "scalar_parameters"]
+__all__ = ["PortableEngine", "drawn_points", "portable_engine", "scalar_parameters", "unknown_friction"]

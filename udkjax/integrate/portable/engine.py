@@ -18,7 +18,7 @@ from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
 from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
-from udkjax.integrate.portable.portable_events import PortableEvents
+from udkjax.integrate.portable.portable_events import PortableEvents, unknown_friction
 from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
@@ -141,8 +141,7 @@ def _engine(
     }
     data |= _places(dressed, pull)
     problem = _problem(dressed, analysis, rtol, atol)
-    stuck = "a page does not know joints that stick" if Friction.may_stick(mechanism._forces) else ""
-    data["why"] = problem.compiled.plan.why_not_native or stuck
+    data["why"] = problem.compiled.plan.why_not_native or unknown_friction(mechanism)
     data["closing"] = _closing(analysis)
     modules = {"close": _close(dressed)} if held is None else {}
     if data["marks"]:

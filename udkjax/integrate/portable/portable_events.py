@@ -10,15 +10,16 @@ from udkjax.equations.analysis import Analysis
 from udkjax.integrate.events import impacts as law
 from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions, with_forces
 from udkjax.integrate.events.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
-from udkjax.integrate.events.event import ExpandsToEvents, expand_events
+from udkjax.integrate.events.event import Event, ExpandsToEvents, expand_events
 from udkjax.integrate.events.phases import HeldContact, Switches
 from udkjax.native.base.program import UnsupportedError
 from udkjax.native.operations import EvaluateEvents
 from udkjax.native.runs import RunStates
 from udkjax.native.watching.conditions import Conditions
 from udkjax.requirements import ArgumentError
+from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
-from udkjax.wording import quote
+from udkjax.wording import join_names, quote
 
 CONTACT = "{}.contact"  # name of the joint that holds the contact of an event
 MOST_EVENTS = 1000  # largest number in a run of a page; nobody would look at more
@@ -34,6 +35,27 @@ TOLERANCES = {
 }
 
 
+def unknown_friction(mechanism: Mechanism, events: Sequence[Event] = ()) -> str:
+    """Return which friction a page cannot compute, and the cure; empty if it can compute all.
+
+    Args:
+        mechanism: the scene.
+        events: the events of its runs, expanded.
+
+    Returns:
+        The sentence of a refusal.
+    """
+    joints = [force.joint for force in mechanism.forces.values() if isinstance(force, Friction) and force.sticks]
+    contacts = [event.name for event in events if event.action.friction is not None]
+    if joints:
+        which, cure = f"joints that stick ({join_names(list(map(quote, joints)))})", 'give their friction law="smooth"'
+    elif contacts:
+        which, cure = f"friction of contacts ({join_names(list(map(quote, contacts)))})", "leave out their coefficients"
+    else:
+        return ""
+    return f"a page cannot compute {which} yet: {cure}, or leave out `live` to play the run as it is"
+
+
 class PortableEvents:
     """The events, if any, of the runs of a portable engine.
 
@@ -45,10 +67,11 @@ class PortableEvents:
     def __init__(self, events: Sequence[ExpandsToEvents], mechanism: Mechanism):
         self._given = tuple(events)
         self._events = expand_events(events, mechanism) if events else ()
+        if refused := unknown_friction(mechanism, self._events):
+            raise ArgumentError(f"live: {refused}")
         for event in self._events:
             if not event.action.on_page:
-                kind = type(event.action).__name__ if event.action.friction is None else "an impact with friction"
-                cure = "a page knows Log, Stop and Impact without friction; leave out live"
+                kind, cure = type(event.action).__name__, "a page knows Log, Stop and Impact; leave out live"
                 raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) cannot run in a page yet: {cure}")
         self._conditions = watched_conditions(self._events, mechanism) if events else None
         if self._conditions is None and events:

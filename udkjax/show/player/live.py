@@ -15,7 +15,7 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.equations.analysis import analyse
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
-from udkjax.integrate.portable import portable_engine
+from udkjax.integrate.portable import portable_engine, unknown_friction
 from udkjax.native.base.program import UnsupportedError
 from udkjax.positions.assembly import close
 from udkjax.requirements import ArgumentError
@@ -70,10 +70,12 @@ def live_data(
 
 
 def _require_solvable(mechanism: Mechanism, solution: ShownMotion, events: Sequence[ExpandsToEvents]):
-    happened = getattr(solution, "events", None)
+    expanded = expand_events(events, mechanism) if events else ()
+    if refused := unknown_friction(mechanism, expanded):
+        raise ArgumentError(f"live: {refused}")
+    happened, names = getattr(solution, "events", None), [event.name for event in expanded]
     if happened is not None and not events:
         raise ArgumentError("live: the run has events, whose conditions the page needs: give `animate` the same `events`")
-    names = [event.name for event in expand_events(events, mechanism)] if events else []
     if names and (happened is None or list(happened.names[: len(names)]) != names or len(happened.names) != 3 * len(names)):
         raise ArgumentError(f"live: the run was not simulated with the events {', '.join(names)}: give them to `simulate`, too")
     stabilization = getattr(solution, "settings", {}).get("stabilization", "Projection")
