@@ -14,7 +14,8 @@ from udkjax.equations import constraints, loads, prepare
 from udkjax.equations.dense_rows import DenseTerms
 from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.scene_programs import _scene_programs, scene_programs
-from udkjax.expressions import loop_program
+from udkjax.expressions import float_loops
+from udkjax.expressions.array_loops import ArrayLoops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.deferred import deferred
 
@@ -265,19 +266,20 @@ def test_floats_and_arrays_find_the_same(monkeypatch):
     names = ("revolute", "prismatic", "slot", "weld")
     mechanism = udk.Mechanism(BODIES, {name: JOINTS[name] for name in names}, forces={"push": FORCES["push"]})
     q, v = np.asarray(mechanism.q0).ravel(), np.linspace(-1.0, 1.0, mechanism.q0.size)
-    states = [(q, v)] * 25 + [(np.full_like(q, np.inf), v)]  # the first ones step by step, later ones by the written function
+    states = [(q, v)] * 105 + [(np.full_like(q, np.inf), v)]  # the first ones row by row, later ones by the written function
 
     def evaluate(few):
-        monkeypatch.setattr(loop_program, "FEW_ROWS", few)
+        monkeypatch.setattr(float_loops, "FEW_ROWS", few)
         _scene_programs.cache_clear()
         at = arrays_in_time(mechanism)(0.3)
         return [np.concatenate([at.psi(0.3, q), *at.geometry(0.3, q, v), *at.loads(0.3, q, v)]) for q, v in states]
 
-    few = loop_program.FEW_ROWS
+    few = float_loops.FEW_ROWS
     by_arrays, by_floats = evaluate(0), evaluate(few)
-    assert loop_program.ArrayLoops(scene_programs(mechanism).geometry, np)._short_parts
+    assert ArrayLoops(scene_programs(mechanism).geometry, np)._on_floats
     assert_allclose(by_floats, by_arrays, rtol=1e-12, atol=1e-12)
     assert np.isnan(by_floats[-1]).any() and np.isfinite(by_floats[:-1]).all()
+    assert (np.array(by_floats[:-1]) == by_floats[0]).all()  # to the last bit
 
 
 def test_one_position_is_evaluated_once(monkeypatch):

@@ -18,7 +18,7 @@ from udkjax.arrays import ArrayLibrary, library_for, number
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import join_concrete_numbers, numbers_as_vector
-from udkjax.expressions.loop_program import ArrayLoops
+from udkjax.expressions.array_loops import ArrayLoops
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity

@@ -11,7 +11,7 @@ from udkjax.arrays import ArrayLibrary
 from udkjax.equations.rest_program import CURVATURE
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import numbers_as_vector
-from udkjax.expressions.loop_program import ArrayLoops
+from udkjax.expressions.array_loops import ArrayLoops
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -63,11 +63,9 @@ class SceneArrays(Generic[AnyArray]):
     def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
         """Run a program whose loops have independent iterations."""
         p, xp = self.programs, self._xp
-        evaluate, arrays = _evaluator(p, name, xp)
-        sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count, "energy": 2}
-        sizes |= p.at_rest.sizes if name.startswith("at_rest.") else {}
+        evaluate, sizes = _evaluator(p, name, xp)
         many = q.shape[1:]
-        blank = {x: xp.zeros((size, *many)) for x, size in sizes.items() if x in arrays}
+        blank = {x: xp.zeros((size, *many)) for x, size in sizes.items()}
         constants = self._constants[:, None] if many else self._constants
         state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}
         return evaluate(blank | state | given)
@@ -92,7 +90,10 @@ def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -
 
 
 @cached_by_identity
-def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[ArrayLoops, set[str]]:
-    """Return a program as a function of its arrays, and the names of these arrays."""
-    program = attrgetter(name)(programs)
-    return ArrayLoops(program, xp), program.arrays | set(ROWS_AND_LOADS)
+def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> tuple[ArrayLoops, dict[str, int]]:
+    """Return a program as a function of its arrays, and the lengths of those that it begins with zeros."""
+    program, p = attrgetter(name)(programs), programs
+    sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count, "energy": 2}
+    sizes |= p.at_rest.sizes if name.startswith("at_rest.") else {}
+    arrays = program.arrays | set(ROWS_AND_LOADS)
+    return ArrayLoops(program, xp), {x: size for x, size in sizes.items() if x in arrays}

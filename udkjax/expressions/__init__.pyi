@@ -1,5 +1,6 @@
 """The door of `expressions`: the names that floors above import, each from its own module."""
 
+from udkjax.expressions.array_loops import ArrayLoops as ArrayLoops
 from udkjax.expressions.complex_scalars import ComplexScalar as ComplexScalar
 from udkjax.expressions.complex_scalars import solve_complex as solve_complex
 from udkjax.expressions.differential import Differential as Differential
@@ -28,7 +29,6 @@ from udkjax.expressions.loop_program import ALL as ALL
 from udkjax.expressions.loop_program import MAXIMUM as MAXIMUM
 from udkjax.expressions.loop_program import SET as SET
 from udkjax.expressions.loop_program import Address as Address
-from udkjax.expressions.loop_program import ArrayLoops as ArrayLoops
 from udkjax.expressions.loop_program import Kernel as Kernel
 from udkjax.expressions.loop_program import KernelLoop as KernelLoop
 from udkjax.expressions.loop_program import KernelWriter as KernelWriter

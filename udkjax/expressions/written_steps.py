@@ -11,6 +11,39 @@ _SYMBOLS: dict[Callable, str] = {operator.add: "+", operator.sub: "-", operator.
 _WORTH_WRITING = 20
 
 
+class PythonFunction:
+    """The text of a function of one argument that is being written; each value has a name of its own."""
+
+    def __init__(self, argument: str):
+        self.lines: list[str] = []
+        self._argument, self._known, self._count = argument, dict[str, Any](), 0
+
+    def new_name(self) -> str:
+        """Return a name that no other value has."""
+        self._count += 1
+        return f"x{self._count}"
+
+    def assign(self, expression: str) -> str:
+        """Give an expression a name, and return it."""
+        self.lines.append(f"{(name := self.new_name())} = {expression}")
+        return name
+
+    def call(self, function: Callable[..., Any], *arguments: str) -> str:
+        """Call a function of named values, and return the name of its result."""
+        if function in _SYMBOLS:
+            return self.assign(f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}")
+        if function is operator.neg:
+            return self.assign(f"-{arguments[0]}")
+        key = f"f{id(function)}"
+        self._known[key] = function
+        return self.assign(f"{key}({', '.join(arguments)})")
+
+    def compile(self) -> Callable[[Any], Any]:
+        """Return the function."""
+        exec("\n ".join([f"def run({self._argument}):", *self.lines]), self._known)
+        return self._known.pop("run")
+
+
 class WrittenSteps:
     """Functions called one after another; the arguments of each are given numbers or earlier results.
 
@@ -37,20 +70,16 @@ class WrittenSteps:
 
     def _write(self) -> Callable[[Sequence[Operand]], list[Operand]]:
         """Return the steps as one Python function."""
-        lines = ["def run(values):"]
-        if self._input_count:
-            lines.append(f" {''.join(f'x{k}, ' for k in range(self._input_count))} = values")
-        functions: dict[str, Any] = {}
-        for k, (function, places) in enumerate(self._steps, self._input_count):
-            arguments = [f"x{p}" for p in places]
-            if function in _SYMBOLS:
-                expression = f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}"
-            elif function is operator.neg:
-                expression = f"-{arguments[0]}"
-            else:
-                functions[f"f{k}"] = function
-                expression = f"f{k}({', '.join(arguments)})"
-            lines.append(f" x{k} = {expression}")
-        lines.append(f" return [{', '.join(f'x{k}' for k in self._outputs)}]")
-        exec("\n".join(lines), functions)
-        return functions["run"]
+        text = PythonFunction("values")
+        inputs = [text.new_name() for _ in range(self._input_count)]
+        if inputs:
+            text.lines.append(f"{', '.join(inputs)}, = values")
+        text.lines.append(f"return [{', '.join(self.write(text, inputs))}]")
+        return text.compile()
+
+    def write(self, text: PythonFunction, inputs: Sequence[str]) -> list[str]:
+        """Write the steps into a function, and return the names of the outputs."""
+        names = [*inputs]
+        for function, places in self._steps:
+            names.append(text.call(function, *[names[k] for k in places]))
+        return [names[k] for k in self._outputs]
