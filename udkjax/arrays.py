@@ -71,7 +71,7 @@ def put_arrays(arrays: Any) -> Any:
     """Convert a tree of NumPy arrays and numbers to JAX arrays."""
     leaves, tree = jax.tree.flatten(arrays)
     _calls[shapes := tuple(map(np.shape, leaves))] += 1
-    if _calls[shapes] <= _WORTH_A_PROGRAM:
+    if _calls[shapes] <= _WORTH_A_PROGRAM or jax.config.jax_debug_nans or jax.config.jax_debug_infs:
         return jax.device_put(arrays)
     leaves = [np.asarray(x) for x in leaves]
     has_words = jax.config.jax_enable_x64 and all(x.dtype in (np.float64, np.int64) for x in leaves)

@@ -95,11 +95,8 @@ class DenseTerms(RowTerms):
     def __init__(self, mechanism: Mechanism):
         super().__init__(mechanism)
         self.mass = np.asarray(mass_of(mechanism, np))  # the diagonal of M
-        self._gravity, self._programs, self._has_forces = (
-            mechanism.gravity,
-            scene_programs(mechanism),
-            bool(mechanism.force_names),
-        )
+        self._programs, self._has_forces = scene_programs(mechanism), bool(mechanism.force_names)
+        self._weight = self.mass * np.tile([*np.asarray(mechanism.gravity, float), 0.0], self.size // 3)
 
     @staticmethod
     @cached_by_identity
@@ -135,10 +132,6 @@ class DenseTerms(RowTerms):
     def curvature(self, t: Time, q: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
         """Return (lambda^T Psi)_qq (n, n)."""
         return self._matrix(CURVATURE, self._arrays_at(t).curvature(t, q, multipliers))
-
-    @property
-    def _weight(self) -> np.ndarray:
-        return self.mass * np.tile([*np.asarray(self._gravity, float), 0.0], self.size // 3)
 
     def _matrix(self, name: str, entries: np.ndarray | None) -> np.ndarray:
         matrix = np.zeros((self.size, self.size))

@@ -81,14 +81,12 @@ def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mappin
     if is_traced(given):
         return _drive(*given)
     with jax.ensure_compile_time_eval():  # concrete even while something else is traced
-        if driver is None:
-            return _drive(*given)
         pairs = [(name, np.asarray(value, float).item()) for name, value in (held or {}).items()]
         return _drive_concrete(mechanism, driver, np.asarray(t, float).item(), *itertools.chain(*pairs))
 
 
 @cached_by_identity
-def _drive_concrete(mechanism: Mechanism, driver: str | Coordinate, t: float, *held: Any) -> Driven:
+def _drive_concrete(mechanism: Mechanism, driver: Drive, t: float, *held: Any) -> Driven:
     """Return the driven mechanism; `held` has names and values in turn, which the cache compares by value."""
     return _drive(mechanism, driver, t, dict(zip(held[::2], held[1::2], strict=True)))
 

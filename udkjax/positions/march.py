@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.native.position_operations import March
 from udkjax.native.primitive import call_concrete, native_p
 from udkjax.native.unsupported import unsupported
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
@@ -43,8 +44,11 @@ class MarchResult(NamedTuple):
 
 def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
     """Return True if machine code supports the mechanism."""
-    if not jax.config.jax_enable_x64:
-        return False
+    return jax.config.jax_enable_x64 and _is_supported(mechanism, analysis)
+
+
+@cached_by_identity  # also for traced numbers, on which the answer does not depend
+def _is_supported(mechanism: Mechanism, analysis: Analysis) -> bool:
     knots = sum(len(x.times) for (section, *_), x in mechanism.samples.items() if section == "_drivers")
     return knots <= MOST_KNOTS and not unsupported(_operation(mechanism, analysis).code)
 
@@ -56,7 +60,7 @@ def march(
 
     The value of the driver replaces time; `unit` is the unit of the values.
     """
-    inputs = _inputs(mechanism, analysis, unit, s, q, values, jnp)
+    inputs = _inputs(_numbers(mechanism, analysis, jnp), analysis, unit, s, q, values, jnp)
     return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
 
 
@@ -67,12 +71,11 @@ def march_at_once(
 
     Where values are too far apart, values between them are followed as well.
     """
-    operation = _operation(mechanism, analysis)
-    mechanism, analysis, unit = jax.tree.map(_by_numpy, (mechanism, analysis, unit))
+    prepared, analysis = _numbers_of_concrete(mechanism, analysis)
 
     def march_on(s: NumberLike, q: NumericArray, values: NumericArray) -> MarchResult:
-        inputs = _inputs(mechanism, analysis, unit, s, q, values, np)
-        return _march(call_concrete(operation, inputs, APPROACH + len(values)), np)
+        inputs = _inputs(prepared, analysis, unit, s, q, values, np)
+        return _march(call_concrete(prepared.operation, inputs, APPROACH + len(values)), np)
 
     found, parts, piece = march_on(s, q, values), FINER, FIRST_PIECE
     count = int(found.trusted)
@@ -101,8 +104,28 @@ def _march(outputs: Sequence, xp: ModuleType) -> MarchResult:
     return MarchResult(q, dq, ddq, side, outputs[3][0, 0], xp.maximum(outputs[4][0, 0].astype(int) - APPROACH, 0))
 
 
+class _Prepared(NamedTuple):
+    """The operation of a mechanism and its first input: the numbers of the scene, and the two thresholds of pivots."""
+
+    operation: March
+    numbers: list[Any]
+
+
+def _numbers(mechanism: Mechanism, analysis: Analysis, xp: ModuleType) -> _Prepared:
+    numbers = _of_unit_masses(_without_loads(mechanism), analysis.scales.length, xp).numbers
+    return _Prepared(_operation(mechanism, analysis), [*numbers, DEPENDENT, 0.0])
+
+
+@cached_by_identity
+def _numbers_of_concrete(mechanism: Mechanism, analysis: Analysis) -> tuple[_Prepared, Analysis]:
+    """Return the numbers of a concrete mechanism as one array, and its analysis by NumPy."""
+    mechanism, analysis = jax.tree.map(_by_numpy, (mechanism, analysis))
+    prepared = _numbers(mechanism, analysis, np)
+    return prepared._replace(numbers=[np.concatenate([np.ravel(x) for x in prepared.numbers])]), analysis
+
+
 def _inputs(
-    mechanism: Mechanism,
+    prepared: _Prepared,
     analysis: Analysis,
     unit: NumberLike,
     s: NumberLike,
@@ -113,9 +136,8 @@ def _inputs(
     scales = analysis.scales
     approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
     ts, settings = xp.concatenate([approach, values]), {"length": scales.length, "omega": unit}
-    numbers = [*_of_unit_masses(_without_loads(mechanism), scales.length, xp).numbers, DEPENDENT, 0.0]
     at_rest = xp.zeros(analysis.coordinates)
-    return _operation(mechanism, analysis).pack(numbers, ts, q, at_rest, settings, scales.rows, xp=xp)
+    return prepared.operation.pack(prepared.numbers, ts, q, at_rest, settings, scales.rows, xp=xp)
 
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:

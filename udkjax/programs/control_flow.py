@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit
+from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit, put_arrays
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 
@@ -106,7 +106,7 @@ def solve(function: Callable[..., Result], *arguments: Any) -> Result:
         return _compiled(_by_jax, function, *arguments)
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
         concrete = jax.tree.map(_concrete, arguments, is_leaf=lambda x: isinstance(x, eqx.Module))
-        return jax.device_put(function(*concrete, BY_NUMPY))
+        return put_arrays(function(*concrete, BY_NUMPY))
 
 
 def _concrete(x: Any) -> Any:

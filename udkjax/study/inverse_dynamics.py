@@ -18,14 +18,13 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import library_for, number, number_called
+from udkjax.arrays import is_traced, library_for, number, number_called, put_arrays
 from udkjax.equations.analysis import analyse
 from udkjax.positions.channels import StateHistory
 from udkjax.positions.coordinates import Coordinate, choose_name, coordinate_value, element_of
@@ -189,7 +188,8 @@ def inverse_dynamics(
     )
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
-    columns, powers, residual = jax.device_put((columns, powers, residual))
+    if not is_traced((columns, powers, residual)):
+        columns, powers, residual = put_arrays((columns, powers, residual))
     effort_units = tuple((name, value.effort_unit) for name, value in zip(named, values, strict=True))
     return InverseDynamics(ts, computed, columns, powers, residual, effort_units)
 
