@@ -149,15 +149,16 @@ def failing(monkeypatch):
     """A problem whose runs fail beyond some distance."""
     mech = pendulum(*FIRST)
     problem = FitProblem(mech, unknowns_of(mech, NAMES), [udk.Record(TS, {ANGLE: DATA[ANGLE]})])
-    evaluate = problem.evaluate
+    row_blocks = problem.row_blocks
 
     def beyond(distance):
         def limited(z, tol):
-            found, fails = evaluate(z, tol), np.linalg.norm(z, axis=1) > distance
-            r = np.where(fails[:, None], np.nan, found.r)
-            return found._replace(r=r, code=np.where(fails, int(Result.step_limit), found.code))
+            fails = np.linalg.norm(z, axis=1) > distance
+            for found in row_blocks(z, tol):
+                r = np.where(fails[:, None], np.nan, found.r)
+                yield found._replace(r=r, code=np.where(fails, int(Result.step_limit), found.code))
 
-        monkeypatch.setattr(problem, "evaluate", limited)
+        monkeypatch.setattr(problem, "row_blocks", limited)
         return problem
 
     return beyond

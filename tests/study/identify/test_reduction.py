@@ -123,3 +123,42 @@ def test_memory_holds_residuals_but_no_jacobian():
     ]
     per_sample = (peaks[1] - peaks[0]) / (2 * (many - few))  # of two records
     assert per_sample < 500.0
+
+
+SIZE = """
+import resource, sys
+import numpy as np, udkjax as udk
+
+links, ts, rng = 25, np.linspace(0.0, 0.5, 100), np.random.default_rng(0)
+bodies, joints, springs, before = {}, {}, {}, "ground"
+for k in range(links):
+    bodies[f"b{k}"] = udk.Body(1.0 + 0.1 * (k % 3), 0.1, [k + 0.5, 0.0])
+    joints[f"j{k}"] = udk.Revolute([before, f"b{k}"], [[0.5 if k else 0.0, 0.0], [-0.5, 0.0]])
+    springs[f"t{k}"] = udk.TorsionSpring([before, f"b{k}"], stiffness=40.0 + 4000.0 * (1 - k / 26) ** 2, damping=5.0)
+    before = f"b{k}"
+right = udk.Mechanism(bodies, joints, forces=springs)
+records = []
+for _ in range(10):
+    angles = 0.1 * rng.standard_normal(links)
+    steps = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    start = udk.State(np.column_stack([np.cumsum(steps, axis=0) - 0.5 * steps, angles]), np.zeros((links, 3)))
+    measured = np.asarray(udk.simulate(right, ts, start).q)[:, :, 2] + 1e-3 * rng.standard_normal((len(ts), links))
+    records.append(udk.Record(ts, {f"body.{b}.angle": measured[:, k] for k, b in enumerate(bodies)}, initial_state=start))
+values = {n: float(x) for n, x in right.parameters().items() if n.startswith("force.") and n.endswith(("stiffness", "damping"))}
+first = right.with_parameters({name: 1.1 * x for name, x in values.items()})
+found = udk.identify(first, records, list(values), progress=False)
+assert found.success and len(values) == 50
+errors = (found.values - list(values.values())) / found.uncertainty.standard_errors
+print(np.sqrt(np.mean(errors**2)), np.abs(errors).max())
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no `resource`")
+def test_fifty_parameters_of_twenty_five_links_from_ten_records():
+    """They are right to within their standard errors, in 0.75 GB, most of it for compilation, and half a minute of a core."""
+    lines = subprocess.run([sys.executable, "-c", SIZE], check=True, capture_output=True, text=True).stdout.splitlines()
+    mean, largest = map(float, lines[0].split())
+    assert 0.7 < mean < 1.3 and largest < 4.0
+    assert int(lines[1]) < 1.2e9

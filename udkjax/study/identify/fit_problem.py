@@ -158,7 +158,7 @@ class FitProblem:
             tol: tolerances of the integration.
             horizon: duration of the part of each record that is used (s); later residuals are left out. None: the whole record.
         """
-        ends, code = [], np.zeros(len(z), int)
+        code, ends = np.zeros(len(z), int), list[RunEnds]()
         together = max(1, int(BLOCK_BYTES // (len(z) * self._bytes_per_time * self.runs.ts.shape[1])))
         runs = np.arange(len(self.runs.ts))
         if horizon is not None:  # the first window of a record is computed in any case, for its beginning
@@ -166,22 +166,33 @@ class FitProblem:
             later[self.beginnings] = False
             runs = runs[~later]
         for first in range(0, len(runs), together):
-            some = runs[first : first + together]
-            prediction = self.predictor(self.members(z, some, horizon), tol)
-            prediction = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), prediction)
-            rows = np.arange(*np.searchsorted(self.run, [some[0], some[-1] + 1]))
-            if horizon is not None:
-                record, time, _ = self.index[rows].T
-                rows = rows[self.ts[record, time] - self.ts[record, 0] <= horizon]
-            yield self._residuals_of(prediction, rows, some, z)
-            code = np.maximum(code, prediction.code.max(1))
-            if prediction.ends is not None:
-                ends.append(RunEnds(np.asarray(prediction.ends), np.asarray(prediction.d_ends)))
+            yield self._block(z, runs[first : first + together], tol, horizon, code, ends)
         row = len(self.index)
         of_all = RunEnds(*(np.concatenate(parts, axis=1) for parts in zip(*ends, strict=True))) if ends else None
         for r, J in self.further_rows(of_all, z):
             yield Residuals(r, J, code, np.arange(row, row + r.shape[1]))
             row += r.shape[1]
+
+    def _block(
+        self,
+        z: Float[np.ndarray, "B K"],
+        runs: Int[np.ndarray, "N"],
+        tol: TolerancePair,
+        horizon: float | None,
+        code: Int[np.ndarray, "B"],
+        ends: list[RunEnds],
+    ) -> Residuals:
+        """Compute the rows of some runs, and add their results to `code` and `ends`; nothing else of them stays in memory."""
+        prediction = self.predictor(self.members(z, runs, horizon), tol)
+        prediction = jax.tree.map(lambda part: part.reshape(len(z), -1, *part.shape[1:]), prediction)
+        rows = np.arange(*np.searchsorted(self.run, [runs[0], runs[-1] + 1]))
+        if horizon is not None:
+            record, time, _ = self.index[rows].T
+            rows = rows[self.ts[record, time] - self.ts[record, 0] <= horizon]
+        np.maximum(code, prediction.code.max(1), out=code)
+        if prediction.ends is not None:
+            ends.append(RunEnds(np.asarray(prediction.ends), np.asarray(prediction.d_ends)))
+        return self._residuals_of(prediction, rows, runs, z)
 
     def code(self, z: Float[np.ndarray, "K"], tol: TolerancePair) -> int:
         """Return the worst result of the runs of all records."""

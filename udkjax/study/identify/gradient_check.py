@@ -10,10 +10,10 @@ Along a chaotic motion even the smallest step leads to an entirely different mot
 therefore excluded if h J d exceeds the values of a channel and the channel changes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,13 +22,15 @@ from udkjax.integrate.solution import CAUSES, Result
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.differences import DIFFERENCE_STEPS, Differences, best_steps, differences, leave_out_far_steps, sizes
+from udkjax.study.differences import DIFFERENCE_STEPS, Differences, DifferenceSums, best_steps, leave_out_far_steps
 from udkjax.study.identify import prediction
-from udkjax.study.identify.fit_problem import FitProblem, Residuals, build_problem
+from udkjax.study.identify.fit_problem import FitProblem, build_problem
 from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import TIGHT_TOL, TolerancePair
 from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
+from udkjax.study.identify.residuals import Residuals
+from udkjax.study.identify.windows import BLOCK_BYTES
 from udkjax.wording import join_names
 
 AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
@@ -39,6 +41,10 @@ USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which ag
 RANDOM_DIRECTIONS = 3  # number of directions in which all unknowns change
 OTHER_TOL = 0.01, 10.0  # tolerances, relative to the given one, to estimate errors; the second is used if runs fail at the first
 SMALLEST_TOL = 1e-14  # below this, the step controller responds to rounding errors
+
+
+# The numbers (R,) of rows, the values (B, R) predicted with B sets of unknowns, and how their runs ended (B,).
+_Values: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class DisagreementPlace(NamedTuple):
@@ -164,8 +170,9 @@ def check_gradients(
 ) -> GradientCheck:
     """Compare the derivatives that `identify` uses with finite differences, at the first guess of the parameters.
 
-    The directions are each unknown by itself, and some random combinations; in each direction, the mechanism is closed and
-    simulated forty times. For the same check at an estimate, see `Estimate.check_gradients`.
+    The directions are each unknown by itself, so that each entry of the Jacobian is compared, and some random combinations; in
+    each direction, the mechanism is closed and simulated forty times. Memory holds a block of rows of the Jacobian, however long
+    the records are. For the same check at an estimate, see `Estimate.check_gradients`.
 
     Args:
         mechanism: mechanism with the first guesses.
@@ -188,77 +195,109 @@ def check_gradients(
 
 def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, seed: int = 0) -> GradientCheck:
     """Compare the derivatives of a problem at z with finite differences, at given tolerances of the integration."""
-    rows, names = len(problem.index), problem.all_names[: problem.K - problem.constrained]
-    _, residuals = _evaluate_first(problem, z, [tol])
+    names = problem.all_names[: problem.K - problem.constrained]
+    tol = _completed_tol(problem, z, [tol])
     smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
-    other_tols = [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger]
-    other_tol, with_other = _evaluate_first(problem, z, other_tols)
-    series = problem.series()
+    tols = tol, _completed_tol(problem, z, [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger])
     random = np.random.default_rng(seed).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
     directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
-    J, error = (problem.sigma[:, None] * rows_of[0, :rows] for rows_of in (residuals.J, residuals.J - with_other.J))
-    derivatives = directions @ J.T
-    by_direction, places = [], []
-    for d, slope in zip(directions, derivatives, strict=True):
-        points = z + np.concatenate([DIFFERENCE_STEPS, -DIFFERENCE_STEPS])[:, None] * d
-        y, y_other = (
-            _predict(problem, points, by).reshape(2, len(DIFFERENCE_STEPS), rows).swapaxes(0, 1) for by in (tol, other_tol)
-        )
-        by_direction.append(leave_out_far_steps(differences(y, y - y_other, series), sizes(slope, series), series))
-        places.append(_places(problem, series, slope, by_direction[-1]))
+    series, errors, found = problem.series(), [], list[Differences]()
+    together = max(1, int(BLOCK_BYTES // (8 * len(tols) * len(problem.index))))
+    for first in range(0, len(directions), together):
+        some = directions[first : first + together]
+        for d, slopes in zip(some, _slopes(problem, z, some, tols), strict=True):
+            found.append(_compare(problem, z, d, slopes[0], tols, series))
+            errors.append([np.sqrt(np.mean((slopes[0, rows] - slopes[1, rows]) ** 2)) for rows in series])
     keys = [(int(problem.index[p[0], 0]), problem.channels[problem.index[p[0], 2]]) for p in series]
-    prefixes = label_prefixes(problem.records)
     return GradientCheck(
         title=problem.mechanism.name or "mechanism",
         names=(*names, *(f"random direction {k + 1}" for k in range(len(random)))),
         directions=directions,
         series=tuple((k, channel.name) for k, channel in keys),
-        labels=tuple(prefixes[k] + channel.name for k, channel in keys),
+        labels=tuple(label_prefixes(problem.records)[k] + channel.name for k, channel in keys),
         units=tuple(channel.units for _, channel in keys),
-        steps=by_direction[0].steps,
-        discrepancy=np.stack([sizes(f.values - slope, series).T for f, slope in zip(by_direction, derivatives, strict=True)]),
-        noise=np.stack([f.noise.T for f in by_direction]),
-        truncation=np.stack([f.truncation.T for f in by_direction]),
-        derivative_error=sizes(directions @ error.T, series),
-        size=sizes(derivatives, series),
-        places=tuple(places),
+        steps=found[0].steps,
+        discrepancy=np.stack([f.discrepancy.T for f in found]),
+        noise=np.stack([f.noise.T for f in found]),
+        truncation=np.stack([f.truncation.T for f in found]),
+        derivative_error=np.array(errors),
+        size=np.stack([f.derivative_size for f in found]),
+        places=tuple(_places(problem, f) for f in found),
         tol=tol,
-        other_tol=other_tol,
+        other_tol=tols[1],
     )
 
 
-def _evaluate_first(problem: FitProblem, z: np.ndarray, tols: Sequence[TolerancePair]) -> tuple[TolerancePair, Residuals]:
-    """Return the first of the tolerances at which all runs are completed, and the residuals at this tolerance."""
+def _completed_tol(problem: FitProblem, z: Float[np.ndarray, "K"], tols: Sequence[TolerancePair]) -> TolerancePair:
+    """Return the first of the tolerances at which all runs are completed."""
+    code = Result.successful
     for tol in tols:
-        residuals = problem.evaluate(z[None], tol)
-        if residuals.code[0] == Result.successful and np.isfinite(residuals.r[0]).all():
-            return tol, residuals
-    code = Result(int(residuals.code[0]))
+        found = [(int(block.code[0]), np.isfinite(block.r[0]).all()) for block in problem.row_blocks(z[None], tol)]
+        code = Result(max(code for code, _ in found))
+        if code == Result.successful and all(finite for _, finite in found):
+            return tol
     cause = "some channels are NaN" if code == Result.successful else CAUSES[code]
     raise IdentificationError([f"there are no derivatives to check: {cause}"])
 
 
-def _predict(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B R"]:
-    """Return the predicted values of channels, in their units; NaN if a run fails."""
-    rows = len(problem.index)
+def _slopes(
+    problem: FitProblem, z: Float[np.ndarray, "K"], directions: Float[np.ndarray, "D K"], tols: Sequence[TolerancePair]
+) -> Float[np.ndarray, "D tols R"]:
+    """Return J d for some directions, at each of the tolerances, in the units of channels."""
+    slopes = np.zeros((len(directions), len(tols), len(problem.index)))
+    for k, tol in enumerate(tols):
+        for block in problem.row_blocks(z[None], tol):
+            rows = block.row_numbers[block.row_numbers < len(problem.index)]
+            slopes[:, k, rows] = directions @ (problem.sigma[rows, None] * block.J[0, : len(rows)]).T
+    return slopes
+
+
+def _compare(
+    problem: FitProblem,
+    z: Float[np.ndarray, "K"],
+    d: Float[np.ndarray, "K"],
+    slopes: Float[np.ndarray, "R"],
+    tols: Sequence[TolerancePair],
+    series: Sequence[np.ndarray],
+) -> Differences:
+    """Compare derivatives along a direction with differences, in blocks of rows."""
+    series_of = np.full(len(problem.index), -1)
+    series_of[np.concatenate(series)] = np.repeat(np.arange(len(series)), [len(rows) for rows in series])
+    points = z + np.concatenate([DIFFERENCE_STEPS, -DIFFERENCE_STEPS])[:, None] * d
     # Batches small enough to be computed one by one, since a program with vector lanes would have to be compiled.
-    together = max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns))
-    batches = [problem.evaluate(z[k : k + together], tol) for k in range(0, len(z), together)]
-    r, code = np.concatenate([batch.r for batch in batches]), np.concatenate([batch.code for batch in batches])
-    values = r[:, :rows] * problem.sigma + problem.measured
-    return np.where((code == Result.successful)[:, None], values, np.nan)
+    most = min(problem.sets_together, max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns)))
+    size = max(n for n in range(1, len(points) + 1) if len(points) % n == 0 and n <= most)
+    batches = [points[k : k + size] for k in range(0, len(points), size)]
+    sums, failed = DifferenceSums(len(series)), np.zeros((len(tols), len(points)), bool)
+    for blocks in zip(*(_values(problem, batch, tol) for tol in tols for batch in batches), strict=True):
+        rows = blocks[0][0]
+        used = series_of[rows] >= 0
+        y, code = (np.concatenate(x).reshape(len(tols), len(points), -1) for x in list(zip(*blocks, strict=True))[1:])
+        failed |= (code != Result.successful).any(2)
+        y = y[:, :, used].reshape(len(tols), 2, len(DIFFERENCE_STEPS), -1).swapaxes(1, 2)
+        sums.add(y[0], y[0] - y[1], series_of[rows[used]], slopes[rows[used]], rows[used])
+    return leave_out_far_steps(sums.differences(failed.any(0).reshape(2, -1).T))
 
 
-def _places(
-    problem: FitProblem, series: Sequence[np.ndarray], slope: np.ndarray, computed: Differences
-) -> tuple[DisagreementPlace, ...]:
-    places = []
-    for rows, best in zip(series, best_steps((computed.noise + computed.truncation).T), strict=True):
-        difference = computed.values[best][rows]
-        worst = int(np.argmax(np.abs(difference - slope[rows])))
-        record, time, channel = problem.index[rows[worst]]
-        name, t = problem.channel_names[channel], float(problem.ts[record, time])
-        places.append(DisagreementPlace(int(record), name, t, float(slope[rows[worst]]), float(difference[worst])))
+def _values(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Iterator[_Values]:
+    """Iterate over blocks of rows: their numbers, the predicted values of channels in their units, and how runs ended.
+
+    Derivatives, which are computed as well, are dropped at once: several such iterators are suspended together.
+    """
+
+    def values(block: Residuals) -> _Values:
+        rows = block.row_numbers[block.row_numbers < len(problem.index)]
+        return rows, block.r[:, : len(rows)] * problem.sigma[rows] + problem.measured[rows], block.code
+
+    return map(values, problem.row_blocks(z, tol))
+
+
+def _places(problem: FitProblem, computed: Differences) -> tuple[DisagreementPlace, ...]:
+    best, places = best_steps((computed.noise + computed.truncation).T), []
+    for row, derivative, difference in np.take_along_axis(computed.worst, best[None, :, None], 0)[0].tolist():
+        record, time, channel = problem.index[int(row)]
+        where = int(record), problem.channel_names[channel], float(problem.ts[record, time])
+        places.append(DisagreementPlace(*where, derivative, difference))
     return tuple(places)
 
 
