@@ -24,6 +24,11 @@ def rod_between_guides(length=3.0, tilt=0.0, height=1.0, angle_to_first_order=Fa
     return udk.Mechanism(bodies, {**guides, **pins, **last}, forces=[spring])
 
 
+def held_pins(mechanism):
+    holding = hold_pins(mechanism)
+    return [pin.name for pin in holding.pins] if holding else []
+
+
 def guide(body, through, tilt):
     return udk.Prismatic(("ground", body), [through, [0, 0]], tilt + np.pi / 2)
 
@@ -97,7 +102,7 @@ def test_a_square_of_guides():
             joints[f"guide {end}"] = udk.Prismatic(("ground", end), [x * across, [0, 0]], np.arctan2(*along[::-1]))
             joints[f"pin {end}"] = udk.Revolute((end, rod), [[0, 0], [x - a / 2, 0]])
     square = udk.Mechanism(bodies, joints)
-    assert [pin.name for pin in hold_pins(square).pins] == ["pin w", "pin s"]
+    assert held_pins(square) == ["pin w", "pin s"]
     sol = udk.simulate(square, TS)
     q = np.asarray(square.q0) + np.zeros((len(TS), 1, 1))
     for body in ("flat", "w", "e"):
@@ -113,7 +118,7 @@ def test_a_rod_at_the_end_of_a_crank():
     pivot = udk.Revolute(("ground", "crank"), [[-1.5, 1.0], [-0.5, 0.0]])
     end = udk.Slot(("one", "crank"), [[0, 0], [0.5, 0]], 0.0)
     driven = udk.Mechanism({**free.bodies, "crank": crank}, {**free.joints, "pivot": pivot, "end": end}, forces=free.forces)
-    assert [pin.name for pin in hold_pins(driven).pins] == ["A"]
+    assert held_pins(driven) == ["A"]
     sol = udk.simulate(driven, TS)
     np.testing.assert_allclose(sol.q[:, 2, 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(udk.energy(driven, sol).total, udk.energy(driven, sol).total[0], atol=1e-6)
@@ -127,7 +132,7 @@ def test_diagnosis_names_the_pin_and_a_fix():
     assert 'A: make it a prismatic joint along 0 degrees of the frame of "one"' in str(diagnosis)
     assert diagnosis.degrees_of_freedom == 1
     cured = diagnosis.cured
-    assert cured is not None and analyse(cured).redundant == () and hold_pins(cured).pins == ()
+    assert cured is not None and analyse(cured).redundant == () and hold_pins(cured) is None
     sol, right = (udk.simulate(m, TS) for m in (cured, rod_between_guides(tilt=0.5, angle_to_first_order=True)))
     np.testing.assert_allclose(sol.q, right.q, atol=1e-7)
 
@@ -144,4 +149,4 @@ def test_diagnosis_names_the_pin_and_a_fix():
     ],
 )
 def test_no_other_pin_is_held(mechanism):
-    assert hold_pins(mechanism).pins == ()
+    assert hold_pins(mechanism) is None

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.choices import fast
 from udkjax.native import primitive
 from udkjax.native.base import loading
 from udkjax.programs import identity_cache
@@ -64,3 +65,28 @@ def test_machine_code_that_is_dropped_is_unloaded_unless_compiled_programs_call_
     assert library() is None and name not in loading._LOADED
     registered = run(1)
     assert registered.name == name and loading._REGISTERED[name] is registered._optimized
+
+
+TIMES = np.linspace(0.0, 0.1, 3)
+QUESTIONS = {
+    "simulate": lambda m: udk.simulate(m, TIMES),
+    "inverse dynamics": lambda m: udk.inverse_dynamics(m, TIMES),
+    "diffrax": lambda m: udk.simulate(m, TIMES, engine="jax"),
+    "kinematics": lambda m: udk.kinematics(m, None, TIMES),
+    "equilibrium": udk.equilibrium,
+    "reactions": lambda m: udk.reactions(m, udk.simulate(m, TIMES)),
+    "power balance": lambda m: udk.power_balance(m, udk.simulate(m, TIMES)),
+    "diagnose": udk.diagnose,
+    "explain": udk.explain,
+}
+
+
+@pytest.mark.parametrize("name", fast(["simulate", "inverse dynamics"], QUESTIONS))
+def test_a_mechanism_that_nobody_uses_is_forgotten(name):
+    """Else all that is cached for it, programs of megabytes among them, stays in memory with it."""
+    mechanism = udk.library.slider_crank()
+    QUESTIONS[name](mechanism)
+    kept = weakref.ref(mechanism)
+    del mechanism
+    gc.collect()
+    assert kept() is None

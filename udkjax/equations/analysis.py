@@ -200,13 +200,13 @@ class Holding(NamedTuple):
     pins: tuple[HeldPin, ...]
 
 
-@cached_by_identity
-def hold_pins(mechanism: Mechanism) -> Holding:
-    """Hold the pins that constraints hold only to second order (stationary_rows.py), if concrete numbers show this."""
+@cached_by_identity  # a result with the mechanism itself would keep this in memory, with all that is stored for it
+def hold_pins(mechanism: Mechanism) -> Holding | None:
+    """Hold the pins that constraints hold only to second order (stationary_rows.py), if concrete numbers show any; else None."""
     source = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     pins = () if source is None else _held_pins(source)
     with jax.ensure_compile_time_eval() if mechanism.is_concrete else nullcontext():
-        return Holding(with_held_pins(mechanism, pins) if pins else mechanism, pins)
+        return Holding(with_held_pins(mechanism, pins), pins) if pins else None
 
 
 @cached_by_identity

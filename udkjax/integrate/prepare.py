@@ -126,7 +126,7 @@ def with_held_pins(
     if any(getattr(getattr(event, "action", None), "removed", None) for event in listed):
         return mechanism, analysis, choices
     holding = hold_pins(mechanism)
-    if not holding.pins:
+    if holding is None:
         return mechanism, analysis, choices
     return holding.mechanism, None, choices._replace(held=", ".join(pin.name for pin in holding.pins))
 

@@ -35,7 +35,7 @@ from udkjax.programs.numpy_program import evaluate_as
 from udkjax.programs.varying_axes import result_type
 from udkjax.threads import shared_threads, thread_count
 
-CODE_BYTES = 1  # memory of loaded code, with the programs of its scene, for each character of the text
+CODE_BYTES = 1.4  # memory of loaded code, with the programs of its scene, for each character of the text
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
@@ -43,7 +43,7 @@ TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
 FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
 
-@lru_cache(maxsize=8)  # the code of the host and of a graphics card share a module, which takes ten times as much memory
+@lru_cache(maxsize=1)  # a module takes ten times as much memory as its code
 def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
     """Write the module of an operation in `width` lanes; raise `UnsupportedError` if machine code does not support it.
 
@@ -95,7 +95,7 @@ class LoadedCode:
         self._seconds = QUICK_SECONDS_OF_LINE * text.count("\n") if operation.code.is_small else 0.0
         names = (*INPUTS, *module.inputs, *module.results, *module.outputs)
         self._lengths = [names.index(name) for name in module.lengths]
-        self.size = CODE_BYTES * len(text)  # an estimate of its memory, with that of the scene's programs
+        self.size = round(CODE_BYTES * len(text))  # an estimate of its memory, with that of the scene's programs
 
     def _load(self, level: int) -> Code:
         later = self._operation.later

@@ -80,11 +80,12 @@ def diagnose(
     q = np.asarray(closure.state.q, float)
     positions = RankedPositions(mechanism, rank_tol)
     rows = positions.rows
-    current, (held_mechanism, held) = positions.at(float(t), q.ravel()), hold_pins(mechanism)
+    current, holding = positions.at(float(t), q.ravel()), hold_pins(mechanism)
+    held = () if holding is None else holding.pins
     neighbours = positions.around(current)
-    if held:  # only with their angles held do positions lie on the motion
-        holding = RankedPositions(held_mechanism, rank_tol)
-        neighbours = [positions.at(c.t, c.q) for c in holding.around(holding.at(current.t, current.q))]
+    if holding is not None:  # only with their angles held do positions lie on the motion
+        of_held = RankedPositions(holding.mechanism, rank_tol)
+        neighbours = [positions.at(c.t, c.q) for c in of_held.around(of_held.at(current.t, current.q))]
     generic_rank = max([current.rank, *(c.rank for c in neighbours)])
     generic = [c for c in [current, *neighbours] if c.rank == generic_rank]
     owners = [name for name, _ in rows.names]
