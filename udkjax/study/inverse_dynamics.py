@@ -15,7 +15,7 @@ direction v of the motion.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -188,10 +188,10 @@ def inverse_dynamics(
     )
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
-    if not is_traced((columns, powers, residual)):
-        columns, powers, residual = put_arrays((columns, powers, residual))
+    found: Any = columns, powers, residual
+    found = found if is_traced(found) else put_arrays(found)
     effort_units = tuple((name, value.effort_unit) for name, value in zip(named, values, strict=True))
-    return InverseDynamics(ts, computed, columns, powers, residual, effort_units)
+    return InverseDynamics(ts, computed, *found, effort_units)
 
 
 @checked
