@@ -188,7 +188,7 @@ def inverse_dynamics(
     )
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
-    found: Any = columns, powers, residual
+    found: tuple[Any, Any, Any] = columns, powers, residual
     found = found if is_traced(found) else put_arrays(found)
     effort_units = tuple((name, value.effort_unit) for name, value in zip(named, values, strict=True))
     return InverseDynamics(ts, computed, *found, effort_units)
