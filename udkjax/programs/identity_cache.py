@@ -25,7 +25,7 @@ Argument_contra = TypeVar("Argument_contra", contravariant=True)
 Known = TypeVar("Known")
 Produced_co = TypeVar("Produced_co", covariant=True)
 
-MOST_BYTES = 2**26  # of all results of functions that are `cached_by_size` together, by the estimates of these functions
+MOST_BYTES = 3 * 2**24  # of all results of functions that are `cached_by_size` together, by the estimates of these functions
 CACHE_SIZE = 64  # results stored per function; the least recently used one is dropped
 
 
