@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from tests.integrate.own_systems import disc
+from tests.integrate.own_systems import G, disc, pendulum
 
 TS = np.linspace(0.0, 1.0, 5)
 FORMULATIONS = {
@@ -61,6 +61,15 @@ def test_both_engines_and_the_equation_of_udwadia_and_kalaba(name, copies, coupl
     assert_allclose(one.q, other.q, rtol=0, atol=1e-9)
     assert_allclose(one.q, reference.q, rtol=0, atol=1e-8)
     assert_allclose(one.v, reference.v, rtol=0, atol=1e-7)
+
+
+def test_a_spatial_pendulum_by_independent_coordinates():
+    """Its row holds at all outputs, and its energy stays."""
+    start = udk.State(START.q[:3], START.v[:3])
+    found = udk.simulate(pendulum(), TS, start, formulation=udk.CoordinatePartitioning(), stabilization=None)
+    assert found.settings["engine"] == "native"
+    assert_allclose(np.sum(np.square(found.q), 1), 1.0, rtol=1e-15)
+    assert_allclose(udk.energy(pendulum(), found).total, 2.0 * (1.5**2 / 2 - 0.8 * G), rtol=1e-7)
 
 
 @pytest.mark.slow

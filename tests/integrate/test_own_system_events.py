@@ -36,6 +36,14 @@ def test_times_of_events(engine):
     assert run.events.q_before.shape == (5, 3)
 
 
+@pytest.mark.slow
+def test_events_of_independent_coordinates():
+    event = udk.Event(lambda t, q, v: q[0], udk.Log(), name="crosses")
+    run = udk.simulate(pendulum(), [0.0, 2.0], CONICAL, **TIGHT, events=[event], formulation=udk.CoordinatePartitioning())
+    assert run.events is not None and run.settings["engine"] == "native"
+    assert_allclose(run.events.of("crosses") * RATE / np.pi, [0.5, 1.5, 2.5], atol=1e-8)
+
+
 def test_rolling_until_a_heading():
     """A disc that rolls in a circle has turned by a right angle after a quarter of its turn."""
     lean, turn = -0.3, 2.0

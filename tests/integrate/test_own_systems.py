@@ -16,6 +16,7 @@ from tests.fresh_process import python
 from tests.integrate.own_systems import G, pendulum
 from udkjax.equations import equations_of
 from udkjax.equations.general import prepare_general
+from udkjax.equations.system_solver import factorize_mass, mass_operations
 from udkjax.equations.traced_system import trace_system
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
@@ -86,7 +87,8 @@ def test_functions_of_a_state(kind, method):
             assert_allclose(x, wanted, rtol=0, atol=1e-12 * max(1.0, float(jnp.abs(wanted).max())))
 
 
-@pytest.mark.parametrize("kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[1:])], ids=str)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS, ids=str)
 def test_partitions_of_a_state(kind):
     """Accelerations of closed random states, and states that are closed by other dependent coordinates and velocities."""
     system, n, t = random_system(1, **kind), kind.get("n", 5), 0.3
@@ -199,6 +201,30 @@ def test_what_has_no_scalar_form_is_left_to_diffrax():
     plan = compile_mechanism(system, None, udk.Auto(), udk.Projection()).plan
     assert not plan.is_native
     assert plan.why_not_native.endswith("which is not arithmetic on numbers")
+
+
+def test_a_long_mass_matrix_is_left_to_diffrax_without_its_elimination():
+    """The elimination would add some 40,000 nodes; constant entries and zeros take none."""
+    n = 50
+
+    def traced(mass):
+        return trace_system(udk.ConstrainedSystem(mass, lambda t, q, v: -q), n)
+
+    system = traced(lambda q: jnp.eye(n) + 0.1 * jnp.cos(q[0]))
+    plan = compile_mechanism(system, None, udk.Auto(), udk.Projection()).plan
+    assert plan.why_not_native == "the elimination of its mass matrix takes 41,650 operations, more than 8,000"
+    assert len(system.functions.graph.nodes) < 1_000
+    assert mass_operations(traced(lambda q: jnp.diag(2.0 + jnp.cos(q))).functions.mass) == 0
+
+
+@pytest.mark.slow
+def test_the_operations_of_a_mass_matrix():
+    """As many as the elimination writes, but those with pivots."""
+    mass = trace_system(random_system(3, n=12, m=0, k=0), 12).functions.mass
+    graph = mass[0][0].graph
+    before = len(graph.nodes)
+    factorize_mass(graph, mass, [])
+    assert mass_operations(mass) == pytest.approx(len(graph.nodes) - before, rel=0.2)
 
 
 def test_the_shape_of_what_functions_return():

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from udkjax.equations.system_derivatives import ONCE, DifferentiableSystem, SystemEquation, WrittenScalars
-from udkjax.equations.system_solver import SystemFactors
+from udkjax.equations.system_solver import SystemFactors, mass_operations
 from udkjax.equations.system_terms import SystemTerms, less
 from udkjax.equations.traced_system import MOST_NUMBERS, SystemFunctions, TracedSystem
 from udkjax.expressions import Scalar
@@ -19,6 +19,7 @@ from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.rank_policy import RankPolicy
 
 MOST_OPERATIONS = 8_000  # of the accelerations: compiling takes 10 s for as many, and longer than in proportion for more
+LONG_MASS = 2  # beyond this multiple, those of the mass matrix alone are estimated: equal ones, which count once, are fewer
 
 
 class SystemPrograms(SystemTerms):
@@ -37,6 +38,9 @@ class SystemPrograms(SystemTerms):
     @cached_property
     def excess(self) -> str:
         """The reason why the programs are too long for machine code; empty if they are not."""
+        of_mass = mass_operations(self.functions.mass)
+        if of_mass > LONG_MASS * MOST_OPERATIONS:  # writing them, only to count, would take seconds
+            return f"the elimination of its mass matrix takes {of_mass:,} operations, more than {MOST_OPERATIONS:,}"
         count = sum(len(part.kernel.program.order) for part in self.accelerations.parts if isinstance(part, KernelLoop))
         many = f"its accelerations take {count:,} operations, more than {MOST_OPERATIONS:,}" if count > MOST_OPERATIONS else ""
         numbers = self.functions.number_count

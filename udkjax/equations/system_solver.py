@@ -115,6 +115,25 @@ def factorize_mass(graph: Graph, mass: Sequence[SparseRow], A: Sequence[SparseRo
     return MassFactors(factors, entries)
 
 
+def mass_operations(mass: Sequence[SparseRow]) -> int:
+    """Return the number of products and sums of variable numbers in the elimination of M, without writing them."""
+    n = len(mass)
+    present, varies = np.zeros((n, n), bool), np.zeros((n, n), bool)
+    for i, row in enumerate(mass):
+        for k, s in row.items():
+            present[i, k] = present[k, i] = True
+            varies[i, k] = varies[k, i] = s.constant is None
+    products = 0
+    for k in range(n):
+        rest = slice(k + 1, n)
+        pairs = np.outer(present[rest, k], present[rest, k])
+        changes = pairs & (varies[k, k] | varies[rest, k, None] | varies[rest, k])
+        products += np.count_nonzero(np.tril(changes))
+        present[rest, rest] |= pairs
+        varies[rest, rest] |= changes
+    return 2 * products
+
+
 @dataclass(frozen=True)
 class PivotRule:
     """The treatment of small pivots: see `RankPolicy`."""
