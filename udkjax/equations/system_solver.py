@@ -128,7 +128,7 @@ def mass_operations(mass: Sequence[SparseRow]) -> int:
         rest = slice(k + 1, n)
         pairs = np.outer(present[rest, k], present[rest, k])
         changes = pairs & (varies[k, k] | varies[rest, k, None] | varies[rest, k])
-        products += np.count_nonzero(np.tril(changes))
+        products += int(np.count_nonzero(np.tril(changes)))
         present[rest, rest] |= pairs
         varies[rest, rest] |= changes
     return 2 * products
