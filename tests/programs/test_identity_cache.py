@@ -72,6 +72,7 @@ def test_the_oldest_make_room(counted, monkeypatch):
     assert len(calls) == 4
 
 
+@pytest.mark.slow
 def test_results_of_traced_trees_hold_within_their_trace():
     """One computation for concrete numbers, and one in each trace. A trace within another one stores nothing of its own."""
     calls = []

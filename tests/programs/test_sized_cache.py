@@ -81,7 +81,7 @@ QUESTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", fast(["simulate", "inverse dynamics"], QUESTIONS))
+@pytest.mark.parametrize("name", fast(["simulate"], QUESTIONS))
 def test_a_mechanism_that_nobody_uses_is_forgotten(name):
     """Else all that is cached for it, programs of megabytes among them, stays in memory with it."""
     mechanism = udk.library.slider_crank()
