@@ -14,6 +14,7 @@ NAMES = (
     "batch",
     "gradients",
     "stiff",
+    "friction",
     "systems",
     "mechanisms",
     "startup",

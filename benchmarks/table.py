@@ -108,6 +108,9 @@ def _claims() -> Iterable[Claim]:
         yield Claim(f"stiff four-bar, {name}: first call, s", "stiff", 2.0, value("first", name=name))
     yield Claim("a bushing of 1e9 N/m, 20 s: ms", "stiff", 5.0, value("ms", name="bushing, 1e+09"))
     yield Claim("a bumper of 1e7 N m/rad, 20 s: ms", "stiff", 5.0, value("ms", name="bumper, 1e+07"))
+    for name in ("four-bar", "slider-crank", "double pendulum", "chain of ten"):
+        relative = value("times_run", name=name, law="speed 0.001 m/s")  # the default
+        yield Claim(f"{name} with friction in all joints: time relative to the run without", "friction", 3.0, relative)
     for name, least in (("spatial pendulum", 20.0), ("1024 in vmap", 50.0), ('64 linkages, engine="diffrax"', 0.67)):
         yield Claim(f"{name}: a script's time relative to ours", "systems", least, value("times_ours", name=name), True)
     for name, most in (("spatial pendulum", 1.0), ("its gradient", 1.5)):

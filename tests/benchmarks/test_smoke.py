@@ -51,6 +51,11 @@ SMALL = {  # what must be true of the figures of a small run; most hold their pr
         and all(row["successful"] and row["error"] < 1e-5 for row in rows if row["name"].startswith("damper"))
         and rows[1]["implicit"] > 0 == rows[0]["implicit"]
     ),
+    "friction": lambda rows: (
+        [row["law"] for row in rows] == ["none", "speed 0.1 m/s", "sticks"]
+        and 1 < rows[1]["times_operations"] < 4
+        and all(row["times_run"] > 0 for row in rows)
+    ),
     "systems": lambda rows: names(rows)[0] == "spatial pendulum" and all(row["apart"] < 1e-2 for row in rows),
     "mechanisms": lambda rows: (
         all(row.get("per_second", row.get("ms", 0.0)) > 0 for row in rows)
