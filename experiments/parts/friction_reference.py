@@ -55,18 +55,17 @@ def rubs_of(table: Table, q: np.ndarray, v: np.ndarray) -> dict[str, Rub]:
     """Return the friction of each joint at q and v (bodies, 3), by hand."""
     index = {body["name"]: k for k, body in enumerate(table["body"])}
     by_joint = {f["joint"]: f for f in table["force"] if f["type"] == "friction" and "coefficient" in f}
-    counts, start = {"revolute": 2, "prismatic": 2, "slot": 1, "weld": 3}, 0
-    found: dict[str, Rub] = {}
+    counts, start, found = {"revolute": 2, "prismatic": 2, "slot": 1, "weld": 3}, 0, {}
     for joint in table["joint"]:
-        count = counts.get(joint["type"], 1)
-        rows, start = slice(start, start + count), start + count
+        rows = slice(start, start + counts.get(joint["type"], 1))
+        start = rows.stop
         if joint["name"] not in by_joint:
             continue
         rub, along = by_joint[joint["name"]], np.zeros((len(q), 3))
         frames = [(np.zeros(3), np.zeros(3)) if b == "ground" else (q[index[b]], v[index[b]]) for b in joint["bodies"]]
         (q1, v1), (q2, v2) = frames
         if joint["type"] == "revolute":
-            speed, size, forms = rub["radius"] * (v2[2] - v1[2]), _length, _circle(32)
+            speed, size, forms = rub["radius"] * (v2[2] - v1[2]), np.linalg.norm, _circle(32)
             wrenches = [np.array([0.0, 0.0, sign * rub["radius"]]) for sign in (-1.0, 1.0)]
         else:
             axis = complex(np.exp(1j * (q1[2] + joint["axis"])))
@@ -83,10 +82,6 @@ def rubs_of(table: Table, q: np.ndarray, v: np.ndarray) -> dict[str, Rub]:
                 along[index[body]] += wrench
         found[joint["name"]] = Rub(along.ravel(), rub["coefficient"] * np.tanh(4 * speed / rub["speed"]), rows, size, forms)
     return found
-
-
-def _length(x: np.ndarray) -> float:
-    return float(np.linalg.norm(x))
 
 
 def _edges(length: float | None) -> Callable[[np.ndarray], float]:
@@ -112,22 +107,19 @@ class Balance:
 
     def __init__(self, scene: RandomScene, terms: Terms, rubs: Sequence[Rub]):
         self.terms, self.rubs = terms, rubs
-        unit: np.ndarray = np.tile([scene.length, scene.length, 1.0], len(terms.mass) // 3)
+        unit = np.tile([scene.length, scene.length, 1.0], len(terms.mass) // 3)
         self.unit, self.load = unit, scene.mass * scene.length / scene.time**2
-        self.row: np.ndarray = np.max(abs(terms.psi_q * unit), axis=1)
-        J: np.ndarray = terms.psi_q * unit / self.row[:, None]
+        self.row = np.max(abs(terms.psi_q * unit), axis=1)
+        J = self._J = terms.psi_q * unit / self.row[:, None]
         u, sigma, _ = np.linalg.svd(J)
         padded = np.append(sigma, np.zeros(len(u) - len(sigma)))
         self.is_clear = not np.any((padded > GAP[0] * sigma[0]) & (padded < GAP[1] * sigma[0]))
-        self.N: np.ndarray = u[:, padded <= GAP[0] * sigma[0]]
+        self.N = u[:, padded <= GAP[0] * sigma[0]]
         kg = scene.mass * scene.length**2
-        inverse: np.ndarray = kg * np.linalg.pinv((J / unit**2 / terms.mass * kg) @ J.T, 1e-11)
-        self._drags: np.ndarray = (
-            np.array([r.along * r.coefficient for r in rubs]).reshape(len(rubs), len(unit)).T
-        )  # of unit loads
-        self._J = J
-        self._x0: np.ndarray = inverse @ (J @ (terms.force / terms.mass / unit) - terms.gamma / self.row)
-        self._B: np.ndarray = -inverse @ (J @ (self._drags / terms.mass[:, None] / unit[:, None]))
+        inverse = kg * np.linalg.pinv((J / unit**2 / terms.mass * kg) @ J.T, 1e-11)
+        self._drags = np.array([r.along * r.coefficient for r in rubs]).reshape(len(rubs), len(unit)).T  # of unit loads
+        self._x0 = inverse @ (J @ (terms.force / terms.mass / unit) - terms.gamma / self.row)
+        self._B = -inverse @ (J @ (self._drags / terms.mass[:, None] / unit[:, None]))
 
     def solve(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return a (n,) and x (m,) by repeated substitution of the loads; None if it does not end.
@@ -152,11 +144,11 @@ class Balance:
     def solutions(self, rng: np.random.Generator) -> list[np.ndarray]:
         """Return the different loads s that SciPy finds from some starts, for y = 0."""
         found: list[np.ndarray] = []
-        unit = float(np.max(self.sizes(self._x0))) or self.load
+        unit = np.max(self.sizes(self._x0)) or self.load
         for k in range(STARTS):
             start = rng.exponential(10.0 ** rng.uniform(-1, 2), len(self.rubs)) if k else self.sizes(self._x0) / unit
             it = root(lambda s: s - self.sizes(self._x0 / unit + self._B @ s), start, method=("hybr", "lm")[k % 2])
-            left, size = float(np.max(abs(it.fun))), float(np.max(abs(it.x)))
+            left, size = np.max(abs(it.fun)), np.max(abs(it.x))
             if left <= SOLVED * size and not any(np.max(abs(it.x * unit - s)) <= 1e-6 * size * unit for s in found):
                 found.append(it.x * unit)
         return found
@@ -187,11 +179,9 @@ class Balance:
         where w_j is the power of a unit load. The largest is that of random corners.
         """
         k, rubs = self.N.shape[1], self.rubs
-        unit = float(FAR * (np.linalg.norm(x) + self.load * self.unit[0]))
+        unit = FAR * (np.linalg.norm(x) + self.load * self.unit[0])
         weights = v @ self._drags
-        spread: list[np.ndarray] = []
-        given: list[np.ndarray] = []
-        bounds: list[np.ndarray] = []
+        spread, given, bounds = [], [], []
         for j, rub in enumerate(rubs):
             forms = rub.forms / self.row[rub.rows]
             spread.append(forms @ self.N[rub.rows] * unit)
