@@ -6,9 +6,9 @@ With friction G(q, v, lambda) on the right-hand side, M a + Psi_q^T lambda = F +
 
 with D, b, weights w and D^+ as in udwadia_kalaba.py: with redundant rows they are those of least norm, or with compliances those
 of least elastic energy. Newton's method solves this from lambda = L(0). Loads have kinks where they change their signs, and with
-strong friction its steps may go back and forth between two sets of signs. Then the solution is followed from L(0) on, in `STAGES`
-of growing friction: lambda = L(s G(lambda)). The implicit function theorem gives derivatives of any order. Where friction admits
-no motion (the mechanism jams), Newton's method does not end, and the multipliers are NaN.
+strong friction its steps may go back and forth between two sets of signs. Then the solution is followed from L(0) on, in
+`RunPrograms.STAGES` of growing friction: lambda = L(s G(lambda)). The implicit function theorem gives derivatives of any order.
+Where friction admits no motion (the mechanism jams), Newton's method does not end, and the multipliers are NaN.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,6 +23,7 @@ from udkjax.equations import constraints
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.compliance import sharing
 from udkjax.equations.constraints import BodyArray, bodies
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.structure import RubbingJoint, rubbing_joints
 from udkjax.equations.udwadia_kalaba import Baumgarte, Weights
 from udkjax.pinv import Pseudoinverse
@@ -31,8 +32,6 @@ from udkjax.scene.forces import Wrench
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.newton_steps import repeated_newton
-
-STAGES = 8  # of equal shares; fewer may do, but most mechanisms need none
 
 
 def rubbing_names(mechanism: Mechanism) -> list[str]:
@@ -217,7 +216,7 @@ def settle(
         def stage(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             """Solve with all friction in stage 0; where this fails, with growing shares of it, each from the last solution."""
             x, fails, lost = state
-            share = jnp.where(k == 0, 1.0, k / STAGES)
+            share = jnp.where(k == 0, 1.0, k / RunPrograms.STAGES)
 
             def step(x: Array) -> tuple[Array, Array, Array]:
                 def parts(x: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -234,7 +233,7 @@ def settle(
             found, is_open = repeated_newton(step, x, (k == 0) | (fails & ~lost))
             return found, jnp.where(k == 0, is_open, fails), (k > 0) & (lost | is_open)
 
-        x, fails, lost = jax.lax.fori_loop(0, STAGES + 1, stage, (start, jnp.asarray(False), jnp.asarray(False)))
+        x, fails, lost = jax.lax.fori_loop(0, RunPrograms.STAGES + 1, stage, (start, jnp.asarray(False), jnp.asarray(False)))
         return jnp.where(fails & lost, jnp.nan, x)
 
     def solve_for_tangent(linear: Callable[[Array], Array], y: Array) -> Array:

@@ -34,6 +34,8 @@ class RunPrograms:
     """True if friction depends on the loads of joints: `accelerations` then report that these are `unsettled`."""
     FURTHER: ClassVar[str] = "accelerations_further"
     """The program that goes on from `settled`."""
+    STAGES: ClassVar[int] = 8
+    """Equal shares by which friction grows where its loads do not settle; fewer may do, but most mechanisms need none."""
     is_linear: bool = True
     """True if constraints on velocities are linear in them."""
 

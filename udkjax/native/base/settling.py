@@ -2,7 +2,7 @@
 
 The programs `SETTLING` take one round. They set `unsettled` to one where it does not suffice, and leave the solution of their
 linear system as `settled`. Two functions then take as many more rounds as such lanes need, and leave other lanes as they are.
-Lanes that still do not settle follow the solution from that without friction on, in `SETTLING_STAGES` of growing friction:
+Lanes that still do not settle follow the solution from that without friction on, in `RunPrograms.STAGES` of growing friction:
 
     settle_state(work, out)    at `state v`; the accelerations are at `out`
     settle_end(work, out)      the same at `result v`, the velocities at the end of a step
@@ -12,7 +12,7 @@ from udkjax.equations.run_programs import RunPrograms
 from udkjax.native.base.ir import DOUBLE, INT, Function
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.memory import Memory
-from udkjax.native.base.steps import SETTLING_ROUNDS, SETTLING_STAGES
+from udkjax.native.base.steps import SETTLING_ROUNDS
 
 AT_STATE = ("accelerations", "accelerations_and_drift")
 AT_END = ("project_and_accelerate", "end_of_step")
@@ -27,8 +27,9 @@ def write_settle_state(module: Memory, f: Function, s: Lane):
     with f.if_(f.any_of(s.unsettled > 0.5)):
         s.staged = s.unsettled
         stage = f.variable(0, INT, 1)
-        with f.while_(lambda: f.any_of(s.staged > 0.5) & (stage.value <= SETTLING_STAGES)):
-            s.where(s.staged > 0.5, unsettled=1.0, friction_share=f.like(stage.value, DOUBLE, f.width) * (1 / SETTLING_STAGES))
+        with f.while_(lambda: f.any_of(s.staged > 0.5) & (stage.value <= RunPrograms.STAGES)):
+            share = f.like(stage.value, DOUBLE, f.width) * (1 / RunPrograms.STAGES)
+            s.where(s.staged > 0.5, unsettled=1.0, friction_share=share)
             _write_rounds(module, f, s)
             s.where(s.unsettled > 0.5, staged=0.0)  # it jams already with a part of the friction
             stage.value = stage.value + 1

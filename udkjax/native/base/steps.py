@@ -38,8 +38,6 @@ SURE, EXPECTED = 0.85, 0.3
 
 # Further rounds of Newton's method for the loads of joints with friction. Five are needed at 0.99 of the jamming coefficients.
 SETTLING_ROUNDS = 20
-# Where they do not settle: growing shares of friction, each from the solution before, as in `equations.rubbing`.
-SETTLING_STAGES = 8
 
 # Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.
 # Breakpoints closer to one another than the smallest step count as one.
