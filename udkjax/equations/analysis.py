@@ -200,7 +200,7 @@ class Holding(NamedTuple):
     pins: tuple[HeldPin, ...]
 
 
-@cached_by_identity  # a result with the mechanism itself would keep this in memory, with all that is stored for it
+@cached_by_identity  # the result must not contain the mechanism, or the cache would keep it in memory
 def hold_pins(mechanism: Mechanism) -> Holding | None:
     """Hold the pins that constraints hold only to second order (stationary_rows.py), if concrete numbers show any; else None."""
     source = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism

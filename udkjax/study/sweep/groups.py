@@ -103,9 +103,9 @@ class GroupRun:
         moving = any(name not in {column.name for column in plan.columns} for name in self.names)
         self.assembled = fixed.get("state") is None
         closure = close(fixed["mechanism"], plan.ts[0]) if self.assembled and not self.varied and not moving else None
-        shared = None if "mechanism" in self._own else fixed["mechanism"]
-        plain = shared.without_origin if isinstance(shared, Mechanism) else shared
-        elements, self._elements = eqx.partition(None if plain is shared else plain, eqx.is_array)
+        common = None if "mechanism" in self._own else fixed["mechanism"]
+        plain = common.without_origin if isinstance(common, Mechanism) else common
+        elements, self._elements = eqx.partition(None if plain is common else plain, eqx.is_array)
         self.shared = jax.tree.map(np.asarray, Shared(arrays, closure, elements))
         method, formulation = fixed.get("method"), fixed.get("formulation")
         is_straight = isinstance(method, STRAIGHT_METHODS) and formulation is None
