@@ -16,6 +16,7 @@ from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.scene_programs import _scene_programs, scene_programs
 from udkjax.expressions import float_loops
 from udkjax.expressions.array_loops import ArrayLoops
+from udkjax.expressions.float_loops import _WORTH_WRITING_FOR_MANY, FloatLoops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.deferred import deferred
 
@@ -280,6 +281,31 @@ def test_floats_and_arrays_find_the_same(monkeypatch):
     assert_allclose(by_floats, by_arrays, rtol=1e-12, atol=1e-12)
     assert np.isnan(by_floats[-1]).any() and np.isfinite(by_floats[:-1]).all()
     assert (np.array(by_floats[:-1]) == by_floats[0]).all()  # to the last bit
+
+
+def test_many_states_at_once_are_single_states(monkeypatch):
+    """By loops at first, later by a written function, whose variables have a number for each state."""
+    names = ("revolute", "prismatic", "slot", "weld")
+    mechanism = udk.Mechanism(BODIES, {name: JOINTS[name] for name in names}, forces={"push": FORCES["push"]})
+    _scene_programs.cache_clear()
+    at = arrays_in_time(mechanism)(0.3)
+    rng, q0 = np.random.default_rng(0), np.asarray(mechanism.q0).ravel()
+    t, q, v = rng.random(5), q0[:, None] + 0.1 * rng.standard_normal((q0.size, 5)), rng.standard_normal((q0.size, 5))
+    q[0, 4] = np.inf
+
+    def evaluate(t, q, v):
+        with np.errstate(all="ignore"):
+            return np.concatenate([at.psi(t, q), *at.geometry(t, q, v), *at.loads(t, q, v), at.energy(t, q, v)])
+
+    single = np.stack([evaluate(t[k], q[:, k], v[:, k]) for k in range(5)], 1)
+    runs, run = [], FloatLoops.of_many
+    monkeypatch.setattr(FloatLoops, "of_many", lambda self, names: runs.append(found := run(self, names)) or found)
+    for _ in range(_WORTH_WRITING_FOR_MANY + 1):
+        assert_allclose(evaluate(t, q, v), single, rtol=1e-12, atol=1e-12)
+    at_rest = at.geometry(t, q, np.zeros((q0.size, 1)))  # the same velocity for all states
+    assert_allclose(at_rest[2], at.geometry(t, q, np.zeros_like(q))[2], rtol=0, atol=0)
+    assert runs[0] is None and runs[-1] is not None
+    assert np.isnan(single[:, 4]).any() and np.isfinite(single[:, :4]).all()
 
 
 def test_one_position_is_evaluated_once(monkeypatch):

@@ -50,8 +50,8 @@ def test_calls_of_kinematics_and_inverse_dynamics():
     four_bar = udk.library.four_bar()
     assert calls_of(lambda: udk.kinematics(crank, None, TIMES)) < 2_000
     assert calls_of(lambda: udk.kinematics(four_bar, "body.crank.angle", ANGLES)) < 2_200
-    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES, motion)) < 2_800
-    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES)) < 4_700
+    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES, motion)) < 1_700
+    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES)) < 3_500
 
 
 def test_calls_of_a_position_of_rest():

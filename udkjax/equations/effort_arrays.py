@@ -55,9 +55,9 @@ def _efforts_at(equations: StateArrays, analysis: Analysis, w: np.ndarray, t: np
     reached = np.isfinite(rows).all((1, 2)) & np.isfinite(missing).all(1)
     C, J, missing = (np.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0) for x in (C, J, missing))
     held, rank = _row_space(J)
-    determined = reached
-    if analysis.rank is not None:  # otherwise the number of degrees of freedom is unknown
-        deficient = rank < analysis.rank
+    determined, known_rank = reached, analysis.rank
+    if known_rank is not None:  # otherwise the number of degrees of freedom is unknown
+        deficient = rank < known_rank
         u = v / units
         speed = np.linalg.norm(u, axis=1)
         determined = reached & (~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0)))
@@ -65,7 +65,7 @@ def _efforts_at(equations: StateArrays, analysis: Analysis, w: np.ndarray, t: np
     def free(x: np.ndarray) -> np.ndarray:
         """Return the part of columns (T, n, k) that the joints do not hold: in deficient positions, along the motion."""
         result = x - held.transpose(0, 2, 1) @ (held @ x)
-        if analysis.rank is not None and deficient.any():
+        if known_rank is not None and deficient.any():
             along = np.where(speed > 0, u.T / speed, 0.0).T[deficient, :, None]
             result[deficient] = along @ (along.transpose(0, 2, 1) @ x[deficient])
         return result

@@ -55,8 +55,10 @@ class Scales(NamedTuple):
             return self.length / self.rows
         return number(np.asarray(self.length) / np.asarray(self.rows))
 
-    def coordinates(self, n: int) -> Float[Array, "n"]:
-        """Return the units of coordinates: L, L and one radian for each body."""
+    def coordinates(self, n: int) -> Any:
+        """Return the units of coordinates (n,): L, L and one radian for each body."""
+        if isinstance(self.length, np.ndarray):
+            return np.tile([float(self.length), float(self.length), 1.0], n // 3)
         if library_for(self.length) is np:
             return number(np.tile([float(self.length), float(self.length), 1.0], n // 3))
         return jnp.tile(jnp.stack([self.length, self.length, jnp.ones_like(self.length)]), n // 3)

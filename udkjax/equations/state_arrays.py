@@ -117,7 +117,7 @@ class StateArrays:
 
     def jacobian(self, t: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return Psi_q (T, m, n)."""
-        return self.dense(self._evaluate(self._at.geometry, t, q, np.zeros_like(q))[2])
+        return self.dense(self._evaluate(self._at.geometry, t, q, np.zeros((1, self.size)))[2])
 
     def dense(self, entries: np.ndarray) -> np.ndarray:
         """Return matrices (T, m, n) from their entries (entries, T)."""

@@ -40,9 +40,11 @@ class ArrayLoops:
             for part in self._parts:
                 _run_by_jax(part, results)
             return results
-        if self._on_floats and all(np.ndim(x) < 2 for x in arrays.values()):
+        if self._on_floats:
+            run = self._run_at_many if any(np.ndim(x) > 1 for x in arrays.values()) else self._run_on_floats
             try:
-                return self._run_on_floats(arrays, self._on_floats)
+                if (found := run(arrays, self._on_floats)) is not None:
+                    return found
             except (ArithmeticError, ValueError):  # a number is not finite
                 pass
         results = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
@@ -55,6 +57,25 @@ class ArrayLoops:
         lists = {name: np.asarray(x, float).tolist() for name, x in arrays.items() if name in involved}
         run(lists)
         return {name: np.array(lists[name], float) if name in self._written else x for name, x in arrays.items()}
+
+    def _run_at_many(self, arrays: Mapping[str, Any], loops: FloatLoops) -> dict[str, np.ndarray] | None:
+        """Run on lists of arrays, which have one number for each state; None if that is not worth writing a function."""
+        involved = {name: np.asarray(x, float) for name, x in arrays.items() if name in self._written | self._read}
+        run, count = loops.of_many(involved.keys()), max((x.shape[1] for x in involved.values()), default=1)
+        if run is None:
+            return None
+        # A number that is the same for all states is a float, with which NumPy computes faster.
+        lists: dict[str, list[Any]] = {
+            name: x[:, 0].tolist() if x.shape[1] == 1 else list(np.ascontiguousarray(x)) for name, x in involved.items()
+        }
+        with np.errstate(all="ignore"):
+            run(lists)
+        results = dict(arrays)
+        for name in self._written & lists.keys():
+            results[name] = table = np.empty((len(lists[name]), count))
+            for row, x in zip(table, lists[name], strict=True):
+                row[...] = x
+        return results
 
 
 def _lay_out(part: KernelLoop | Reset) -> LaidOutPart:

@@ -1,26 +1,31 @@
 """Loops of few rows on Python's floats: run row by row at first, and as one generated Python function once they have run often.
 
-In the function each number of an array is a variable, from the row that writes it to those that read it.
+In the function each number of an array is a variable, from the row that writes it to those that read it. For many states at once
+these variables are NumPy arrays, one number for each state.
 """
 
 import operator
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
+
 from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, SET
 from udkjax.expressions.scalar_program import ScalarProgram
 from udkjax.expressions.written_steps import PythonFunction
 
-_UPDATES = {  # NaN propagates
+_UPDATES_OF_FLOATS = {  # NaN propagates
     ADD: operator.add,
     MAXIMUM: lambda a, b: a if a >= b or a != a else b,
     ALL: lambda a, b: a if a <= b or a != a else b,
 }
+_UPDATES_OF_ARRAYS = {ADD: operator.add, MAXIMUM: np.maximum, ALL: np.minimum}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
 # Runs row by row that take as long as generating a Python function (20 us per operation); it runs three times as fast.
 _WORTH_WRITING = 100
+_WORTH_WRITING_FOR_MANY = 20  # the same for runs at many states, which take 20 times as long
 
-Lists: TypeAlias = dict[str, list[float]]  # the numbers of each array
+Lists: TypeAlias = dict[str, list[Any]]  # the numbers of each array: floats, or arrays of one number for each state
 
 
 class LaidOutPart(NamedTuple):
@@ -41,6 +46,7 @@ class FloatLoops:
     def __init__(self, parts: Sequence[LaidOutPart]):
         self._parts = [_with_lists(part) for part in parts if part.outputs]
         self._runs, self._function = 0, None
+        self._runs_of_many, self._function_of_many = 0, None
 
     @staticmethod
     def support(parts: Sequence[LaidOutPart]) -> bool:
@@ -57,6 +63,13 @@ class FloatLoops:
         self._runs += 1
         if self._runs == _WORTH_WRITING:
             self._function = _write(self._parts, lists.keys())
+
+    def of_many(self, names: Collection[str]) -> Callable[[Lists], None] | None:
+        """Return the function of the lists of these names at many states; None until it has run so often that it is worth it."""
+        self._runs_of_many += 1
+        if self._runs_of_many == _WORTH_WRITING_FOR_MANY:
+            self._function_of_many = _write(self._parts, names, many=True)
+        return self._function_of_many
 
 
 def _with_lists(part: LaidOutPart) -> LaidOutPart:
@@ -79,11 +92,12 @@ def _run(part: LaidOutPart, lists: Lists) -> None:
     for column, (name, places, update) in zip(zip(*rows, strict=True), part.outputs, strict=True):
         target = lists[name]
         for k, x in zip(places, column, strict=True):
-            target[k] = x if update == SET else _UPDATES[update](target[k], x)
+            target[k] = x if update == SET else _UPDATES_OF_FLOATS[update](target[k], x)
 
 
-def _write(parts: Sequence[LaidOutPart], names: Collection[str]) -> Callable[[Lists], None]:
-    """Return the parts as one function of the lists; `names` are those of the lists."""
+def _write(parts: Sequence[LaidOutPart], names: Collection[str], many: bool = False) -> Callable[[Lists], None]:
+    """Return the parts as one function of the lists, which have the given names, of floats or of arrays for many states."""
+    updates = _UPDATES_OF_ARRAYS if many else _UPDATES_OF_FLOATS
     text = PythonFunction("lists")
     lists = {name: text.assign(f"lists[{name!r}]") for name in names}
     known: dict[tuple[str, int], str] = {}  # the variables of numbers
@@ -96,14 +110,14 @@ def _write(parts: Sequence[LaidOutPart], names: Collection[str]) -> Callable[[Li
 
     for part in parts:
         if isinstance(part.run, ScalarProgram):
-            program = part.run.on_floats
+            program = part.run.on_arrays if many else part.run.on_floats
             inputs = [[read(name, k) if name else "0.0" for name, k in row] for row in _rows(part.inputs, part.count)]
             rows = [program.write(text, row) for row in inputs]
         else:
             rows = [[text.assign(repr(part.run))]] * part.count
         for column, (name, places, update) in zip(zip(*rows, strict=True), part.outputs, strict=True):
             for k, x in zip(places, column, strict=True):
-                known[name, k] = x if update == SET else text.call(_UPDATES[update], read(name, k), x)
+                known[name, k] = x if update == SET else text.call(updates[update], read(name, k), x)
                 written[name, k] = None
     text.lines += [f"{lists[name]}[{k}] = {known[name, k]}" for name, k in written]
     return text.compile()

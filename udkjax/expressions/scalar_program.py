@@ -86,7 +86,7 @@ class ScalarProgram:
                 return self.on_floats(values)
             except (ArithmeticError, ValueError):  # 1/0, overflow, sin(inf): not errors in JAX, which returns inf or NaN
                 with np.errstate(all="ignore"):
-                    return self._steps_on_arrays([np.float64(v) for v in values])
+                    return self.on_arrays([np.float64(v) for v in values])
         return self._traced(self._typed(values))
 
     def by_numpy(self, values: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -98,7 +98,7 @@ class ScalarProgram:
                 columns = [np.broadcast_to(v, shape).ravel().tolist() for v in values]
                 results = [self(row) for row in zip(*columns, strict=True)] if columns else [self([])]
                 return [np.array(x, float).reshape(shape) for x in zip(*results, strict=True)]
-            results = self._steps_on_arrays(values)
+            results = self.on_arrays(values)
         return [x if np.shape(x) == shape else np.broadcast_to(x, shape) for x in results]
 
     @cached_property
@@ -122,7 +122,7 @@ class ScalarProgram:
         return [_signed(computed, s) for s in self.outputs]
 
     @cached_property
-    def on_floats(self) -> Callable[[Sequence[float]], list[Operand]]:
+    def on_floats(self) -> WrittenSteps:
         """The program on Python floats, which raises errors where a result is not finite."""
         return self._steps(_function_of_floats)
 
@@ -133,7 +133,8 @@ class ScalarProgram:
         return all(n.kind == "constant" or _plain_function(n, math, _NUMBER_FUNCTIONS) for n in nodes)
 
     @cached_property
-    def _steps_on_arrays(self) -> WrittenSteps:
+    def on_arrays(self) -> WrittenSteps:
+        """The program on NumPy arrays of compatible shapes, or numbers that are the same for all elements."""
         return self._steps(_function_of_arrays)
 
     def _steps(self, function_of: Callable[[Node], Callable]) -> WrittenSteps:
