@@ -348,3 +348,13 @@ def test_small_singular_values_of_a_sparse_matrix_are_those_of_the_dense_one(red
     assert np.abs(small.left.T @ A).max(initial=0.0) < 1e-12 * sigma[0]
     x = random.standard_normal(90)
     assert small.null_space_part(x) == approx(x - np.linalg.pinv(A, rcond=1e-9) @ (A @ x), abs=1e-9)
+
+
+def test_singular_values_of_more_rows_than_columns_from_those_of_a_similar_matrix():
+    """The vectors of the first matrix, one for each of its rows, are more than the second one has singular values."""
+    random = np.random.default_rng(2)
+    A = random.standard_normal((25, 15))
+    B = A + 1e-6 * random.standard_normal(A.shape)
+    small = SmallSingularValues(csr_array(B), 1e-9, SmallSingularValues(csr_array(A), 1e-9).vectors)
+    assert small.zero_count == 10 and small.values[10] == approx(np.linalg.svd(B)[1][-1], rel=1e-11)
+    assert np.abs(small.left.T @ B).max() < 1e-12 * small.largest

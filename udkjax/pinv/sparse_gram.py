@@ -91,8 +91,9 @@ class SmallSingularValues:
         values = np.full(X.shape[1], np.inf)
         for _ in range(MOST_ITERATIONS):
             X, before = np.linalg.qr(factor.solve(X))[0], values
-            turn, values, _ = np.linalg.svd((self._A.T @ X).T, full_matrices=False)
-            X, values = X @ turn[:, ::-1], values[::-1]
+            image = (self._A.T @ X).T
+            turn, values, _ = np.linalg.svd(image, full_matrices=image.shape[0] > image.shape[1])
+            X, values = X @ turn[:, ::-1], np.pad(values, (0, len(turn) - len(values)))[::-1]
             wanted = self._count_zeros(values) + 1
             if np.all(np.abs(values - before)[:wanted] <= CONVERGED * self._bounds[1]):
                 return values, X, True
