@@ -3,6 +3,7 @@
 import json
 import math
 
+import jax
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from experiments.parts.state_properties import check_large, check_states
 from experiments.parts.tally import Tally
 from experiments.properties import PROPERTIES, page
 from udkjax.cli import main
+from udkjax.integrate.events import simulate_events
 
 SEED = 3
 
@@ -71,6 +73,43 @@ def test_loads_that_rounds_do_not_settle_are_followed_from_those_without_frictio
     unit = np.array([scene.length, scene.length, 1.0])
     error = np.max(abs((4 * second - 3 * first - third) / (2 * h) - right) / unit)
     assert error < 1e-6 * np.max(abs(right) / unit)
+
+
+@pytest.mark.slow
+def test_forces_are_watched_where_loads_are_followed_from_those_without_friction(monkeypatch):
+    """A block beside such a mechanism sticks in machine code, which does not leave the run to its plain form."""
+    scene = with_friction(random_scene(0, 161, 5))
+    (q, v), beside, kg, m, s = state_of(scene.table), build(scene.table), scene.mass, scene.length, scene.time
+    pull = udk.Spring(["ground", "block"], [[0.1 * m, 2 * m], [0, 0]], stiffness=30 * kg / s**2, length=0.0)
+    mechanism = udk.Mechanism(
+        {**beside.bodies, "block": udk.Body(kg, kg * m**2)},
+        {**beside.joints, "S": udk.Prismatic(["ground", "block"], [[0, 0], [0, 0]], axis=0.0)},
+        beside.drivers,
+        {**beside.forces, "pull": pull, "stick": udk.Friction("S", coefficient=0.2, law="set-valued")},
+        gravity=beside.gravity,
+    )
+    monkeypatch.delattr(simulate_events, "_deferred_run")  # the only way to the plain form
+    state, ts = udk.State(*(np.vstack([x, np.zeros(3)]) for x in (q, v))), [0.0, 0.05 * s]
+    run = udk.simulate(mechanism, ts, state, rtol=1e-10, atol=1e-10)
+    alone = udk.simulate(beside, ts, udk.State(q, v), rtol=1e-10, atol=1e-10)
+    assert run.sticking is not None and run.sticking["S"].all()
+    np.testing.assert_allclose(run.q[-1, :-1], alone.q[-1], rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_derivatives_where_loads_are_followed_from_those_without_friction():
+    """First derivatives, forward and in reverse, and second ones begin with the same loads as the run."""
+    scene = with_friction(random_scene(0, 161, 5))
+    state, mechanism = udk.State(*state_of(scene.table)), build(scene.table)
+
+    def end(coefficient):
+        changed = mechanism.with_parameters({"force.rub1.coefficient": coefficient})
+        return udk.simulate(changed, [0.0, 0.05 * scene.time], state, rtol=1e-11, atol=1e-11).q[-1].sum()
+
+    at, h, slope = 0.15, 1e-4, jax.grad(end)
+    assert float(slope(at)) == pytest.approx(float(end(at + h) - end(at - h)) / (2 * h), rel=1e-6)
+    assert float(jax.jacfwd(end)(at)) == pytest.approx(float(slope(at)), rel=1e-9)
+    assert float(jax.jacfwd(slope)(at)) == pytest.approx(float(slope(at + h) - slope(at - h)) / (2 * h), rel=1e-6)
 
 
 def test_random_scenes_are_closed_and_drawn_again():

@@ -66,7 +66,7 @@ class DifferentiablePrograms:
 
     @cached_property
     def accelerations(self) -> DifferentiableProgram:
-        """Compute a; set safe."""
+        """Compute a; set safe. The loads of joints with friction have `settled` before."""
         return self._implicit(list(self._solver.terms.free_accelerations("v")), "b", "free", "a", 1)
 
     @cached_property
@@ -128,11 +128,11 @@ class DifferentiablePrograms:
         solver, terms = self._solver, self._solver.terms
         z, result = terms.add("z", solution=0), terms.add(target, start=x, change="z", sign=sign)
         system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]
-        rubs = self._friction(right) is not None
+        friction = self._friction(right)
         residuals = [*self._implicit_terms.residuals(right), *self._rubbing(right)]
-        respond = solver.responding_solve(1) if rubs else solver.solve(1)
+        respond = solver.solve(1) if friction is None else friction.solve(1)
         implicit = [*residuals, z, *terms.rates("z", 1, subtract=True), *respond]
-        solve = solver.accelerating_solve(0) if rubs else solver.solve()
+        solve = solver.solve() if friction is None else friction.settled(0)
         return DifferentiableProgram(
             program(system, solve, [z, result], [solver.safe] if target == "a" else []),
             [*loads, *implicit, terms.add("z", solution=1, update=ADD, fixed=("constants",)), result],

@@ -18,8 +18,9 @@ direction, such as those of slides, are exact once their signs are.
 One round leaves an error of s^8: it suffices if the coefficients are below about a thirtieth of those that jam the mechanism, as
 in most machines. Programs that a run evaluates often take one round, and report loads that have not settled; machine code then
 takes as many further rounds as are needed (`further`). Where rounds go back and forth between two sets of signs of the loads, it
-follows the solution from that without friction on, with a growing `friction_share` of G. Other programs take `ROUNDS`. If the
-loads do not settle, friction admits no motion (the mechanism jams), and the accelerations are NaN.
+follows the solution from that without friction on, with a growing `friction_share` of G. Programs that are differentiated begin
+with the loads that settled in this way. Other programs take `ROUNDS`. If the loads do not settle, friction admits no motion (the
+mechanism jams), and the accelerations are NaN.
 """
 
 from collections.abc import Callable
@@ -33,8 +34,7 @@ from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
 from udkjax.expressions.selection import greater, where
 
-# Rounds of programs that cannot ask for more. At 0.9 of the coefficients that jam pins, three are needed; the fourth evaluates
-# the slopes at the solution, for derivatives.
+# Rounds of programs that cannot ask for more. At 0.9 of the coefficients that jam pins, three are needed.
 ROUNDS = 4
 CORRECTION = SOLVES  # the number of the system of corrections
 # Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
@@ -69,10 +69,19 @@ class FrictionElimination:
 
     def further(self, solve: int, v: str = "v") -> ProgramParts:
         """Compute the results of `settle`, with `friction_share` times all friction, by a round that begins at x = `settled`."""
-        yield from self._skew.form_symmetric
-        yield from self._copy_solution("settled", f"x{solve}")
+        yield from self._begin_at_settled(solve)
         yield from self._round(solve, v, in_part=True)
         yield from self._finish(solve, v, reports=True, in_part=True)
+
+    def settled(self, solve: int, v: str = "v") -> ProgramParts:
+        """Compute the results of `settle` where x = `settled` is the solution, by one round: its factors are those there."""
+        yield from self._begin_at_settled(solve)
+        yield from self._round(solve, v)
+        yield from self._finish(solve, v, reports=False)
+
+    def _begin_at_settled(self, solve: int) -> ProgramParts:
+        yield from self._skew.form_symmetric
+        yield from self._copy_solution("settled", f"x{solve}")
 
     def _round(self, solve: int, v: str, in_part: bool = False) -> ProgramParts:
         yield from self._slopes(solve, v, in_part)

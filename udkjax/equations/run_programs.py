@@ -9,6 +9,8 @@ RESULTS = (
     *("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root", "energy"),
     *("independent", "multipliers", "unsettled", "settled", "friction_power"),
 )
+# Arrays with which programs of friction begin: the solution `settled` of their linear system, and the share of friction.
+BEGINS = "settled", "friction_share"
 
 
 class RunPrograms:

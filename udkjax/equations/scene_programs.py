@@ -14,7 +14,7 @@ import numpy as np
 from udkjax.annotations import TreeDef
 from udkjax.equations.differentiable_programs import DifferentiablePrograms
 from udkjax.equations.rest_program import RestProgram, write_rest_program
-from udkjax.equations.run_programs import RunPrograms
+from udkjax.equations.run_programs import BEGINS, RunPrograms
 from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
@@ -65,7 +65,7 @@ class ScenePrograms(RunPrograms):
     def stored_sizes(self) -> dict[str, int]:
         """The sizes of all arrays of a state that derivatives may need."""
         n = self.coordinate_count
-        return self.scratch | {"q1": n, "v1": n}
+        return {x: size for x, size in self.scratch.items() if x not in BEGINS} | {"q1": n, "v1": n}
 
     @property
     def piece_count(self) -> int:
@@ -157,6 +157,15 @@ class ScenePrograms(RunPrograms):
     def multipliers(self) -> LoopProgram:
         """Compute multipliers, the lambda of all rows, and a; set safe."""
         return program(self.settled_accelerations.parts, self._terms.multipliers(0))
+
+    @cached_property
+    def multipliers_of_settled(self) -> LoopProgram:
+        """Compute the results of `multipliers`; the loads of joints with friction have `settled` before."""
+        solver, friction = self._solver, self._solver.friction
+        if friction is None:
+            return self.multipliers
+        solve = [*solver.factorize, *friction.settled(0), self._terms.add("a", start="free", solution=0)]
+        return program(solver.acceleration_system, solve, [solver.safe], self._terms.multipliers(0))
 
     @cached_property
     def accelerations_and_friction(self) -> LoopProgram:

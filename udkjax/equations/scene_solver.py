@@ -50,10 +50,6 @@ class SceneSolver:
         friction = [Reset("jt_x0", 0, terms.layout.coordinate_count), *self.friction.add_loads(0)]
         return [*solved, *friction, terms.add("free", solution=0, update=ADD)]
 
-    def responding_solve(self, solve: int) -> ProgramParts:
-        """Solve the system `solve` for a change of x at the solution of `accelerating_solve`."""
-        return self.solve(solve) if self.friction is None else self.friction.solve(solve)
-
     @property
     def factorize_dropping(self) -> ProgramParts:
         """The factorization for corrections, without rows that depend on others."""

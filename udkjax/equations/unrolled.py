@@ -10,7 +10,7 @@ from itertools import product
 from typing import NamedTuple
 
 from udkjax.equations.differentiable_programs import DifferentiableProgram
-from udkjax.equations.run_programs import RESULTS, RunPrograms
+from udkjax.equations.run_programs import BEGINS, RESULTS, RunPrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
 from udkjax.expressions.loop_derivative import COTANGENT, FORWARD, OTHER, PREFIXES, REVERSE, SECOND, TANGENT, TWICE
 from udkjax.expressions.loop_program import LoopProgram
@@ -69,12 +69,10 @@ class Unrolled:
         state = {x: {k: graph.input((x, k), group) for k in range(size)} for x, (size, group) in sizes.items()}
         layout = unroll(programs.prologue, {"numbers": dict(enumerate(self.numbers))}, graph)["constants"]
         self._arrays: Arrays = {"constants": layout, **state}
-        begins = {
-            x: {k: graph.input((x, k), "loads") for k in range(programs.scratch[x])}
-            for x in ("settled", "friction_share")
-            if programs.rubs
+        begins = self._begins = {
+            x: {k: graph.input((x, k), "loads") for k in range(programs.scratch[x])} for x in BEGINS if programs.rubs
         }
-        given: dict[str, Arrays] = {programs.FURTHER: begins}
+        given: dict[str, Arrays] = dict.fromkeys((programs.FURTHER, "multipliers_of_settled"), begins)
         self._results = {
             name: _entries(
                 self._unroll(getattr(programs, name), given.get(name)), RESULTS + (ENTRIES if name in WITH_ENTRIES else ())
@@ -110,7 +108,8 @@ class Unrolled:
         """Return a differentiable program with its derivative."""
         results, outputs = self._derivatives[name]
         before_seeds = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
-        stored = [s for s in before_seeds if s not in self._inputs]
+        others = {s for scalars in self._begins.values() for s in scalars.values()}  # of another state by the time of `reverse`
+        stored = [s for s in before_seeds if s not in self._inputs or s in others]
         stored_inputs = {s: ("stored", k) for k, s in enumerate(stored)}
         evaluation = self._program(results | {place: s for s, place in stored_inputs.items()}, {})
         return UnrolledDerivative(evaluation, self._program(outputs, stored_inputs | self._seeds))
@@ -173,7 +172,7 @@ class Unrolled:
         self, differentiable: DifferentiableProgram, n: int, mode: str, moving: Sequence[int]
     ) -> tuple[dict[ArrayPlace, Scalar], dict[ArrayPlace, Scalar]]:
         """Return the results and their tangents, or the cotangents of the inputs."""
-        arrays = self._unroll(differentiable.program)
+        arrays = self._unroll(differentiable.program, self._begins)
         results = {x: range(n) for x in ("a", "q1", "v1") if x in arrays}
         variables = {"constants": moving, "q": range(n), "v": range(n)}
         prefixes, program = PREFIXES[mode], differentiable.in_mode(mode)

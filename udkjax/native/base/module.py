@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from udkjax.equations.run_programs import RunPrograms
+from udkjax.equations.run_programs import BEGINS, RunPrograms
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.expressions.loop_derivative import FORWARD
 from udkjax.native.base.ir import BOOL, POINTER, Function, Value
@@ -203,7 +203,7 @@ class Module(Running):
         if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}
         if self.settles:
-            named |= {x: x for x in ("settled", "friction_share")}
+            named |= {x: x for x in BEGINS}
         if "couplings" in self.places.places:
             named["couplings"] = "couplings"
         return {x: ("work", self.places[place]) for x, place in named.items()}
@@ -338,6 +338,11 @@ class Module(Running):
         if name in SETTLING and self.settles:
             with f.if_(f.any_of(Lane(f, self.places).unsettled > 0.5)):
                 f.call("settle_end" if name in AT_END else "settle_state", f.given["work"], self.address(f, out or "result a"))
+
+    def settle(self, f: Function, out: str):
+        """Settle the loads of joints with friction at `state`, with which programs of derivatives begin; `out` changes."""
+        if self.settles:
+            self.invoke(f, "accelerations", out)
 
     def accelerate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i at `state`."""

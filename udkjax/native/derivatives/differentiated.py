@@ -27,12 +27,14 @@ class Differentiated(Trajectory):
 
     def evaluate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i with the intermediate results that derivatives need."""
+        self.settle(f, f"stage{i} a")
         f.call("evaluation", f.given["work"], self.address(f, f"stage{i} a"), self.address(f, f"stage{i} linearization"))
         if self.dense or self.formulated:
             self.accelerate(f, f"stage{i} a")  # derivatives are the same for all methods; values depend on the method
 
     def _evaluate_solved(self, f: Function, i: int):
         """Evaluate what derivatives need at the state of a solved stage of an implicit method, and factorize its matrix there."""
+        self.settle(f, "residual a")
         f.call("evaluation", f.given["work"], self.address(f, "residual a"), self.address(f, f"stage{i} linearization"))
         f.call("factor_exact", f.given["work"])
 
@@ -63,6 +65,7 @@ class Differentiated(Trajectory):
     def _evaluate_end(self, f: Function):
         """Evaluate accelerations and a projection at the end of a step for their derivatives, from one factorization."""
         accelerations = self.address(f, f"stage{self.last} linearization")
+        self.settle(f, "corrected q")
         if self.unrolled and self.of_projection:
             f.call("evaluation_end", f.given["work"], accelerations, self.address(f, "projection linearization"))
         else:

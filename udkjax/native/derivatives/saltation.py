@@ -54,6 +54,7 @@ def _write_along_motion(module: Differentiated):
 
     differentiate("point3", f"stage{module.last} linearization", AFTER_STEP)
     go_to("point2")
+    module.settle(f, "corrected q")
     f.call("evaluation", f.given["work"], module.address(f, "corrected q"), module.address(f, BEFORE))
     differentiate("point2", BEFORE, BEFORE_STEP)
     go_to("point3")

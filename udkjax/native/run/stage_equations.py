@@ -100,6 +100,7 @@ class StageEquations:
         f, s = module.function(name)
         work, d, lanes = f.given["work"], DenseMatrices(layout, f), self._tangent.width
         tangent = f.given["tangent"] = module.address(f, "slope tangent")
+        module.settle(f, "residual a")
         f.call(f"evaluation_{SLOPES}", work, module.address(f, "residual a"), module.address(f, "slopes linearization"))
         hg = s.step * self._method.diagonal
         of_v = hg if module.plan.width > 1 else f.repeat(hg, lanes) if lanes > 1 else hg

@@ -50,7 +50,7 @@ class EventStates(StateTangentPart, StateAccelerations):
         return ["accelerations", *(of_directions if self.directed else [])]
 
     def program_names(self) -> list[str]:
-        return [*super().program_names(), *(["multipliers"] if self.conditions.forces else [])]
+        return [*super().program_names(), *(["multipliers_of_settled"] if self.conditions.forces else [])]
 
     @property
     def arrays(self):
@@ -81,7 +81,7 @@ class EventStates(StateTangentPart, StateAccelerations):
         StateAccelerations._evaluate(self, f, s)
         f.call("conditions", f.given["work"])
         if self.conditions.forces is not None:
-            self.invoke(f, "multipliers")
+            self.invoke(f, "multipliers_of_settled")
             f.call("own_forces", f.given["work"])
         count = self.conditions.own_count
         for k, event in enumerate(self.directed):

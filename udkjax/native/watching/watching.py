@@ -53,7 +53,7 @@ class Watching(WatchMemory):
         s.where(begins, fresh=s.t1)
 
     def program_names(self) -> list[str]:
-        return [*super().program_names(), *(["multipliers"] if self.conditions.forces else [])]
+        return [*super().program_names(), *(["multipliers_of_settled"] if self.conditions.forces else [])]
 
     @property
     def arrays(self):
@@ -82,7 +82,8 @@ class Watching(WatchMemory):
         step, before = f.const(FORCE_STEP, DOUBLE, f.width) / s.omega, getattr(s, "state t")
         ahead, nan = self.broadcast(f, step), f.const(float("nan"), DOUBLE, f.width)
         for name in ("g", "rate"):
-            self.invoke(f, "multipliers")
+            self.settle(f, "result a")
+            self.invoke(f, "multipliers_of_settled")
             f.call("own_forces", f.given["work"])
             for k in range(self.conditions.force_count):
                 place, c = f.like(k, INT, 1) + self.places["forces"], f.like(self.conditions.own_count + k, INT, 1)
