@@ -57,6 +57,16 @@ def impulses_by_routh(angle: float, velocity: tuple[float, float], mu: float, e:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("restitution", [0.3, 0.5])
+def test_friction_of_all_rebounds_is_that_of_the_weight(restitution):
+    """A body that slides while it bounces until it rests has the normal impulse m g t, and so the speed v0 - mu g t."""
+    body = udk.Mechanism({"body": udk.Body(1.0, 0.1, [0.0, 0.3], velocity=[4.0, 0.0])})
+    foot = udk.Contact("body", restitution=restitution, coefficient=0.2, name="foot")
+    run = udk.simulate(body, [0.0, 1.0, 1.9], events=foot, max_events=300, **TOL)
+    np.testing.assert_allclose(run.v[1:, 0], [[4.0 - 0.2 * G * t, 0.0, 0.0] for t in (1.0, 1.9)], atol=1e-9)
+
+
+@pytest.mark.slow
 def test_plate_slides_and_sticks():
     """It decelerates by mu g, on both feet, and stays."""
     mechanism, feet = plate(2.0, coefficient=0.3)

@@ -297,7 +297,7 @@ def hit_contacts(
     if np.any(contacts.tangents >= 0) and (xp is not np or rubs.any()):
         rubbing = impulses_with_friction(contacts, rows, rate, restitution, closed > OPEN, floor, xp)
         impact = Impulses(*(_where_any(rubs, x, y, xp) for x, y in zip(rubbing, impact, strict=True)))
-    v = v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
+    before_impact, v = v, v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
 
     # The set of held contacts is discrete, and has no derivatives.
     W, of_rest, fixed_rate = stop(rows.W), impact.rate, stop(rate)
@@ -314,6 +314,12 @@ def hit_contacts(
         # Pressed contacts that rise as slowly are at rest, too: feet that take turns would do so without end.
         rises = xp.any(presses & (stop(of_rest) > still), axis=-1, keepdims=True)
         if xp is not np or rises.any():
+            if np.any(contacts.tangents >= 0) and (xp is not np or rubs.any()):
+                # Friction goes with the normal impulse: without a rebound, it has none of an expansion either.
+                without = xp.where(presses & rises, 0.0, restitution)
+                again = impulses_with_friction(contacts, rows, rate, without, closed > OPEN, floor, xp)
+                v_again = before_impact + (again.impulse[..., None, :] @ rows.directions)[..., 0, :]
+                of_rest, v = (_where_any(rubs & rises, x, y, xp) for x, y in ((again.rate, of_rest), (v_again, v)))
             caught = solve_rows(rows.W, of_rest, presses & rises, xp)
             v = v + (caught[..., None, :] @ rows.directions)[..., 0, :]
         is_held = xp.where(closed > OPEN, presses & contacts.hold, held)
