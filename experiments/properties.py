@@ -6,6 +6,8 @@ implementation (reference_equations.py), all methods, formulations and engines a
 orders, axes, units or copies of constraints. Power is balanced, a is nearest to a_F in the metric of M, impulses are
 reciprocal, impacts neither pull nor add energy, and derivatives are limits of differences. With friction in all joints the same
 holds of runs, friction takes power, loads are those of repeated substitution, and `diagnose` knows which of them are unique.
+Trained mechanisms are saved as they run. Derivatives hold where forces branch and where bodies have come to rest, events at
+samples happen once, joints keep within their limits, and runs without projection agree with SciPy or report that they do not.
 Wrong scene files, arguments and command lines neither hang nor abort a process. Each has to end in a documented error that
 names the place, without a traceback and without writing part of a file; any other result is a fault, which the page lists.
 
@@ -27,12 +29,12 @@ import xarray
 from matplotlib.figure import Figure
 
 from experiments.common import data_file, described, load, panels
-from experiments.parts import contact_properties, friction_properties, run_properties, state_properties
+from experiments.parts import contact_properties, friction_properties, idiom_properties, run_properties, state_properties
 from experiments.parts.fuzz import KINDS, Fault, cases_of, run, verdict
 from experiments.parts.tally import Found, Tally
 
 PROPERTIES = state_properties.PROPERTIES | run_properties.PROPERTIES | contact_properties.PROPERTIES
-PROPERTIES |= friction_properties.PROPERTIES
+PROPERTIES |= friction_properties.PROPERTIES | idiom_properties.PROPERTIES
 MARGINS = 50.0, 10_000.0  # tolerance over worst error: below the first it is nearly exceeded, above the second it tests little
 MEMBERS = 100  # mechanisms of each structure
 LISTED, SHOWN = 100, 60  # faults that the data list, and kinds of faults that the page lists
@@ -49,6 +51,7 @@ def study(
     rubbing: int = 1000,
     redundant: int = 1000,
     rubbing_runs: int = 8,
+    idioms: int = 24,
     seed: int = 0,
     first: int = 0,
     minutes: float = 60.0,
@@ -67,6 +70,7 @@ def study(
         rubbing: Number of mechanisms with friction in all joints whose equations are checked at single states.
         redundant: Number of redundant mechanisms with friction in all joints of which `diagnose` says what is unique.
         rubbing_runs: Number of structures with friction to integrate; every third also by diffrax, with derivatives.
+        idioms: Number of mechanisms of each kind that are trained, have conditions in forces, limits, or run without projection.
         seed: Seed of all random numbers.
         first: The number of the first structure and of the first input.
         minutes: Time limit.
@@ -74,9 +78,9 @@ def study(
     """
     if smoke:
         mechanisms, files, arguments, rubbing, redundant, minutes = 20, 30, 10, 2, 2, 5.0
-        commands = runs = contacts = rubbing_runs = 0
+        commands = runs = contacts = rubbing_runs = idioms = 0
     members = 5 if smoke else MEMBERS
-    sets = "mechanisms", "large", "runs", "contacts", "rubbing", "redundant", "rubbing runs"
+    sets = "mechanisms", "large", "runs", "contacts", "rubbing", "redundant", "rubbing runs", "idioms"
     end, tally = time.time() + 60 * minutes, Tally()
     count: dict[str, int] = dict.fromkeys(sets, 0)
     for structure in _until(end, first, mechanisms // members, "structures"):
@@ -101,6 +105,8 @@ def study(
             tried = friction_properties.check_friction_runs(tally, seed, structure, 24, integrated % 3 == 0)
             count["rubbing runs"] += tried
             integrated += tried > 0
+    if idioms and time.time() < end:
+        count["idioms"] += idiom_properties.check_idioms(tally, seed + first, idioms)
     faults: list[Fault] = []
     done = dict.fromkeys(KINDS, 0)
     for kind, wanted in {"commands": commands, "arguments": arguments, "files": files}.items():  # the quickest last
@@ -224,6 +230,12 @@ def _about_friction(sets: dict[str, int]) -> str:
     )
 
 
+def _about_idioms(sets: dict[str, int]) -> str:
+    if not sets.get("idioms"):
+        return ""
+    return f"{sets['idioms']} mechanisms are trained, differentiated across conditions, and run with limits, without projection. "
+
+
 def page(data: xarray.Dataset) -> str:
     """Return properties.md: the result for each property, and each remaining fault."""
     at, margins = json.loads(data.worst_at), _margins(data)
@@ -238,7 +250,7 @@ def page(data: xarray.Dataset) -> str:
         f"The equations of {sets['mechanisms']:,} mechanisms are evaluated by NumPy at single states, those of "
         f"{sets['large']} large mechanisms by loops. {sets['runs']} mechanisms are integrated by machine code, a part of them "
         f"also by diffrax and with derivatives; {sets['contacts']} bodies are thrown onto a floor and onto other bodies. "
-        f"{_about_friction(sets)}The "
+        f"{_about_friction(sets)}{_about_idioms(sets)}The "
         "call next to an error reproduces the case: "
         "`random_scene(seed, structure, numbers)` of "
         "experiments/parts/random_scenes.py. The margin is the tolerance divided by the worst error, marked `!` below 50 and "

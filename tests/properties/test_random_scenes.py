@@ -15,6 +15,14 @@ from experiments.parts import fuzz_arguments, state_properties
 from experiments.parts.friction_properties import check_friction, check_friction_runs, check_uniqueness
 from experiments.parts.friction_reference import with_friction
 from experiments.parts.fuzz import Case, cases_of, run, verdict
+from experiments.parts.idiom_properties import (
+    check_conditions,
+    check_limits,
+    check_rest,
+    check_samples,
+    check_training,
+    check_unprojected,
+)
 from experiments.parts.random_scenes import build, random_scene, shrunk, state_of
 from experiments.parts.reference_equations import evaluate
 from experiments.parts.state_properties import check_large, check_states
@@ -47,6 +55,24 @@ def test_states_by_all_methods():
     check_states(tally, SEED, range(4, 12), 8)
     check_large(tally, SEED, range(2))
     check(tally)
+
+
+@pytest.mark.filterwarnings("ignore:assembly moved")
+def test_training_and_runs_without_projection():
+    tally = Tally()
+    assert check_training(tally, SEED, 1) == 1
+    assert check_unprojected(tally, SEED, range(1)) == 1
+    check(tally)
+
+
+@pytest.mark.slow
+def test_conditions_samples_rest_and_limits():
+    tally = Tally()
+    for property_check in (check_samples, check_rest, check_limits):
+        assert property_check(tally, SEED, 3) >= 3
+    assert check_conditions(tally, SEED, 3, ["maximum"]) == 3
+    check(tally)
+    assert {"once at a sample", "rest", "gradient at rest", "limits of all joints", "gradient of a condition"} <= set(tally.found)
 
 
 @pytest.mark.slow
