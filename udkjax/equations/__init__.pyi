@@ -38,7 +38,7 @@ from udkjax.equations.formulations import WrappedSystem as WrappedSystem
 from udkjax.equations.general import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations.loads import mass_of as mass_of
 from udkjax.equations.motion_measures import MotionModel as MotionModel
-from udkjax.equations.partitioning import PARTITION_NEWTON_STEPS as PARTITION_NEWTON_STEPS
+from udkjax.equations.partitioning import PARTITION_NEWTON as PARTITION_NEWTON
 from udkjax.equations.partitioning import CoordinatePartitioning as CoordinatePartitioning
 from udkjax.equations.position_closure import CLOSURE as CLOSURE
 from udkjax.equations.position_closure import Assembly as Assembly

@@ -11,12 +11,14 @@ system, which restrict velocities alone, make more velocities dependent than coo
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from numpy.typing import DTypeLike
 
 from udkjax.annotations import Time, Vector
 from udkjax.arrays import number_called
@@ -27,7 +29,18 @@ from udkjax.pinv import SVD, Plus
 from udkjax.pinv.householder import complete_qr
 from udkjax.transforms.newton_steps import repeated_newton
 
-PARTITION_NEWTON_STEPS = 10  # maximum number of steps from the predicted state; three or four are usual
+
+class NewtonLimits(NamedTuple):
+    """Limits of Newton's method in dependent coordinates."""
+
+    most_steps: int = 10  # from the predicted state; three or four are usual
+
+    def last_change(self, dtype: DTypeLike) -> float:
+        """Return the largest change, relative to the scales, by a last step: the error after it is of the order of eps."""
+        return float(np.sqrt(jnp.finfo(dtype).eps))
+
+
+PARTITION_NEWTON = NewtonLimits()
 
 
 class CoordinatePartitioning(Formulation):
@@ -160,8 +173,8 @@ def _solve(fixed: PartitionedSystem, newton: Callable[[Vector], Vector], x: Vect
         corrected = newton(x)
         return corrected, fixed.equations.size(corrected - x), jnp.ones((), x.dtype)
 
-    tol = float(np.sqrt(jnp.finfo(x.dtype).eps))  # the error after this step is of the order of tol^2
-    x, is_open = repeated_newton(step, x, most_steps=PARTITION_NEWTON_STEPS, last_change=tol)
+    most_steps, last_change = PARTITION_NEWTON.most_steps, PARTITION_NEWTON.last_change(x.dtype)
+    x, is_open = repeated_newton(step, x, most_steps=most_steps, last_change=last_change)
     return jnp.where(is_open, jnp.nan, x)
 
 

@@ -14,7 +14,7 @@ as if it integrated only these; the dependent ones are the first guess of Newton
 
 import numpy as np
 
-from udkjax.equations.partitioning import PARTITION_NEWTON_STEPS
+from udkjax.equations.partitioning import PARTITION_NEWTON
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import FORMULATION_SETTINGS, Lane
@@ -24,7 +24,7 @@ from udkjax.native.pseudoinverses.householder import HouseholderCode
 from udkjax.native.run.formulations import FORMULATE, FormulatedAccelerations, FormulationCode
 from udkjax.native.run.manifold import iterate_newton, take_newton_step
 
-NEWTON_TOL = float(np.sqrt(np.finfo(float).eps))  # the error after the last step is of the order of its square
+LAST_CHANGE = PARTITION_NEWTON.last_change(np.float64)
 
 
 class PartitioningCode(FormulationCode):
@@ -78,13 +78,13 @@ class PartitionedAccelerations(FormulatedAccelerations):
 
     def _write_closure(self):
         """Write `close_state(work)`."""
-        module, steps = self._in, PARTITION_NEWTON_STEPS
+        module, steps = self._in, PARTITION_NEWTON.most_steps
         f, s = module.function("close_state")
         closing = s.closing > 0.5
         module.copy(f, "state q", "predicted q")
         s.iterating = f.const(0.0, DOUBLE, f.width)
         if module.code.position_rows:
-            iterate_newton(module, f, s, closing, lambda _: self._newton(f, "q", "corrected q"), steps, NEWTON_TOL)
+            iterate_newton(module, f, s, closing, lambda _: self._newton(f, "q", "corrected q"), steps, LAST_CHANGE)
         # A solution farther from the predicted state might be another assembly mode.
         moved = module.largest(
             f,
@@ -101,7 +101,7 @@ class PartitionedAccelerations(FormulatedAccelerations):
             self._newton(f, "v", "result v")
             change = take_newton_step(module, f, active, "state v", "result v")
             if not module.code.is_linear:
-                s.iterating = f.select(active & ~(change <= NEWTON_TOL), f.const(1.0, DOUBLE, f.width), 0.0)
+                s.iterating = f.select(active & ~(change <= LAST_CHANGE), f.const(1.0, DOUBLE, f.width), 0.0)
             k.value = k.value + 1
         if not module.code.is_linear:
             lost = lost | (s.iterating > 0.5)
