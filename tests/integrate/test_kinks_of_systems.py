@@ -147,6 +147,18 @@ def test_what_is_not_located_is_told():
     assert found.settings["kinks"] == 'not located in "mass"' and found.unlocated is None
 
 
+def test_a_power_without_value_beyond_its_kink():
+    """Hertz's contact: the power 1.5 of a negative depth is not a number, so the run succeeds without locating the kink."""
+
+    def contact(t, q, v):
+        return 1e4 * jnp.maximum(-q, 0.0) ** 1.5
+
+    system = udk.ConstrainedSystem(lambda q: jnp.eye(1), contact)
+    run = udk.simulate(system, [0.0, 0.5, 1.0], udk.State(np.array([0.4]), np.array([-1.0])), rtol=1e-9, atol=1e-9)
+    assert run.result.is_success and 0.4 < float(run.unlocated) < 0.5  # it is located where the contact begins, not where it ends
+    assert float(run.v[-1, 0]) == pytest.approx(1.0, abs=1e-7)
+
+
 @pytest.mark.slow
 def test_a_force_that_chatters_is_told():
     rubbed = udk.ConstrainedSystem(lambda q: jnp.eye(1), lambda t, q, v: -jnp.sign(v))

@@ -1,5 +1,6 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
+import dataclasses
 import warnings
 from collections.abc import Sequence
 from types import ModuleType
@@ -236,7 +237,7 @@ def simulate(
 
 def _as_located(solution: Solution, located: Solution) -> Solution:
     """Return a solution without located kinks, with the time until which a run that failed has located them."""
-    return eqx.tree_at(lambda s: s.unlocated, solution, located.time, is_leaf=lambda x: x is None)
+    return dataclasses.replace(solution, unlocated=located.time)
 
 
 def _has_failed(code: Any) -> bool:
