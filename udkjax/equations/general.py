@@ -214,7 +214,7 @@ class GeneralEquations(ConstrainedRows):
         return v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """Return (I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq."""
+        """Return (I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq; with phi, dv follows dq in Psi_dot = 0 and phi = 0."""
         if self.system.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)
             plus, weight = self._plus(q, slopes)
@@ -222,7 +222,10 @@ class GeneralEquations(ConstrainedRows):
         if self.constrained:
             slopes = self._slopes(t, q, v)
             plus, weight = self._plus(q, slopes)
-            dv = dv - weight(plus @ (slopes @ dv))
+            rates = slopes @ dv
+            if self.restricts_velocities:
+                rates += jax.jvp(lambda q: jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]), (q,), (dq,))[1]
+            dv = dv - weight(plus @ rates)
         return TangentPart(dq, dv)
 
     def impulse(self, t: Time, q: Vector, v: Vector, normal: Vector) -> tuple[Vector, Vector]:

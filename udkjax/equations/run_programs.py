@@ -7,7 +7,7 @@ from udkjax.pinv.rank_policy import RankPolicy
 # The arrays that programs return; all others are scratch.
 RESULTS = (
     *("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root", "energy"),
-    *("independent", "multipliers", "unsettled", "settled", "friction_power"),
+    *("independent", "multipliers", "unsettled", "settled", "friction_power", "drift"),
 )
 # Arrays with which programs of friction begin: the solution `settled` of their linear system, and the share of friction.
 BEGINS = "settled", "friction_share"

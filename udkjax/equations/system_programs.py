@@ -5,6 +5,7 @@ They are written as one straight line each: all terms are scalars of one graph (
 of velocities remove Psi_dot and phi together.
 """
 
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -13,7 +14,7 @@ from udkjax.equations.system_derivatives import ONCE, DifferentiableSystem, Syst
 from udkjax.equations.system_solver import SystemFactors, mass_operations
 from udkjax.equations.system_terms import SystemTerms, less
 from udkjax.equations.traced_system import MOST_NUMBERS, SystemFunctions, TracedSystem
-from udkjax.expressions import Scalar
+from udkjax.expressions import Scalar, tangents
 from udkjax.expressions.loop_program import KernelLoop, KernelWriter, LoopProgram
 from udkjax.expressions.selection import absolute, greater, where
 from udkjax.pinv.rank_policy import RankPolicy
@@ -114,7 +115,22 @@ class SystemPrograms(SystemTerms):
 
     def _tangent_parts(self, factors: SystemFactors) -> list[WrittenScalars]:
         dq1 = factors.tangent_part(self._dq, self.position_rows)
-        return [{"dq1": dq1, "dv1": factors.tangent_part(self._dv)}, self._distance(factors)]
+        return [{"dq1": dq1, "dv1": factors.tangent_part(self._dv, drift=self._drift_of_rates(dq1))}, self._distance(factors)]
+
+    def _drift_of_rates(self, dq: Sequence[Scalar]) -> list[Scalar] | None:
+        """Return the change of Psi_dot and phi by dq, for which a projection changes the velocities; None without phi.
+
+        A row such as lag v + q = u(t) makes an error of q one of v that is 1 / lag times as large. Rows of Psi alone make it one
+        of the size of dv: their slopes change by a rate of the motion.
+        """
+        if self.position_rows == self.row_count:
+            return None
+        return tangents(self._graph, self._rate, dict(zip(self.functions.q, dq, strict=True)))
+
+    @cached_property
+    def drift_of_rates(self) -> LoopProgram:
+        """Compute drift, the change of Psi_dot and phi by dq, of a system with phi."""
+        return self._program({"drift": self._drift_of_rates(self._dq) or []})
 
     @cached_property
     def tangent_part(self) -> LoopProgram:

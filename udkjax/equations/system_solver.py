@@ -76,10 +76,14 @@ class SystemFactors:
         """Return the least change w in the metric of M for which A w is the residual."""
         return self.rows.mass.backward(self.rows.combine(self.gram.solve(residual, count)))
 
-    def tangent_part(self, change: Sequence[Scalar], count: int | None = None) -> list[Scalar]:
-        """Return the part of a change that the rows allow."""
-        normal = self.correct(self.rows.rates(self.rows.mass.transposed(change)), count)
-        return [s - w for s, w in zip(change, normal, strict=True)]
+    def tangent_part(
+        self, change: Sequence[Scalar], count: int | None = None, drift: Sequence[Scalar] | None = None
+    ) -> list[Scalar]:
+        """Return the change that is left after a projection of A w = -drift, where drift is zero unless it is given."""
+        rates = self.rows.rates(self.rows.mass.transposed(change))
+        if drift is not None:
+            rates = [rate + s for rate, s in zip(rates, drift, strict=True)]
+        return [s - w for s, w in zip(change, self.correct(rates, count), strict=True)]
 
     @property
     def numbers(self) -> list[Scalar]:

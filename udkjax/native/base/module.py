@@ -67,6 +67,8 @@ class Module(Running):
         self.is_dense = plan.pseudoinverse is not None and m > 0 and not self.partitions
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
+        # Rows of phi make errors of q errors of v; elimination adds these in the program `tangent_part`.
+        self.adds_drift_of_rates = code.position_rows < m and (self.is_dense or self.falls_back)
         self.measures_drift = plan.steps and m > 0 and not plan.projected
         self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports and not self.partitions
         self.pieces = code.piece_count if plan.breaks else 0
@@ -132,6 +134,8 @@ class Module(Running):
             self._add_arrays("", {"couplings": code.scratch["couplings"], "change": n})
         if self.takes_dense_rows and "root" not in p.places:
             self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.unrolled else {}))
+        if self.adds_drift_of_rates:
+            self._add_arrays("", {"drift": m, "saved state dq": n})
         if self.is_formulated or self.settles or self.drops_rows:
             p.add("saved v", n)
         if self.settles:
@@ -178,6 +182,8 @@ class Module(Running):
             names.append("drift" if self.takes_dense_rows else "accelerations_and_drift")
         if self.falls_back and self.plan.unrolled:
             names.append("rows_and_loads")
+        if self.adds_drift_of_rates:
+            names.append("drift_of_rates")
         return names
 
     @property
@@ -204,6 +210,8 @@ class Module(Running):
             named |= {x: x for x in ("psi_q", "root")}
         if self.settles:
             named |= {x: x for x in BEGINS}
+        if self.adds_drift_of_rates:
+            named["drift"] = "drift"
         if "couplings" in self.places.places:
             named["couplings"] = "couplings"
         return {x: ("work", self.places[place]) for x, place in named.items()}

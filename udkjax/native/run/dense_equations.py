@@ -4,8 +4,9 @@ With D = W Psi_q M^(-1/2), W the weights of the rows, and a method of pseudoinve
 
     a = a_F + M^(-1/2) D^+ W b,        q - M^(-1/2) D^+ W Psi,        v - M^(-1/2) D^+ W Psi_dot,
 
-and the tangent part of a small change, dq - M^(-1/2) D^+ W Psi_q dq. The functions have the names and results of the scene's
-programs by elimination. All systems at one state share a factorization.
+and the tangent part of a small change, dq - M^(-1/2) D^+ W Psi_q dq. Rows of phi make dq a change of velocities as well,
+-M^(-1/2) D^+ W (Psi_dot; phi)_q dq. The functions have the names and results of the scene's programs by elimination. All
+systems at one state share a factorization.
 """
 
 from collections.abc import Callable
@@ -121,13 +122,18 @@ class DenseEquations:
         self._correct_changes(f)
 
     def _correct_changes(self, f: Function):
-        """Compute the tangent parts of changes, with the factors of all rows."""
-        for x in ("dv", "dq") if self._rows.splits else ("dq", "dv"):
+        """Compute the tangent parts of changes, with the factors of all rows; those of rows of Psi alone are computed for dq."""
+        module, rows = self._in, self._rows
+        for x in ("dv", "dq") if rows.splits else ("dq", "dv"):
             change = f"state {x}"
-            if x == "dq" and self._rows.splits:
-                self._rows.factor(f, of_positions=True)
-            if self._in.code.couples:
-                self._in.copy(f, change, "change")
-                self._in.invoke(f, "gather", "change")
-            rates = self._rows.solve_rates(f, "change" if self._in.code.couples else change)
-            self._rows.correct(f, rates, change, f"result {x}")
+            if x == "dq" and rows.splits:
+                rows.factor(f, of_positions=True)
+            if module.code.couples:
+                module.copy(f, change, "change")
+                module.invoke(f, "gather", "change")
+            rates = rows.solve_rates(f, "change" if module.code.couples else change)
+            rows.correct(f, rates, change, f"result {x}")
+        if module.adds_drift_of_rates:
+            self._at(f, "state dq", "result dq", lambda: module.invoke(f, "drift_of_rates"))
+            rows.factor(f)
+            rows.correct(f, rows.solve(f, "drift"), "result dv", "result dv")

@@ -112,6 +112,14 @@ def _write_singular_values(module: Module):
             rows.factor(f)
         put(f, x, rows.solve_rates(f, f"fallback {x}" if couples else f"state {x}"), f"state {x}", -1.0)
 
+    if module.adds_drift_of_rates:
+        f = module.new_function("fallback_drift_of_lane", of_lane, 1)
+        rows.factor(f)
+        change = rows.solve(f, "drift")
+        with f.each(module.n) as i:
+            part = rows.array(f, "root", i) * change.entry(i)
+            rows.put(f, "change" if couples else "fallback dv", i, part if couples else rows.array(f, "fallback dv", i) - part)
+
     def each_lane(f: Function, s: Lane, name: str):
         with module.each_lane(f, s.wanted) as k:
             f.call(f"{name}_of_lane", f.given["work"], k)
@@ -133,3 +141,14 @@ def _write_singular_values(module: Module):
     if couples:
         for x in ("dq", "dv"):
             spread(f, x, f"state {x}")
+    if not module.adds_drift_of_rates:
+        return
+    module.copy(f, "state dq", "saved state dq")
+    module.copy(f, "fallback dq", "state dq")
+    module.invoke(f, "drift_of_rates")
+    module.copy(f, "saved state dq", "state dq")
+    with_threshold(f, module.places["fallback_tol"], threshold, lambda: each_lane(f, s, "fallback_drift"))
+    if couples:
+        module.invoke(f, "spread", "change")
+        with f.each(module.n) as i:
+            module.put_entry(f, "fallback dv", i, module.entry(f, "fallback dv", i) - module.entry(f, "change", i))
