@@ -9,8 +9,6 @@ RESULTS = (
     *("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root", "energy"),
     *("independent", "multipliers", "unsettled", "settled", "friction_power", "drift"),
 )
-# Arrays with which programs of friction begin: the solution `settled` of their linear system, and the share of friction.
-BEGINS = "settled", "friction_share"
 
 
 class RunPrograms:
@@ -21,6 +19,8 @@ class RunPrograms:
     accelerations; corrections leave out the rows whose pivots do not exceed `drop_tol`.
     """
 
+    # Arrays with which programs of friction begin: the solution `settled` of their linear system, and the share of friction.
+    BEGINS: ClassVar[tuple[str, ...]] = ("settled", "friction_share")
     policy: RankPolicy
     coordinate_count: int
     row_count: int

@@ -14,7 +14,7 @@ import numpy as np
 from udkjax.annotations import TreeDef
 from udkjax.equations.differentiable_programs import DifferentiablePrograms
 from udkjax.equations.rest_program import RestProgram, write_rest_program
-from udkjax.equations.run_programs import BEGINS, RunPrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
 from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
@@ -65,7 +65,7 @@ class ScenePrograms(RunPrograms):
     def stored_sizes(self) -> dict[str, int]:
         """The sizes of all arrays of a state that derivatives may need."""
         n = self.coordinate_count
-        return {x: size for x, size in self.scratch.items() if x not in BEGINS} | {"q1": n, "v1": n}
+        return {x: size for x, size in self.scratch.items() if x not in RunPrograms.BEGINS} | {"q1": n, "v1": n}
 
     @property
     def piece_count(self) -> int:

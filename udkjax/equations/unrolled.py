@@ -10,7 +10,7 @@ from itertools import product
 from typing import NamedTuple
 
 from udkjax.equations.differentiable_programs import DifferentiableProgram
-from udkjax.equations.run_programs import BEGINS, RESULTS, RunPrograms
+from udkjax.equations.run_programs import RESULTS, RunPrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
 from udkjax.expressions.loop_derivative import COTANGENT, FORWARD, OTHER, PREFIXES, REVERSE, SECOND, TANGENT, TWICE
 from udkjax.expressions.loop_program import LoopProgram
@@ -70,7 +70,7 @@ class Unrolled:
         layout = unroll(programs.prologue, {"numbers": dict(enumerate(self.numbers))}, graph)["constants"]
         self._arrays: Arrays = {"constants": layout, **state}
         begins = self._begins = {
-            x: {k: graph.input((x, k), "loads") for k in range(programs.scratch[x])} for x in BEGINS if programs.rubs
+            x: {k: graph.input((x, k), "loads") for k in range(programs.scratch[x])} for x in RunPrograms.BEGINS if programs.rubs
         }
         given: dict[str, Arrays] = dict.fromkeys((programs.FURTHER, "multipliers_of_settled"), begins)
         self._results = {

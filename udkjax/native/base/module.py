@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from udkjax.equations.run_programs import BEGINS, RunPrograms
+from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.unrolled import Unrolled, UnrolledProgram
 from udkjax.expressions.loop_derivative import FORWARD
 from udkjax.native.base.ir import BOOL, POINTER, Function, Value
@@ -209,7 +209,7 @@ class Module(Running):
         if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}
         if self.settles:
-            named |= {x: x for x in BEGINS}
+            named |= {x: x for x in RunPrograms.BEGINS}
         if self.adds_drift_of_rates:
             named["drift"] = "drift"
         if "couplings" in self.places.places:
