@@ -123,6 +123,14 @@ def test_forces_are_watched_where_loads_are_followed_from_those_without_friction
 
 
 @pytest.mark.slow
+def test_uniqueness_near_a_singular_configuration():
+    """Joints that cannot slide do not, though the rank of accelerations leaves out a singular value of 2e-4."""
+    tally = Tally()
+    assert check_uniqueness(tally, 0, [2055], 3)
+    check(tally)
+
+
+@pytest.mark.slow
 def test_derivatives_where_loads_are_followed_from_those_without_friction():
     """First derivatives, forward and in reverse, and second ones begin with the same loads as the run."""
     scene = with_friction(random_scene(0, 161, 5))

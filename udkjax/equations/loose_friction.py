@@ -19,7 +19,6 @@ from udkjax.equations import rubbing
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.determinacy import UNIQUE_TOL
 from udkjax.equations.scales import Scales
-from udkjax.pinv import Pseudoinverse
 from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 
@@ -34,7 +33,7 @@ class LooseFriction(NamedTuple):
 
 @deferred
 def loose_friction(
-    mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m k"], scales: Scales, method: Pseudoinverse
+    mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m k"], scales: Scales
 ) -> LooseFriction:
     """Return which joints with friction have a load that equilibrium leaves open if the friction of all others is given.
 
@@ -46,7 +45,6 @@ def loose_friction(
         q: Coordinates (m, rad), (n,).
         N: Basis of the null space of Psi_q^T, for multipliers in units of one over their rows' scales.
         scales: Scales of the scene.
-        method: The pseudoinverse.
 
     Returns:
         `LooseFriction`, in the order of `rubbing_names`.
@@ -56,7 +54,7 @@ def loose_friction(
     rate = jnp.where(jnp.asarray(scales.rate) > 0, scales.rate, 1.0)  # without loads and velocities, there is no time
     everywhere = jnp.asarray(random.normal(size=q.size)) * unit * rate  # all joints slide
     D, root = uk.D(mechanism, t, q, scales.weights), uk.inverse_sqrt_mass(mechanism)
-    plus = uk.pseudoinverse(method, D)
+    plus = _inverse_of_rank(D, len(D) - N.shape[1])  # of the rank that N has, near a singular configuration, too
     v = everywhere - root * (plus @ (D @ (everywhere / root)))
 
     def frictions(speeds: Array, multipliers: Array) -> Array:
@@ -79,3 +77,9 @@ def loose_friction(
 
     answers = jax.vmap(response)(drags / jnp.where(slides, jnp.linalg.norm(drags, axis=1), jnp.inf)[:, None])
     return LooseFriction(loose, slides, answers > UNIQUE_TOL * usual)
+
+
+def _inverse_of_rank(D: Float[Array, "m n"], rank: int) -> Float[Array, "n m"]:
+    """Return the pseudoinverse of D from its largest singular values."""
+    u, sigma, vt = jnp.linalg.svd(D, full_matrices=False)
+    return (vt[:rank].T / sigma[:rank]) @ u[:, :rank].T

@@ -114,7 +114,7 @@ class TextbookEquations(MechanismSystem):
 
     def loose_friction(self, t: Time, q: Vector, N: Float[Array, "m k"]) -> LooseFriction:
         """Return which joints with friction have a load that is not unique: see `loose_friction`."""
-        return loose_friction(self.mechanism, t, q, N, self.scales, self.method)
+        return loose_friction(self.mechanism, t, q, N, self.scales)
 
     @property
     def rubbing_joints(self) -> list[str]:
