@@ -32,9 +32,7 @@ class LooseFriction(NamedTuple):
 
 
 @deferred
-def loose_friction(
-    mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m k"], scales: Scales
-) -> LooseFriction:
+def loose_friction(mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m k"], scales: Scales) -> LooseFriction:
     """Return which joints with friction have a load that equilibrium leaves open if the friction of all others is given.
 
     The marks are those of a random motion, in which all joints slide that can.
