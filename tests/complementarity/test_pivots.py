@@ -25,7 +25,24 @@ def test_one_joint_at_a_time_changes_its_mode_if_two_alternate():
         return Response(a, np.where(other_sticks, -1.0, 1.0), np.ones(2))
 
     no, yes = np.zeros(2, bool), np.ones(2, bool)
-    joints = JointsAtRest.of(yes, np.zeros(2), np.eye(2), np.ones(2), no, np.full(2, 1e-9), np)
+    joints = JointsAtRest.of(yes, np.zeros(2), np.eye(2), np.ones(2), no, yes, np.full(2, 1e-9), np)
     modes, has_failed, _ = joints.decide(respond, np.zeros(2), no, yes, np)
     assert not has_failed and sorted(modes.locked) == [False, True]
     assert modes.direction[~modes.locked] == 1.0
+
+
+def test_pivots_begin_with_the_modes_before():
+    """Of nine joints that stick and one that stops, all stick: one evaluation of the motion shows it."""
+    calls, F = [], 10
+
+    def respond(modes):
+        calls.append(modes.locked.copy())
+        return Response(np.where(modes.locked, 0.0, 1.0), np.ones(F), np.ones(F))
+
+    no, rested = np.zeros(F, bool), np.arange(F) < F - 1
+    for before, count in ((rested, 1), (no, None)):  # where all come to rest together, the limits are iterated first
+        calls.clear()
+        joints = JointsAtRest.of(~no, np.zeros(F), np.eye(F), np.ones(F), before, before, np.full(F, 1e-9), np)
+        modes, has_failed, _ = joints.decide(respond, np.zeros(F), no, no, np)
+        assert not has_failed and modes.locked.all()
+        assert len(calls) == count if count else len(calls) > 1

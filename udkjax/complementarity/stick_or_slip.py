@@ -8,9 +8,9 @@ acceleration a_i, force f_i and limit c_i, obeys
 Limits depend on the loads of the joints, and these on the forces, so the law is not a linear complementarity problem. It is
 solved by pivots (Murty 1974; Judice and Pires 1994): each joint is either within its limit, or at its limit in one direction. The
 equations of motion are solved for these modes, with locked joints as constraints. Then a locked joint whose force exceeds the
-limit is set to its limit, and a joint at its limit that accelerates against its direction is locked again. If several joints are
-at rest, the first modes come from a fixed-point iteration of the limits: with given limits the law is a quadratic program with
-bounds, whose accelerations are unique.
+limit is set to its limit, and a joint at its limit that accelerates against its direction is locked again. If several joints
+have come to rest together, or pivots do not end, the first modes come from a fixed-point iteration of the limits: with given
+limits the law is a quadratic program with bounds, whose accelerations are unique.
 
 Where the joints of a mechanism at rest lock each other, their forces are not unique. Only joints with independent rows are
 locked; they keep the others at rest, whose forces stay as they were. If a locked joint reaches its limit, another one is locked
@@ -153,6 +153,7 @@ class JointsAtRest(NamedTuple):
     W: Float[Any, "*m F F"]  # accelerations of joints at unit forces of others, rows of unit size; zero where nothing can move
     size: Float[Any, "*m F"]  # roots of the accelerations at unit forces: the units of W
     locked: Bool[Any, "*m F"]  # before
+    rested: Bool[Any, "*m F"]  # before, locked or kept at rest by others
     unit: Float[Any, "*m F"]  # size of accelerations that are not zero
     contacts: ContactsAtRest
 
@@ -164,6 +165,7 @@ class JointsAtRest(NamedTuple):
         W: Any,
         mobility: Any,
         locked: Any,
+        rested: Any,
         unit: Any,
         xp: ModuleType,
         contacts: ContactsAtRest | None = None,
@@ -173,7 +175,8 @@ class JointsAtRest(NamedTuple):
         moves = diagonal > AT_REST.blocked * mobility
         size = xp.sqrt(xp.where(moves, diagonal, 1.0))
         W = xp.where(moves[..., None, :] & moves[..., :, None], W / size[..., None, :] / size[..., :, None], 0.0)
-        return cls(rest, sliding, W, size, locked, unit, ContactsAtRest.none(rest.shape[-1]) if contacts is None else contacts)
+        contacts = ContactsAtRest.none(rest.shape[-1]) if contacts is None else contacts
+        return cls(rest, sliding, W, size, locked, rested, unit, contacts)
 
     def decide(
         self,
@@ -194,10 +197,7 @@ class JointsAtRest(NamedTuple):
         """
         F, contacts = self.rest.shape[-1], self.contacts
         E, count = contacts.held.shape[-1], F + contacts.most
-        if F > 1 and (xp is not np or (self.rest.sum(axis=-1) > 1).any()):
-            direction = xp.where(is_given, direction, self._guess(respond, direction, xp))
-        done = ~(xp.any(self.rest, axis=-1) | xp.any(contacts.may_change, axis=-1))
-        start = _Pivot(contacts.held, self.rest & (direction == 0), departs, direction, xp.asarray(0), done, done & False)
+        is_settled = ~(xp.any(self.rest, axis=-1) | xp.any(contacts.may_change, axis=-1))
         most = (BLOCK_STEPS + SINGLE_STEPS) * count + 8
 
         def step(pivot: _Pivot) -> _Pivot:
@@ -231,12 +231,37 @@ class JointsAtRest(NamedTuple):
         def goes_on(pivot: _Pivot) -> Any:
             return ~xp.all(pivot.done) & (pivot.steps < most)
 
-        if xp is np:
-            pivot = start
-            while goes_on(pivot):
-                pivot = step(pivot)
-        else:
-            pivot = jax.lax.while_loop(goes_on, step, start)
+        def pivots(start: _Pivot) -> _Pivot:
+            if xp is not np:
+                return jax.lax.while_loop(goes_on, step, start)
+            while goes_on(start):
+                start = step(start)
+            return start
+
+        def from_guess(pivot: _Pivot) -> _Pivot:
+            keep, first = pivot.done[..., None], xp.where(is_given, direction, self._guess(respond, direction, xp))
+            return pivots(
+                pivot._replace(
+                    held=xp.where(keep, pivot.held, contacts.held),
+                    within=xp.where(keep, pivot.within, self.rest & (first == 0)),
+                    departs=xp.where(keep, pivot.departs, departs),
+                    direction=xp.where(keep, pivot.direction, first),
+                    steps=xp.asarray(0),
+                )
+            )
+
+        # After an event of one joint the others keep their modes, or nearly so: pivots begin with these.
+        at_once = xp.sum(self.rest & ~self.rested, axis=-1) > 1
+        done = is_settled | at_once
+        start = contacts.held, self.rest & (direction == 0), departs, direction, xp.asarray(0), done, done & False
+        pivot = pivots(_Pivot(*start))
+        pivot = pivot._replace(done=pivot.done & ~at_once)
+        if F > 1:
+            is_done = xp.all(pivot.done)
+            if xp is not np:
+                pivot = jax.lax.cond(is_done, lambda x: x, from_guess, pivot)
+            elif not is_done:
+                pivot = from_guess(pivot)
         return Decision(self._modes(pivot, xp), ~pivot.done, pivot.by_contacts)
 
     def _guess(

@@ -79,8 +79,8 @@ class StickingState(eqx.Module):
         u = jax.vmap(lambda row: row - plus @ (D @ row))(root * A)
         mobility, accelerations = jnp.sum((root * A) ** 2, axis=1), unit * self.scales.rate**2
         rest = rest & jnp.all(jnp.isfinite(u))
-        joints = JointsAtRest.of(rest, jnp.sign(speed), u @ u.T, mobility, sticking, accelerations, jnp)
         none = jnp.zeros_like(rest)
+        joints = JointsAtRest.of(rest, jnp.sign(speed), u @ u.T, mobility, sticking, none, accelerations, jnp)
         respond = lambda modes: self._respond(directed, modes, t, q, v)[1]  # noqa: E731
         found, failed, _ = joints.decide(respond, jnp.zeros(len(unit)), none, none, jnp)
         if self.sticking is None:

@@ -117,7 +117,8 @@ def _decide(
     inverse_mass = take(system.inverse_mass, members)[..., None, :]
     mobility, W = (normals**2 * inverse_mass).sum(-1), directions / inverse_mass @ directions.swapaxes(-1, -2)
     at = _with_locks(system, members, at, rest & ~before.locked)
-    joints = JointsAtRest.of(rest, xp.sign(speed), W, mobility, before.locked, scale * rate, xp, contacts)
+    rested = before.locked | before.at_rest
+    joints = JointsAtRest.of(rest, xp.sign(speed), W, mobility, before.locked, rested, scale * rate, xp, contacts)
 
     def respond(modes: FrictionModes) -> Response:
         found = system.look(members, with_modes(system, members, at, modes), has_forces=True)
