@@ -35,14 +35,15 @@ def test_pivots_begin_with_the_modes_before():
     """Of nine joints that stick and one that stops, all stick: one evaluation of the motion shows it."""
     calls, F = [], 10
 
-    def respond(modes):
+    def respond(modes):  # each carries half of its limit
         calls.append(modes.locked.copy())
-        return Response(np.where(modes.locked, 0.0, 1.0), np.ones(F), np.ones(F))
+        force = np.where(modes.locked, 0.5, modes.direction)
+        return Response(0.5 - force, 1.0 - force, 1.0 + force)
 
-    no, rested = np.zeros(F, bool), np.arange(F) < F - 1
+    no, yes, rested = np.zeros(F, bool), np.ones(F, bool), np.arange(F) < F - 1
     for before, count in ((rested, 1), (no, None)):  # where all come to rest together, the limits are iterated first
         calls.clear()
-        joints = JointsAtRest.of(~no, np.zeros(F), np.eye(F), np.ones(F), before, before, np.full(F, 1e-9), np)
+        joints = JointsAtRest.of(yes, np.zeros(F), np.eye(F), np.ones(F), before, before, np.full(F, 1e-9), np)
         modes, has_failed, _ = joints.decide(respond, np.zeros(F), no, no, np)
         assert not has_failed and modes.locked.all()
         assert len(calls) == count if count else len(calls) > 1

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 import udkjax as udk
 from tests.friction import G, pendulum
+from udkjax.native.primitive import PreparedCall
 
 TOL: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-11}
 STICKS: Any = {"law": "set-valued"}
@@ -86,6 +87,14 @@ def test_block_slides_up_and_sticks_for_ever():
     assert solution.sticking["S"].tolist() == [False, False, True, True]
     assert "S at 2 of 4 times" in str(solution)
     assert solution.events.of("S sticks") == pytest.approx([stop], abs=1e-12)
+
+
+def test_a_stop_takes_few_calls_of_machine_code(monkeypatch):
+    """At the start: one state, one decision, the marks of rows, a run. At the stop as many, and a projection."""
+    scene, calls, call = block(0.2, 2.0, coefficient=0.3), [], PreparedCall.__call__
+    monkeypatch.setattr(PreparedCall, "__call__", lambda self: (calls.append(self), call(self))[1])
+    solution = udk.simulate(scene, [0.0, 2.0], **TOL)
+    assert solution.events.counts["S sticks"] == 1 and len(calls) <= 9
 
 
 def test_mistakes():

@@ -136,6 +136,7 @@ class Decision(NamedTuple):
 
 
 class _Pivot(NamedTuple):
+    modes: FrictionModes  # those that follow from the other fields
     held: Any  # contacts
     within: Any  # whether the force of a joint at rest is within its limit
     departs: Any  # whether others move a joint that is at rest only at this instant
@@ -201,7 +202,7 @@ class JointsAtRest(NamedTuple):
         most = (BLOCK_STEPS + SINGLE_STEPS) * count + 8
 
         def step(pivot: _Pivot) -> _Pivot:
-            modes = self._modes(pivot, xp)
+            modes = pivot.modes
             found, active = respond(modes), contacts.active(modes.held)
             a, reserves = found.accelerations, (found.forwards, found.backwards)
             floor = AT_REST.still * xp.maximum(xp.abs(reserves[0]), xp.abs(reserves[1]))
@@ -218,7 +219,7 @@ class JointsAtRest(NamedTuple):
             changes = violates_now & ~done[..., None]
             flips, changes = changes[..., :E], changes[..., E:]
             new = xp.where(departs, xp.sign(a), xp.where(beyond[0], 1.0, xp.where(beyond[1], -1.0, 0.0)))
-            return _Pivot(
+            following = pivot._replace(
                 held=pivot.held ^ flips,
                 within=xp.where(changes, returns, pivot.within),
                 departs=xp.where(changes, departs, pivot.departs),
@@ -227,6 +228,10 @@ class JointsAtRest(NamedTuple):
                 done=done,
                 by_contacts=xp.any(of_contacts, axis=-1),
             )
+            return following if xp is np and done.all() else with_modes(following)
+
+        def with_modes(pivot: _Pivot) -> _Pivot:
+            return pivot._replace(modes=self._modes(pivot, xp))
 
         def goes_on(pivot: _Pivot) -> Any:
             return ~xp.all(pivot.done) & (pivot.steps < most)
@@ -240,21 +245,22 @@ class JointsAtRest(NamedTuple):
 
         def from_guess(pivot: _Pivot) -> _Pivot:
             keep, first = pivot.done[..., None], xp.where(is_given, direction, self._guess(respond, direction, xp))
-            return pivots(
-                pivot._replace(
-                    held=xp.where(keep, pivot.held, contacts.held),
-                    within=xp.where(keep, pivot.within, self.rest & (first == 0)),
-                    departs=xp.where(keep, pivot.departs, departs),
-                    direction=xp.where(keep, pivot.direction, first),
-                    steps=xp.asarray(0),
-                )
+            start = pivot._replace(
+                held=xp.where(keep, pivot.held, contacts.held),
+                within=xp.where(keep, pivot.within, self.rest & (first == 0)),
+                departs=xp.where(keep, pivot.departs, departs),
+                direction=xp.where(keep, pivot.direction, first),
+                steps=xp.asarray(0),
             )
+            return pivots(with_modes(start))
 
         # After an event of one joint the others keep their modes, or nearly so: pivots begin with these.
         at_once = xp.sum(self.rest & ~self.rested, axis=-1) > 1
         done = is_settled | at_once
-        start = contacts.held, self.rest & (direction == 0), departs, direction, xp.asarray(0), done, done & False
-        pivot = pivots(_Pivot(*start))
+        none = FrictionModes(self.rest, direction, self.rest, self.rest, contacts.held)  # replaced at once
+        within = self.rest & (direction == 0)
+        pivot = _Pivot(none, contacts.held, within, departs, direction, xp.asarray(0), done, done & False)
+        pivot = pivots(with_modes(pivot))
         pivot = pivot._replace(done=pivot.done & ~at_once)
         if F > 1:
             is_done = xp.all(pivot.done)
@@ -262,7 +268,7 @@ class JointsAtRest(NamedTuple):
                 pivot = jax.lax.cond(is_done, lambda x: x, from_guess, pivot)
             elif not is_done:
                 pivot = from_guess(pivot)
-        return Decision(self._modes(pivot, xp), ~pivot.done, pivot.by_contacts)
+        return Decision(pivot.modes, ~pivot.done, pivot.by_contacts)
 
     def _guess(
         self, respond: Callable[[FrictionModes], Response], direction: Float[Any, "*m F"], xp: ModuleType

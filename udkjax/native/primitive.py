@@ -134,19 +134,19 @@ class LoadedCode:
         """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
         if self._later:
             return self._later(inputs, shapes)
-        if (
-            self._seconds > 0.0
-            and shapes[0][0] <= QUICK_MEMBERS
-            and not self._quick.library.is_optimized
-            and self._is_quick(inputs)
-        ):
+        if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and self.is_quick(inputs):
             outputs = self._call_quickly(inputs, shapes)
             if outputs is not None:
                 return outputs
         return (self._later or self).prepare(inputs, shapes)()
 
-    def _is_quick(self, inputs: Sequence[np.ndarray]) -> bool:
-        """Return whether a limit of steps can be set and met: not if reverse mode integrates again, which has no such result."""
+    def is_quick(self, inputs: Sequence[np.ndarray]) -> bool:
+        """Return whether quickly compiled code runs a call with few members.
+
+        It needs a limit of steps, which reverse mode cannot meet where it integrates again.
+        """
+        if self._seconds <= 0.0 or self._quick.library.is_optimized:
+            return False
         return not isinstance(self._operation, RunCotangents) or not goes_back(inputs) or records.are_given(inputs)
 
     def _call_quickly(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray] | None:
@@ -224,6 +224,30 @@ def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
 def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
     """Run an operation on concrete numbers of any number of members."""
     return _select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
+
+
+class RepeatedCall:
+    """Calls of one operation with numbers that change; arrays of the same shapes as in the last call are prepared already.
+
+    The outputs of a call are overwritten by the next one. The operation computes at single states: it writes all of its outputs,
+    and has no later operation.
+    """
+
+    def __init__(self, operation: Operation, times: int):
+        self._operation, self._times, self._shapes = operation, times, ()
+        self._prepared: PreparedCall | None = None
+
+    def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
+        shapes = tuple([x.shape for x in inputs])
+        if self._prepared is not None and shapes == self._shapes:
+            for own, x in zip(self._prepared.inputs, inputs, strict=True):
+                own[...] = x
+            return self._prepared()
+        code, results = _select_code(inputs, self._operation), self._operation.shapes(inputs, self._times)
+        if results[0][0] <= QUICK_MEMBERS and code.is_quick(inputs):
+            return code(inputs, results)
+        self._prepared, self._shapes = code.prepare([np.array(x, float) for x in inputs], results), shapes
+        return self._prepared()
 
 
 def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:

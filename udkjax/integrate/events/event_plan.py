@@ -81,6 +81,11 @@ class EventPlan:
         return np.array([*self.directions, *[-1] * self.count])
 
     @cached_property
+    def follows_velocity(self) -> Bool[np.ndarray, "E"]:
+        """Mask of the conditions that depend on velocities."""
+        return np.array(self.by_velocity, bool)
+
+    @cached_property
     def impacts(self) -> Bool[np.ndarray, "E"]:
         """Mask of the events that are impacts."""
         return np.array([x.is_impact for x in self.actions])
@@ -167,12 +172,12 @@ class EventPlan:
                 found[x.contact] = x.event
         return found
 
-    @property
+    @cached_property
     def has_rubbing_contacts(self) -> bool:
         """True if there is a contact with friction."""
         return bool(np.any(self.contacts_that_rub >= 0))
 
-    @property
+    @cached_property
     def has_sticking_joints(self) -> bool:
         """True if a joint of the scene may stick."""
         return bool(np.any(self.contacts_that_rub < 0))
@@ -192,17 +197,26 @@ class EventPlan:
 
     def with_locks(self, phase: Bool[Any, "*m C"], locked: Bool[Any, "*m F"], xp: ModuleType) -> Bool[Any, "*m C"]:
         """Return a phase in which the masked joints stick, and no others."""
-        pairs = self.locks[:, None] == np.arange(len(self.first))
-        return (phase & ~self._switches_of_locks) | xp.any(locked[..., None] & pairs, axis=-2)
+        return (phase & ~self._switches_of_locks) | xp.any(locked[..., None] & self._pairs_of_locks, axis=-2)
+
+    @cached_property
+    def _pairs_of_locks(self) -> Bool[np.ndarray, "F C"]:
+        return self.locks[:, None] == np.arange(len(self.first))
 
     def not_sliding(self, sides: Float[Any, "*m S"], xp: ModuleType) -> Bool[Any, "*m E"]:
         """Return a mask of the directions that do not count: joints do not slide in them, and do not wait for their drivers."""
         direction, at_rest = (sides[..., self.directions_of_sliding + k] for k in range(2))
         either = [((direction * sign < 0.5) | (at_rest > 0.5)) & (at_rest < 1.5) for sign in (1, -1)]
+        position, is_backwards = self._joints_of_slides
+        return self.slides & xp.where(is_backwards, either[1][..., position], either[0][..., position])
+
+    @cached_property
+    def _joints_of_slides(self) -> tuple[Int[np.ndarray, "E"], Bool[np.ndarray, "E"]]:
+        """The joint of each event that may stick, and whether its direction of sliding is negative."""
         position, own = np.zeros((2, self.count), int)
         position[self.forwards], position[self.forwards + 1] = np.arange(len(self.forwards)), np.arange(len(self.forwards))
         own[self.forwards + 1] = 1
-        return self.slides & xp.where(own == 1, either[1][..., position], either[0][..., position])
+        return position, own == 1
 
     def is_first(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m"]:
         """Return whether a phase is that in which runs begin."""

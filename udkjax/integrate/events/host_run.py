@@ -106,14 +106,18 @@ class HostRun:
     def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
         B, plan = max(len(x) for x in inputs), self.plan
         numbers, further, phases = inputs[NUMBERS], list(inputs[SHARED:]), []
-        joints = [np.full((B, len(joint.program.outputs)), np.nan) for joint in plan.added]
-        joints.append(np.full((B, plan.events.side_count), FREE))
+        widths = [*(len(joint.program.outputs) for joint in plan.added), plan.events.side_count]
+        of_joints = np.full((B, sum(widths)), np.nan)  # of joints that events add, then all sides
+        joints = np.split(of_joints, np.cumsum(widths)[:-1], axis=1)  # views
+        joints[-1][:] = FREE
         shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED])
-        ts, q, v, code, units, _, of_impacts, inverse_mass, of_joints = shared
+        ts, q, v, code, units, _, of_impacts, inverse_mass, joint_numbers = shared
         for phase in plan.phases:
-            phases.append(PhaseCode(phase, plan.events.switches, further[: phase.count], numbers, inverse_mass, B, joints))
+            phases.append(
+                PhaseCode(phase, plan.events.switches, further[: phase.count], numbers, inverse_mass, of_joints, widths)
+            )
             further = further[phase.count :]
-        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), of_impacts, inverse_mass, of_joints, numbers)
+        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), of_impacts, inverse_mass, joint_numbers, numbers)
         state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.tile(plan.events.first, (B, 1)), joints)
         joints[-1][:] = system.first_sides(state)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))

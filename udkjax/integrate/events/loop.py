@@ -196,6 +196,9 @@ def _carried(system: System, members: MemberIndices, carried: Bool[Any, "b E"], 
 def _may_follow(
     system: System, values: ConditionValues, watched: Bool[Any, "b E"], closed: Int[Any, "b E"], settled: Bool[Any, "b E"]
 ) -> Bool[Any, "b"]:
-    """Return a mask of the members whose event may cause another at once: a condition is zero, or depends on velocities."""
+    """Return a mask of the members whose event may cause another at once: a condition is zero, or depends on velocities.
+
+    Joints with set-valued friction cause none: a decision about one covers all that are at rest.
+    """
     unclear = watched & ~settled & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO * values.scale)
-    return system.xp.any(unclear | np.array(system.plan.by_velocity), axis=-1)
+    return system.xp.any((unclear | system.plan.follows_velocity) & ~system.plan.slides, axis=-1)

@@ -20,7 +20,7 @@ from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.native_engine import marking, run_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
-from udkjax.native.primitive import call_members
+from udkjax.native.primitive import RepeatedCall, call_members
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
 from udkjax.scene.mechanism import Mechanism
@@ -28,6 +28,9 @@ from udkjax.scene.mechanism import Mechanism
 INPUTS = RunWatched.input_names
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # the inputs of a run that are times and initial state
 PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a phase, followed by its samples if it has any
+
+
+ALL = np.ones(1, bool)  # of one member
 
 
 class PhasePlan(NamedTuple):
@@ -134,8 +137,8 @@ class PhaseCode:
         arrays: arrays from `phase_arrays`, for one member or for all.
         event_numbers: the numbers of all events.
         inverse_mass: one over the mass of each coordinate.
-        members: number of members.
-        joints: the numbers of the joints that events have added, for all members; changed in place.
+        joints: the numbers of the joints that events have added, then all sides, for all members; changed in place.
+        widths: the number of those of each joint, then of sides.
     """
 
     def __init__(
@@ -145,8 +148,8 @@ class PhaseCode:
         arrays: Sequence[np.ndarray],
         event_numbers: np.ndarray,
         inverse_mass: np.ndarray,
-        members: int,
-        joints: Sequence[np.ndarray],
+        joints: Float[np.ndarray, "B K"],
+        widths: Sequence[int],
     ):
         self.plan, (self._numbers, self._settings, self._rows, self._breaks, self._tol, *self._samples) = plan, arrays
         names = plan.run.all_settings
@@ -161,9 +164,17 @@ class PhaseCode:
         for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues` before directions
             self._places.append((slice(start, start + math.prod(shape)), shape))
             start += math.prod(shape)
-        self._switches = switches
+        self._switches, self._holds = switches, np.array(switches.rows, int) >= 0
+        places = np.concatenate([np.array(x or [-1] * width, int) for x, width in zip(plan.joints, widths, strict=True)])
+        self._columns, self._first_side = np.flatnonzero(places >= 0), joints.shape[1] - widths[-1]
+        self._places_of_joints = places[self._columns]
+        self._of_switches = np.array(plan.active, int).reshape(-1, 2).T
+        self._evaluate = RepeatedCall(plan.states, 2)
+        self._mark_rows, self._project = (x and RepeatedCall(x, 2) for x in (plan.marking, plan.project))
+        self._seen: tuple[np.ndarray, ...] = ()  # the states that were evaluated last, and their values
+        self._values: StateValues | None = None
         self._marks: dict[bytes, np.ndarray] = {}  # by the phase, of all members; NaN: not known yet
-        self._no_marks = np.full((members, plan.run.code.row_count), np.nan)
+        self._no_marks = np.full((len(joints), plan.run.code.row_count), np.nan)
 
     def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray) -> StretchEnd:
         """Run members over times (b, T) to the first crossing; `watch` describes the conditions, with room for their numbers."""
@@ -187,13 +198,17 @@ class PhaseCode:
         operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
         assert conditions is not None  # this code has conditions
         numbers = self._with_samples(members, t, self._with_marks(members, state))
+        given = members, t.copy(), q.copy(), v.copy(), numbers
+        if self._values is not None and all(map(np.array_equal, given, self._seen)):
+            return self._values
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
         inputs = numbers, np.stack([t, t], axis=1), q, v, *further
         of_states = _of(self._numbers_of_states, members)
         if self.plan.sides_of_events:
             of_states = _spread(of_states, b).copy()
             self._put_sides(of_states, members)
-        (results,) = call_members(*inputs, of_states, operation=operation, times=2)
+        (results,) = self._evaluate(*inputs, of_states)
+        results = results.copy()
         values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
         directions, mobilities = np.zeros((2, b, conditions.own_count, n))
         start, end = self._places[-1][0].stop, results.shape[1] - conditions.force_count
@@ -203,36 +218,32 @@ class PhaseCode:
                 array[:, list(operation.directed)] = x
         forces = np.ones((b, conditions.own_count))
         if conditions.force_count:
-            forces[:, np.array(self._switches.rows) >= 0] = results[:, end:]
-        return StateValues._make([*values, directions, mobilities, forces])
+            forces[:, self._holds] = results[:, end:]
+        self._seen, self._values = given, StateValues._make([*values, directions, mobilities, forces])
+        return self._values
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of members, projected to the constraints of their phases."""
         t, q, v, *_ = state
-        operation, n = self.plan.project, q.shape[1]
-        assert operation is not None  # events add joints
+        n = q.shape[1]
+        assert self._project is not None  # events add joints
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
         numbers = self._with_samples(members, t, self._with_marks(members, state))
-        inputs = numbers, np.stack([t, t], axis=1), q, v
-        (results,) = call_members(*inputs, *further, operation=operation, times=2)
-        return results[:, :n], results[:, n:]
+        (results,) = self._project(numbers, np.stack([t, t], axis=1), q, v, *further)
+        return results[:, :n].copy(), results[:, n:].copy()
 
     def _put_sides(self, numbers: np.ndarray, members: Int[np.ndarray, "b"]):
         """Put the sides of comparisons into the numbers of events."""
         for place, side in self.plan.sides_of_events:
-            numbers[:, place] = self._joints[-1][members, side]
+            numbers[:, place] = self._joints[members, self._first_side + side]
 
     def _numbers_of(self, members: Int[np.ndarray, "b"], phase: Bool[np.ndarray, "b C"]) -> np.ndarray:
         """Return the numbers of members in their phases, with those of the joints that events have added."""
-        numbers = _of(self._numbers, members)
-        if any(self.plan.joints) or self.plan.active:
-            numbers = _spread(numbers, len(members)).copy()
-            for places, joint in zip(self.plan.joints, self._joints, strict=True):
-                here = np.array(places, int) >= 0
-                if here.any():
-                    numbers[:, np.array(places)[here]] = joint[members][:, here]
-            for place, k in self.plan.active:
-                numbers[:, place] = phase[:, k]
+        numbers = np.empty((len(members), self._numbers.shape[1]))
+        numbers[:] = _of(self._numbers, members)
+        numbers[:, self._places_of_joints] = self._joints[members[:, None], self._columns]
+        places, switches = self._of_switches
+        numbers[:, places] = phase[:, switches]
         return numbers
 
     def _with_samples(self, members: Int[np.ndarray, "b"], t: Float[np.ndarray, "b"], numbers: np.ndarray) -> np.ndarray:
@@ -249,9 +260,11 @@ class PhaseCode:
         numbers, m = self._numbers_of(members, state.phase), self.plan.run.code.row_count
         if self.plan.marking is None:
             return numbers
-        numbers = _spread(numbers, len(members)).copy()
-        for phase in np.unique(state.phase, axis=0):
-            marks, here = self._marks.setdefault(phase.tobytes(), self._no_marks.copy()), (state.phase == phase).all(axis=1)
+        is_one = len(members) == 1
+        for phase in state.phase if is_one else np.unique(state.phase, axis=0):
+            marks, here = self._marks.get(phase.tobytes()), ALL if is_one else (state.phase == phase).all(axis=1)
+            if marks is None:
+                marks = self._marks[phase.tobytes()] = self._no_marks.copy()
             unknown = here & np.isnan(marks[members]).any(axis=1)
             if unknown.any():
                 found = self._mark(members[unknown], numbers[unknown], state.where(unknown))
@@ -262,7 +275,7 @@ class PhaseCode:
     def _mark(self, members: Int[np.ndarray, "b"], numbers: np.ndarray, state: RunState) -> np.ndarray:
         """Return the marks of independent rows of members at their states."""
         marking, (t, q, v, phase, _), m = self.plan.marking, state, self.plan.run.code.row_count
-        assert marking is not None  # checked by the caller
+        assert marking is not None and self._mark_rows is not None  # checked by the caller
         numbers = self._with_samples(members, t, numbers)
         scene_numbers, tol = numbers[:, : marking.code.number_count - 2 - m], _spread(_of(self._tol, members), len(numbers))
         among = np.ones((len(numbers), m))
@@ -270,7 +283,7 @@ class PhaseCode:
             among = self._switches.independent(phase, np).astype(float)
         inputs = np.concatenate([scene_numbers, among, tol, np.zeros((len(numbers), 1))], axis=1), np.stack([t, t], axis=1), q, v
         further = _of(self._settings, members)[:, self._of_marking], _of(self._rows, members), np.zeros((1, 0))
-        (marks,) = call_members(*inputs, *further, operation=marking, times=2)
+        (marks,) = self._mark_rows(*inputs, *further)
         return marks * among
 
 
