@@ -90,6 +90,7 @@ MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
 MOST_STUCK = 4  # maximum number of successive refinements; before a jump, some finer intervals are resolved
 FIRST, SECOND, THIRD = range(3)  # the next node of two intervals
 LAST_CHANGE = 1e-7  # largest final correction of the event time, in T; as a Taylor step it has an error of its square
+MOST_AIMS = 12  # maximum number of Newton's steps to a crossing on the polynomial, before bisection goes on
 MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; usually one
 LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long
 WANTED, UNDER_WAY = 1, 2  # states of a landing: a step from the point before the crossing is requested, or has been planned

@@ -1,13 +1,17 @@
-"""Location of zero crossings of conditions, on the polynomial of dense output and by a step that ends at the crossing."""
+"""Location of zero crossings of conditions, on the polynomial of dense output and by a step that ends at the crossing.
+
+On the polynomial, Newton's method finds the first zero, between bounds: each step goes a little beyond the zero, so that it moves
+the other bound, and bisection replaces steps that leave the bounds. It takes about six evaluations, where bisection takes forty.
+"""
 
 from udkjax.native.base.ir import DOUBLE, Value
 from udkjax.native.base.steps import POINTS, UNIT, Status
-from udkjax.native.watching.conditions import LAST_CHANGE, LEAST_STEP, MOST_LANDINGS, UNDER_WAY, WANTED
+from udkjax.native.watching.conditions import LAST_CHANGE, LEAST_STEP, MOST_AIMS, MOST_LANDINGS, UNDER_WAY, WANTED
 from udkjax.native.watching.watch_memory import WatchMemory
 
 
 def write_locate(module: WatchMemory):
-    """Write `locate(work)`: find the crossing between `low` and `high` by bisection, in lanes that seek one."""
+    """Write `locate(work)`: find the crossing between `low` and `high`, in lanes that seek one."""
     f, s = module.function("locate")
     work, one, zero = f.given["work"], f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
 
@@ -24,12 +28,28 @@ def write_locate(module: WatchMemory):
         s.due = f.select((s.seeks > 0.5) & (s.high - s.low > s.smallest * UNIT) & (middle > s.low) & (middle < s.high), one, zero)
         return f.any_of(s.due > 0.5)
 
+    def zero_ahead() -> Value:
+        """Return the first zero of the linear approximations at `look`; infinite without any."""
+        first, inf = f.variable(float("inf")), f.const(float("inf"), DOUBLE, f.width)
+        with f.each(module.conditions.count) as c:
+            rate = module.condition(f, "rate", c)
+            crosses = module.condition(f, "hit", c) * rate > 0.0
+            root = s.look - module.condition(f, "g", c) / f.select(crosses, rate, one)
+            first.value = f.min(first.value, f.select(crosses, root, inf))
+        return first.value
+
+    inf = f.const(float("inf"), DOUBLE, f.width)
+    s.where(s.seeks > 0.5, aim=inf, looks=zero)
     with f.while_(wide):
-        s.look = (s.low + s.high) * 0.5
+        is_between = (s.aim > s.low) & (s.aim < s.high) & (s.looks < float(MOST_AIMS))
+        s.look = f.select(is_between, s.aim, (s.low + s.high) * 0.5)
         f.call("look", work)
-        due, is_beyond = s.due > 0.5, crossed() >= 0.0
+        due, is_beyond, root = s.due > 0.5, crossed() >= 0.0, zero_ahead()
         s.where(due & is_beyond, high=s.look)
         s.where(due & ~is_beyond, low=s.look)
+        change = s.look - root
+        beyond = f.max(change * change * s.omega, s.smallest * (UNIT * 0.25))  # the error of Newton's step, or a bound's distance
+        s.where(due, aim=f.select(is_beyond, root - beyond, root + beyond), looks=s.looks + 1.0)
     s.look, s.due = s.high, s.seeks
     f.call("look", work)
     event, seeks = crossed(), s.seeks > 0.5

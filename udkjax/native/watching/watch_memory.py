@@ -24,6 +24,8 @@ LANE_NUMBERS = {
     "look": "time at which conditions are evaluated (s)",
     "low": "lower bound of the time of a crossing (s)",
     "high": "upper bound of the time of a crossing (s)",
+    "aim": "time at which the search for a crossing is to look next (s)",
+    "looks": "number of times at which it has looked",
     "seeks": "whether a crossing is being located",
     "landing": "whether a step is to end at a crossing: 0, WANTED or UNDER_WAY",
     "landings": "number of steps that have ended at a crossing",

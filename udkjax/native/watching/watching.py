@@ -4,7 +4,7 @@ Conditions g(t, q, v) are programs, like accelerations. They are evaluated with 
 accepted steps, two intervals at a time. In an interval a condition is Hermite's cubic up to an error E, the error of the cubic
 over both intervals at the middle node; the error in one interval is a sixteenth of it, so E is a safe bound. If the Bernstein
 coefficients of the cubic plus and minus E do not change sign, there is no crossing; if they change sign once, there is one
-crossing, which is located by bisection on the polynomial of dense output. A step is then repeated to end at the crossing, whose
+crossing, which is located on the polynomial of dense output. A step is then repeated to end at the crossing, whose
 time is corrected by Newton's method; the last correction is a Taylor step. All other intervals are refined by a factor of eight;
 conditions that still vary have a jump or a kink. If jumps repeat, or a condition is NaN, the run ends unresolved, and the caller
 continues.
