@@ -143,6 +143,7 @@ class _Pivot(NamedTuple):
     direction: Any
     steps: Any
     done: Any
+    failed: Any
     by_contacts: Any  # whether a contact is held wrongly, or not
 
 
@@ -243,8 +244,15 @@ class JointsAtRest(NamedTuple):
                 start = step(start)
             return start
 
-        def from_guess(pivot: _Pivot) -> _Pivot:
-            keep, first = pivot.done[..., None], xp.where(is_given, direction, self._guess(respond, direction, xp))
+        def attempt(state: tuple[_Pivot, Any]) -> tuple[_Pivot, Any]:
+            """Begin with a guess in the masked members; the others that fail begin with one next."""
+            pivot, guesses = state
+            improved = lambda: xp.where(is_given, direction, self._guess(respond, direction, xp))  # noqa: E731
+            if xp is not np:
+                first = jax.lax.cond(xp.any(guesses), improved, lambda: direction) if F > 1 else direction
+            else:
+                first = xp.where(guesses[..., None], improved(), direction) if guesses.any() else direction
+            keep = pivot.done[..., None]
             start = pivot._replace(
                 held=xp.where(keep, pivot.held, contacts.held),
                 within=xp.where(keep, pivot.within, self.rest & (first == 0)),
@@ -252,23 +260,25 @@ class JointsAtRest(NamedTuple):
                 direction=xp.where(keep, pivot.direction, first),
                 steps=xp.asarray(0),
             )
-            return pivots(with_modes(start))
+            pivot = pivots(with_modes(start))
+            fails = ~pivot.done & (guesses | (F == 1))
+            pivot = pivot._replace(failed=pivot.failed | fails, done=pivot.done | fails)
+            return pivot, ~pivot.done
 
         # After an event of one joint the others keep their modes, or nearly so: pivots begin with these.
         at_once = xp.sum(self.rest & ~self.rested, axis=-1) > 1
-        done = is_settled | at_once
         none = FrictionModes(self.rest, direction, self.rest, self.rest, contacts.held)  # replaced at once
-        within = self.rest & (direction == 0)
-        pivot = _Pivot(none, contacts.held, within, departs, direction, xp.asarray(0), done, done & False)
-        pivot = pivots(with_modes(pivot))
-        pivot = pivot._replace(done=pivot.done & ~at_once)
-        if F > 1:
-            is_done = xp.all(pivot.done)
-            if xp is not np:
-                pivot = jax.lax.cond(is_done, lambda x: x, from_guess, pivot)
-            elif not is_done:
-                pivot = from_guess(pivot)
-        return Decision(pivot.modes, ~pivot.done, pivot.by_contacts)
+        no = is_settled & False
+        pivot = _Pivot(none, contacts.held, self.rest & (direction == 0), departs, direction, xp.asarray(0), is_settled, no, no)
+        if xp is np:
+            pivot, fails = attempt((pivot, at_once))
+            if fails.any():
+                pivot, _ = attempt((pivot, fails))
+        else:
+            pivot = pivot._replace(steps=xp.asarray(-1))  # not begun yet
+            goes = lambda state: (state[0].steps < 0) | xp.any(state[1])  # noqa: E731
+            pivot, _ = jax.lax.while_loop(goes, attempt, (with_modes(pivot), at_once))
+        return Decision(pivot.modes, pivot.failed, pivot.by_contacts)
 
     def _guess(
         self, respond: Callable[[FrictionModes], Response], direction: Float[Any, "*m F"], xp: ModuleType
