@@ -14,6 +14,7 @@ FUNCTIONS = {
     "clamp": lambda x: jnp.clip(x, -0.4, 0.7),
     "floor": lambda x: jnp.floor(3 * x) + jnp.ceil(2 * x) + jnp.round(x),
     "remainder": lambda x: x % 0.3 + jax.lax.rem(x, 0.7),
+    "part of a period": lambda x: (x - 2.0) % 0.3 + (x - 2.0) // 0.7 + (x - 1.0) % -0.4,
     "truncated": lambda x: jnp.int32(4 * x) * x,
     "wrapped": lambda x: jnp.where((5 * x + jnp.pi) % (2 * jnp.pi) > 2.0, x, 0.0),
     "angle": lambda x: jnp.arctan2(jnp.sin(5 * x), jnp.cos(5 * x)),

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 import udkjax as udk
 from udkjax.equations.smooth_loads import SmoothLoads
+from udkjax.expressions import scalar_program
 
 
 class Of(udk.ForceElement):
@@ -41,6 +42,13 @@ class Steps(Of):
 class Saw(Of):
     def along(self, t, x, v):
         return -self.k * ((x + 0.13) % 0.3)
+
+
+class SawFromBelow(Of):
+    """It jumps where the remainder, negative before, is zero."""
+
+    def along(self, t, x, v):
+        return -self.k * (((x - 0.25) % 0.3) + 0.1 * ((x - 0.35) // 0.3))
 
 
 class DeadZone(Of):
@@ -88,7 +96,7 @@ class Wall(udk.ForceElement):
         return 0.5 * self.k * jnp.maximum(frames[0].x - 0.2, 0.0) ** 2
 
 
-KINDS = (Brake, Bumper, Steps, Saw, DeadZone, Saturated, Wrapped, ByTangent, LaterFurther, Wall)
+KINDS = (Brake, Bumper, Steps, Saw, SawFromBelow, DeadZone, Saturated, Wrapped, ByTangent, LaterFurther, Wall)
 P = np.array([1.0, 2.0])
 
 
@@ -157,6 +165,15 @@ def test_derivatives_are_those_of_differences(kind):
 
 
 @pytest.mark.slow
+def test_no_operation_within_a_run_waits_for_jax(monkeypatch):
+    """A run with kinks is a function that XLA calls: JAX may wait for the thread that runs it."""
+    monkeypatch.setattr(scalar_program, "_evaluate_by_jax", lambda node, values: pytest.fail(str(node.detail)))
+    for kind in KINDS:
+        element = kind(["b"], k=np.array(2.0))
+        renewal = SmoothLoads.of_element(element, ["b"], False).renewal
+        assert len(renewal.by_numpy([np.full(3, 0.3)] * len(renewal.inputs))) == len(renewal.outputs) > 0
+
+
 def test_members_of_a_batch_have_kinks_of_their_own():
     ps = jnp.stack([jnp.array([v, 2.0]) for v in (0.2, 0.5, 1.0, 1.5)])
     found = jax.vmap(lambda p: (lambda s: (s.q[-1, 0, 0], s.stats["kinks"]))(run(Steps, p)))(ps)

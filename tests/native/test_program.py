@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 from numpy.testing import assert_allclose, assert_array_equal
 
-from udkjax.expressions import Graph, ScalarProgram, cotangents, tangents, trace
+from udkjax.expressions import Graph, ScalarProgram, cotangents, scalar_program, tangents, trace
 from udkjax.native.base.ir import Function
 from udkjax.native.base.program import UnsupportedError, Writer, write
 
@@ -189,6 +189,14 @@ def test_a_check_writes_no_arithmetic():
     assert "  %" in f.text()
     with pytest.raises(UnsupportedError, match="erf_inv"):
         Writer(f, program_of(lambda x: 3.0 * lax.erf_inv(-x) + x)).check()
+
+
+def test_numpy_computes_what_machine_code_computes(monkeypatch):
+    """XLA calls runs that are made of both, and JAX may wait for the thread that runs them."""
+    monkeypatch.setattr(scalar_program, "_evaluate_by_jax", lambda node, values: pytest.fail(str(node.detail)))
+    for name, function in ONE.items():
+        found, right = program_of(function).by_numpy([ORDINARY])[0], jax.vmap(function)(ORDINARY)
+        assert_allclose(found, np.asarray(right, float), rtol=1e-11, atol=1e-300, err_msg=name)
 
 
 SLOPED = {name: f for name, f in ONE.items() if name not in ("is_finite", "of conditions")} | {

@@ -17,8 +17,9 @@ B = X > 0
 ONE_ARGUMENT = (
     *(jnp.sin, jnp.cos, jnp.tan, jnp.exp, jnp.expm1, jnp.tanh, jnp.sinh, jnp.cosh, jnp.arctan, jnp.abs, jnp.sign, jnp.floor),
     *(jnp.ceil, jnp.square, jnp.cbrt, jnp.isfinite, jnp.isnan, jnp.negative, jnp.exp2, jnp.nan_to_num),
+    *(jnp.arcsinh, jnp.round, jax.lax.round, jax.lax.logistic, jax.lax.erf, jax.lax.erfc, lambda x: jnp.arccosh(1 + x * x)),
 )
-OF_PARTS = (jnp.sqrt, jnp.log, jnp.log1p, jnp.arcsin, jnp.arccos, jax.lax.rsqrt)
+OF_PARTS = (jnp.sqrt, jnp.log, jnp.log2, jnp.log1p, jnp.arcsin, jnp.arccos, jnp.arctanh, jax.lax.rsqrt)
 TWO_ARGUMENTS = (
     *(jnp.add, jnp.subtract, jnp.multiply, jnp.divide, jnp.maximum, jnp.minimum, jnp.arctan2, jnp.fmod, jnp.hypot, jnp.power),
     *(jnp.nextafter, jnp.equal, jnp.not_equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal),
@@ -58,7 +59,23 @@ SHAPED = {
     ),
     "taken": lambda x, k: (jnp.take(x, k, axis=1, mode="fill"), jnp.take(x, k, axis=0, mode="clip"), x[k[0, 2]]),
     "taken along": lambda x, k: jnp.take_along_axis(x, k % 5, axis=1),
-    "whole numbers": lambda x, k: (k // 2, k % 3, k * k, -k, k**2, jnp.abs(k), k & 5, k | 2, k ^ 1, ~k, k.astype(float), k > 1),
+    "whole numbers": lambda x, k: (
+        k // 2,
+        k % 3,
+        k * k,
+        -k,
+        k**2,
+        jnp.abs(k),
+        k & 5,
+        k | 2,
+        k ^ 1,
+        ~k,
+        k << 2,
+        k >> 1,
+        k.astype(float),
+        k > 1,
+    ),
+    "shifted": lambda x, k: (k << 2, k >> 1),
     "rounded": lambda x, k: (x.astype(int), x.astype(bool), x.astype(jnp.float32), k.astype(jnp.int32).sum(), jnp.round(x, 1)),
     "changed": lambda x, k: (
         x.at[1].set(0.0),

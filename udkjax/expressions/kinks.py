@@ -3,6 +3,8 @@
 Comparisons, |x|, signs, maxima, rounding and remainders are smooth except where an argument g crosses zero or a whole number.
 Each such g has a *side*, a number: 1 or -1, the sign of g; or the whole number below it. With its sides held, an expression is
 smooth, and continues smoothly beyond the crossing. A side that is not finite leaves the operation as it was.
+The whole number below x / y is the side of a remainder of x by y, and tells the sign that the remainder has on its piece. At the
+ends of the piece it is zero, where `jnp.mod` and `//`, which ask whether it is, would otherwise take another branch.
 """
 
 from collections.abc import Collection, Sequence
@@ -75,6 +77,7 @@ class _Held:
         self.ways: list[Leaving] = []
         self.is_nested: list[bool] = []
         self._known: dict[tuple[str, int], tuple[Scalar, int]] = {}  # the side of each g, and the sign with which it was added
+        self._remainders: dict[int, tuple[Scalar, Scalar]] = {}  # by the copy of each: its side, and y
 
     def hold(self, outputs: Sequence[Scalar]) -> list[Scalar]:
         graph, copies = self.graph, {}
@@ -130,7 +133,12 @@ class _Held:
                 return n and self._either(n, plain, n)
             case "rem":
                 n = self._whole(a[0] / a[1])
-                return n and self._either(n, plain, a[0] - a[1] * _towards_zero(n))
+                held = n and self._either(n, plain, a[0] - a[1] * _towards_zero(n))
+                if n is not None and held is not None:
+                    self._remainders[held.index] = n, a[1]
+                return held
+            case "ne" | "eq" if a[1].is_zero and a[0].index in self._remainders:
+                return self._either(self._remainders[a[0].index][0], plain, self.graph.constant(name == "ne", bool))
             case "convert_element_type" if np.issubdtype(node.dtype, np.integer):
                 n = self._whole(a[0])
                 return n and self._either(n, plain, self.graph.again(node, [_towards_zero(n)]))
@@ -145,6 +153,8 @@ class _Held:
         g = a if b is None else a - b
         if not g.node.depends & self.moving:
             return None
+        if g.index in self._remainders:
+            return self._sign_of_remainder(g.sign, *self._remainders[g.index])
         key = SIDE, g.index
         if key not in self._known:
             size = absolute(a) if b is None else absolute(a) + absolute(b)
@@ -154,6 +164,12 @@ class _Held:
             self._leave(side, side * g, -1.0, 0.0)
         side, sign = self._known[key]
         return side if sign == g.sign else -side
+
+    def _sign_of_remainder(self, sign: int, n: Scalar, y: Scalar) -> Scalar:
+        of_y = self._sign(y, None)
+        of_y = apply(lax.sign_p, y.node.dtype, y) if of_y is None else of_y
+        side = where(_compare(lax.ge_p, n, 0.0), of_y, -of_y)
+        return where(apply(lax.is_finite_p, bool, n), side if sign > 0 else -side, n)
 
     def _whole(self, u: Scalar) -> Scalar | None:
         """Return the whole number below u; None if it does not move."""

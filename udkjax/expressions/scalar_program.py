@@ -7,7 +7,7 @@ Python floats it is evaluated at once, so that a scene is analysed without compi
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from types import ModuleType
 
 import jax
@@ -16,6 +16,7 @@ import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 from udkjax.expressions.written_steps import Operand, WrittenSteps
+from udkjax.programs.numpy_rules import RULES
 
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # they have the same names in `math` and NumPy
@@ -248,7 +249,11 @@ def _function_of_arrays(node: Node) -> Callable:
     """Return the function that computes a node on NumPy arrays or float constants."""
     if node.kind == "constant":
         return lambda: np.float64(node.detail) if isinstance(node.detail, float) else node.detail
-    return _plain_function(node, np, _ARRAY_FUNCTIONS) or (lambda *values: _evaluate_by_jax(node, values))
+    plain = _plain_function(node, np, _ARRAY_FUNCTIONS)
+    rule = RULES.get(node.detail.primitive.name) if plain is None and node.kind == "apply" else None
+    if rule is not None:
+        return partial(rule, **node.detail.parameters)
+    return plain or (lambda *values: _evaluate_by_jax(node, values))
 
 
 def _plain_function(node: Node, library: ModuleType, others: Mapping[str, Callable]) -> Callable | None:

@@ -3,10 +3,12 @@
 A rule may return `NotImplemented`: then JAX evaluates the operation.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jax import lax
 
 from udkjax.programs.numpy_indexing import dynamic_slice, dynamic_update_slice, gather, scatter
 
@@ -163,6 +165,16 @@ def _triangular_solve(
     return np.swapaxes(np.linalg.solve(np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2)), -1, -2)
 
 
+def _round(x: Any, rounding_method: Any) -> Any:
+    if np.asarray(x).dtype.kind in "iu" or rounding_method == lax.RoundingMethod.TO_NEAREST_EVEN:
+        return np.rint(x)
+    return np.copysign(np.floor(np.abs(x)) + (np.abs(x) - np.floor(np.abs(x)) >= 0.5), x)
+
+
+def _element_by_element(function: Callable[[float], float]) -> Callable[[Any], np.ndarray]:
+    return np.vectorize(function, otypes=[float])
+
+
 def _ufunc(function: Callable[..., Any]) -> Rule:
     return lambda *xs, **_: function(*xs)
 
@@ -198,6 +210,16 @@ UFUNCS = {
     "sinh": np.sinh,
     "cosh": np.cosh,
     "tanh": np.tanh,
+    "asinh": np.arcsinh,
+    "acosh": np.arccosh,
+    "atanh": np.arctanh,
+    "log2": np.log2,
+    "logistic": lambda x: 1 / (1 + np.exp(-x)),
+    "erf": _element_by_element(math.erf),
+    "erfc": _element_by_element(math.erfc),
+    "one_minus_square": lambda x: (1 - x) * (1 + x),
+    "shift_left": np.left_shift,
+    "shift_right_arithmetic": np.right_shift,
     "pow": np.power,
     "nextafter": np.nextafter,
     "rem": np.fmod,
@@ -224,6 +246,7 @@ UFUNCS = {
 RULES: dict[str, Rule] = {name: _ufunc(function) for name, function in UFUNCS.items()} | {
     "is_evaluated": lambda: np.True_,
     "integer_pow": lambda x, y: np.power(x, y) if y != 2 else x * x,
+    "round": _round,
     "select_n": _select,
     "broadcast_in_dim": _broadcast,
     "convert_element_type": _convert,
