@@ -27,8 +27,8 @@ from udkjax.native.packing import ActiveNumbers as ActiveNumbers
 from udkjax.native.packing import SampleRows as SampleRows
 from udkjax.native.position_operations import Close as Close
 from udkjax.native.position_operations import March as March
+from udkjax.native.primitive import MemberCalls as MemberCalls
 from udkjax.native.primitive import call_concrete as call_concrete
-from udkjax.native.primitive import call_members as call_members
 from udkjax.native.primitive import machine_code as machine_code
 from udkjax.native.primitive import native_p as native_p
 from udkjax.native.run.method_code import MethodCode as MethodCode

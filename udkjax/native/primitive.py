@@ -226,24 +226,28 @@ def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[
     return _select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
 
 
-class RepeatedCall:
-    """Calls of one operation with numbers that change; arrays of the same shapes as in the last call are prepared already.
+class MemberCalls:
+    """Calls of one operation on concrete numbers of any number of members."""
 
-    The outputs of a call are overwritten by the next one. The operation computes at single states: it writes all of its outputs,
-    and has no later operation.
-    """
-
-    def __init__(self, operation: Operation, times: int):
-        self._operation, self._times, self._shapes = operation, times, ()
+    def __init__(self, operation: Operation):
+        self._operation, self._shapes = operation, ()
         self._prepared: PreparedCall | None = None
 
-    def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
+    def __call__(self, *inputs: np.ndarray, times: int) -> list[np.ndarray]:
+        """Return the outputs."""
+        return call_members(*inputs, operation=self._operation, times=times)
+
+    def at_states(self, *inputs: np.ndarray) -> list[np.ndarray]:
+        """Return the outputs, which the next call overwrites; arrays of the same shapes as in the last call are prepared already.
+
+        The operation computes at single states: it writes all of its outputs, and has no later operation.
+        """
         shapes = tuple([x.shape for x in inputs])
         if self._prepared is not None and shapes == self._shapes:
             for own, x in zip(self._prepared.inputs, inputs, strict=True):
                 own[...] = x
             return self._prepared()
-        code, results = _select_code(inputs, self._operation), self._operation.shapes(inputs, self._times)
+        code, results = _select_code(inputs, self._operation), self._operation.shapes(inputs, 2)
         if results[0][0] <= QUICK_MEMBERS and code.is_quick(inputs):
             return code(inputs, results)
         self._prepared, self._shapes = code.prepare([np.array(x, float) for x in inputs], results), shapes

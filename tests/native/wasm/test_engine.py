@@ -9,7 +9,6 @@ from tests.choices import fast
 from tests.wasm_host import Host, run_without_contraction
 from udkjax.equations import analyse
 from udkjax.integrate import native_engine
-from udkjax.integrate.events import phase_code
 from udkjax.native import position_operations, primitive, runs
 from udkjax.native.wasm import wasm_module
 from udkjax.positions import march, native_closing
@@ -62,13 +61,13 @@ def test_a_run_up_to_where_a_condition_crosses_zero(monkeypatch, name):
     k = int(np.argmax(np.ptp(path, axis=0)))
     middle, coordinate = float(path[:, k].min() + path[:, k].max()) / 2, ("x", "y", "angle")[k]
     event = udk.Event(lambda t, at: getattr(at[body], coordinate) - middle, udk.Stop())
-    seen = []
+    seen, call_members = [], primitive.call_members
 
     def call(*inputs, operation, times):
         seen.append((operation, inputs, times))
-        return primitive.call_members(*inputs, operation=operation, times=times)
+        return call_members(*inputs, operation=operation, times=times)
 
-    monkeypatch.setattr(phase_code, "call_members", call)
+    monkeypatch.setattr(primitive, "call_members", call)
     events = udk.simulate(mechanism, ts, events=[event]).events
     operation, inputs, times = [x for x in seen if isinstance(x[0], runs.RunWatched)][-1]
     wasm, native = both(operation, inputs, times)

@@ -20,7 +20,7 @@ from udkjax.integrate.events.system import StateValues
 from udkjax.integrate.native_engine import marking, run_inputs
 from udkjax.integrate.problem import Problem
 from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
-from udkjax.native.primitive import RepeatedCall, call_members
+from udkjax.native.primitive import MemberCalls
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
 from udkjax.scene.mechanism import Mechanism
@@ -169,8 +169,8 @@ class PhaseCode:
         self._columns, self._first_side = np.flatnonzero(places >= 0), joints.shape[1] - widths[-1]
         self._places_of_joints = places[self._columns]
         self._of_switches = np.array(plan.active, int).reshape(-1, 2).T
-        self._evaluate = RepeatedCall(plan.states, 2)
-        self._mark_rows, self._project = (x and RepeatedCall(x, 2) for x in (plan.marking, plan.project))
+        self._run, self._evaluate = MemberCalls(plan.run), MemberCalls(plan.states).at_states
+        self._mark_rows, self._project = (x and MemberCalls(x).at_states for x in (plan.marking, plan.project))
         self._seen: tuple[np.ndarray, ...] = ()  # the states that were evaluated last, and their values
         self._values: StateValues | None = None
         self._marks: dict[bytes, np.ndarray] = {}  # by the phase, of all members; NaN: not known yet
@@ -179,14 +179,14 @@ class PhaseCode:
     def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray) -> StretchEnd:
         """Run members over times (b, T) to the first crossing; `watch` describes the conditions, with room for their numbers."""
         _, q, v, *_ = state
-        operation, conditions = self.plan.run, self.plan.run.conditions
+        conditions = self.plan.run.conditions
         assert conditions is not None  # this code has conditions
         numbers = self._with_marks(members, state)
         further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
         watch[:, : conditions.number_count] = _of(self._event_numbers, members)
         self._put_sides(watch, members)
         inputs = numbers, ts, q, v, *further, watch
-        qs, vs, violation, info, crossing = call_members(*inputs, operation=operation, times=ts.shape[1])
+        qs, vs, violation, info, crossing = self._run(*inputs, times=ts.shape[1])
         last_side, n = Conditions.head + conditions.count, q.shape[1]
         (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
         q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
