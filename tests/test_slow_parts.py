@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tomllib
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
@@ -39,7 +40,8 @@ def project(slow, tmp_path, monkeypatch):
     (tmp_path / ".gitignore").write_text("*.fails\n*.stops\n.pytest_cache/\n__pycache__/\n")
     for words in (["init", "-q"], ["add", "."], ["-c", "user.name=x", "-c", "user.email=x@x", "commit", "-qm", "All"]):
         subprocess.run(["git", *words], cwd=tmp_path, check=True)
-    for name, value in {"ROOT": tmp_path, "PARTS": {"a": ("tests/a",)}, "ONLY_SLOW": {}, "LOWEST_TESTS": ()}.items():
+    none = {"ONLY_SLOW": {}, "LOWEST_TESTS": (), "OLDEST_TESTS": (), "TYPED": ()}
+    for name, value in {"ROOT": tmp_path, "PARTS": {"a": ("tests/a",)}, **none}.items():
         monkeypatch.setattr(slow, name, value)
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # they import JAX
     return tmp_path
@@ -102,3 +104,20 @@ def test_the_lowest_versions_are_those_of_the_project(slow):
     assert "numpy==2.2" in versions and any(x.startswith("xarray==") for x in versions)
     assert all(x.count("==") == 1 and not set("<>,;") & set(x) for x in versions)
     assert all((ROOT / path).exists() for path in slow.LOWEST_TESTS)
+
+
+def test_types_are_those_that_pyright_finds(slow, tmp_path):
+    (tmp_path / "pyright").write_text(
+        """#!/bin/sh
+echo '{"generalDiagnostics": [{"file": "a.py", "severity": "error", "message": "no", "range": {"start": {"line": 1}}}],
+       "summary": {"filesAnalyzed": 3}}'
+exit 1
+"""
+    )
+    (tmp_path / "pyright").chmod(0o755)
+    entry = slow.run_types(tmp_path / "python", ["tests"])
+    assert (entry["result"], entry["passed"], entry["failed"]) == ("failed", 2, 1)
+    assert slow.run_types(tmp_path / "other" / "python", ["tests"])["result"] == "skipped"
+    assert slow.run_fast(None, ["tests"], [])["result"] == "skipped"
+    configured = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pyright"]["include"]
+    assert set(slow.TYPED) == set(configured) and all((ROOT / path).exists() for path in slow.OLDEST_TESTS)
