@@ -136,7 +136,7 @@ class Decision(NamedTuple):
 
 
 class _Pivot(NamedTuple):
-    modes: FrictionModes  # those that follow from the other fields
+    modes: FrictionModes  # as they follow from the other fields
     held: Any  # contacts
     within: Any  # whether the force of a joint at rest is within its limit
     departs: Any  # whether others move a joint that is at rest only at this instant
