@@ -95,8 +95,8 @@ def test_pins_hold_their_links_in_all_positions(published):
 def test_motions_confirm_what_has_no_defect(published):
     free = [k for k, defect in enumerate(published.defects) if defect == "none"]
     assert free == [0, 1] and published.confirmed[free].all()
-    assert published.confirmed.mean() > 0.99  # but where a position is within a thousandth of a dead point
-    assert (np.abs(published.transmission[~published.confirmed.all(axis=1)]) < 2e-3).all()
+    assert np.abs(published.transmission).min() < 1e-3  # a position next to a dead point, from where the crank turns by little
+    assert published.confirmed.all()
     one = published[0]
     moved = udk.kinematics(one.mechanism, "motor", one.values)
     np.testing.assert_allclose(udk.path(one.mechanism, moved, "P"), DATA["points"], atol=1e-9)

@@ -24,7 +24,7 @@ from udkjax.threads import thread_count
 LAST_STEP = 1e-7
 LONGEST_CORRECTION = 0.5  # largest Newton step, in units of the coordinates; longer steps lead to another position
 LONGEST_OF_MARCH = 0.1  # largest Newton step in a march; otherwise the step of the march is shortened
-SHORTEST = 1 / 128  # shortest step of a march, relative to the longest; a member that fails even so has reached its end
+SHORTEST = 2.0**-15  # shortest step of a march, relative to the longest; a member that fails even so has reached its end
 MOST_CORRECTIONS = 12
 FARTHEST = 4.0  # largest extrapolation by the cubic through two positions, relative to the previous step
 MOST_SUBSTEPS = 1000  # maximum number between two positions; more indicate a wrong unit of the values
