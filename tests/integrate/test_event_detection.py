@@ -120,6 +120,22 @@ def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
     assert work[1] == work[0] and work[2] < work[0] + 16 * 60  # a step to the event, and the first ones behind it
 
 
+def test_a_stiff_run_goes_on_implicitly_up_to_a_crossing():
+    """An arm falls slowly against a strong damper: c angle' = -m g l cos(angle) / 2, sin(angle) = -tanh(m g l t / 2 c)."""
+    mass, length, gravity, damping = 2.0, 1.0, 9.81, 1e6
+    rod = udk.Body(mass, mass * length**2 / 12, position=[length / 2, 0.0])
+    pin = udk.Revolute(["ground", "rod"], points=[[0.0, 0.0], [-length / 2, 0.0]])
+    damper = udk.TorsionSpring(["ground", "rod"], 0.0, damping=damping)
+    arm = udk.Mechanism({"rod": rod}, {"pin": pin}, forces={"damper": damper}, gravity=[0.0, -gravity])
+    rate, aim = mass * gravity * length / (2 * damping), -0.05
+    event = udk.Event(lambda t, body: body["rod"].angle - aim, udk.Stop(), name="e")
+    end = np.arctanh(-np.sin(aim)) / rate
+    run = udk.simulate(arm, [0.0, 2 * end], events=event, rtol=1e-7, atol=1e-9)
+    without = udk.simulate(arm, [0.0, end], rtol=1e-7, atol=1e-9)
+    assert float(run.time) == pytest.approx(end, rel=1e-6)
+    assert without.stats["implicit"] > 10 and run.stats["steps"] <= without.stats["steps"] + 10
+
+
 def test_what_is_too_fast_is_said():
     """A condition that changes its sign from each floating-point number to the next."""
     noise = udk.Event(lambda t, at: jnp.sin(1e13 * at["b"].x + 1.0) + 2 * jnp.sin(3e12 * at["b"].x), udk.Log(), name="noise")
