@@ -60,3 +60,9 @@ def test_held_expressions_are_the_given_ones_until_a_condition_falls(name):
 @pytest.mark.parametrize("function", [lambda x: jnp.where(x * x + jnp.abs(x) > 0, x, 0.0), lambda x: jnp.where(2.0 > 1.0, x, -x)])
 def test_what_cannot_change_its_side_is_no_kink(function):
     assert len(pieces_of(function)[0].sides) <= 1  # that of |x| itself
+
+
+def test_powers_and_roots_go_on_beyond_the_crossing():
+    _, evaluate = pieces_of(lambda x: jnp.maximum(x - 0.2, 0.0) ** 1.5 + jnp.sqrt(jnp.maximum(x - 0.2, 0.0)))
+    sides = evaluate(0.5, [np.inf])[1]
+    assert evaluate(0.2 - 0.04, sides)[0] == pytest.approx(-(0.04**1.5) - 0.2, rel=1e-12)

@@ -74,12 +74,16 @@ def test_redundant_rows_that_count_as_independent_end_a_run(method, engine):
         assert udk.simulate(swing(-0.6), 2 * TS, method=method, drift_tol=np.inf, **run).result == Result.successful
 
 
-@pytest.mark.parametrize("method", [udk.SVD(1e-10), pytest.param(udk.Varga(1e-12), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", [udk.SVD, pytest.param(udk.Varga, marks=pytest.mark.slow)])
 def test_rounding_that_counts_as_rank_ends_a_projected_run(method):
-    """Near a singular configuration the last digits of redundant rows exceed the threshold."""
-    mech = swing(np.deg2rad(40.0))
-    codes = [udk.simulate(mech, 2 * TS, method=m, rtol=1e-10, atol=1e-10, throw=False).result for m in (method, udk.SVD(1e-6))]
-    assert codes == [Result.spurious_rank, Result.successful]
+    """Near a singular configuration the last digits of redundant rows may exceed the threshold: a run ends, or it is right."""
+    mech, run = swing(np.deg2rad(40.0)), {"rtol": 1e-10, "atol": 1e-10, "throw": False}
+    right = udk.simulate(mech, 2 * TS, method=udk.SVD(1e-6), **run)
+    assert right.result == Result.successful
+    found = [udk.simulate(mech, 2 * TS, method=method(tol), **run) for tol in np.geomspace(1e-10, 1e-14, 9)]
+    assert {x.result for x in found} <= {Result.successful, Result.spurious_rank}
+    assert Result.spurious_rank in {x.result for x in found}
+    assert all(np.abs(x.q - right.q).max() < 1e-6 for x in found if x.result == Result.successful)
 
 
 def squares():
@@ -143,7 +147,7 @@ def test_default_thresholds_leave_out_no_row_that_counts(method):
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("gain", [10.0, pytest.param(100.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gain", [30.0, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_a_run_that_is_stabilized_well_passes(gain, engine):
     solution = udk.simulate(swing(), TS, stabilization=udk.Baumgarte(gain, gain), engine=engine, **TIGHT)
     assert solution.result == Result.successful and np.abs(solution.q - reference(swing())).max() < 1e-6

@@ -131,8 +131,10 @@ def phase_codes(mechanism, events):
         problems = [replace(run.problem, compiled=x) for x in compiled]
         arrays = event_arrays(plan, listed, phases, problems, np.zeros(()), np.asarray(1e-6), np)
     numbers, inverse_mass, rest, codes = arrays[5], arrays[7], arrays[9:], []
+    widths = [*(len(joint.program.outputs) for joint in plan.added), plan.events.side_count]
+    joints = np.full((3, sum(widths)), np.nan)
     for of_phase in plan.phases:
-        codes.append(PhaseCode(of_phase, phases.switches, rest[: of_phase.count], numbers, inverse_mass, 3, []))
+        codes.append(PhaseCode(of_phase, phases.switches, rest[: of_phase.count], numbers, inverse_mass, joints, widths))
         rest = rest[of_phase.count :]
     return codes, inverse_mass
 

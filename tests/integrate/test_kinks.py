@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from scipy.special import gamma
 
 import udkjax as udk
 from udkjax.equations.smooth_loads import SmoothLoads
@@ -89,6 +90,13 @@ class Sign(Of):
         return -self.k * jnp.sign(v)
 
 
+class Hertz(Of):
+    """An elastic contact: beyond its end a power of a negative number is no number."""
+
+    def along(self, t, x, v):
+        return -self.k * jnp.maximum(x - 0.2, 0.0) ** 1.5
+
+
 class Wall(udk.ForceElement):
     k: Float[Array, ""]
 
@@ -164,7 +172,19 @@ def test_derivatives_are_those_of_differences(kind):
     np.testing.assert_allclose(jax.jacfwd(lambda p: place(kind, p))(jnp.asarray(P)), differences, atol=1e-9)
 
 
-@pytest.mark.slow
+def test_the_end_of_a_power_is_located():
+    """A body that has struck an elastic wall leaves it with the speed with which it came, after a time by quadrature."""
+    found = run(Hertz, P, 4.0)
+    depth = (2.5 * P[0] ** 2 / (2 * P[1])) ** 0.4
+    contact = 2 * depth / P[0] * np.sqrt(np.pi) * gamma(1.4) / gamma(0.9)  # 2 int dx / sqrt(v^2 - 4 k x^2.5 / 5)
+    assert found.settings["kinks"] == "located" and int(found.stats["kinks"]) == 2
+    assert found.v[-1, 0, 0] == pytest.approx(-P[0], rel=1e-11)
+    assert found.q[-1, 0, 0] == pytest.approx(0.2 - P[0] * (4.0 - 0.2 / P[0] - contact), abs=1e-10)
+    slopes = jax.grad(lambda p: place(Hertz, p, end=4.0))(jnp.asarray(P))
+    exact = jax.grad(lambda p: -p[0] * 4.0 + p[0] * contact * (p[0] / P[0]) ** -0.2 * (p[1] / P[1]) ** -0.4)(jnp.asarray(P))
+    np.testing.assert_allclose(slopes, exact, rtol=1e-7)  # the slope of x^1.5 has no bounded slope itself
+
+
 def test_no_operation_within_a_run_waits_for_jax(monkeypatch):
     """A run with kinks is a function that XLA calls: JAX may wait for the thread that runs it."""
     monkeypatch.setattr(scalar_program, "_evaluate_by_jax", lambda node, values: pytest.fail(str(node.detail)))
@@ -174,6 +194,7 @@ def test_no_operation_within_a_run_waits_for_jax(monkeypatch):
         assert len(renewal.by_numpy([np.full(3, 0.3)] * len(renewal.inputs))) == len(renewal.outputs) > 0
 
 
+@pytest.mark.slow
 def test_members_of_a_batch_have_kinks_of_their_own():
     ps = jnp.stack([jnp.array([v, 2.0]) for v in (0.2, 0.5, 1.0, 1.5)])
     found = jax.vmap(lambda p: (lambda s: (s.q[-1, 0, 0], s.stats["kinks"]))(run(Steps, p)))(ps)

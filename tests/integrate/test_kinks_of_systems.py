@@ -147,11 +147,11 @@ def test_what_is_not_located_is_told():
     assert found.settings["kinks"] == 'not located in "mass"' and found.unlocated is None
 
 
-def test_a_power_without_value_beyond_its_kink():
-    """Hertz's contact: the power 1.5 of a negative depth is not a number, so the run succeeds without locating the kink."""
+def test_a_force_without_value_beyond_its_kink():
+    """The force is that of Hertz's contact for small depths, and no number for negative ones: the run succeeds anyway."""
 
     def contact(t, q, v):
-        return 1e4 * jnp.maximum(-q, 0.0) ** 1.5
+        return 1e4 * jnp.arccos(1.0 - jnp.maximum(-q, 0.0)) ** 3
 
     system = udk.ConstrainedSystem(lambda q: jnp.eye(1), contact)
     run = udk.simulate(system, [0.0, 0.5, 1.0], udk.State(np.array([0.4]), np.array([-1.0])), rtol=1e-9, atol=1e-9)

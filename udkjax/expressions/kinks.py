@@ -90,9 +90,17 @@ class _Held:
             arguments = [copied(a) for a in node.arguments]
             held = self._operation(node, arguments) if node.kind == "apply" and node.depends & self.moving else None
             unchanged = all(a == b for a, b in zip(arguments, node.arguments, strict=True))
-            same = Scalar(graph, index) if unchanged else graph.again(node, arguments)
+            same = Scalar(graph, index) if unchanged else self._again(node, arguments)
             copies[index] = same if held is None else held
         return [copied(s) for s in outputs]
+
+    def _again(self, node: Node, a: Sequence[Scalar]) -> Scalar:
+        """Return a node with held arguments: powers and roots of what is negative beyond a crossing continue as odd functions."""
+        graph = self.graph
+        if node.kind != "sqrt" and not (node.kind == "apply" and node.detail.primitive.name == "pow"):
+            return graph.again(node, a)
+        size = graph.again(node, [absolute(a[0]), *a[1:]])
+        return where(_compare(lax.lt_p, a[0], 0.0), -size, size)
 
     def _operation(self, node: Node, a: Sequence[Scalar]) -> Scalar | None:
         """Return an operation with its side held; None if it has none."""
