@@ -95,7 +95,7 @@ class _Held:
         return [copied(s) for s in outputs]
 
     def _again(self, node: Node, a: Sequence[Scalar]) -> Scalar:
-        """Return a node with held arguments: powers and roots of negative numbers, beyond a crossing, continue as odd functions."""
+        """Return a node with held arguments: powers and roots of negative numbers continue as odd functions beyond a crossing."""
         graph = self.graph
         if node.kind != "sqrt" and not (node.kind == "apply" and node.detail.primitive.name == "pow"):
             return graph.again(node, a)
