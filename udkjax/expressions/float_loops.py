@@ -23,7 +23,7 @@ _UPDATES_OF_ARRAYS = {ADD: operator.add, MAXIMUM: np.maximum, ALL: np.minimum}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
 # Runs row by row that take as long as generating a Python function (20 us per operation); it runs three times as fast.
 _WORTH_WRITING = 100
-_WORTH_WRITING_FOR_MANY = 20  # the same for runs at many states, which take 20 times as long
+_WORTH_WRITING_FOR_MANY = 20  # the same for runs at many states, each of which takes longer
 
 Lists: TypeAlias = dict[str, list[Any]]  # the numbers of each array: floats, or arrays of one number for each state
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
 from udkjax.expressions.written_steps import Operand, WrittenSteps
-from udkjax.programs.numpy_rules import RULES
+from udkjax.programs.numpy_rules import RULES, UFUNCS
 
 _SINE_AND_COSINE = ("sin", "cos")
 _LIBRARY_FUNCTIONS = (*_SINE_AND_COSINE, "tanh", "exp")  # they have the same names in `math` and NumPy
@@ -37,21 +37,11 @@ _NUMBER_FUNCTIONS: dict[str, Callable] = {
     "square": lambda x: x * x,
 }
 # The same on NumPy arrays, element by element.
-_ARRAY_FUNCTIONS: dict[str, Callable] = {
+_ARRAY_FUNCTIONS: dict[str, Callable] = UFUNCS | {
     **{name.strip("_"): getattr(operator, name) for name in (*_COMMON_OPERATORS, "neg")},
-    "abs": np.abs,
-    "asinh": np.arcsinh,
-    "atan2": np.arctan2,
-    "cbrt": np.cbrt,
-    "floor": np.floor,
-    "max": np.maximum,
-    "min": np.minimum,
-    "rem": np.fmod,
     "select_n": lambda which, *cases: (
         np.where(which, cases[1], cases[0]) if len(cases) == 2 else np.choose(np.asarray(which, int), cases)
     ),
-    "sign": np.sign,
-    "square": np.square,
 }
 # Operators on floats, and functions of jax.lax for tracing: an operator on a JAX array takes ten times as long to trace.
 _OPERATORS: dict[str, tuple[Callable, Callable]] = {

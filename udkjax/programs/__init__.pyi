@@ -21,6 +21,7 @@ from udkjax.programs.numpy_program import expand_as as expand_as
 from udkjax.programs.numpy_program import has_rules as has_rules
 from udkjax.programs.numpy_program import numpy_program as numpy_program
 from udkjax.programs.numpy_rules import RULES as RULES
+from udkjax.programs.numpy_rules import UFUNCS as UFUNCS
 from udkjax.programs.numpy_rules import exact_rule as exact_rule
 from udkjax.programs.varying_axes import result_type as result_type
 from udkjax.programs.varying_axes import vary_together as vary_together

@@ -166,7 +166,7 @@ def _triangular_solve(
 
 
 def _round(x: Any, rounding_method: Any) -> Any:
-    if np.asarray(x).dtype.kind in "iu" or rounding_method == lax.RoundingMethod.TO_NEAREST_EVEN:
+    if rounding_method == lax.RoundingMethod.TO_NEAREST_EVEN:
         return np.rint(x)
     return np.copysign(np.floor(np.abs(x)) + (np.abs(x) - np.floor(np.abs(x)) >= 0.5), x)
 

@@ -28,8 +28,6 @@ from udkjax.scene.mechanism import Mechanism
 INPUTS = RunWatched.input_names
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # the inputs of a run that are times and initial state
 PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a phase, followed by its samples if it has any
-
-
 ALL = np.ones(1, bool)  # of one member
 
 

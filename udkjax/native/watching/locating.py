@@ -1,7 +1,7 @@
 """Location of zero crossings of conditions, on the polynomial of dense output and by a step that ends at the crossing.
 
 On the polynomial, Newton's method finds the first zero, between bounds: each step goes a little beyond the zero, so that it moves
-the other bound, and bisection replaces steps that leave the bounds. It takes about six evaluations, where bisection takes forty.
+the other bound, and bisection replaces steps that leave the bounds.
 """
 
 from udkjax.native.base.ir import DOUBLE, Value
