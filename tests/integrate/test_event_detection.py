@@ -212,3 +212,24 @@ def test_an_event_just_before_a_sample_happens_with_the_force_before_it():
     for time in (0.2, 0.249, 0.25 - 1e-9):
         place = udk.Event(lambda t, at, x=0.5 * time**2: at["b"].x - x, udk.Stop(), name="place")
         assert float(udk.simulate(body, [0.0, 0.5], events=[place]).time) == pytest.approx(time, abs=1e-13)
+
+
+def test_events_within_a_step_that_reaches_a_sample():
+    """Just after the start or another event, the first step may reach it; at 1 s, the last step ends there."""
+    held = udk.Held(np.array([1.0, -5.0, 0.5])[:, None] * [1.0, 0.0], 0.5)
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", held)}, gravity=[0.0, 0.0])
+    stops = udk.Event(lambda t, at: at["b"].vx, udk.Log(), name="stops")
+
+    def times(velocity, start, end):
+        state = udk.State(jnp.zeros((1, 3)), jnp.zeros((1, 3)).at[0, 0].set(velocity))
+        run = udk.simulate(body, jnp.stack([start, end]), state, events=stops, max_events=3)
+        return run.events.time, run.stats["rejected"]
+
+    rates = jax.jit(jax.jacfwd(lambda *x: times(*x)[0][:2]))
+    for start, before in ((0.0, 0.25), (0.25, 0.125), (0.4375, 0.03125), (0.499, 0.0004), (0.4999999, 1e-9)):
+        for end in (0.625, 1.0, 1.375):
+            found, rejected = times(-before, start, end)
+            expected = [start + before, 0.5 + (0.5 - start - before) / 5.0]
+            np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
+            assert int(rejected) == 0
+            np.testing.assert_allclose(rates(-before, start, end), [-1.0, 0.2], atol=1e-12)

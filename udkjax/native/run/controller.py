@@ -264,8 +264,9 @@ def _judge_drift(module: Module, f: Function, s: Lane, accept: Value) -> Value:
 def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value) -> Value:
     """Return the time up to which outputs are due."""
     begin, alone = s.begin > 0.5, s.begin < -0.5
-    # Outputs of the first step are interpolated after the second; by an implicit method each step serves its own.
-    ready = accept & ((s.accepted > 0.0) | (~begin & (s.last > 0.5)) | alone)
+    # Outputs of the first step are interpolated after the second, unless the motion ends or changes there; by an implicit method
+    # each step serves its own.
+    ready = accept & ((s.accepted > 0.0) | (~begin & ((s.last > 0.5) | (s.lands > 0.5))) | alone)
     # The last step may end slightly before a breakpoint at the end of the run, where outputs are also due.
     until = f.select(ready, f.select(s.last > 0.5, f.max(s.t1, s.end), s.t1), -np.inf)
     if module.plan.breaks:

@@ -55,8 +55,10 @@ def write_locate(module: WatchMemory):
     event, seeks = crossed(), s.seeks > 0.5
     is_found = seeks & (event >= 0.0)
     # A step to the crossing lies between two breakpoints. Just after the first breakpoint, and if the second has been reached,
-    # the crossing is located on the polynomial instead, which is as accurate as the states.
-    lands = is_found & (s.high - f.max(s.point0_t, s.fresh) > s.smallest * LEAST_STEP) & (s.lands < 0.5)
+    # the crossing is located on the polynomial instead, which is as accurate as the states: the numbers that are sampled are then
+    # those after it.
+    reached = (s.lands > 0.5) | ((s.last > 0.5) & (s.point3_t < s.end))
+    lands = is_found & (s.high - f.max(s.point0_t, s.fresh) > s.smallest * LEAST_STEP) & ~reached
     s.where(seeks, stops=f.select(lands, zero, one), seeks=zero)
     s.where(is_found, event=event, sure_t=s.high, target=s.high)
     s.where(lands, landing=float(WANTED))
