@@ -214,7 +214,8 @@ def test_an_event_just_before_a_sample_happens_with_the_force_before_it():
         assert float(udk.simulate(body, [0.0, 0.5], events=[place]).time) == pytest.approx(time, abs=1e-13)
 
 
-def test_events_within_a_step_that_reaches_a_sample():
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_events_within_a_step_that_reaches_a_sample(engine):
     """Just after the start or another event, the first step may reach it; at 1 s, the last step ends there."""
     held = udk.Held(np.array([1.0, -5.0, 0.5])[:, None] * [1.0, 0.0], 0.5)
     body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", held)}, gravity=[0.0, 0.0])
@@ -222,7 +223,7 @@ def test_events_within_a_step_that_reaches_a_sample():
 
     def times(velocity, start, end):
         state = udk.State(jnp.zeros((1, 3)), jnp.zeros((1, 3)).at[0, 0].set(velocity))
-        run = udk.simulate(body, jnp.stack([start, end]), state, events=stops, max_events=3)
+        run = udk.simulate(body, jnp.stack([start, end]), state, events=stops, max_events=3, engine=engine)
         return run.events.time, run.stats["rejected"]
 
     rates = jax.jit(jax.jacfwd(lambda *x: times(*x)[0][:2]))

@@ -144,6 +144,9 @@ class PlainSystem:
         zooms = window.event != NO_EVENT
         end = jnp.where(zooms, window.high, t + jnp.minimum(full, window.reach))
         end = jnp.minimum(end, jnp.minimum(requested[-1], ts[-1]))
+        if (breakpoints := hybrid.phases.mechanisms[SCENE].breakpoints) is not None:
+            # The cubics of a window belong to one piece of the motion.
+            end = jnp.min(jnp.where(breakpoints > t + 2 * hybrid.smallest, breakpoints, jnp.inf), initial=end)
         nodes = (t + (end - t) * NODES).at[-1].set(end)
         times = jnp.sort(jnp.concatenate([nodes, jnp.clip(requested, t, end)]))
         length = end - t
