@@ -15,7 +15,12 @@ from udkjax.native.base.memory import Memory
 LATER, LOAD = POINTERS = "later", "load_later"
 RESUME = "resume"
 # Functions of which the two modules have different ones; they share the code of most others.
-DIFFERENT = frozenset(("attempt", "decide", "differences", "prologue", "begin", "enter", "run", RESUME))
+DIFFERENT = frozenset(
+    (
+        *("prologue", "begin", "enter", "run", RESUME, "attempt", "decide", "approach"),
+        *("differences", "tangent_differences", "step_back", "differences_back"),
+    )
+)
 GLOBALS = [f"@{name} = global ptr null" for name in POINTERS]
 
 
