@@ -25,6 +25,8 @@ NAMES = (
     "planetary_gear",
     "hammer",
     "toggle_clamp",
+    "woodpecker",
+    "rod_on_floor",
     "identification",
     "double_pendulum_map",
     "neural_friction",

@@ -21,6 +21,10 @@ FACTS = {  # of each example, what must be true of the numbers that it prints
     "planetary_gear": lambda ratio, willis: abs(ratio - willis) < 1e-12,
     "hammer": lambda blows, rebound, between: blows > 10 and abs(rebound - 0.6) < 1e-9 and abs(between - 1) < 1e-6,
     "toggle_clamp": lambda limit, dry, greased: limit == 2 and abs(dry - 0.5) < 1e-9 and greased > 20,
+    "woodpecker": lambda pecks, time, descent, gain: (
+        pecks == 7 and abs(time - 0.193) < 0.001 and 50 < descent < 60 and gain < 1e-9
+    ),
+    "rod_on_floor": lambda slides, vaults, found, limit: abs(slides) + abs(vaults - 180) < 1e-6 and abs(found - limit) < 1e-8,
     "identification": lambda off, *_: off < 3,
     "double_pendulum_map": lambda members, over, calm, failed: members == 2500 and over > 0.1 and calm == 0 and failed == 0,
     "neural_friction": lambda after, before, law: after < 0.1 * before and law < 0.4,
