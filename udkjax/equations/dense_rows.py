@@ -3,6 +3,7 @@
 This module is used to close a mechanism and to find its redundant rows (position_rows.py).
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
+from udkjax.equations.eliminated_steps import EliminatedSteps
 from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, driver_time_step, is_closed, try_to_close
 from udkjax.equations.position_rows import PositionRows
@@ -17,6 +19,7 @@ from udkjax.equations.rest_program import CURVATURE, DAMPING, LOADS, STIFFNESS
 from udkjax.equations.scales import Scales, concrete_scales
 from udkjax.equations.scene_arrays import arrays_in_time
 from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.structure import structure
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
@@ -37,14 +40,20 @@ class TruncatedPseudoinverse(NamedTuple):
     @classmethod
     def of(cls, D: np.ndarray, tol: float, full: bool = False) -> "TruncatedPseudoinverse":
         """Return the pseudoinverse of a matrix, `full` with all right singular vectors; NaN if the matrix is not finite."""
-        if not np.all(np.isfinite(D)):  # for which NumPy raises an error
+        if D.shape == (1, 1) and math.isfinite(D[0, 0]) and D[0, 0]:  # of one degree of freedom
+            return cls(np.sign(D), 1 / np.abs(D[0]), np.ones((1, 1)), 1)
+        if not np.isfinite(D).all():  # for which NumPy raises an error
             D, tol = np.zeros_like(D), np.nan
         u, sigma, vt = np.linalg.svd(D, full_matrices=full)
+        if sigma[-1] > tol * sigma[0]:
+            return cls(u[:, : len(sigma)], 1 / sigma, vt, len(sigma))
         counts = ~(sigma <= tol * sigma[0])
         inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0) + 0.0 * tol
         return cls(u[:, : len(sigma)], inverse, vt, int(counts.sum()))
 
     def __matmul__(self, b: np.ndarray) -> np.ndarray:
+        if b.ndim == 1:
+            return (self.inverse * (b @ self.u)) @ self.vt[: len(self.inverse)]
         return self.vt[: len(self.inverse)].T @ ((self.u.T @ b).T * self.inverse).T
 
     def transposed_times(self, b: np.ndarray) -> np.ndarray:
@@ -97,6 +106,9 @@ class DenseTerms(RowTerms):
         self.mass = np.asarray(mass_of(mechanism, np))  # the diagonal of M
         self._programs, self._has_forces = scene_programs(mechanism), bool(mechanism.force_names)
         self._weight = self.mass * np.tile([*np.asarray(mechanism.gravity, float), 0.0], self.size // 3)
+        self._at_rest, self._flat = np.zeros(self.size), dict[str, np.ndarray]()
+        self._kind, self._is_sampled = structure(mechanism), bool(mechanism.samples)
+        self._latest_loads: tuple[Any, Any] = ((), None)  # the last position and the loads there
 
     @staticmethod
     @cached_by_identity
@@ -104,9 +116,13 @@ class DenseTerms(RowTerms):
         """Return the terms of a mechanism, made once for each mechanism."""
         return DenseTerms(mechanism)
 
+    def eliminated_steps(self, redundant_rows: tuple[int, ...], length: float) -> EliminatedSteps | None:
+        """Return Newton steps to Psi = 0, the smallest with `length` (m) as a unit; None if numbers are sampled over time."""
+        return None if self._is_sampled else EliminatedSteps(self._kind, self._arrays_at(0.0).numbers, redundant_rows, length)
+
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
-        _, rate, entries = self.geometry(t, q, np.zeros_like(q))
+        _, rate, entries = self.geometry(t, q, self._at_rest)
         Psi_q = np.zeros((self.count, self.size))
         Psi_q[self.entries] = entries
         return Psi_q, rate
@@ -117,27 +133,41 @@ class DenseTerms(RowTerms):
         return b + self.slopes(t, q)[0] @ free
 
     def loads_at_rest(self, t: Time, q: np.ndarray) -> RestingLoads:
-        """Return the loads at rest in a position, and their derivatives."""
+        """Return the loads at rest in a position, and their derivatives; those at the last position are cached."""
+        key, latest = _key(t, q), self._latest_loads
+        if latest[0] != key:
+            self._latest_loads = latest = key, self._find_loads(t, q)
+        return latest[1]
+
+    def _find_loads(self, t: Time, q: np.ndarray) -> RestingLoads:
         weight = self._weight
         if not self._has_forces:
             return RestingLoads(weight, np.abs(weight), *np.zeros((2, self.size, self.size)))
-        entries = self._arrays_at(t).element_loads(t, q, np.zeros_like(q))
-        force, sizes = weight.copy(), np.abs(weight)
+        entries = self._arrays_at(t).element_loads(t, q, self._at_rest)
+        force, sizes = weight, np.abs(weight)
         if LOADS in entries:
-            rows = self._programs.at_rest.places[LOADS].rows
-            np.add.at(force, rows, entries[LOADS])
-            np.add.at(sizes, rows, np.abs(entries[LOADS]))
-        return RestingLoads(force, sizes, *(self._matrix(name, entries.get(name)) for name in (STIFFNESS, DAMPING)))
+            rows, loads = self._programs.at_rest.places[LOADS].rows, entries[LOADS]
+            force = force + np.bincount(rows, loads, self.size)
+            sizes = sizes + np.bincount(rows, np.abs(loads), self.size)
+        stiffness, damping = self._matrix(STIFFNESS, entries.get(STIFFNESS)), self._matrix(DAMPING, entries.get(DAMPING))
+        return RestingLoads(force, sizes, stiffness, damping)
 
     def curvature(self, t: Time, q: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
         """Return (lambda^T Psi)_qq (n, n)."""
         return self._matrix(CURVATURE, self._arrays_at(t).curvature(t, q, multipliers))
 
     def _matrix(self, name: str, entries: np.ndarray | None) -> np.ndarray:
-        matrix = np.zeros((self.size, self.size))
-        if entries is not None:
-            np.add.at(matrix, tuple(self._programs.at_rest.places[name]), entries)
-        return matrix
+        if entries is None:
+            return np.zeros((self.size, self.size))
+        return np.bincount(self._places(name), entries, self.size**2).reshape(self.size, self.size)
+
+    def _places(self, name: str) -> np.ndarray:
+        """Return the places of a matrix's entries among its entries in the order of rows."""
+        found = self._flat.get(name)
+        if found is None:
+            place = self._programs.at_rest.places[name]
+            self._flat[name] = found = self.size * place.rows + place.columns
+        return found
 
 
 class DenseRows(DenseTerms):

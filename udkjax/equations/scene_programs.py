@@ -178,6 +178,12 @@ class ScenePrograms(RunPrograms):
         return program(self._solver.newton("psi", "q"), [self._solver.safe])
 
     @cached_property
+    def newton_q_and_distance(self) -> LoopProgram:
+        """Compute q1, q after a Newton step to Psi = 0, the psi of all rows at q, and distance."""
+        terms, solver = self._terms, self._solver
+        return program(solver.newton("psi", "q", dropping=False), [solver.elimination.distance()], terms.row_terms("psi", "psi"))
+
+    @cached_property
     def newton_v_and_psi(self) -> LoopProgram:
         """Compute v1, v after the Newton step to Psi_dot = 0, and psi of all rows."""
         return program(self._solver.newton("psi_dot", "v"), self._terms.row_terms("psi", "psi"))
@@ -240,6 +246,11 @@ class ScenePrograms(RunPrograms):
         terms = self._terms
         rows = [*terms.row_terms("psi", "psi"), *terms.row_terms("psi_dot", "psi_dot")]
         return program([terms.sincos(), *terms.every_entry()], rows)
+
+    @cached_property
+    def psi_q(self) -> LoopProgram:
+        """Compute psi_q of all rows."""
+        return program([self._terms.sincos(), *self._terms.every_entry()])
 
     @property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -362,6 +373,11 @@ def _scene_programs(
     tree: TreeDef, shapes: LeafShapes, redundant_rows: tuple[int, ...] | None, baumgarte: bool, policy: RankPolicy
 ) -> ScenePrograms:
     return ScenePrograms(tree, shapes, redundant_rows, baumgarte, policy)
+
+
+def programs_of_structure(tree: TreeDef, shapes: LeafShapes, redundant_rows: tuple[int, ...]) -> ScenePrograms:
+    """Return the programs of a structure, as `scene_programs` does."""
+    return _scene_programs(tree, shapes, redundant_rows, False, RankPolicy.DROP)
 
 
 def scene_programs(

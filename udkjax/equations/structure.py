@@ -26,6 +26,7 @@ from udkjax.scene.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
 
 LeafShapes: TypeAlias = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shape and dtype of each leaf of a tree
+Structure: TypeAlias = tuple[TreeDef, LeafShapes]
 
 
 class RubbingJoint(eqx.Module):
@@ -52,7 +53,7 @@ AnyElement = TypeVar("AnyElement", bound=eqx.Module)
 
 
 @cached_by_identity  # also for traced numbers: the result contains no numbers
-def structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
+def structure(mechanism: Mechanism) -> Structure:
     """Return the tree of a mechanism and the shape and dtype of each of its numbers; equal for any number of samples."""
     return _structure(mechanism.without_origin.without_samples)
 

@@ -1,7 +1,7 @@
 """Loop programs as functions of arrays, without machine code: by NumPy, without compilation, or by JAX."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.expressions.float_loops import FloatLoops, LaidOutPart
+from udkjax.expressions.float_loops import FloatLoops, LaidOutPart, Lists
 from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, SET, Address, KernelLoop, LoopProgram, Reset
 from udkjax.expressions.scalar_program import ScalarProgram
 
@@ -25,13 +25,39 @@ class ArrayLoops:
 
     The indices of all numbers are computed once, for all calls. By NumPy, arrays may have a second axis of many states, or of
     length one if they are the same for all.
+
+    Args:
+        program: the program.
+        xp: NumPy or jax.numpy.
+        results: the arrays whose numbers are needed after a run, for functions that compute no others; None: all.
     """
 
-    def __init__(self, program: LoopProgram, xp: ModuleType):
+    def __init__(self, program: LoopProgram, xp: ModuleType, results: Collection[str] | None = None):
         self._parts, self._xp = list(map(_lay_out, program.parts)), xp
         self._written = {name for part in self._parts for name, *_ in part.outputs}
         self._read = {name for part in self._parts for name, _ in part.inputs if name}
-        self._on_floats = FloatLoops(self._parts) if xp is np and FloatLoops.support(self._parts) else None
+        self._on_floats = FloatLoops(self._parts, results) if xp is np and FloatLoops.support(self._parts) else None
+
+    @property
+    def needed(self) -> Collection[str] | None:
+        """The names of the lists that `on_lists` needs; None: all."""
+        return self._on_floats and self._on_floats.needed
+
+    def on_lists(self, lists: Lists, often: bool = False) -> bool:
+        """Change the lists of the numbers of arrays by a run at one state; return False if that is not possible.
+
+        It is not if loops have many rows, or a number is not finite; the lists are then of no more use. Rows may read what
+        earlier rows have written. The function that takes a third of the time is generated at once if the runs are `often`.
+        """
+        if self._on_floats is None:
+            return False
+        if often and not self._on_floats.is_written:
+            self._on_floats.write(lists.keys())
+        try:
+            self._on_floats(lists)
+        except (ArithmeticError, ValueError):
+            return False
+        return True
 
     def __call__(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
         """Return the arrays after a run of the program; the given arrays do not change."""

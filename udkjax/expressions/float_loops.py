@@ -40,13 +40,27 @@ class LaidOutPart(NamedTuple):
 class FloatLoops:
     """The parts of a program whose loops have few rows, as a function of the lists of its numbers, which it changes.
 
-    It raises `ArithmeticError` or `ValueError` if a number is not finite.
+    Rows run one after another, so that a row may read what an earlier one has written.
+
+    It raises `ArithmeticError` or `ValueError` if a number is not finite. Of other arrays than `results`, if given, the lists may
+    stay as they are.
     """
 
-    def __init__(self, parts: Sequence[LaidOutPart]):
+    def __init__(self, parts: Sequence[LaidOutPart], results: Collection[str] | None = None):
+        self._results = results
         self._parts = [_with_lists(part) for part in parts if part.outputs]
         self._runs, self._function = 0, None
+        self.needed: Collection[str] | None = None  # names of the lists at one state that are needed; None: all
         self._runs_of_many, self._function_of_many = 0, None
+
+    @property
+    def is_written(self) -> bool:
+        """True if the function of lists at one state has been generated."""
+        return self._function is not None
+
+    def write(self, names: Collection[str]) -> None:
+        """Generate the function of the lists of these names now."""
+        self._function, self.needed = _write(self._parts, names, self._results)
 
     @staticmethod
     def support(parts: Sequence[LaidOutPart]) -> bool:
@@ -62,13 +76,13 @@ class FloatLoops:
             _run(part, lists)
         self._runs += 1
         if self._runs == _WORTH_WRITING:
-            self._function = _write(self._parts, lists.keys())
+            self.write(lists.keys())
 
     def of_many(self, names: Collection[str]) -> Callable[[Lists], None] | None:
         """Return the function of the lists of these names at many states; None until it has run so often that it is worth it."""
         self._runs_of_many += 1
         if self._runs_of_many == _WORTH_WRITING_FOR_MANY:
-            self._function_of_many = _write(self._parts, names, many=True)
+            self._function_of_many, _ = _write(self._parts, names, self._results, many=True)
         return self._function_of_many
 
 
@@ -87,16 +101,20 @@ def _run(part: LaidOutPart, lists: Lists) -> None:
             lists[name][places.start : places.stop] = [part.run] * part.count
         return
     run = part.run.on_floats
-    columns = [[lists[name][k] for k in places] if name else places for name, places in part.inputs]
-    rows = [run(row) for row in (zip(*columns, strict=True) if columns else [()] * part.count)]
-    for column, (name, places, update) in zip(zip(*rows, strict=True), part.outputs, strict=True):
-        target = lists[name]
-        for k, x in zip(places, column, strict=True):
-            target[k] = x if update == SET else _UPDATES_OF_FLOATS[update](target[k], x)
+    for k in range(part.count):
+        row = run([lists[name][places[k]] if name else 0.0 for name, places in part.inputs])
+        for x, (name, places, update) in zip(row, part.outputs, strict=True):
+            target, place = lists[name], places[k]
+            target[place] = x if update == SET else _UPDATES_OF_FLOATS[update](target[place], x)
 
 
-def _write(parts: Sequence[LaidOutPart], names: Collection[str], many: bool = False) -> Callable[[Lists], None]:
-    """Return the parts as one function of the lists, which have the given names, of floats or of arrays for many states."""
+def _write(
+    parts: Sequence[LaidOutPart], names: Collection[str], results: Collection[str] | None, many: bool = False
+) -> tuple[Callable[[Lists], None], Collection[str]]:
+    """Return the parts as one function of the lists, which have the given names, and the names that it uses.
+
+    The lists have floats, or arrays for `many` states.
+    """
     updates = _UPDATES_OF_ARRAYS if many else _UPDATES_OF_FLOATS
     text = PythonFunction("lists")
     lists = {name: text.assign(f"lists[{name!r}]") for name in names}
@@ -109,20 +127,16 @@ def _write(parts: Sequence[LaidOutPart], names: Collection[str], many: bool = Fa
         return known[name, place]
 
     for part in parts:
-        if isinstance(part.run, ScalarProgram):
-            program = part.run.on_arrays if many else part.run.on_floats
-            inputs = [[read(name, k) if name else "0.0" for name, k in row] for row in _rows(part.inputs, part.count)]
-            rows = [program.write(text, row) for row in inputs]
-        else:
-            rows = [[text.assign(repr(part.run))]] * part.count
-        for column, (name, places, update) in zip(zip(*rows, strict=True), part.outputs, strict=True):
-            for k, x in zip(places, column, strict=True):
-                known[name, k] = x if update == SET else text.call(updates[update], read(name, k), x)
-                written[name, k] = None
-    text.lines += [f"{lists[name]}[{k}] = {known[name, k]}" for name, k in written]
-    return text.compile()
-
-
-def _rows(columns: Sequence[tuple[str, Any]], count: int) -> list[list[tuple[str, int]]]:
-    """Return the array and index of each input of each row."""
-    return [[(name, places[k]) for name, places in columns] for k in range(count)]
+        for k in range(part.count):
+            if isinstance(part.run, ScalarProgram):
+                program = part.run.on_arrays if many else part.run.on_floats
+                row = program.write(text, [read(name, places[k]) if name else "0.0" for name, places in part.inputs])
+            else:
+                row = [text.assign(repr(part.run))]
+            for x, (name, places, update) in zip(row, part.outputs, strict=True):
+                place = places[k]
+                known[name, place] = x if update == SET else text.call(updates[update], read(name, place), x)
+                written[name, place] = None
+    text.lines += [f"{lists[name]}[{k}] = {known[name, k]}" for name, k in written if results is None or name in results]
+    used = text.drop_unused()
+    return text.compile(), {name for name, x in lists.items() if x in used}

@@ -92,6 +92,13 @@ class LoopProgram(NamedTuple):
     parts: Sequence[KernelLoop | Reset]
 
     @property
+    def written(self) -> set[str]:
+        """The names of all arrays that the program writes."""
+        names = {part.array for part in self.parts if isinstance(part, Reset)}
+        loops = [part for part in self.parts if isinstance(part, KernelLoop)]
+        return names.union(*({part.array(x.array) for x in part.kernel.outputs} for part in loops))
+
+    @property
     def arrays(self) -> set[str]:
         """The names of all arrays that the program reads or writes."""
         names = {part.array for part in self.parts if isinstance(part, Reset)}

@@ -1,12 +1,14 @@
 """Steps on numbers: run one by one at first, and as one generated Python function once they have run often."""
 
 import operator
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 Operand: TypeAlias = Any  # a number or array of Python, NumPy or JAX, each with its own operators
 
 _SYMBOLS: dict[Callable, str] = {operator.add: "+", operator.sub: "-", operator.mul: "*", operator.truediv: "/"}
+_NAME = re.compile(r"\bx\d+\b")
 # Runs of single steps that take as long as generating a Python function, which is three times as fast.
 _WORTH_WRITING = 20
 
@@ -17,6 +19,7 @@ class PythonFunction:
     def __init__(self, argument: str):
         self.lines: list[str] = []
         self._argument, self._known, self._count = argument, dict[str, Any](), 0
+        self._names = dict[str, str]()  # by expression
 
     def new_name(self) -> str:
         """Return a name that no other value has."""
@@ -24,9 +27,11 @@ class PythonFunction:
         return f"x{self._count}"
 
     def assign(self, expression: str) -> str:
-        """Give an expression a name, and return it."""
-        self.lines.append(f"{(name := self.new_name())} = {expression}")
-        return name
+        """Give an expression a name, and return it; the same expression has one name."""
+        if expression not in self._names:
+            self._names[expression] = name = self.new_name()
+            self.lines.append(f"{name} = {expression}")
+        return self._names[expression]
 
     def call(self, function: Callable[..., Any], *arguments: str) -> str:
         """Call a function of named values, and return the name of its result."""
@@ -37,6 +42,17 @@ class PythonFunction:
         key = f"f{id(function)}"
         self._known[key] = function
         return self.assign(f"{key}({', '.join(arguments)})")
+
+    def drop_unused(self) -> set[str]:
+        """Drop the lines whose values no later line uses; return the names that are used."""
+        used, lines = set[str](), []
+        for line in reversed(self.lines):
+            name, is_assigned, expression = line.partition(" = ")
+            if not (is_assigned and _NAME.fullmatch(name)) or name in used:
+                used.update(_NAME.findall(expression if is_assigned else line), _NAME.findall(name))
+                lines.append(line)
+        self.lines = lines[::-1]
+        return used
 
     def compile(self) -> Callable[[Any], Any]:
         """Return the function."""

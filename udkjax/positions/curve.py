@@ -1,15 +1,19 @@
 """Positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value, X = (q, s)."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
+from udkjax.equations.analysis import Analysis
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scale_program import RANK_TOL
@@ -17,6 +21,7 @@ from udkjax.pinv import SVD, Plus
 from udkjax.pinv.svd import SVDFactors
 from udkjax.positions.drive import Driven
 from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 NEWTON_STEPS = 8  # largest number; three are usual
@@ -55,32 +60,22 @@ class AbstractCurve(ABC):
 
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
         """Return True if the residual is rounding."""
-        xp = self.by.xp
-        return self.violation(X) <= CLOSURE.rounding * float(np.finfo(X.dtype).eps) * xp.maximum(1.0, xp.max(xp.abs(X)))
+        return self.violation(X) <= self.rounding(X)
+
+    def rounding(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
+        """Return the largest violation that rounding errors of the coordinates cause."""
+        return CLOSURE.rounding * float(np.finfo(X.dtype).eps) * self.by.xp.maximum(1.0, abs(X).max())
 
     def violation(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
         """Return the largest row of |Psi|, each relative to its scale."""
-        xp = self.by.xp
-        return xp.max(xp.abs(self.residual(X) / (self.weights * self.rows)), initial=0.0)
+        return abs(self.residual(X) / (self.weights * self.rows)).max(initial=0.0)
 
+    @abstractmethod
     def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
-        """Return the nearest point of the curve, with the same value if `fixed`, and whether Newton's method converged."""
-        xp = self.by.xp
-        if not len(self.rows):  # no constraints
-            return X, xp.asarray(True)
+        """Return the nearest point of the curve, with the same value if `fixed`, and whether Newton's method converged.
 
-        def body(state: _Correction) -> _Correction:
-            X, k, _ = state
-            E = self.slopes(X)
-            E = xp.where(fixed & (np.arange(len(X)) == len(X) - 1), 0.0, E)
-            return X - self.plus(E) @ self.residual(X), k + 1, self.is_closed(X)
-
-        def is_unfinished(state: _Correction) -> Bool[Array, ""]:  # the last step corrects a closed point once more
-            _, k, closed = state
-            return (k < NEWTON_STEPS) & ~closed
-
-        X, _, closed = self.by.while_loop(is_unfinished, body, (X, xp.asarray(0), xp.asarray(False)))
-        return X, closed
+        The last step corrects a closed point once more.
+        """
 
     def clearance(self, X: Float[Array, "n+1"]) -> Any:
         """Return the distance of E from rank loss, which occurs where branches meet: its n-th singular value over the largest."""
@@ -158,6 +153,23 @@ class Curve(AbstractCurve):
     def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
         return constraints.gamma(self.mechanism, s, q, v)
 
+    def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
+        if not len(self.rows):  # no constraints
+            return X, jnp.asarray(True)
+
+        def body(state: _Correction) -> _Correction:
+            X, k, _ = state
+            E = self.slopes(X)
+            E = jnp.where(fixed & (np.arange(len(X)) == len(X) - 1), 0.0, E)
+            return X - self.plus(E) @ self.residual(X), k + 1, self.is_closed(X)
+
+        def is_unfinished(state: _Correction) -> Bool[Array, ""]:
+            _, k, closed = state
+            return (k < NEWTON_STEPS) & ~closed
+
+        X, _, closed = jax.lax.while_loop(is_unfinished, body, (X, jnp.asarray(0), jnp.asarray(False)))
+        return X, closed
+
 
 @dataclass(frozen=True)
 class NumpyCurve(AbstractCurve):
@@ -168,23 +180,54 @@ class NumpyCurve(AbstractCurve):
     units: Float[np.ndarray, "n+1"]
     rows: Float[np.ndarray, "m"]
     independent: tuple[int, ...]
+    steps: Callable[[float, np.ndarray], tuple[np.ndarray, np.ndarray] | None] | None  # `DenseTerms.eliminated_steps`
 
     by: ClassVar[ControlFlow] = BY_NUMPY
 
+    @staticmethod
+    def of(driven: Driven) -> "NumpyCurve":
+        """Return the curve, made once for each mechanism and analysis."""
+        return _curve_of_concrete(driven.mechanism, driven.analysis, np.asarray(driven.unit).item())
+
     @classmethod
-    def of(cls, driven: Driven) -> "NumpyCurve":
-        scales = jax.tree.map(np.asarray, driven.analysis.scales)
-        units = np.append(np.tile([scales.length, scales.length, 1.0], driven.analysis.coordinates // 3), driven.unit)
-        independent = driven.analysis.independent_rows
-        return cls(DenseTerms.of(driven.mechanism), scales.weights, units, scales.rows, independent)
+    def make(cls, mechanism: Mechanism, analysis: Analysis, unit: float) -> "NumpyCurve":
+        scales = jax.tree.map(np.asarray, analysis.scales)
+        units = np.append(np.tile([scales.length, scales.length, 1.0], analysis.coordinates // 3), unit)
+        terms = DenseTerms.of(mechanism)
+        steps = terms.eliminated_steps(analysis.redundant_rows or (), float(scales.length))
+        return cls(terms, scales.weights, units, scales.rows, analysis.independent_rows, steps)
+
+    @cached_property
+    def _factors(self) -> Float[np.ndarray, "m n+1"]:
+        return self.weights[:, None] * self.units
+
+    @cached_property
+    def _at_rest(self) -> Float[np.ndarray, "n"]:
+        return np.zeros(len(self.units) - 1)
+
+    @cached_property
+    def _still(self) -> Float[np.ndarray, "m"]:
+        return np.zeros(len(self.rows))
+
+    def _geometry(self, X: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return Psi, Psi_s and the entries of Psi_q."""
+        x = X * self.units
+        return self.terms.geometry(x[-1], x[:-1], self._at_rest)
 
     def residual(self, X: Any) -> Any:
-        x = X * self.units
-        return self.weights * self.terms.psi(x[-1], x[:-1])
+        return self.weights * self._geometry(X)[0]
+
+    def violation(self, X: Any) -> Any:
+        return np.abs(self._geometry(X)[0] / self.rows).max(initial=0.0)
 
     def slopes(self, X: Any) -> Any:
-        x = X * self.units
-        return self.weights[:, None] * np.column_stack(self.terms.slopes(x[-1], x[:-1])) * self.units
+        return self._slopes(*self._geometry(X)[1:])
+
+    def _slopes(self, rate: np.ndarray, entries: np.ndarray) -> np.ndarray:
+        E = np.zeros(self._factors.shape)
+        E[self.terms.entries] = entries
+        E[:, -1] = rate
+        return E * self._factors
 
     def plus(self, E: Any, tol: float = RANK_TOL) -> TruncatedPseudoinverse:
         return TruncatedPseudoinverse.of(E, tol)
@@ -194,3 +237,38 @@ class NumpyCurve(AbstractCurve):
 
     def gamma(self, s: Any, q: Any, v: Any) -> Any:
         return self.terms.gamma(s, q, v)
+
+    def correct(self, X: Any, fixed: Any = False) -> tuple[Any, Any]:
+        """Correct as `Curve` does, a closed point by the pseudoinverse of the step before, from which it differs by rounding."""
+        if not len(self.rows):
+            return X, np.True_
+        if fixed and (corrected := self._eliminate(X)) is not None:
+            return corrected, np.True_
+        plus, closed = None, np.False_
+        for _ in range(NEWTON_STEPS):
+            psi, rate, entries = self._geometry(X)
+            closed = np.abs(psi / self.rows).max() <= self.rounding(X)
+            if plus is None or not closed:
+                plus = self.plus(self._slopes(self._still if fixed else rate, entries))
+            X = X - plus @ (self.weights * psi)
+            if closed:
+                break
+        return X, closed
+
+    def _eliminate(self, X: Any) -> np.ndarray | None:
+        """Return the nearest point of the curve with the same value, by elimination; None if that is not possible."""
+        x = X * self.units
+        q, s, rounding = x[:-1], float(x[-1]), self.rounding(X)
+        for _ in range(NEWTON_STEPS):
+            found = self.steps and self.steps(s, q)
+            if not found:
+                return None
+            q, psi = found
+            if np.abs(psi / self.rows).max() <= rounding:
+                return np.append(q, s) / self.units
+        return None
+
+
+@cached_by_identity
+def _curve_of_concrete(mechanism: Mechanism, analysis: Analysis, unit: float) -> NumpyCurve:
+    return NumpyCurve.make(mechanism, analysis, unit)

@@ -52,7 +52,7 @@ class Driven(NamedTuple):
     analysis: Analysis
     name: str  # name of the driver; empty if s is time
     row: int  # row of the driver in Psi; -1 if s is time
-    unit: Float[Array, ""]  # the unit of s: one radian, the characteristic length or the characteristic time
+    unit: NumberLike  # the unit of s: one radian, the characteristic length or the characteristic time
 
     @property
     def is_angle(self) -> bool:
@@ -77,9 +77,8 @@ def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mappin
     `held` has other values for them, or values of further coordinates, by name. Raises `SceneError` if there is no such driver or
     coordinate, or positions do not follow from its value.
     """
-    given = mechanism, driver, t, held
-    if is_traced(given):
-        return _drive(*given)
+    if not mechanism.is_concrete or is_traced((driver, t, held)):
+        return _drive(mechanism, driver, t, held)
     with jax.ensure_compile_time_eval():  # concrete even while something else is traced
         pairs = [(name, np.asarray(value, float).item()) for name, value in (held or {}).items()]
         return _drive_concrete(mechanism, driver, np.asarray(t, float).item(), *itertools.chain(*pairs))

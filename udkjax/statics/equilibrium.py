@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import library_for, number, stored
+from udkjax.arrays import library_for, make_module, number, stored
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.positions.assembly import State, close
@@ -36,6 +36,7 @@ SMALLEST_STIFFNESS = 1e-12  # relative to the scale of stiffnesses: smaller valu
 
 # The fraction of a step, the number of trials, whether the last was better, its q and the linearization at q.
 Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
+IsTrue: TypeAlias = Bool[Array, ""]  # named, since annotations of inner functions are evaluated at each call
 Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization at q, steps, whether the last was better
 
 
@@ -139,7 +140,7 @@ def equilibrium(
     free = degrees_of_freedom(analysis)
     t = number(t)
     q = close(mechanism, t, state, analysis=analysis).state.q
-    return solve(_equilibrium, mechanism.without_origin, analysis, t, number(library_for(q).ravel(q)), free, stable)
+    return solve(_equilibrium, mechanism.without_origin, analysis, t, library_for(q).ravel(q), free, stable)
 
 
 @checked
@@ -183,12 +184,12 @@ def degrees_of_freedom(analysis: Analysis) -> int:
 
 def _rest_curve(mechanism: Mechanism, analysis: Analysis, by: ControlFlow) -> AbstractCurve:
     """Return the positions of the mechanism as a curve over time."""
-    return (Curve if by is BY_JAX else NumpyCurve).of(Driven(mechanism, analysis, "", -1, number(1.0)))
+    return (Curve if by is BY_JAX else NumpyCurve).of(Driven(mechanism, analysis, "", -1, 1.0))
 
 
 def _omega2(at: Linearization, by: ControlFlow) -> Float[Array, "f"]:
     """Return omega^2 of the undamped linearization, (rad/s)^2, ascending."""
-    xp, (_, K) = by.xp, with_unit_mass(at, by)
+    xp, K = by.xp, with_unit_mass(at, by)[1]
     return xp.linalg.eigvalsh(0.5 * (K + K.T)) if len(K) else xp.zeros(0)
 
 
@@ -206,7 +207,8 @@ def _equilibrium(
     unbalanced = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
     balanced = curve.is_closed(xp.append(q, t) / curve.units) & (unbalanced <= FORCE_TOL)
     neutral, friction = SMALLEST_STIFFNESS * scale.stiffness, Friction.names_in(mechanism.forces)
-    return Equilibrium(
+    return make_module(
+        Equilibrium,
         q=q.reshape(-1, 3),
         multipliers=at.multipliers,
         omega2=_omega2(at, by),
@@ -226,10 +228,7 @@ def _settle(
         return q
     by, xp, scale = curve.by, curve.by.xp, near.scale(t, q)
 
-    def at(q: Float[Array, "n"]) -> Linearization:
-        return near.linearize(t, q)
-
-    def is_unsettled(state: Settling) -> Bool[Array, ""]:
+    def is_unsettled(state: Settling) -> IsTrue:
         _, current, k, better = state
         return better & (k < MOST_NEWTON_STEPS) & (xp.linalg.norm(current.force) > FORCE_ROUNDING * scale.force)
 
@@ -244,21 +243,21 @@ def _settle(
             share, j, *_ = state
             X, closed = curve.correct(xp.append(q + share * step, t) / curve.units, fixed=True)
             new = (X * curve.units)[:-1]
-            trial = at(new)
+            trial = near.linearize(t, new)
             # A position is better if the loads do work (by the trapezoidal rule), or the unbalanced loads decrease.
             work = 0.5 * (current.loads + trial.loads) @ (new - q)
             better = (work > 0 if stable else False) | (xp.linalg.norm(trial.force) < size)
             return 0.5 * share, j + 1, closed & better, new, trial
 
-        def worse(state: Trial) -> Bool[Array, ""]:
+        def worse(state: Trial) -> IsTrue:
             return (state[1] < CLOSURE.halvings) & ~state[2]
 
         first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, current
-        _, _, better, new, new_linearization = by.while_loop(worse, trial, first)
-        new, new_linearization = jax.tree.map(lambda x, y: xp.where(better, x, y), (new, new_linearization), (q, current))
-        return new, new_linearization, k + 1, better
+        _, _, better, new, following = by.while_loop(worse, trial, first)
+        new, following = by.cond(better, lambda: (new, following), lambda: (q, current))
+        return new, following, k + 1, better
 
-    start = q, at(q), xp.asarray(0), xp.asarray(True)
+    start = q, near.linearize(t, q), xp.asarray(0), xp.asarray(True)
     return by.while_loop(is_unsettled, body, start)[0]
 
 

@@ -24,6 +24,7 @@ from udkjax.equations.analysis import Analysis
 from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.load_scale import LoadScale, load_scale, scale_of
 
@@ -86,21 +87,32 @@ class NumpyLinearizer:
         self._weights, self._tol = scales.weights, float(scales.rank_tol)
         self._units = np.asarray(scales.coordinates(self._terms.size))
         self._root = 1 / np.sqrt(self._terms.mass)
+        self._factors = self._weights[:, None] * self._root
+        self._latest: tuple[Any, Any] = None, None  # the last state and its linearization
 
     def linearize(self, t: Any, q: Any) -> Any:
-        """Return the linearization at rest in a closed position q at time t (s)."""
+        """Return the linearization at rest in a closed position q at time t (s); the last one is cached."""
+        key, latest = (float(t), q.tobytes()), self._latest
+        if latest[0] != key:
+            self._latest = latest = key, self._linearize(t, q)
+        return latest[1]
+
+    def _linearize(self, t: Any, q: Any) -> Linearization:
         terms, root, w = self._terms, self._root, self._weights
         at_rest = terms.loads_at_rest(t, q)
         if terms.count:
-            D = w[:, None] * terms.slopes(t, q)[0] * root
+            D = terms.slopes(t, q)[0] * self._factors
             plus = TruncatedPseudoinverse.of(D, self._tol, full=True)
             V = plus.vt[terms.size - self._free :].T
-            N = root[:, None] * (V - plus @ (D @ V))
+            if plus.rank + self._free > terms.size:  # V is not orthogonal to all rows: this position is not closed
+                V = V - plus @ (D @ V)
+            N = root[:, None] * V
             multipliers = w * plus.transposed_times(root * at_rest.force)
             K = at_rest.stiffness + terms.curvature(t, q, multipliers)
         else:
             N, multipliers, K = np.diag(root), np.zeros(0), at_rest.stiffness
-        reduced = N.T @ (terms.mass[:, None] * N), N.T @ at_rest.damping @ N, N.T @ K @ N, N.T @ at_rest.force
+        NT = N.T
+        reduced = NT @ (terms.mass[:, None] * N), NT @ at_rest.damping @ N, NT @ K @ N, NT @ at_rest.force
         found: tuple[Any, ...] = N, *reduced, at_rest.force, multipliers
         return Linearization._make(found)
 
@@ -131,7 +143,12 @@ Linearizer = NumpyLinearizer | TracedLinearizer
 
 def linearizer(mechanism: Mechanism, analysis: Analysis, free: int, by: ControlFlow) -> Linearizer:
     """Return the linearizer of a mechanism with `free` degrees of freedom."""
-    return (TracedLinearizer if by is BY_JAX else NumpyLinearizer)(mechanism, analysis, free)
+    return (TracedLinearizer if by is BY_JAX else _linearizer_of_concrete)(mechanism, analysis, free)
+
+
+@cached_by_identity
+def _linearizer_of_concrete(mechanism: Mechanism, analysis: Analysis, free: int) -> NumpyLinearizer:
+    return NumpyLinearizer(mechanism, analysis, free)
 
 
 def with_unit_mass(at: Linearization, by: ControlFlow) -> tuple[Array, Array]:

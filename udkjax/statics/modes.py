@@ -98,7 +98,7 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
     analysis = analyse(mechanism) if analysis is None else analysis
     free, t = degrees_of_freedom(analysis), number(t)
     state = equilibrium(mechanism, None, t, analysis=analysis).state if state is None else state
-    found = solve(_modes, mechanism.without_origin, analysis, t, number(library_for(state.q).ravel(state.q)), free)
+    found = solve(_modes, mechanism.without_origin, analysis, t, library_for(state.q).ravel(state.q), free)
     rubbing = [name for name, x in mechanism.forces.items() if isinstance(x, Friction) and (x.rubs or x.sticks)]
     return replace(found, left_out=tuple(rubbing))
 

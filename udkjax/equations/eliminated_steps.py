@@ -1,0 +1,68 @@
+"""Newton steps to Psi = 0 by elimination, on Python's floats: three times as fast as by singular values, for small scenes.
+
+The steps are the smallest in units of the scene's coordinates, as those by singular values of the same rows. Elimination is used
+only where rows are clearly independent, and for structures that have been corrected often enough: its function of floats takes
+as long to generate as some hundred corrections by singular values.
+"""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from udkjax.equations.scene_arrays import SceneArrays
+from udkjax.equations.scene_programs import programs_of_structure
+from udkjax.equations.structure import Structure
+
+WORTH = 100  # corrections of one structure by singular values before elimination is prepared
+CLEAR = 0.1  # smallest distance from dependent rows: elimination loses as many digits as the square of its reciprocal has, two
+
+
+class EliminatedSteps:
+    """Newton steps of a mechanism of concrete numbers.
+
+    Args:
+        kind: the structure of the mechanism.
+        numbers: its numbers as a vector.
+        redundant_rows: rows of Psi that are left out.
+        length: the unit of coordinates that are lengths (m); angles are in rad.
+    """
+
+    def __init__(self, kind: Structure, numbers: np.ndarray, redundant_rows: tuple[int, ...], length: float):
+        self._given, self._uses = (kind, numbers, redundant_rows, length), _uses(kind, redundant_rows)
+        self._arrays: SceneArrays[np.ndarray] | None = None
+
+    def __call__(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return q after a step, and Psi of all rows before it; None if another method is needed."""
+        if self._arrays is None:
+            self._uses.append(0)
+            if len(self._uses) <= WORTH:
+                return None
+            self._arrays = self._make_arrays(*self._given)
+        found = self._arrays.newton_step(t, q)
+        return None if found is None or not found[2] > CLEAR else found[:2]
+
+    @staticmethod
+    def _make_arrays(
+        kind: Structure, numbers: np.ndarray, redundant_rows: tuple[int, ...], length: float
+    ) -> SceneArrays[np.ndarray]:
+        numbers, (masses, inertias) = numbers.copy(), _places(kind)
+        numbers[masses], numbers[inertias] = 1.0, length**2
+        return SceneArrays(programs_of_structure(*kind, redundant_rows), numbers, np)
+
+
+@lru_cache(maxsize=64)
+def _places(kind: Structure) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places of masses and inertias among the numbers of a structure."""
+    tree, shapes = kind
+    ends = np.cumsum([math.prod(shape) for shape, _ in shapes]).tolist()
+    leaves = [np.arange(end - math.prod(shape), end).reshape(shape) for end, (shape, _) in zip(ends, shapes, strict=True)]
+    bodies = tree.unflatten(leaves).bodies.values()
+    masses, inertias = (np.array([getattr(body, name) for body in bodies], int) for name in ("mass", "inertia"))
+    return masses, inertias
+
+
+@lru_cache(maxsize=64)
+def _uses(kind: Structure, redundant_rows: tuple[int, ...]) -> list[int]:
+    """Return a list with an entry for each correction so far of mechanisms with this structure and these rows."""
+    return []
