@@ -40,12 +40,17 @@ def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = Non
         isinstance(mechanism, Mechanism)
         and mechanism.is_concrete
         and (method is None or (type(method) in (SVD, Auto) and method.relative and not is_traced(method)))
-        and not (is_traced(numbers) or is_within_jit() or mechanism.samples)
+        and not (is_traced(numbers) or is_within_jit())
         and config.jax_enable_x64
         and not (config.jax_disable_jit or config.jax_debug_nans)
-        and not any(joint is not None for joint in rubbing_joints(mechanism))
-        and not Friction.may_stick(mechanism._forces)
+        and _is_supported(mechanism)
     )
+
+
+@cached_by_identity
+def _is_supported(mechanism: Mechanism) -> bool:
+    rubs = any(joint is not None for joint in rubbing_joints(mechanism))
+    return not (mechanism.samples or rubs or Friction.may_stick(mechanism._forces))
 
 
 StateArraysOverTime: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]  # times (T,), coordinates and velocities (T, n)
@@ -102,14 +107,15 @@ class StateArrays:
         """Return F (T, n)."""
         return self.mass * self._along(lambda t, q, v: self._at.loads(t, q, v)[0], t, q, v)
 
-    def load_sizes(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the sums of the absolute loads of gravity and of each force element (T, n)."""
-        sizes = np.tile(np.abs(self._weight), (len(t), 1))
+    def force_and_sizes(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return F (T, n), and the sums of the absolute loads of gravity and of each force element (T, n)."""
+        force, sizes = (np.tile(x, (len(t), 1)) for x in (self._weight, np.abs(self._weight)))
         rows = self._at.programs.at_rest.places[LOADS].rows
         if len(rows):
             loads = self._along(lambda t, q, v: self._at.element_loads(t, q, v)[LOADS], t, q, v)
+            np.add.at(force.T, rows, loads.T)
             np.add.at(sizes.T, rows, np.abs(loads).T)
-        return sizes
+        return force, sizes
 
     def energy(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the kinetic and the potential energy (T, 2)."""
@@ -117,7 +123,7 @@ class StateArrays:
 
     def jacobian(self, t: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return Psi_q (T, m, n)."""
-        return self.dense(self._evaluate(self._at.geometry, t, q, np.zeros((1, self.size)))[2])
+        return self.dense(self._evaluate(lambda t, q, v: self._at.jacobian(t, q), t, q, q))
 
     def dense(self, entries: np.ndarray) -> np.ndarray:
         """Return matrices (T, m, n) from their entries (entries, T)."""

@@ -7,6 +7,7 @@ import weakref
 import zlib
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache, partial
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -230,24 +231,29 @@ class MemberCalls:
     """Calls of one operation on concrete numbers of any number of members."""
 
     def __init__(self, operation: Operation):
-        self._operation, self._shapes = operation, ()
+        self._operation, self._shapes, self._lock = operation, (), Lock()
         self._prepared: PreparedCall | None = None
 
     def __call__(self, *inputs: np.ndarray, times: int) -> list[np.ndarray]:
         """Return the outputs."""
         return call_members(*inputs, operation=self._operation, times=times)
 
-    def at_states(self, *inputs: np.ndarray) -> list[np.ndarray]:
+    def of_one(self, *inputs: np.ndarray, times: int) -> list[np.ndarray]:
+        """Return the outputs of an operation as for `at_states`, for one member at some times."""
+        with self._lock:
+            return [x.copy() for x in self.at_states(*inputs, times=times)]
+
+    def at_states(self, *inputs: np.ndarray, times: int = 2) -> list[np.ndarray]:
         """Return the outputs, which the next call overwrites; arrays of the same shapes as in the last call are prepared already.
 
-        The operation computes at single states: it writes all of its outputs, and has no later operation.
+        The operation writes all of its outputs, as one at single states does, and has no later operation.
         """
         shapes = tuple([x.shape for x in inputs])
         if self._prepared is not None and shapes == self._shapes:
             for own, x in zip(self._prepared.inputs, inputs, strict=True):
                 own[...] = x
             return self._prepared()
-        code, results = _select_code(inputs, self._operation), self._operation.shapes(inputs, 2)
+        code, results = _select_code(inputs, self._operation), self._operation.shapes(inputs, times)
         if results[0][0] <= QUICK_MEMBERS and code.is_quick(inputs):
             return code(inputs, results)
         self._prepared, self._shapes = code.prepare([np.array(x, float) for x in inputs], results), shapes

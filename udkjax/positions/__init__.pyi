@@ -58,6 +58,7 @@ from udkjax.positions.kinematics import FULL_TURN as FULL_TURN
 from udkjax.positions.kinematics import Kinematics as Kinematics
 from udkjax.positions.kinematics import Travel as Travel
 from udkjax.positions.kinematics import kinematics as kinematics
+from udkjax.positions.kinematics import motion_in_time as motion_in_time
 from udkjax.positions.kinematics import travel as travel
 from udkjax.positions.linkage_type import pins_with_bodies as pins_with_bodies
 from udkjax.positions.linkage_type import transmission_pins as transmission_pins

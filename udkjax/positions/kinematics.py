@@ -1,6 +1,7 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the values of a driver."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,9 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import library_for, number, stored
+from udkjax.arrays import is_traced, library_for, make_module, number, stored
 from udkjax.equations.analysis import Analysis, analyse
-from udkjax.positions.assembly import State, assemble
+from udkjax.positions.assembly import State, assemble, close
 from udkjax.positions.branches import SAME_POSITION
 from udkjax.positions.carried_bodies import carried_bodies
 from udkjax.positions.continuation import Points, Reached, follow, no_points
@@ -177,7 +178,25 @@ def kinematics(
         SceneError: no such driver or coordinate, or positions do not follow from it.
         ValueError: `values`, `rate` or `acceleration` has the wrong shape.
     """
-    values, rate, acceleration = number(values), number(rate), number(acceleration)
+    return _over_values(mechanism, driver, number(values), state, rate, acceleration, held, put=True)
+
+
+def motion_in_time(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> Kinematics:
+    """Return the `kinematics` of all drivers at the times ts (s), with NumPy arrays if all numbers are concrete."""
+    return _over_values(mechanism, None, ts, None, 1.0, 0.0, None, put=False)
+
+
+def _over_values(
+    mechanism: Mechanism,
+    driver: Drive,
+    values: Any,
+    state: State | None,
+    rate: Any,
+    acceleration: Any,
+    held: Mapping[str, NumberLike] | None,
+    put: bool,
+) -> Kinematics:
+    rate, acceleration = (number(x) if is_traced(x) else np.asarray(x, float) for x in (rate, acceleration))
     if values.ndim != 1 or not len(values):
         raise ValueError(f"values must be a list of at least one number, not of the shape {values.shape}; batch it by jax.vmap")
     for name, given in (("rate", rate), ("acceleration", acceleration)):
@@ -187,7 +206,7 @@ def kinematics(
             )
     first = values[0] if isinstance(values, Tracer) else np.asarray(values)[0]
     driven, q = _start(mechanism, driver, first, state, held)
-    return solve(_kinematics, driven, q, values, rate, acceleration, mechanism.body_names)
+    return solve(_kinematics, driven, q, values, rate, acceleration, mechanism.body_names, put=put)
 
 
 @checked
@@ -243,7 +262,19 @@ def _kinematics(
     a = points.ddq * rate[:, None] ** 2 + points.dq * acceleration[:, None]
     q, v, a = (xp.reshape(x, (len(values), -1, 3)) for x in (points.q, v, a))
     limit_q, unit = points.limit_q.reshape(-1, 3), driven.value_unit
-    return Kinematics(values, q, v, a, rate, points.status, points.limit, limit_q, bodies, unit)
+    return make_module(
+        Kinematics,
+        values=values,
+        q=q,
+        v=v,
+        a=a,
+        rate=rate,
+        status=points.status,
+        limit=points.limit,
+        limit_q=limit_q,
+        bodies=bodies,
+        unit=unit,
+    )
 
 
 def _travel(driven: Driven, q: Float[Array, "n"], far: NumberLike, by: ControlFlow) -> Travel:
@@ -271,7 +302,7 @@ def _start(
 
 
 def _assemble(mechanism: Mechanism, t: NumberLike, state: State | None, analysis: Analysis) -> Float[Array, "n"]:
-    q = assemble(mechanism, t, state, throw=False, analysis=analysis).q
+    q = close(mechanism, t, state, analysis=analysis).state.q
     return library_for(q).ravel(q)
 
 

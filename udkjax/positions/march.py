@@ -14,7 +14,7 @@ from udkjax.annotations import NumberLike, NumericArray
 from udkjax.equations.analysis import Analysis
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.native.position_operations import March
-from udkjax.native.primitive import call_concrete, native_p
+from udkjax.native.primitive import MemberCalls, native_p
 from udkjax.native.unsupported import unsupported
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.held import row_size, with_row
@@ -75,7 +75,7 @@ def march_at_once(
 
     def march_on(s: NumberLike, q: NumericArray, values: NumericArray) -> MarchResult:
         inputs = _inputs(prepared, analysis, unit, s, q, values, np)
-        return _march(call_concrete(prepared.operation, inputs, APPROACH + len(values)), np)
+        return _march(prepared.calls.of_one(*inputs, times=APPROACH + len(values)), np)
 
     found, parts, piece = march_on(s, q, values), FINER, FIRST_PIECE
     count = int(found.trusted)
@@ -109,11 +109,18 @@ class _Prepared(NamedTuple):
 
     operation: March
     numbers: list[Any]
+    calls: MemberCalls
 
 
 def _numbers(mechanism: Mechanism, analysis: Analysis, xp: ModuleType) -> _Prepared:
     numbers = _of_unit_masses(_without_loads(mechanism), analysis.scales.length, xp).numbers
-    return _Prepared(_operation(mechanism, analysis), [*numbers, DEPENDENT, 0.0])
+    operation = _operation(mechanism, analysis)
+    return _Prepared(operation, [*numbers, DEPENDENT, 0.0], _calls(operation))
+
+
+@cached_by_identity
+def _calls(operation: March) -> MemberCalls:
+    return MemberCalls(operation)
 
 
 @cached_by_identity

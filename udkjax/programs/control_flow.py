@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import PyTree
 
 from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit, put_arrays
@@ -100,22 +101,31 @@ def control_flow(xp: ArrayLibrary) -> ControlFlow:
     return BY_NUMPY if xp is np else BY_JAX
 
 
-def solve(function: Callable[..., Result], *arguments: Any) -> Result:
-    """Return function(*arguments, flow), by NumPy's control flow if all numbers are concrete, else by JAX's in one program."""
-    if is_traced(arguments):
+def solve(function: Callable[..., Result], *arguments: Any, put: bool = True) -> Result:
+    """Return function(*arguments, flow), by NumPy's control flow if all numbers are concrete, else by JAX's in one program.
+
+    NumPy's results are converted to JAX arrays, if `put`.
+    """
+    leaves, tree = jax.tree.flatten(arguments, is_leaf=lambda x: isinstance(x, eqx.Module))
+    is_module = [isinstance(x, eqx.Module) for x in leaves]
+    if any(_is_traced_module(x) if m else isinstance(x, Tracer) for x, m in zip(leaves, is_module, strict=True)):
         return _compiled(_by_jax, function, *arguments)
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
-        concrete = jax.tree.map(_concrete, arguments, is_leaf=lambda x: isinstance(x, eqx.Module))
-        return put_arrays(function(*concrete, BY_NUMPY))
+        concrete = [_concrete_module(x) if m else _by_numpy(x) for x, m in zip(leaves, is_module, strict=True)]
+        found = function(*jax.tree.unflatten(tree, concrete), BY_NUMPY)
+        return put_arrays(found) if put else found
 
 
-def _concrete(x: Any) -> Any:
-    return _concrete_module(x) if isinstance(x, eqx.Module) else np.asarray(x) if eqx.is_array(x) else x
+_is_traced_module = cached_by_identity(is_traced)
+
+
+def _by_numpy(x: Any) -> Any:
+    return np.asarray(x) if isinstance(x, jax.Array) else x
 
 
 @cached_by_identity  # the same object for the same module, so that what is computed from it is found again
 def _concrete_module(module: eqx.Module) -> eqx.Module:
-    return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, module)
+    return jax.tree.map(_by_numpy, module)
 
 
 def _by_jax(function: Callable[..., Result], *arguments: Any) -> Result:

@@ -16,7 +16,7 @@ from udkjax.equations.directed_friction import DirectedFriction
 from udkjax.equations.effort_arrays import efforts_by_numpy
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD
-from udkjax.positions.coordinates import Coordinate, choose_name, constant_motion, named_element, value_of
+from udkjax.positions.coordinates import Coordinate, choose_name, constant_motion, element_of, named_element, value_of
 from udkjax.positions.drive import with_drivers
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
@@ -112,6 +112,12 @@ def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
         return lambda x: x
     plus = SVD(RANK_TOL).plus(J)
     return lambda x: x - plus @ (J @ x)
+
+
+@cached_by_identity
+def elements_of(mechanism: Mechanism, *drivers: str | Coordinate) -> tuple[Coordinate, ...]:
+    """Return the coordinates of drivers, as `element_of`."""
+    return tuple(element_of(mechanism, driver) for driver in drivers)
 
 
 @cached_by_identity

@@ -15,21 +15,23 @@ direction v of the motion.
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any, Literal, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import is_traced, library_for, number, number_called, put_arrays
+from udkjax.arrays import is_traced, is_within_jit, library_for, make_module, number, number_called, put_arrays
 from udkjax.equations.analysis import analyse
 from udkjax.positions.channels import StateHistory
 from udkjax.positions.coordinates import Coordinate, choose_name, coordinate_value, element_of
 from udkjax.positions.drive import without_drivers
-from udkjax.positions.kinematics import Kinematics, kinematics
+from udkjax.positions.kinematics import Kinematics, motion_in_time
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
@@ -37,7 +39,7 @@ from udkjax.scene.drivers import Motion, Spline
 from udkjax.scene.fields import CALLED
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.driver_efforts import driver_efforts
+from udkjax.study.driver_efforts import driver_efforts, elements_of
 from udkjax.wording import quote
 
 
@@ -166,10 +168,10 @@ def inverse_dynamics(
         SceneError: there are no drivers, or a name is unknown.
         ValueError: the number of states of `motion` differs from that of `ts`.
     """
-    ts = number(ts)
+    times: Any = number(ts) if is_traced(ts) else np.array(ts, float)
     computed = None
     if motion is None:
-        motion = computed = kinematics(mechanism, None, ts)
+        motion = computed = motion_in_time(mechanism, times)
     chosen = list(mechanism.driver_names) if drivers is None else list(drivers)
     if not chosen:
         raise SceneError(["drivers: the scene has none; name coordinates to drive, such as body.crank.angle"], mechanism.name)
@@ -177,21 +179,26 @@ def inverse_dynamics(
     unknown = [name for name in weights or {} if name not in named]
     if unknown:
         raise SceneError([f"weights: {quote(name)} is not among the drivers" for name in unknown], mechanism.name)
-    xp = library_for((weights, ts))
+    xp = library_for((weights, times))
     w = xp.stack([xp.asarray((weights or {}).get(name, 1.0), float) for name in named])
-    values = tuple(element_of(mechanism, d) for d in named.values())
+    values = elements_of(mechanism, *named.values())
     joints, q = without_drivers(mechanism), motion.q
-    if len(q) != len(ts):
-        raise ValueError(f"motion has {len(q)} states, but ts has {len(ts)} times: give the times of the motion")
+    if len(q) != len(times):
+        raise ValueError(f"motion has {len(q)} states, but ts has {len(times)} times: give the times of the motion")
     efforts, rates, residual = driver_efforts(
-        mechanism, joints, analyse(joints), tuple(named.values()), values, w, ts, (q, motion.v, motion.a)
+        mechanism, joints, analyse(joints), tuple(named.values()), values, w, times, (q, motion.v, motion.a)
     )
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
-    found: tuple[Any, Any, Any] = columns, powers, residual
-    found = found if is_traced(found) else put_arrays(found)
+    parts: dict[str, Any] = {"ts": times, "motion": computed, "efforts": columns, "powers": powers, "residual": residual}
+    with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext():  # concrete numbers stay concrete
+        parts = _put_concrete(parts) if is_traced(parts) else put_arrays(parts)
     effort_units = tuple((name, value.effort_unit) for name, value in zip(named, values, strict=True))
-    return InverseDynamics(ts, computed, *found, effort_units)
+    return make_module(InverseDynamics, **parts, effort_units=effort_units)
+
+
+def _put_concrete(parts: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: part if is_traced(part) else put_arrays(part) for name, part in parts.items()}
 
 
 @checked
