@@ -42,7 +42,7 @@ def make():
         ),
     }
     shapes = {"rod": [(-0.5, 0.0), (0.5, 0.0)]}
-    mechs, sols = ({label: run[k] for label, run in runs.items()} for k in range(2))
+    mechs, sols = {label: mech for label, (mech, _) in runs.items()}, {label: sol for label, (_, sol) in runs.items()}
     return facts, {"motion": udk.animate(mechs, sols, shapes=shapes, traces=[("rod", (-0.5, 0.0)), ("rod", (0.5, 0.0))])}
 
 
