@@ -3,6 +3,7 @@
 # pyright: reportOptionalMemberAccess=false
 # All of these runs have events.
 import warnings
+from itertools import product
 from typing import Any
 
 import equinox as eqx
@@ -234,3 +235,68 @@ def test_events_within_a_step_that_reaches_a_sample(engine):
             np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
             assert int(rejected) == 0
             np.testing.assert_allclose(rates(-before, start, end), [-1.0, 0.2], atol=1e-12)
+
+
+def test_a_run_that_ends_before_a_sample():
+    """No step may end a little before another sample: interpolation through close points would amplify rounding errors."""
+    values, dt, velocity = np.array([1.82, 7.62, -2.68]), 0.25, -0.217
+    held = udk.Held(values[:, None] * [1.0, 0.0], dt)
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", held)}, gravity=[0.0, 0.0])
+    state = udk.State(np.zeros((1, 3)), [[velocity, 0.0, 0.0]])
+    slow = udk.Event(lambda t, at: at["b"].vx + 0.306, udk.Log(), name="slow")
+    for before, dt0 in product((1e-3, 1e-4, 1e-5), (0.006, 0.04, 0.07, 0.2)):  # these lead to such steps
+        run = udk.simulate(body, [0.0, 0.75 - before], state, rtol=1e-10, atol=1e-10, dt0=dt0, events=slow)
+        assert int(run.events.count) == 0
+        np.testing.assert_allclose(run.v[-1, 0, 0], velocity + values @ [dt, dt, dt - before], rtol=1e-12)
+
+
+def test_events_just_before_the_end_happen_once():
+    """In a step of a nanosecond, velocities follow from velocities and accelerations: positions are rounded too coarsely."""
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", [1.0, 0.0])}, gravity=[0.0, 0.0])
+    stops = udk.Event(lambda t, at: at["b"].vx, udk.Log(), name="stops")
+
+    def times(place, velocity, rest):
+        state = udk.State(jnp.zeros((1, 3)).at[0, 0].set(place), jnp.zeros((1, 3)).at[0, 0].set(velocity))
+        run = udk.simulate(body, jnp.stack([0.0, -jax.lax.stop_gradient(velocity) + rest]), state, events=stops, max_events=3)
+        return run.events.time, run.events.count
+
+    run = jax.jit(times)
+    for place in (0.0, 0.7, -1.3):
+        for velocity in (-0.3, -0.6, -1.1):
+            for rest in (1e-7, 1e-9, 1e-11):
+                found, count = run(place, velocity, rest)
+                assert int(count) == 1
+                np.testing.assert_allclose(found[0], -velocity, rtol=0.0, atol=1e-14)
+
+
+def test_an_event_just_after_a_start_at_a_sample():
+    """The first node is at the state behind the sample, or an event in the first interval would be bisected."""
+    held = udk.Held(np.array([9.0, 1.0, 5.0])[:, None] * [1.0, 0.0], 0.5)
+    guide = udk.Prismatic(["ground", "b"], [[0.0, 0.0], [0.0, 0.0]], axis=0.0)
+    rub, g, mu = udk.Friction("guide", coefficient=0.25, law="set-valued"), 9.81, 0.25
+    forces = {"u": udk.Force("b", held), "f": rub}
+    block = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, {"guide": guide}, forces=forces, gravity=[0.0, -g])
+    rest = udk.State(np.zeros((1, 3)), np.zeros((1, 3)))
+    for time in (0.5001, 0.51, 0.53):
+        tick = udk.Event(lambda t, at, time=time: t - time, udk.Log(), name="tick")
+        run = udk.simulate(block, [0.5, 1.5], rest, events=tick)
+        np.testing.assert_allclose(run.events.time, [time, 1.0], rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(run.v[-1, 0, 0], (5.0 - mu * g) * 0.5, rtol=1e-12)
+        assert int(run.stats["steps"]) < 30
+
+
+class Step(udk.ForceElement):
+    """A force that jumps at x = 0."""
+
+    def loads(self, t, *frames):
+        return [(jnp.where(frames[0].x > 0.0, -3.0, 0.0), 0.0, 0.0)]
+
+
+def test_a_jump_of_a_force_just_after_a_start_at_a_sample():
+    held = udk.Held(np.array([9.0, 1.0, 5.0])[:, None] * [1.0, 0.0], 0.5)
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1)}, forces={"u": udk.Force("b", held), "s": Step("b")}, gravity=[0.0, 0.0])
+    for time in (1e-4, 1e-2, 5e-2):
+        place = -(2.0 * time + 0.5 * time**2)
+        run = udk.simulate(body, [0.5, 1.0], udk.State([[place, 0.0, 0.0]], [[2.0, 0.0, 0.0]]))
+        np.testing.assert_allclose(run.v[-1, 0, 0], 2.0 + time - 2.0 * (0.5 - time), rtol=1e-12)
+        assert np.isinf(run.unlocated) and int(run.stats["rejected"]) == 0

@@ -81,6 +81,9 @@ POINTS = 4  # states that the interpolating polynomial passes through; with thre
 # if the last step is 1/300 of the step before it.
 SHORTEST_LAST = 0.25
 STRETCH = 12.0  # largest ratio of the last step to those before: steps grow at most tenfold
+# Length of a step, in T, below which the change of a position follows from velocities and accelerations at its ends: the error is
+# of the fifth order, while the rounding errors of the positions would add as many units of rounding to a velocity, divided by it.
+SHORT_STEP = 1e-6
 
 
 class Status:

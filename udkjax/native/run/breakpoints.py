@@ -26,7 +26,7 @@ def aim(module: Module, f: Function, s: Lane):
     t1 = start + length
     last = (t1 >= s.end - s.smallest) & ~begin
     if not module.plan.breaks:
-        t1 = where(last, s.end, halve(f, s, t1, begin | last))
+        t1 = where(last, s.end, halve(f, s, t1, s.end, begin | last))
         s.lands = f.const(0.0, DOUBLE, f.width)
     else:
         rest = f.min(stop, s.end) - start
@@ -40,7 +40,9 @@ def aim(module: Module, f: Function, s: Lane):
             splits = splits & (s.trial <= 0.0)
         if module.pieces:
             splits = splits & s.aim.is_not(float(AIM_ACROSS))
-        t1 = where(splits, split, t1 if module.pieces else halve(f, s, t1, begin | last | splits))
+        reached = t1 >= stop - s.smallest * 2.0
+        halved = t1 if module.pieces else halve(f, s, t1, f.min(stop, s.end), begin | last | splits | reached)
+        t1 = where(splits, split, halved)
         reaches = (t1 >= stop - s.smallest * 2.0) & (stop < s.end - s.smallest) & ~begin
         last = last & ~reaches & ~splits
         final = s.end - f.max(s.end - end, 0.0)
@@ -54,10 +56,10 @@ def aim(module: Module, f: Function, s: Lane):
     s.last = where(last, yes, 0.0)
 
 
-def halve(f: Function, s: Lane, t1: Value, otherwise: Value) -> Value:
-    """Return the end of a step: `t1`, or the middle of the remaining time if little would remain after `t1`."""
-    short = (s.end - t1 < s.h * SHORTEST_LAST) & ~otherwise
-    return f.select(short, s.point3_t + (s.end - s.point3_t) * 0.5, t1)
+def halve(f: Function, s: Lane, t1: Value, stop: Value, otherwise: Value) -> Value:
+    """Return the end of a step: `t1`, or the middle of the time until `stop` if little of it would remain after `t1`."""
+    short = (stop - t1 < s.h * SHORTEST_LAST) & ~otherwise
+    return f.select(short, s.point3_t + (stop - s.point3_t) * 0.5, t1)
 
 
 def next_breakpoint(module: Module, f: Function, s: Lane, now: Value):

@@ -3,7 +3,7 @@
 from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import Lane, Layout
 from udkjax.native.base.module import Module
-from udkjax.native.base.steps import POINTS, STRETCH
+from udkjax.native.base.steps import POINTS, SHORT_STEP, STRETCH
 from udkjax.native.run.manifold import project_output
 
 
@@ -12,6 +12,7 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
     pointer = to[0] if to else "work"
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
     inverse, used = _spacing(module, f, s)
+    short = _short_steps(module, f, s)
     with f.each(module.registers(pointer)) as r:
         points = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
         column = [x for x in points["q"] for _ in range(3)]  # each point is a triple node, of its q, v and a (Hermite)
@@ -22,6 +23,10 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
             for i in range(3 * POINTS - degree):
                 first, last = i // 3, (i + degree) // 3  # points
                 difference = given[degree][first] if first == last else (column[i + 1] - column[i]) * inverse[first, last]
+                if degree == 1 and first != last:
+                    mask, step = short[first]
+                    mean, change = (points["v"][first] + points["v"][last]) * 0.5, points["a"][first] - points["a"][last]
+                    difference = f.select(mask, mean - change * step * (1 / 12), difference)
                 following.append(difference)
             column = following
             mask = used[degree // 3]
@@ -51,10 +56,16 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
     return inverse, used
 
 
+def _short_steps(module: Module, f: Function, s: Lane) -> list[tuple[Value, Value]]:
+    """Return for each step, the latest first, whether it is short, and its length."""
+    steps = [getattr(s, f"point{POINTS - 1 - k}_t") - getattr(s, f"point{POINTS - 2 - k}_t") for k in range(POINTS - 1)]
+    return [(step * s.omega < SHORT_STEP, module.broadcast(f, step)) for step in steps]
+
+
 def write_differences_back(module: Module):
     """Write `differences_back`: cotangents of the points from those of divided differences, which are cleared."""
     f, s = module.function("differences_back")
-    active, (inverse, used) = s.at > 0.5, _spacing(module, f, s)
+    active, (inverse, used), short = s.at > 0.5, _spacing(module, f, s), _short_steps(module, f, s)
     zero, count = f.const(0.0, DOUBLE, module.plan.vector), 3 * POINTS
     with f.each(module.rowcount) as r:
         bars: dict[str, list[Value]] = {x: [zero] * POINTS for x in "qva"}
@@ -69,6 +80,12 @@ def write_differences_back(module: Module):
                     x, share = ("v", bar) if degree == 0 else ("a", bar * 0.5)
                     bars[x][first] = bars[x][first] + share
                 else:
+                    if degree == 0:
+                        mask, step = short[first]
+                        mean, change = f.select(mask, bar * 0.5, 0.0), f.select(mask, bar * step * (1 / 12), 0.0)
+                        bars["v"][first], bars["v"][last] = bars["v"][first] + mean, bars["v"][last] + mean
+                        bars["a"][first], bars["a"][last] = bars["a"][first] - change, bars["a"][last] + change
+                        bar = f.select(mask, 0.0, bar)
                     part = bar * inverse[first, last]
                     bars_of_column[i + 1] = bars_of_column[i + 1] + part
                     bars_of_column[i] = bars_of_column[i] - part
