@@ -104,9 +104,7 @@ class NumpyLinearizer:
             D = terms.slopes(t, q)[0] * self._factors
             plus = TruncatedPseudoinverse.of(D, self._tol, full=True)
             V = plus.vt[terms.size - self._free :].T
-            if plus.rank + self._free > terms.size:  # V is not orthogonal to all rows: this position is not closed
-                V = V - plus @ (D @ V)
-            N = root[:, None] * V
+            N = root[:, None] * (V - plus @ (D @ V))  # also rounding errors of V matter where masses and inertias differ by far
             multipliers = w * plus.transposed_times(root * at_rest.force)
             K = at_rest.stiffness + terms.curvature(t, q, multipliers)
         else:
