@@ -106,3 +106,16 @@ def test_derivatives_that_would_lack_jumps_are_refused():
     ):
         with pytest.raises(NotImplementedError, match=reason):
             jax.jit(function).lower(X)
+
+
+@pytest.mark.slow
+def test_a_condition_costs_no_step_at_the_end_of_a_piece():
+    """Conditions are watched up to it before the tiny step across it: polynomials through that step amplify rounding errors."""
+    bead = udk.Body(1.0, 0.1, position=[0.00603544, 0.98807494], velocity=[4.78021985, 2.41470853])
+    contact = udk.Cam(["ground", "bead"], FIXED, udk.Profile(ANGLES, RADII))
+    scene = udk.Mechanism({"bead": bead}, {"contact": contact}, gravity=[0.0, -3.0])
+    never = udk.Event(lambda t, at: at["bead"].vx + 99.0, udk.Log(), name="never")
+    with_event, without = (udk.simulate(scene, [0.0, 0.4], rtol=1e-10, atol=1e-10, events=e) for e in (never, None))
+    assert int(with_event.stats["steps"]) == int(without.stats["steps"])
+    assert int(with_event.stats["projections"]) < 2 * int(without.stats["projections"])
+    np.testing.assert_array_equal(with_event.q, without.q)

@@ -11,7 +11,7 @@ from udkjax.native.base.loops import LoopWriter
 from udkjax.native.base.program import PointerPlace, consecutive, write
 from udkjax.native.base.running import Running
 from udkjax.native.base.settling import AT_END, SETTLING, write_settle_end, write_settle_state
-from udkjax.native.base.steps import POINTS
+from udkjax.native.base.steps import AIM_ACROSS, POINTS
 from udkjax.native.base.tableau import Method
 
 # Rarely called functions: once per run, near singular configurations, where a piece may end, or once in an implicit step.
@@ -340,6 +340,10 @@ class Module(Running):
         if self.pieces:
             return f.const(True, BOOL, f.width)
         return s.written + 1.0 < self.field(f, "times") - 1
+
+    def steps_across_next(self, s: Lane) -> Value:
+        """Return the lanes that have ended a step just before the end of a piece, and go on with a tiny step across it."""
+        return s.aim.is_(float(AIM_ACROSS))
 
     def invoke(self, f: Function, name: str, out: str | None = None):
         super().invoke(f, name, out)

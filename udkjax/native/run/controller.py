@@ -272,6 +272,8 @@ def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value
     if module.plan.breaks:
         enough = ~begun & (alone | (s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
         until = f.select(enough, until + f.select(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
+    if module.pieces:  # interpolation through both ends of the tiny step that follows would amplify rounding errors
+        until = f.select(module.steps_across_next(s), s.point3_t, until)
     return until
 
 

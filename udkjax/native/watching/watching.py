@@ -134,11 +134,15 @@ class Watching(WatchMemory):
             self.put(f, "node a", r, a)
 
     def _cut_intervals(self, f: Function, s: Lane):
-        """Cut two intervals that cross the breakpoint at which a step has ended."""
-        cut = (s.lands > 0.5) & (s.until >= s.t1) & (s.behind_middle > s.t1) & s.which.is_not(float(FIRST))
-        cut = cut & (s.t1 - s.first_t > s.smallest * ACROSS_BREAK)
-        node = f.fma(s.t1 - s.first_t, MIDDLE, s.first_t)
-        s.where(cut, which=float(SECOND), node=node, behind_middle=s.t1)
+        """Cut two intervals that cross the breakpoint, or the end of a piece, at which a step has ended."""
+        ends, end = s.lands > 0.5, s.t1
+        if self.pieces:
+            across = self.steps_across_next(s)
+            ends, end = ends | across, f.select(across, s.point3_t, end)
+        cut = ends & (s.until >= end) & (s.behind_middle > end) & s.which.is_not(float(FIRST))
+        cut = cut & (end - s.first_t > s.smallest * ACROSS_BREAK)
+        node = f.fma(end - s.first_t, MIDDLE, s.first_t)
+        s.where(cut, which=float(SECOND), node=node, behind_middle=end)
 
     def _write_watch(self):
         """Write `watch(work)`: evaluate all nodes within accepted steps."""
