@@ -14,7 +14,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import AnyArray
-from udkjax.arrays import ArrayLibrary, library_for, number
+from udkjax.arrays import ArrayLibrary, library_for, number, put_arrays
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.structure import join_concrete_numbers, numbers_as_vector
@@ -88,7 +88,9 @@ class UnitScales(Scales):
 def concrete_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism with concrete numbers, by NumPy."""
     numbers = np.asarray(numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS]))
-    return jax.tree.map(number, _unpack(_evaluate(scene_programs(mechanism), numbers, np)))
+    found = _unpack(_evaluate(scene_programs(mechanism), numbers, np))
+    with jax.ensure_compile_time_eval():  # concrete even while something else is traced
+        return put_arrays(jax.tree.map(lambda x: np.asarray(x, jnp.result_type(float)), found))
 
 
 def traced_scales(mechanism: Mechanism) -> Scales:
@@ -115,7 +117,7 @@ def _evaluate(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> A
 
 @cached_by_identity
 def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
-    return ArrayLoops(programs.scales.program, xp)
+    return ArrayLoops(programs.scales.program, xp, ("scales",))
 
 
 # --- the scales as one JAX operation on vectors of numbers (..., numbers), which native lowers to machine code

@@ -119,13 +119,19 @@ class SceneArrays(Generic[AnyArray]):
 
 def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndarray]]:
     """Return the arrays of a mechanism with concrete numbers as a function of time (s), on which sampled numbers depend."""
-    programs, is_sampled = scene_programs(mechanism), bool(mechanism.samples)
+    if mechanism.samples:
+        return lambda t: _arrays_at(mechanism, t)
+    fixed = _fixed_arrays(mechanism)
+    return lambda t: fixed
 
-    def at(t: Time) -> SceneArrays[np.ndarray]:
-        return SceneArrays(programs, np.asarray(numbers_as_vector(mechanism.at(t).numbers)), np)
 
-    at_start = at(0.0)
-    return at if is_sampled else lambda t: at_start
+@cached_by_identity
+def _fixed_arrays(mechanism: Mechanism) -> SceneArrays[np.ndarray]:
+    return _arrays_at(mechanism, 0.0)
+
+
+def _arrays_at(mechanism: Mechanism, t: Time) -> SceneArrays[np.ndarray]:
+    return SceneArrays(scene_programs(mechanism), np.asarray(numbers_as_vector(mechanism.at(t).numbers)), np)
 
 
 def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:

@@ -1,4 +1,4 @@
-"""Loops of few rows on Python's floats: run row by row at first, and as one generated Python function once they have run often.
+"""Loops of few operations on Python's floats: run row by row at first, and as one generated Python function once they run often.
 
 In the function each number of an array is a variable, from the row that writes it to those that read it. For many states at once
 these variables are NumPy arrays, one number for each state.
@@ -21,6 +21,7 @@ _UPDATES_OF_FLOATS = {  # NaN propagates
 }
 _UPDATES_OF_ARRAYS = {ADD: operator.add, MAXIMUM: np.maximum, ALL: np.minimum}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
+FEW_OPERATIONS = 2_000  # of all rows, up to which they are faster however many rows a loop has: NumPy takes 20 us for each loop
 # Runs row by row that take as long as generating a Python function (20 us per operation); it runs three times as fast.
 _WORTH_WRITING = 100
 _WORTH_WRITING_FOR_MANY = 20  # the same for runs at many states, each of which takes longer
@@ -48,7 +49,7 @@ class FloatLoops:
 
     def __init__(self, parts: Sequence[LaidOutPart], results: Collection[str] | None = None):
         self._results = results
-        self._parts = [_with_lists(part) for part in parts if part.outputs]
+        self._parts, self._has_few_rows = [_with_lists(part) for part in parts if part.outputs], _has_few_rows(parts)
         self._runs, self._function = 0, None
         self.needed: Collection[str] | None = None  # names of the lists at one state that are needed; None: all
         self._runs_of_many, self._function_of_many = 0, None
@@ -66,7 +67,9 @@ class FloatLoops:
     def support(parts: Sequence[LaidOutPart]) -> bool:
         """Return True if there are few rows, and no calls of JAX."""
         programs = [(part.run, part.count) for part in parts if isinstance(part.run, ScalarProgram)]
-        return all(rows <= FEW_ROWS and run.is_plain for run, rows in programs)
+        if not all(run.is_plain for run, _ in programs):
+            return False
+        return _has_few_rows(parts) or sum(rows * len(run.order) for run, rows in programs) <= FEW_OPERATIONS
 
     def __call__(self, lists: Lists) -> None:
         if self._function is not None:
@@ -80,10 +83,14 @@ class FloatLoops:
 
     def of_many(self, names: Collection[str]) -> Callable[[Lists], None] | None:
         """Return the function of the lists of these names at many states; None until it has run so often that it is worth it."""
-        self._runs_of_many += 1
+        self._runs_of_many += self._has_few_rows
         if self._runs_of_many == _WORTH_WRITING_FOR_MANY:
             self._function_of_many, _ = _write(self._parts, names, self._results, many=True)
         return self._function_of_many
+
+
+def _has_few_rows(parts: Sequence[LaidOutPart]) -> bool:
+    return all(part.count <= FEW_ROWS for part in parts if isinstance(part.run, ScalarProgram))
 
 
 def _with_lists(part: LaidOutPart) -> LaidOutPart:

@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import ROUNDING, is_traced, is_within_jit, number, number_called
+from udkjax.arrays import ROUNDING, is_traced, is_within_jit, make_module, number, number_called, put_arrays
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.element_programs import has_rheonomic_joints
@@ -177,14 +177,15 @@ def close(
 def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
     with jax.ensure_compile_time_eval():
         scales = (analyse(mechanism) if analysis is None else analysis).scales
-        guess = State(mechanism.q0, mechanism.v0) if state is None else state
-        q, v = (np.asarray(x, float).ravel() for x in (guess.q, guess.v))
+        guess = (mechanism.q0, mechanism.v0) if state is None else (state.q, state.v)
+        q, v = (np.asarray(x, float).ravel() for x in guess)
         with np.errstate(all="ignore"):  # non-finite states are reported as open
             q, v, psi, psi_dot, rank = _close_concrete(mechanism, scales, t, q, v)
             closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
-        state_found = State(q.reshape(-1, 3), v.reshape(-1, 3))
-        rank, closed = (jax.device_put(np.asarray(x)) for x in (rank, closed))
-        return Closure(state_found, number(psi), number(psi_dot), rank, scales, closed)
+        dtype = jnp.result_type(float)
+        floats = [np.array(x, dtype) for x in (q.reshape(-1, 3), v.reshape(-1, 3), psi, psi_dot)]
+        q, v, psi, psi_dot, rank, closed = put_arrays([*floats, np.asarray(rank), np.asarray(closed)])
+        return Closure(make_module(State, q=q, v=v), psi, psi_dot, rank, scales, closed)
 
 
 def _close_concrete(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
