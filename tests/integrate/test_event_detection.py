@@ -300,3 +300,18 @@ def test_a_jump_of_a_force_just_after_a_start_at_a_sample():
         run = udk.simulate(body, [0.5, 1.0], udk.State([[place, 0.0, 0.0]], [[2.0, 0.0, 0.0]]))
         np.testing.assert_allclose(run.v[-1, 0, 0], 2.0 + time - 2.0 * (0.5 - time), rtol=1e-12)
         assert np.isinf(run.unlocated) and int(run.stats["rejected"]) == 0
+
+
+class Lift(udk.ForceElement):
+    """A force that grows with time, and jumps at x = 0.2 m."""
+
+    def loads(self, t, *frames):
+        return [(jnp.where(frames[0].x > 0.2, -0.5, 0.0), 20.0 * t, 0.0)]
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_a_contact_opens_in_a_scene_with_a_jump(engine):
+    """The opening of a contact is no event of the list: it turns no side of a comparison."""
+    body = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, -0.1])}, forces={"lift": Lift("b")}, gravity=[0.0, -10.0])
+    run = udk.simulate(body, [0.0, 1.0], events=udk.Contact("b"), engine=engine)
+    np.testing.assert_allclose(run.q[-1, 0, :2], [1.0 - 0.25 * 0.8**2, 10 / 3 * 0.5**3], rtol=1e-9)

@@ -47,9 +47,9 @@ class EventPlan:
         return np.array([0 if x is None else x[0] for x in self.turns], int)
 
     @cached_property
-    def side_changes(self) -> Float[np.ndarray, "2 E S"]:
-        """The factor and the shift of each side at an event."""
-        changes = np.stack([np.ones((self.count, self.side_count)), np.zeros((self.count, self.side_count))])
+    def side_changes(self) -> Float[np.ndarray, "2 2E S"]:
+        """The factor and the shift of each side at an event, or where its contact opens, which turns none."""
+        changes = np.stack([np.ones((2 * self.count, self.side_count)), np.zeros((2 * self.count, self.side_count))])
         for k, turn in enumerate(self.turns):
             if turn is not None:
                 changes[:, k, turn[0]] = turn[1:]
