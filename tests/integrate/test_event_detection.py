@@ -315,3 +315,27 @@ def test_a_contact_opens_in_a_scene_with_a_jump(engine):
     body = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, -0.1])}, forces={"lift": Lift("b")}, gravity=[0.0, -10.0])
     run = udk.simulate(body, [0.0, 1.0], events=udk.Contact("b"), engine=engine)
     np.testing.assert_allclose(run.q[-1, 0, :2], [1.0 - 0.25 * 0.8**2, 10 / 3 * 0.5**3], rtol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_a_contact_opens_at_a_sample_with_a_constant_force(engine):
+    """Two bars turn together at the limit of their joint until the torque on it ends: the force of the limit jumps through zero.
+
+    It is then constant up to rounding, which must not count as too quick a change: energy is kept from there on, in few steps.
+    """
+    ends = {"a": (0.5, 0.0), "b": (-0.5, 0.0)}
+    q = np.array([[0.0, 0.0, 0.3], [0.5 * (np.cos(0.3) + np.cos(0.7)), 0.5 * (np.sin(0.3) + np.sin(0.7)), 0.7]])
+    v = 1.5 * np.stack([-q[:, 1], q[:, 0], np.ones(2)], axis=1)
+    bars = udk.Mechanism(
+        {name: udk.Body(1.0, 0.1) for name in ends},
+        {"h": udk.Revolute(("a", "b"), list(ends.values()))},
+        forces={"u": udk.Torque(("a", "b"), udk.Held(np.array([2.0, 0.0]), 0.2))},
+        gravity=[0.0, 0.0],
+    )
+    limit = udk.JointLimit("h", upper=0.4)
+    run = udk.simulate(bars, [0.0, 0.19, 0.4], udk.State(q, v), rtol=1e-10, atol=1e-10, events=limit, engine=engine)
+    np.testing.assert_allclose(run.events.time[1], 0.2, rtol=1e-12)
+    energy = np.sum(np.array([1.0, 1.0, 0.1]) * np.asarray(run.v) ** 2, axis=(1, 2)) / 2
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+    assert np.diff(run.q[:, :, 2])[-1, 0] < 0.37
+    assert engine == "jax" or (int(run.stats["steps"]) < 40 and int(run.stats["projections"]) < 60)

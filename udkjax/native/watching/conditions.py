@@ -42,7 +42,8 @@ class Resolution(NamedTuple):
 
         The condition is Hermite's cubic up to E x^2 (1 - x)^2, with 0 <= x <= 1. It crosses zero once if the Bernstein
         coefficients of degree 4 of the cubic, plus and minus this bound, change sign once (Descartes' rule), and never if they do
-        not change sign. The same code serves lanes of machine code and arrays of JAX.
+        not change sign; at the first node, if the condition is beyond zero from there on. The same code serves lanes of machine
+        code and arrays of JAX.
 
         Args:
             arithmetic: `min` and `max` of two values; a `Function` has them.
@@ -77,7 +78,10 @@ class Resolution(NamedTuple):
                 result = result & (now | ~later)
             return result
 
-        return changes_once(middle - e) & changes_once(middle + e) & is_resolved, is_away
+        # A force that jumps at the first node is beyond zero throughout. If it is then constant, its error is rounding, which
+        # exceeds its changes.
+        is_beyond = high <= -(error * self.far)
+        return (changes_once(middle - e) & changes_once(middle + e) & is_resolved) | is_beyond, is_away
 
 
 RESOLUTION = Resolution()
