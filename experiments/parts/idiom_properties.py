@@ -92,8 +92,8 @@ CONDITIONS: dict[str, Callable[[Array], Array]] = {
 def check_conditions(tally: Tally, seed: int, members: int, kinds: Collection[str] = tuple(CONDITIONS)) -> int:
     """Differentiate where a body ends that passes the places of a condition, by its velocity, the force and the place."""
     for kind in kinds:
-        rng = np.random.default_rng([seed, len(kind), 11])
-        numbers = np.stack([rng.uniform(1.5, 2.0, members), rng.uniform(0.1, 0.5, members), rng.uniform(0.21, 0.29, members)], 1)
+        rng = np.random.default_rng([seed, len(kind), 11])  # numbers with which no body starts where its force jumps
+        numbers = np.stack([rng.uniform(1.5, 2.0, members), rng.uniform(0.1, 0.5, members), rng.uniform(0.26, 0.29, members)], 1)
 
         def end(p: Any, function: Callable[[Array], Array] = CONDITIONS[kind]) -> Any:
             body = udk.Body(1.0, 0.1, velocity=jnp.stack([p[0], 0.0 * p[0]]))
