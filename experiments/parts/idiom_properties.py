@@ -87,13 +87,16 @@ CONDITIONS: dict[str, Callable[[Array], Array]] = {
     "mod": _periodic,
     "maximum": lambda x: jnp.maximum(x, 0.0),
 }
+PERIODS = {"floor": 1 / 3, "mod": 1 / 4}  # distances between the places of conditions (m)
+ALONE = 100.0  # the same of conditions that have a single place
+NEAR = 1e-3  # distance from such a place at the start or the end, within which differences of 1e-4 would see both sides
 
 
 def check_conditions(tally: Tally, seed: int, members: int, kinds: Collection[str] = tuple(CONDITIONS)) -> int:
     """Differentiate where a body ends that passes the places of a condition, by its velocity, the force and the place."""
     for kind in kinds:
-        rng = np.random.default_rng([seed, len(kind), 11])  # numbers with which no body starts where its force jumps
-        numbers = np.stack([rng.uniform(1.5, 2.0, members), rng.uniform(0.1, 0.5, members), rng.uniform(0.26, 0.29, members)], 1)
+        rng = np.random.default_rng([seed, len(kind), 11])
+        numbers = np.stack([rng.uniform(1.5, 2.0, members), rng.uniform(0.1, 0.5, members), rng.uniform(0.21, 0.29, members)], 1)
 
         def end(p: Any, function: Callable[[Array], Array] = CONDITIONS[kind]) -> Any:
             body = udk.Body(1.0, 0.1, velocity=jnp.stack([p[0], 0.0 * p[0]]))
@@ -102,6 +105,8 @@ def check_conditions(tally: Tally, seed: int, members: int, kinds: Collection[st
 
         value, slope = (jax.jit(jax.vmap(f)) for f in (end, jax.grad(end)))
         found, twice = slope(numbers), jax.jit(jax.vmap(jax.hessian(end)))(numbers)
+        ends, period = np.stack([0.0 * numbers[:, 2], np.asarray(value(numbers))]) - numbers[:, 2], PERIODS.get(kind, ALONE)
+        is_near = np.any(np.abs(ends - period * np.round(ends / period)) < NEAR, axis=0)
         h = 1e-4
         for name, function, derivative in (
             ("gradient of a condition", value, found),
@@ -113,7 +118,10 @@ def check_conditions(tally: Tally, seed: int, members: int, kinds: Collection[st
             size = np.maximum(np.max(np.abs(right.reshape(members, -1)), 1), 1.0)
             errors = np.max(np.abs(np.asarray(derivative) - right).reshape(members, -1), 1) / size
             for k in range(members):
-                tally.add(name, errors[k], f"{kind} {k} of seed {seed}")
+                if is_near[k]:
+                    tally.leave_out("a body that starts or ends where its force jumps")
+                else:
+                    tally.add(name, errors[k], f"{kind} {k} of seed {seed}")
     return members * len(kinds)
 
 
