@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
-from udkjax.annotations import NumberLike
+from udkjax.annotations import Number, NumberLike
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
@@ -52,7 +52,7 @@ class Driven(NamedTuple):
     analysis: Analysis
     name: str  # name of the driver; empty if s is time
     row: int  # row of the driver in Psi; -1 if s is time
-    unit: NumberLike  # the unit of s: one radian, the characteristic length or the characteristic time
+    unit: Number  # the unit of s: one radian, the characteristic length or the characteristic time
 
     @property
     def is_angle(self) -> bool:
