@@ -15,7 +15,7 @@ from udkjax.equations.scene_programs import programs_of_structure
 from udkjax.equations.structure import Structure
 
 WORTH = 100  # corrections of one structure by singular values before elimination is prepared
-CLEAR = 0.1  # smallest distance from dependent rows: elimination loses as many digits as the square of its reciprocal has, two
+CLEAR = 0.1  # smallest relative distance from dependent rows: elimination loses accuracy by the square of its reciprocal
 
 
 class EliminatedSteps:
@@ -35,8 +35,8 @@ class EliminatedSteps:
     def __call__(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return q after a step, and Psi of all rows before it; None if another method is needed."""
         if self._arrays is None:
-            self._uses.append(0)
-            if len(self._uses) <= WORTH:
+            if len(self._uses) < WORTH:
+                self._uses.append(0)
                 return None
             self._arrays = self._make_arrays(*self._given)
         found = self._arrays.newton_step(t, q)
@@ -64,5 +64,5 @@ def _places(kind: Structure) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=64)
 def _uses(kind: Structure, redundant_rows: tuple[int, ...]) -> list[int]:
-    """Return a list with an entry for each correction so far of mechanisms with this structure and these rows."""
+    """Return a list with an entry for each correction so far, up to `WORTH`, of mechanisms with this structure and these rows."""
     return []

@@ -198,7 +198,7 @@ def _may_follow(
 ) -> Bool[Any, "b"]:
     """Return a mask of the members whose event may cause another at once: a condition is zero, or depends on velocities.
 
-    Joints with set-valued friction are left out: one decision settles all that are at rest.
+    Joints with set-valued friction are left out: a single decision covers every joint at rest.
     """
     unclear = watched & ~settled & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO * values.scale)
     return system.xp.any((unclear | system.plan.follows_velocity) & ~system.plan.slides, axis=-1)
