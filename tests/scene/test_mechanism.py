@@ -1,5 +1,6 @@
 import dataclasses
 import pickle
+import re
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from tests.elements import P
-from udkjax.scene import element_setup
+from udkjax.scene import element_setup, library
 from udkjax.scene.checks import traced_numbers_are_valid
 
 
@@ -99,6 +100,26 @@ def test_traced_numbers_remember_the_concrete_ones_that_they_were_made_from(ever
     twice(2.0)
     assert seen[0] is not None and seen[0] == seen[1] and seen[0].mechanism is everything
     assert everything.origin is None and everything.with_parameters({"body.a.mass": 2.0}).origin is None
+
+
+@pytest.mark.parametrize("build", [library.four_bar, library.parallelogram], ids=["drawn", "elements"])
+def test_numbers_that_were_never_checked_are_checked_with_others(build):
+    """Functions on trees check nothing; a mechanism that is known to be valid needs only what differs to be checked."""
+    mechanism = build()
+    mass, other = (f"body.{name}.mass" for name in mechanism.body_names[:2])
+    broken = eqx.tree_at(
+        lambda m: m._source.gravity if build is library.parallelogram else m.drawing.gravity, mechanism, jnp.array([0.0, np.nan])
+    )
+    with pytest.raises(udk.SceneError, match=r"gravity.*must be finite"):
+        broken.with_parameters({mass: 2.0})
+    changed = mechanism.with_parameters({mass: 2.0}).with_parameters({other: 3.0})
+    assert float(changed.bodies[mechanism.body_names[0]].mass) == 2.0
+    where = re.escape(f'body "{mechanism.body_names[0]}" (body[0]).mass: must be > 0, not -2.0')
+    for values in ({mass: -2.0}, {mass: -2.0, other: 1.0}, {mass: -2.0, "gravity": [0.0, -1.0]}):
+        with pytest.raises(udk.SceneError, match=where):
+            changed.with_parameters(values)
+    with pytest.raises(udk.SceneError, match=r"gravity.*must be finite"):
+        changed.with_parameters({"gravity": [0.0, np.inf]})
 
 
 @pytest.mark.parametrize(

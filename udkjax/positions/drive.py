@@ -197,9 +197,8 @@ def with_drivers(
     """Return the mechanism with these drivers, and with these forces instead of its own if any are given."""
     if forces is None and not drivers:
         return mechanism.with_drivers({}, origin)
-    forces = dict(mechanism.forces) if forces is None else forces
-    bodies, joints = dict(mechanism.bodies), dict(mechanism.joints)
-    return Mechanism(bodies, joints, drivers, forces, mechanism.gravity, mechanism.name, origin)
+    changed = {"driver": drivers} if forces is None else {"driver": drivers, "force": forces}
+    return mechanism.with_elements(mechanism.groups | changed, origin=origin)
 
 
 def _concrete_element(concrete: Mechanism, name: str, element: Coordinate) -> Coordinate:

@@ -278,7 +278,7 @@ def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMet
 
 
 def _check_entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -> Iterator[str]:
-    for index in map(tuple, np.argwhere(wrong)):
+    for index in map(tuple, np.argwhere(wrong) if np.any(wrong) else ()):
         yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, not {abbreviate(float(array[index]))}"
 
 

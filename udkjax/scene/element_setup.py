@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import numpy as np
 from udkjax.annotations import Numbers
 from udkjax.arrays import is_traced, make_module, number
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body, Frame
-from udkjax.scene.checks import SceneEntry, SceneError, problems_of
+from udkjax.scene.checks import SceneEntry, SceneError, check_table, name_mistake, problems_of
 from udkjax.scene.drivers import Driver
 from udkjax.scene.fields import Requirement, StaticValue, given_number
 from udkjax.scene.forces import ForceElement
@@ -23,6 +23,7 @@ from udkjax.scene.schema import table_of, type_name
 from udkjax.wording import abbreviate
 
 AnyModule = TypeVar("AnyModule", bound=eqx.Module)
+Groups: TypeAlias = Mapping[str, Mapping[str, Any]]  # elements by section and name
 
 
 def name_elements(elements: Sequence[eqx.Module | str], names: Sequence[str | None] = ()) -> list[str]:
@@ -64,6 +65,37 @@ def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> di
     if problems:
         raise SceneError(problems, name)
     return checked
+
+
+def replaced(before: Groups, after: Groups) -> Groups | None:
+    """Return other elements, with their missing numbers, if they are valid because those `before` are; otherwise None.
+
+    Only elements that differ are checked. None means that all elements need to be checked, which finds all mistakes in order.
+    """
+    if any(before[section].keys() != after[section].keys() for section in ("body", "joint")):
+        return None  # names of bodies and joints, to which others refer
+    if any(constants_of(type(c)) for section in ("joint", "driver") for c in after[section].values()):
+        return None  # they follow from bodies that may differ
+    classes = {section: {name: type(x) for name, x in after[section].items()} for section in ("body", "joint")}
+    known = {"body": {GROUND: None, **classes["body"]}, "rubbing": classes["joint"]}
+    found = {section: dict(elements) for section, elements in after.items()}
+    for section, elements in after.items():
+        for name, element in elements.items():
+            old = before[section].get(name)
+            if element is old:
+                continue
+            if old is None or jax.tree.structure(element) != jax.tree.structure(old):
+                if section != "driver" or name_mistake(name) or name in after["joint"] or not _is_plain_driver(element):
+                    return None
+                found[section][name] = element = complete(element, after["body"])
+            if any(check_table(section, type(element), table_of(element), known)):
+                return None
+    return found
+
+
+def _is_plain_driver(element: object) -> bool:
+    """Return True if all leaves of a driver are arrays."""
+    return type(element) is Driver and all(map(eqx.is_array, jax.tree.leaves(element))) and not any(_check_hashable(element))
 
 
 def _check_hashable(element: eqx.Module) -> Iterator[str]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from types import MappingProxyType
 from typing import Any, TypeVar
+from weakref import WeakValueDictionary
 
 import equinox as eqx
 import jax
@@ -16,16 +17,18 @@ from udkjax.arrays import is_traced, make_module, number
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.programs.identity_cache import cached_within_trace
 from udkjax.scene.bodies import Body, stack_coordinates
-from udkjax.scene.checks import SceneError
+from udkjax.scene.checks import SceneError, gravity_mistakes
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.direct_numbers import DirectNumbers
 from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import (
+    Groups,
     attached_bodies,
     check_elements,
     complete,
     completion_mistakes,
     name_elements,
+    replaced,
 )
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.friction import Friction
@@ -100,11 +103,13 @@ class Mechanism(PrintsTable):
             raise SceneError(mistakes, name)
         for field, value in fields_of(checked | completed, number(gravity), name, origin).items():
             setattr(self, field, value)
+        _checked(self)
 
     def with_drivers(self, drivers: Mapping[str, Driver], origin: Origin | None = None) -> "Mechanism":
         """For internal use: return the mechanism with other drivers, which are complete; nothing is checked."""
         sections = {section: list(group.items()) for section, group in (self.groups | {"driver": drivers}).items()}
-        return make_module(type(self), **fields_of(sections, self.gravity, self.name, origin))
+        found = make_module(type(self), **fields_of(sections, self.gravity, self.name, origin))
+        return found if drivers or not _is_checked(self) else _checked(found)
 
     @classmethod
     def of_drawing(cls, source: Drawn, name: str, origin: Origin | None = None) -> "Mechanism":
@@ -120,7 +125,7 @@ class Mechanism(PrintsTable):
         if mistakes := completion_mistakes(given, {section: found[section] for section in ("joint", "driver")}):
             raise SceneError(mistakes, name)
         static = dict(zip((f"{section}_names" for section in SECTIONS), names, strict=True))
-        return make_module(cls, name=name, **static, origin=None if is_concrete(source) else origin, _source=source)
+        return _checked(make_module(cls, name=name, **static, origin=None if is_concrete(source) else origin, _source=source))
 
     @property
     def gravity(self) -> Float[Array, "2"]:
@@ -312,8 +317,23 @@ class Mechanism(PrintsTable):
         if isinstance(self._source, Drawn):
             return self._redrawn(self._source, values, origin)
         elements, gravity = replace_numbers(self.groups, self.gravity, values, parameters_of(self), self.name)
-        parts = elements["body"], elements["joint"], elements["driver"], elements["force"]
-        return Mechanism(*parts, gravity, self.name, origin)
+        return self.with_elements(elements, gravity, origin)
+
+    def with_elements(self, groups: Groups, gravity: Array | None = None, origin: Origin | None = None) -> "Mechanism":
+        """For internal use: return the mechanism of other elements; only those that differ are checked, if this one is valid."""
+        gravity = self.gravity if gravity is None else gravity
+        valid = self._valid_elements(groups, gravity)
+        if valid is None:
+            parts = groups["body"], groups["joint"], groups["driver"], groups["force"]
+            return Mechanism(*parts, gravity, self.name, origin)
+        sections = {section: list(group.items()) for section, group in valid.items()}
+        return _checked(make_module(type(self), **fields_of(sections, gravity, self.name, origin)))
+
+    def _valid_elements(self, groups: Groups, gravity: Array) -> Groups | None:
+        """Return other elements that are valid since this mechanism is, with their missing numbers; None if that is not known."""
+        if not _is_checked(self) or (gravity is not self.gravity and gravity_mistakes(gravity)):
+            return None
+        return replaced(self.groups, groups)
 
     @property
     def departs_from_drawing(self) -> bool:
@@ -321,15 +341,32 @@ class Mechanism(PrintsTable):
         return bool(self.direct)
 
     def _redrawn(self, source: Drawn, values: Mapping[str, Any], origin: Origin | None) -> "Mechanism":
-        drawing, known = source.drawing, parameters_of(self)
+        drawing, known, groups = source.drawing, parameters_of(self), self.groups
         drawn = parameters_in(drawing.groups) | {"gravity": known["gravity"]}
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in drawn}
         direct = {name: value for name, value in values.items() if name not in of_drawing}
-        if direct:
-            replace_numbers(self.groups, self.gravity, direct, known, self.name)  # raises an error if they do not fit
+        elements = groups
+        if direct:  # this raises an error if they do not fit
+            elements, _ = replace_numbers(groups, self.gravity, direct, known, self.name)
         if of_drawing:
             drawing = drawing.with_groups(*replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name))
-        return Mechanism.of_drawing(Drawn(drawing, DirectNumbers.of(direct, source.direct)), self.name, origin)
+        changed = Drawn(drawing, DirectNumbers.of(direct, source.direct))
+        if of_drawing or self._valid_elements(elements, self.gravity) is None:
+            return Mechanism.of_drawing(changed, self.name, origin)
+        return _checked(_copy(self, {"_source": changed, "origin": None if is_concrete(changed) else origin}))
+
+
+_VALID: WeakValueDictionary[int, Source] = WeakValueDictionary()  # sources of mechanisms that were checked, by their identities
+
+
+def _checked(mechanism: Mechanism) -> Mechanism:
+    """Return a mechanism of which all elements are known to be valid."""
+    _VALID[id(mechanism._source)] = mechanism._source
+    return mechanism
+
+
+def _is_checked(mechanism: Mechanism) -> bool:
+    return _VALID.get(id(mechanism._source)) is mechanism._source
 
 
 def _copy(module: Module, changes: dict[str, object]) -> Module:
@@ -343,4 +380,5 @@ def _by_name(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[s
 
 @cached_within_trace
 def _without_origin(mechanism: Mechanism) -> Mechanism:
-    return _copy(mechanism, {"origin": None, "_source": mechanism._source.elements})
+    found = _copy(mechanism, {"origin": None, "_source": mechanism._source.elements})
+    return _checked(found) if _is_checked(mechanism) else found

@@ -8,7 +8,7 @@ import equinox as eqx
 from jaxtyping import Array
 
 from udkjax.annotations import Numbers
-from udkjax.arrays import number
+from udkjax.arrays import make_module, number
 from udkjax.scene.checks import SceneError
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.held import Held, given_sampled
@@ -205,5 +205,6 @@ def _at(element: eqx.Module, path: Sequence[str]) -> Any:
 
 
 def _set(element: eqx.Module, path: Sequence[str], value: Array) -> eqx.Module:
-    old = _at(element, path)
-    return eqx.tree_at(lambda e: _at(e, path), element, value, is_leaf=lambda leaf: leaf is None or leaf is old)
+    name, *inner = path
+    new = _set(getattr(element, name), inner, value) if inner else value
+    return make_module(type(element), **vars(element) | {name: new})

@@ -7,7 +7,9 @@ in this form.
 import dataclasses
 import re
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import cache
+from types import MappingProxyType
 from typing import Any, NamedTuple, Union, cast, get_args, get_origin
 
 import equinox as eqx
@@ -67,7 +69,8 @@ class Key(NamedTuple):
     metadata: FieldMetadata
 
 
-def keys(cls: type) -> dict[str, Key]:
+@cache
+def keys(cls: type) -> Mapping[str, Key]:
     """Return the keys of a class: the fields that its constructor accepts, in order."""
     keys_by_name = {}
     for field in dataclasses.fields(cls):
@@ -79,15 +82,21 @@ def keys(cls: type) -> dict[str, Key]:
             default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
             key = field.name.removesuffix("_")
             keys_by_name[key] = Key(field.name, annotation, not default, cast(FieldMetadata, field.metadata))
-    return keys_by_name
+    return MappingProxyType(keys_by_name)
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:
     """Return an element as a table without absent values (None where it is the default); nested modules stay modules."""
     table = {name: getattr(element, key.field) for name, key in keys(type(element)).items()}
-    defaults = {f.name.removesuffix("_"): f.default for f in dataclasses.fields(element)}
-    may_be_absent = [name for name in table if defaults[name] is None or defaults[name] is dataclasses.MISSING]
+    may_be_absent = _optional_keys(type(element))
     return {name: value for name, value in table.items() if value is not None or name not in may_be_absent}
+
+
+@cache
+def _optional_keys(cls: type) -> frozenset[str]:
+    """Return the keys whose value None means that they are absent."""
+    defaults = {f.name.removesuffix("_"): f.default for f in dataclasses.fields(cls)}
+    return frozenset(name for name in keys(cls) if defaults[name] is None or defaults[name] is dataclasses.MISSING)
 
 
 def build(annotation: Any, value: object) -> Any:

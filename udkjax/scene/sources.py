@@ -20,7 +20,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.annotations import TreeDef
-from udkjax.arrays import is_traced
+from udkjax.arrays import QuickMethods, is_traced, make_module
 from udkjax.printing import PrintsTable
 from udkjax.programs.deferred import deferred_if_traced
 from udkjax.programs.identity_cache import cached_within_trace
@@ -37,7 +37,7 @@ from udkjax.scene.schema import keys
 Leaves = Sequence[Any]
 
 
-class Elements(eqx.Module):
+class Elements(QuickMethods):
     """The elements of a mechanism, in the user's order, and gravity: independent numbers."""
 
     gravity: Float[Array, "2"]  # m/s^2
@@ -50,7 +50,8 @@ class Elements(eqx.Module):
     @classmethod
     def of(cls, gravity: Any, sections: Sequence[Sequence[Any]], **more: Any) -> "Elements":
         """Return the elements of sequences of bodies, joints, drivers and forces."""
-        return cls(gravity, *(tuple(elements) or None for elements in sections), **more)
+        bodies, joints, drivers, forces = (tuple(elements) or None for elements in sections)
+        return make_module(cls, gravity=gravity, bodies=bodies, joints=joints, drivers=drivers, forces=forces, **more)
 
     @property
     def elements(self) -> "Elements":
@@ -141,7 +142,7 @@ class AbstractDrawing(PrintsTable):
         """Return the pins that belong to a single body: the body, and the position in its frame (m)."""
 
 
-class Drawn(eqx.Module):
+class Drawn(QuickMethods):
     """A drawing, and the numbers that were given directly instead of those that follow from it."""
 
     drawing: AbstractDrawing
