@@ -3,7 +3,7 @@
 The equations are those of study/inverse_dynamics.py.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -19,18 +19,20 @@ from udkjax.scene.mechanism import Mechanism
 
 # Efforts (T, k), rates of their coordinates (T, k), unbalanced parts of the loads (T,).
 EffortArrays: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]
+Slopes: TypeAlias = Callable[[np.ndarray], np.ndarray]
 CLEARLY = 0.1  # rank tolerance over the rank tolerance at which rows would count as dependent, for which a bound is known
 
 
 @np.errstate(all="ignore")  # states that are not finite have no efforts
 def efforts_by_numpy(
-    mechanism: Mechanism, analysis: Analysis, weights: ArrayLike, ts: ArrayLike, motion: Sequence[ArrayLike]
+    mechanism: Mechanism, slopes: Slopes, analysis: Analysis, weights: ArrayLike, ts: ArrayLike, motion: Sequence[ArrayLike]
 ) -> EffortArrays | None:
     """Return efforts along coordinates, the rates of these, and the unbalanced part of the loads; None if numbers are traced.
 
     Args:
-        mechanism: a mechanism whose last rows of Psi are the coordinates.
-        analysis: the analysis of the mechanism without these rows.
+        mechanism: the mechanism without its drivers.
+        slopes: the derivatives C (T, k, n) of the coordinates by q, as a function of q (T, n).
+        analysis: the analysis of the mechanism.
         weights: weight of each squared effort.
         ts: times (T,).
         motion: q, v and a, each (T, bodies, 3).
@@ -42,7 +44,8 @@ def efforts_by_numpy(
         return None
     equations, w, times = state_arrays(mechanism), np.asarray(weights, float), np.asarray(ts, float)
     states = [np.asarray(x, float).reshape(len(times), -1) for x in motion]
-    columns = [_efforts_at(equations, analysis, w, *[x[p] for x in (times, *states)]) for p in equations.pieces(len(times))]
+    pieces = equations.pieces(len(times))
+    columns = [_efforts_at(equations, slopes, analysis, w, *[x[p] for x in (times, *states)]) for p in pieces]
     efforts, rates, unbalanced = columns[0] if len(columns) == 1 else map(np.concatenate, zip(*columns, strict=True))
     return efforts, rates, unbalanced
 
@@ -66,15 +69,17 @@ def _units_of(analysis: Analysis) -> _Units:
     return _Units(scales.weights, np.asarray(scales.coordinates(analysis.coordinates)), load, independent, redundant)
 
 
-def _efforts_at(equations: StateArrays, analysis: Analysis, w: np.ndarray, t: np.ndarray, *motion: np.ndarray) -> EffortArrays:
+def _efforts_at(
+    equations: StateArrays, slopes: Slopes, analysis: Analysis, w: np.ndarray, t: np.ndarray, *motion: np.ndarray
+) -> EffortArrays:
     q, v, a = motion
-    scale, joints = _units_of(analysis), len(analysis.row_names)
+    scale = _units_of(analysis)
     units, share = scale.coordinates, 1 / np.sqrt(w)
-    rows, (force, sizes) = equations.jacobian(t, q), equations.force_and_sizes(t, q, v)
-    C, J = rows[:, joints:], rows[:, :joints] * (scale.weights[:, None] * units)
+    rows, C, (force, sizes) = equations.jacobian(t, q), slopes(q), equations.force_and_sizes(t, q, v)
+    J = rows * (scale.weights[:, None] * units)
     missing = units * (equations.mass * a - force)
     rates = (C @ v[:, :, None])[:, :, 0]
-    reached = np.isfinite(rows).all((1, 2)) & np.isfinite(missing).all(1)
+    reached = np.isfinite(rows).all((1, 2)) & np.isfinite(C).all((1, 2)) & np.isfinite(missing).all(1)
     # Relative to the single terms, since their sum may be a rounding error.
     size = np.maximum((units * (equations.mass * np.abs(a) + sizes)).max(1), scale.inertial_load)
     pull = C * (share[:, None] * units)

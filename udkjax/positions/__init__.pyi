@@ -33,7 +33,7 @@ from udkjax.positions.coordinates import choose_name as choose_name
 from udkjax.positions.coordinates import constant_motion as constant_motion
 from udkjax.positions.coordinates import coordinate_value as coordinate_value
 from udkjax.positions.coordinates import element_of as element_of
-from udkjax.positions.coordinates import named_element as named_element
+from udkjax.positions.coordinates import slopes_of as slopes_of
 from udkjax.positions.coordinates import value_of as value_of
 from udkjax.positions.counting import Count as Count
 from udkjax.positions.counting import count_of as count_of

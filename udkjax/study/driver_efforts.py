@@ -16,11 +16,10 @@ from udkjax.equations.directed_friction import DirectedFriction
 from udkjax.equations.effort_arrays import efforts_by_numpy
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD
-from udkjax.positions.coordinates import Coordinate, choose_name, constant_motion, element_of, named_element, value_of
+from udkjax.positions.coordinates import Coordinate, constant_motion, element_of, slopes_of, value_of
 from udkjax.positions.drive import with_drivers
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
-from udkjax.scene.drivers import Driver
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.load_scale import load_sizes
 
@@ -29,10 +28,8 @@ Efforts: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]  # as `effo
 
 
 def driver_efforts(
-    mechanism: Mechanism,
     joints: Mechanism,
     analysis: Analysis,
-    drivers: Sequence[str | Coordinate],
     values: Sequence[Coordinate],
     weights: Float[Array, "k"],
     ts: Float[Array, "T"],
@@ -41,11 +38,9 @@ def driver_efforts(
     """Return the efforts of drivers of least weighted norm, the rates of their coordinates, and the unbalanced part of the loads.
 
     Args:
-        mechanism: the mechanism, to whose drivers and elements names refer.
         joints: the mechanism without its drivers.
         analysis: the analysis of `joints`.
-        drivers: the drivers and coordinates that exert efforts, as given.
-        values: their coordinates.
+        values: the coordinates along which the drivers exert efforts.
         weights: weight of each squared effort.
         ts: times (s).
         motion: q, v and a.
@@ -55,7 +50,7 @@ def driver_efforts(
     """
     found = None
     if joints.is_concrete and not is_traced(values):
-        found = efforts_by_numpy(_with_rows(mechanism, *drivers), analysis, weights, ts, motion)
+        found = efforts_by_numpy(joints, slopes_of(values, joints.body_names), analysis, weights, ts, motion)
     return found or _by_jax(joints.without_origin, analysis, values, jnp.asarray(weights), ts, *map(jnp.asarray, motion))
 
 
@@ -116,16 +111,10 @@ def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
 
 @cached_by_identity
 def elements_of(mechanism: Mechanism, *drivers: str | Coordinate) -> tuple[Coordinate, ...]:
-    """Return the coordinates of drivers, as `element_of`."""
-    return tuple(element_of(mechanism, driver) for driver in drivers)
-
-
-@cached_by_identity
-def _with_rows(mechanism: Mechanism, *drivers: str | Coordinate) -> Mechanism:
-    """Return a mechanism whose last rows of Psi are the coordinates of these drivers, in this order."""
-    rows: dict[str, Driver] = {}
-    for driver in drivers:
-        name, element = named_element(mechanism, driver)
-        rows[choose_name(name, rows)] = element.driver(constant_motion(0.0))
-    with jax.ensure_compile_time_eval():
-        return with_drivers(mechanism.without_origin, rows).without_origin
+    """Return the coordinates of drivers, as `element_of`. Raises `SceneError`."""
+    elements = tuple(element_of(mechanism, driver) for driver in drivers)
+    if not all(isinstance(driver, str) for driver in drivers):
+        with jax.ensure_compile_time_eval():  # a mechanism checks coordinates, however they are given
+            rows = {f"value{k + 1}": element.driver(constant_motion(0.0)) for k, element in enumerate(elements)}
+            with_drivers(mechanism, rows)
+    return elements

@@ -185,9 +185,7 @@ def inverse_dynamics(
     joints, q = without_drivers(mechanism), motion.q
     if len(q) != len(times):
         raise ValueError(f"motion has {len(q)} states, but ts has {len(times)} times: give the times of the motion")
-    efforts, rates, residual = driver_efforts(
-        mechanism, joints, analyse(joints), tuple(named.values()), values, w, times, (q, motion.v, motion.a)
-    )
+    efforts, rates, residual = driver_efforts(joints, analyse(joints), values, w, times, (q, motion.v, motion.a))
     columns = {name: efforts[:, k] for k, name in enumerate(named)}
     powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
     parts: dict[str, Any] = {"ts": times, "motion": computed, "efforts": columns, "powers": powers, "residual": residual}
