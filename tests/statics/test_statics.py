@@ -286,3 +286,12 @@ def test_a_batch_of_equilibria_has_a_code_for_each_member():
     assert found.balanced.shape == (1000,)
     assert np.all(np.asarray(found.residual)[np.asarray(found.balanced)] <= 1e-9)
     assert float(np.mean(found.balanced)) > 0.9
+
+
+def test_a_long_chain_comes_to_rest_in_a_few_steps(monkeypatch):
+    """Its end moves by many lengths of a link while all links turn by 0.1 rad."""
+    positions, linearize = [], NumpyLinearizer.linearize
+    monkeypatch.setattr(NumpyLinearizer, "linearize", lambda self, t, q: positions.append(q) or linearize(self, t, q))
+    found = udk.equilibrium(udk.library.chain(30, angle=0.1))
+    assert found.stable
+    assert len(positions) < 10

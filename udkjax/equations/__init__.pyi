@@ -9,10 +9,10 @@ from udkjax.equations.abstract_system import TangentPart as TangentPart
 from udkjax.equations.analysis import Analysis as Analysis
 from udkjax.equations.analysis import analyse as analyse
 from udkjax.equations.analysis import hold_pins as hold_pins
+from udkjax.equations.dense_pseudoinverse import dense_pseudoinverse as dense_pseudoinverse
 from udkjax.equations.dense_rows import DenseRows as DenseRows
 from udkjax.equations.dense_rows import DenseTerms as DenseTerms
 from udkjax.equations.dense_rows import KinematicRows as KinematicRows
-from udkjax.equations.dense_rows import TruncatedPseudoinverse as TruncatedPseudoinverse
 from udkjax.equations.determinacy import Uniqueness as Uniqueness
 from udkjax.equations.differentiable_programs import DifferentiableProgram as DifferentiableProgram
 from udkjax.equations.directed_friction import DirectedFriction as DirectedFriction

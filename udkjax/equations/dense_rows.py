@@ -3,7 +3,6 @@
 This module is used to close a mechanism and to find its redundant rows (position_rows.py).
 """
 
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
+from udkjax.equations.dense_pseudoinverse import FactoredPseudoinverse, TruncatedPseudoinverse, dense_pseudoinverse
 from udkjax.equations.eliminated_steps import EliminatedSteps
 from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, driver_time_step, is_closed, try_to_close
@@ -27,38 +27,6 @@ from udkjax.scene.mechanism import Mechanism
 # threshold count as zero, because rounding errors of redundant rows reach half of the digits. Values above the second are
 # nonzero. In between, near a singular configuration, the rank is uncertain.
 DEPENDENT_TOL, CLEAR_TOL = float(np.sqrt(np.finfo(float).eps)), 1e-4
-
-
-class TruncatedPseudoinverse(NamedTuple):
-    """D^+ = V S^+ U^T by NumPy, the counterpart of `pinv.SVD`."""
-
-    u: np.ndarray
-    inverse: np.ndarray
-    vt: np.ndarray
-    rank: int
-
-    @classmethod
-    def of(cls, D: np.ndarray, tol: float, full: bool = False) -> "TruncatedPseudoinverse":
-        """Return the pseudoinverse of a matrix, `full` with all right singular vectors; NaN if the matrix is not finite."""
-        if D.shape == (1, 1) and math.isfinite(D[0, 0]) and D[0, 0]:  # of one degree of freedom
-            return cls(np.sign(D), 1 / np.abs(D[0]), np.ones((1, 1)), 1)
-        if not np.isfinite(D).all():  # for which NumPy raises an error
-            D, tol = np.zeros_like(D), np.nan
-        u, sigma, vt = np.linalg.svd(D, full_matrices=full)
-        if sigma[-1] > tol * sigma[0]:
-            return cls(u[:, : len(sigma)], 1 / sigma, vt, len(sigma))
-        counts = ~(sigma <= tol * sigma[0])
-        inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0) + 0.0 * tol
-        return cls(u[:, : len(sigma)], inverse, vt, int(counts.sum()))
-
-    def __matmul__(self, b: np.ndarray) -> np.ndarray:
-        if b.ndim == 1:
-            return (self.inverse * (b @ self.u)) @ self.vt[: len(self.inverse)]
-        return self.vt[: len(self.inverse)].T @ ((self.u.T @ b).T * self.inverse).T
-
-    def transposed_times(self, b: np.ndarray) -> np.ndarray:
-        """Return (D^+)^T b of a vector."""
-        return self.u @ (self.inverse * (self.vt[: len(self.inverse)] @ b))
 
 
 def _key(t: Time, q: np.ndarray) -> tuple[bytes, bytes]:
@@ -189,9 +157,9 @@ class DenseRows(DenseTerms):
         """Return Psi_q (m, n)."""
         return self.slopes(t, q)[0]
 
-    def plus(self, t: Time, q: np.ndarray) -> TruncatedPseudoinverse:
+    def plus(self, t: Time, q: np.ndarray) -> FactoredPseudoinverse | TruncatedPseudoinverse:
         """Return D^+ of weighted rows in the metric."""
-        return TruncatedPseudoinverse.of(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
+        return dense_pseudoinverse(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         return -self.metric * (self.plus(t, q) @ (self.scales.weights * self.psi(t, q)))

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float
 from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
+from udkjax.equations.dense_pseudoinverse import dense_pseudoinverse
+from udkjax.equations.dense_rows import DenseTerms
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.scale_program import RANK_TOL
 from udkjax.pinv import SVD, Plus
@@ -229,10 +230,10 @@ class NumpyCurve(AbstractCurve):
         E[:, -1] = rate
         return E * self._factors
 
-    def plus(self, E: Any, tol: float = RANK_TOL) -> TruncatedPseudoinverse:
-        return TruncatedPseudoinverse.of(E, tol)
+    def plus(self, E: Any, tol: float = RANK_TOL) -> Any:
+        return dense_pseudoinverse(E, tol, with_values=True)
 
-    def inverse_singular_values(self, plus: TruncatedPseudoinverse) -> np.ndarray:
+    def inverse_singular_values(self, plus: Any) -> np.ndarray:
         return plus.inverse
 
     def gamma(self, s: Any, q: Any, v: Any) -> Any:
@@ -249,7 +250,7 @@ class NumpyCurve(AbstractCurve):
             psi, rate, entries = self._geometry(X)
             closed = np.abs(psi / self.rows).max() <= self.rounding(X)
             if plus is None or not closed:
-                plus = self.plus(self._slopes(self._still if fixed else rate, entries))
+                plus = dense_pseudoinverse(self._slopes(self._still if fixed else rate, entries), RANK_TOL)
             X = X - plus @ (self.weights * psi)
             if closed:
                 break

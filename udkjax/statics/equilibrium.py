@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import library_for, make_module, number, stored
+from udkjax.arrays import ArrayLibrary, library_for, make_module, number, stored
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.positions.assembly import State, close
@@ -227,6 +227,7 @@ def _settle(
     if not free:
         return q
     by, xp, scale = curve.by, curve.by.xp, near.scale(t, q)
+    units = _step_units(curve.units[:-1], q, xp)
 
     def is_unsettled(state: Settling) -> IsTrue:
         _, current, k, better = state
@@ -235,8 +236,7 @@ def _settle(
     def body(state: Settling) -> Settling:
         q, current, k, _ = state
         step = current.directions @ _towards_rest(current, scale, stable, curve)
-        longest = xp.max(xp.abs(step / curve.units[:-1]))
-        step = step * CLOSURE.shortening(longest, xp)
+        step = step * CLOSURE.shortening(xp.max(xp.abs(step / units)), xp)
         size = xp.linalg.norm(current.force)
 
         def trial(state: Trial) -> Trial:
@@ -259,6 +259,17 @@ def _settle(
 
     start = q, near.linearize(t, q), xp.asarray(0), xp.asarray(True)
     return by.while_loop(is_unsettled, body, start)[0]
+
+
+def _step_units(units: Float[Array, "n"], q: Float[Array, "n"], xp: ArrayLibrary) -> Float[Array, "n"]:
+    """Return the units of steps: radians, and for lengths the extent of the mechanism, if that is longer than its bodies.
+
+    A body at the end of a long chain moves by many lengths of a link while all links turn by a small angle.
+    """
+    places = q.reshape(-1, 3)[:, :2]
+    extent = xp.max(xp.max(places, axis=0) - xp.min(places, axis=0))
+    lengths, angles = units.reshape(-1, 3)[:, :2], units.reshape(-1, 3)[:, 2:]
+    return xp.concatenate([xp.maximum(lengths, extent), angles], axis=1).ravel()
 
 
 def _towards_rest(linearization: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:

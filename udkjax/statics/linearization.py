@@ -21,7 +21,8 @@ from jaxtyping import Array, ArrayLike, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.dense_rows import DenseTerms, TruncatedPseudoinverse
+from udkjax.equations.dense_pseudoinverse import dense_pseudoinverse
+from udkjax.equations.dense_rows import DenseTerms
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.programs.identity_cache import cached_by_identity
@@ -102,8 +103,8 @@ class NumpyLinearizer:
         at_rest = terms.loads_at_rest(t, q)
         if terms.count:
             D = terms.slopes(t, q)[0] * self._factors
-            plus = TruncatedPseudoinverse.of(D, self._tol, full=True)
-            V = plus.vt[terms.size - self._free :].T
+            plus = dense_pseudoinverse(D, self._tol, self._free)
+            V = plus.null_space(self._free)
             N = root[:, None] * (V - plus @ (D @ V))  # also rounding errors of V matter where masses and inertias differ by far
             multipliers = w * plus.transposed_times(root * at_rest.force)
             K = at_rest.stiffness + terms.curvature(t, q, multipliers)
