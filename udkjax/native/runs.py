@@ -16,6 +16,7 @@ from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import Conditions
+from udkjax.native.watching.passing import Passing
 from udkjax.native.watching.watching import Watching
 
 
@@ -92,9 +93,10 @@ class RunStates(Operation):
         points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
 
-    def watching(self, conditions: Conditions) -> "RunWatched":
-        """Return the operation that integrates up to the first crossing of conditions."""
-        return RunWatched(**{item.name: getattr(self, item.name) for item in fields(self)}, conditions=conditions)
+    def watching(self, conditions: Conditions, passing: Passing | None = None) -> "RunWatched":
+        """Return the operation that integrates up to the first crossing of conditions, but for the kinks that it passes."""
+        own = {item.name: getattr(self, item.name) for item in fields(self)}
+        return RunWatched(**own, conditions=conditions, passing=passing)
 
     @property
     def _for_derivatives(self) -> dict[str, Any]:
@@ -115,14 +117,17 @@ class RunWatched(RunStates):
     """Integrate up to the first crossing of conditions, or until a crossing cannot be ruled out."""
 
     conditions: Conditions | None = None
+    passing: Passing | None = None  # kinks that are recorded, and do not end the run
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         assert self.conditions is not None
-        return Watching(self.plan(width, vector), self.conditions)
+        return Watching(self.plan(width, vector), self.conditions, self.passing)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         assert self.conditions is not None
-        return [*super().outputs(inputs, times), (self.conditions.output_count(self.code.coordinate_count),)]
+        n = self.code.coordinate_count
+        kinks = [(self.passing.record_length(n, self.conditions.count),)] if self.passing else []
+        return [*super().outputs(inputs, times), (self.conditions.output_count(n),), *kinks]
 
 
 @dataclass(frozen=True)

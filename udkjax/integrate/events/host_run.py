@@ -148,7 +148,7 @@ def machine_plan(
     of_kinks = places_of_kinks(events, phases.held)
     rows = [x.plan.operation.code.row_count for x in compiled if x.plan.operation is not None]
     with_rows = [with_forces(conditions, events, phases.switches, m) for m in rows]
-    plans = [phase_plan(which, phases, m, with_rows[which], directed, of_kinks.sides) for which, m in enumerate(compiled)]
+    plans = [phase_plan(which, phases, m, with_rows[which], directed, of_kinks) for which, m in enumerate(compiled)]
     return MachinePlan(plan, tuple(plans), added_joints(phases), tuple(zip(phases.held, of_kinks.elements, strict=True)))
 
 

@@ -137,7 +137,7 @@ def _jump(
     is_noted = xp.concatenate([xp.ones_like(others, shape=(len(k), 1)), others], axis=1)
     total = xp.sum(is_noted, axis=1)
     is_kink = xp.asarray(plan.kinks)[e] & ~releases
-    kinks, turned = _kink_count(system, runs, members), system.sides(members, after.joints)
+    kinks, turned = runs.kink_count(plan, members), system.sides(members, after.joints)
     is_full = (count - kinks + total > plan.max_events) & ~is_kink
     # So many kinks are a force that chatters: its comparisons are no longer held.
     chatters = (is_kink & (kinks + 1 >= MOST_KINKS))[:, None]
@@ -175,14 +175,6 @@ def _jump(
         code=code,
         running=(code == Result.successful) & (follows | (before.t < take(system.end, members))),
     )._replace(joints=after.joints)
-
-
-def _kink_count(system: System, runs: MemberRuns, members: MemberIndices) -> Int[Any, "b"]:
-    """Return the number of kinks so far."""
-    plan, index = system.plan, take(runs.record[INDEX_FIELD], members)
-    if not plan.has_kinks:
-        return system.xp.zeros(len(index), int)
-    return system.xp.sum((index >= 0) & (index < plan.count) & system.xp.asarray(plan.kinks)[index % plan.count], axis=1)
 
 
 def _carried(system: System, members: MemberIndices, carried: Bool[Any, "b E"], joints: Any) -> Bool[Any, "b E"]:

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from udkjax.integrate.events.added_joints import AddedJoint, evaluate_joint
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO
 from udkjax.integrate.events.event_plan import EventPlan
-from udkjax.integrate.events.impacts import Contacts
-from udkjax.integrate.events.kinks import FREE, HeldElement
+from udkjax.integrate.events.impacts import OPEN, Contacts
+from udkjax.integrate.events.kinks import FREE, MOST_KINKS, HeldElement
 from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.phases import SCENE, SWITCHED
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
@@ -23,6 +23,7 @@ from udkjax.integrate.outcome import failure
 from udkjax.integrate.solution import Result
 from udkjax.native.base.steps import Status
 from udkjax.native.runs import RunStates
+from udkjax.native.watching.passing import PassedKinks, Passing
 
 STATUS, TIME, COUNTS, WRITTEN, IMPLICIT = 0, 1, slice(2, 5), 5, 7  # of `RunStates.info_names`
 INFO = len(RunStates.info_names)
@@ -87,6 +88,7 @@ class MachineSystem:
         E = self.plan.count
         holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
         self._watched = [np.append(np.arange(E), E + holds[: x.force_count]) for x in plan.phases]
+        self._rooms = [x.number_count for x in plan.phases]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
     def contacts(self, members: MemberIndices) -> Contacts:
@@ -233,6 +235,25 @@ class MachineSystem:
             runs.t[drifting], runs.q[drifting], runs.v[drifting] = (x[drifts, last_kept] for x in (times, stretch.q, stretch.v))
             is_open = drifts & lost[:, 0] & (start == ts[:, 0])
             runs.code[members[is_open]], runs.t[members[is_open]] = Result.initial_state_open, start[is_open]
+        if stretch.kinks is not None:
+            self._note_kinks(runs, members, stretch.kinks)
+
+    def _note_kinks(self, runs: MemberRuns, members: Int[np.ndarray, "b"], kinks: PassedKinks):
+        """Record the kinks that machine code has passed."""
+        noted = (np.arange(kinks.t.shape[1]) < kinks.count[:, None]) & (kinks.t <= runs.t[members, None])
+        b, k = np.nonzero(noted)
+        if not b.size:
+            return
+        first, here = self.plan.first_kink_side, members[b]
+        sides = runs.joints[-1][here]
+        sides[:, first:] = kinks.sides[b, k]
+        q, v = (np.stack([x[b, k]] * 2, axis=1) for x in (kinks.q, kinks.v))
+        new = kinks.t[b, k], q, v, kinks.event[b, k], runs.phase[here], False, OPEN, sides
+        for array, x in zip(runs.record, new, strict=True):
+            array[here, runs.count[here] + k] = x
+        last = k == noted.sum(1)[b] - 1
+        runs.joints[-1][here[last]] = sides[last]
+        runs.count[members] += noted.sum(1)
 
     def _fail(
         self,
@@ -260,17 +281,18 @@ class MachineSystem:
     def _watch(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b K"]:
         """Return the input that describes watched conditions: room for numbers, sides, masks, tolerances, directions."""
         where, E, watch = self._watched[which], self.plan.count, self._watches[which][members]
-        room, C = watch.shape[1] - 1 - 4 * len(where), len(where)
+        room, C = self._rooms[which], len(where)
         watch[:, room : room + C] = runs.sides[members[:, None], where]
         watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, where]
         watch[:, room + 2 * C : room + 2 * C + E] = ZERO * runs.scale[members]
+        if self.plan.has_kinks:
+            watch[:, -1] = np.minimum(MOST_KINKS - 1 - runs.kink_count(self.plan, members), Passing.most)
         return watch
 
     def _watch_before(self, plan: PhasePlan, watched: Int[np.ndarray, "C"]) -> Float[np.ndarray, "B K"]:
         """Return the array of `_watch` before a run, with the entries that stay constant."""
         units, B = self._units, len(self.end)
-        assert plan.run.conditions is not None  # this code has conditions
-        room, ones = plan.run.conditions.number_count + 2 * len(watched), np.ones((B, 1))
+        room, ones = plan.number_count + 2 * len(watched), np.ones((B, 1))
         force = ZERO * units.mass * units.length * units.rate**2
         constants = force[:, None] * np.ones(len(watched)), self.plan.both_directions[watched] * ones, units.scene_rate[:, None]
-        return np.concatenate([np.zeros((B, room)), *constants], axis=1)
+        return np.concatenate([np.zeros((B, room)), *constants, np.zeros((B, int(plan.run.passing is not None)))], axis=1)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import places_of_joints
-from udkjax.integrate.events.kinks import places_of_sides
+from udkjax.integrate.events.kinks import KinkPlaces, places_of_sides
 from udkjax.integrate.events.phases import SWITCHED, Phases, Switches
 from udkjax.integrate.events.runs import RunState
 from udkjax.integrate.events.switched import places_of_switches
@@ -23,6 +23,7 @@ from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.primitive import MemberCalls
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
+from udkjax.native.watching.passing import PassedKinks, Passing, Renewal
 from udkjax.scene.mechanism import Mechanism
 
 INPUTS = RunWatched.input_names
@@ -44,6 +45,11 @@ class PhasePlan(NamedTuple):
     sides_of_events: tuple[tuple[int, int], ...]  # places of sides among the numbers of events, with the index of the side
 
     @property
+    def number_count(self) -> int:
+        """The number of numbers of the conditions."""
+        return 0 if self.run.conditions is None else self.run.conditions.number_count
+
+    @property
     def force_count(self) -> int:
         """The number of watched forces."""
         return 0 if self.run.conditions is None else self.run.conditions.force_count
@@ -60,7 +66,7 @@ def phase_plan(
     compiled: CompiledMechanism,
     conditions: Conditions,
     directed: Sequence[int],
-    of_kinks: tuple[tuple[int, int], ...],
+    of_kinks: KinkPlaces,
 ) -> PhasePlan:
     """Return the operations of the phases of the mechanism `which`, SCENE or SWITCHED.
 
@@ -70,7 +76,7 @@ def phase_plan(
         compiled: the mechanism, compiled.
         conditions: conditions of all events, with forces.
         directed: the events whose directions of impulses are needed.
-        of_kinks: the places of sides among the numbers of events, each with the index of its side.
+        of_kinks: the places of kinks among the numbers of events.
     """
     run, added, active = compiled.plan.operation, [name for _, name in phases.added_by], ()
     assert run is not None  # checked by the caller
@@ -79,15 +85,37 @@ def phase_plan(
     has_forces = any(which == SWITCHED or x.contact < 0 for x in phases.sticking)
     if which == SWITCHED:
         active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, added)
+    sides = places_of_sides(mechanism, phases.sided) if phases.sided else ()
+    watched = conditions if which == SWITCHED else without  # nothing is held that could let go
     return PhasePlan(
-        run=run.watching(conditions if which == SWITCHED else without),  # nothing is held that could let go
+        run=run.watching(watched, _passing(phases, watched, of_kinks, sides)),
         states=run.accelerations.of_events(conditions if has_forces else without, tuple(directed)),
         marking=_marking(compiled.textbook) if run.code.marks_rows else None,
         projected=compiled.plan.projected,
         project=run.accelerations.projection if added else None,
-        joints=(*joints, places_of_sides(mechanism, phases.sided) if phases.sided else ()),
+        joints=(*joints, sides),
         active=active,
-        sides_of_events=of_kinks,
+        sides_of_events=of_kinks.sides,
+    )
+
+
+def _passing(phases: Phases, conditions: Conditions, of_kinks: KinkPlaces, sides: tuple[int, ...]) -> Passing | None:
+    """Return the kinks that a run passes; `sides` are the places of all sides among the numbers of the scene."""
+    if not phases.held:
+        return None
+    first, turns, renewals = phases.held[0].first, [], []
+    for held, numbers in zip(phases.held, of_kinks.elements, strict=True):
+        turns += [(held.first - first + side, factor, shift) for side, factor, shift in held.smooth.turns]
+        own = [("kink sides", held.first - first + k) for k in range(held.smooth.count)]
+        q, v = ([(name, k) for k in held.coordinates] for name in ("state q", "result v"))
+        given = held.smooth.inputs([("condition numbers", k) for k in numbers], ("state t", 0), q, v, own)
+        renewals.append(Renewal(held.smooth, tuple(given), held.first - first))
+    return Passing(
+        first=conditions.own_count - len(turns),
+        turns=tuple(turns),
+        of_conditions=tuple((place, side - first) for place, side in of_kinks.sides),
+        of_scene=tuple((place, side - first) for side, place in enumerate(sides) if side >= first and place >= 0),
+        renewals=tuple(renewals),
     )
 
 
@@ -124,6 +152,7 @@ class StretchEnd(NamedTuple):
     sides: Float[np.ndarray, "b C"]
     q_end: Float[np.ndarray, "b n"]  # at t
     v_end: Float[np.ndarray, "b n"]
+    kinks: PassedKinks | None  # None if the scene has none
 
 
 class PhaseCode:
@@ -184,11 +213,13 @@ class PhaseCode:
         watch[:, : conditions.number_count] = _of(self._event_numbers, members)
         self._put_sides(watch, members)
         inputs = numbers, ts, q, v, *further, watch
-        qs, vs, violation, info, crossing = self._run(*inputs, times=ts.shape[1])
+        qs, vs, violation, info, crossing, *record = self._run(*inputs, times=ts.shape[1])
         last_side, n = Conditions.head + conditions.count, q.shape[1]
         (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
         q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
-        return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end)
+        passing = self.plan.run.passing
+        kinks = None if passing is None else PassedKinks.of(passing, *record, n)
+        return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, kinks)
 
     def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:
         """Evaluate the conditions of members at states."""

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -105,6 +106,14 @@ class MemberRuns(NamedTuple):
         return RunState(
             take(self.t, members), take(self.q, members), take(self.v, members), take(self.phase, members), self.joints
         )
+
+    def kink_count(self, plan: EventPlan, members: MemberIndices) -> Int[Any, "b"]:
+        """Return the number of kinks so far."""
+        index = take(self.record[RECORD.index("event_index")], members)
+        xp = np if isinstance(index, np.ndarray) else jnp
+        if not plan.has_kinks:
+            return xp.zeros(len(index), int)
+        return xp.sum((index >= 0) & (index < plan.count) & xp.asarray(plan.kinks)[index % plan.count], axis=1)
 
     def put(self, members: MemberIndices, **new: Any) -> "MemberRuns":
         """Return the runs with new values of members."""

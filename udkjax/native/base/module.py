@@ -329,6 +329,13 @@ class Module(Running):
     def begin_member(self, f: Function, lane: Value, member: Value):
         """Hook: called when a member is loaded into a lane; does nothing by default."""
 
+    def begin_numbers(self, f: Function, lane: Value, member: Value):
+        """Hook: called before the constants of a member are computed for the first time."""
+
+    def numbers_in_lane(self, f: Function, lane: Value, numbers: Value) -> Value:
+        """Return the address of the numbers with which the constants of a lane are computed; by default those given."""
+        return numbers
+
     def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
         """Hook: called with the addresses of the numbers and constants of a lane when they have changed."""
 

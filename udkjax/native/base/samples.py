@@ -46,6 +46,7 @@ def write_enter(module: Module):
     knot, member = module.lane_entry(f, "knot", lane), module.to_int(f, module.lane_entry(f, "member", lane))
     module.put_lane_entry(f, "row", lane, knot)
     numbers = numbers_of_row(module, f, member, knot) if module.plan.sampled else module.member_address(f, "numbers", member)
+    numbers = module.numbers_in_lane(f, lane, numbers)
     constants = Value(f, f.reserve(DOUBLE, max(module.constants, 1)), POINTER)
     f.call("prologue", numbers, constants)
     with f.each(module.constants) as i:

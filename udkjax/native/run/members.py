@@ -72,6 +72,7 @@ def write_begin(module: Module):
     put("active", 1.0)
     put("tolerance", settings["atol"])
     put("member", f.op(f"sitofp i64 {member.name} to double", DOUBLE))
+    module.begin_numbers(f, k, member)
     if module.plan.breaks:
         enter_first_row(module, f, k, member)
     else:

@@ -93,6 +93,9 @@ class Trajectory(Module):
     def after_step(self, f: Function, s: Lane):
         """Hook: called after each attempt at a step, when `until` has been set."""
 
+    def after_outputs(self, f: Function, s: Lane):
+        """Hook: called after the outputs of a step, before completed members end."""
+
     def write_functions(self):
         self.write_programs()
         if self.falls_back:
@@ -136,6 +139,7 @@ class Trajectory(Module):
         f.call("decide", work)
         self.after_step(f, s)
         f.call("outputs", work, call)
+        self.after_outputs(f, s)
         ended = (s.active > 0.5) & s.code.is_not(float(Status.RUNNING))
         with f.if_(f.any_of(ended)):
             s.due = f.select(ended, yes, 0.0)

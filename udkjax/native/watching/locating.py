@@ -102,7 +102,7 @@ def write_land(module: WatchMemory):
     goes_on = arrived & ~is_small & (s.landings < float(MOST_LANDINGS)) & (f.abs(change) < s.target - s.point2_t)
     s.where(goes_on, landing=float(WANTED), target=s.target + change, landings=s.landings + 1.0)
     is_complete, change = arrived & ~goes_on, f.select(is_small, change, zero)
-    change = f.max(change, s.start - s.point3_t)  # with a slow condition the corrected time may precede the start
+    change = f.max(change, s.fresh - s.point3_t)  # with a slow condition the corrected time may precede the start
     ahead = module.broadcast(f, change)
     is_exact = is_complete & is_small
     s.where(is_exact, sure_t=s.point3_t + change)

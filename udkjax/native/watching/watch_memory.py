@@ -3,8 +3,8 @@
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.steps import UNIT, Status
-from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import MIDDLE, RESOLUTION, SECOND, TURN, VARIES, Conditions
+from udkjax.native.watching.passing import Passing, PassingRuns
 
 LANE_NUMBERS = {
     "node": "time of the next node (s); infinite if there is none",
@@ -34,14 +34,13 @@ LANE_NUMBERS = {
 }
 
 
-class WatchMemory(Trajectory):
+class WatchMemory(PassingRuns):
     """A trajectory with memory for the conditions that it watches."""
 
-    outputs = ("crossing",)
-
-    def __init__(self, plan: Plan, conditions: Conditions):
-        self.conditions = conditions
+    def __init__(self, plan: Plan, conditions: Conditions, passing: Passing | None = None):
+        self.conditions, self.passing = conditions, passing
         super().__init__(plan)
+        self.outputs = ("crossing", "kinks") if passing else ("crossing",)
         self.inputs = (*self.inputs, "watch")
         for name in LANE_NUMBERS:
             self.places.add(name)
@@ -55,6 +54,7 @@ class WatchMemory(Trajectory):
         self.places.add("forces", conditions.force_count)
         for name in ("force q", "sure q", "sure v", "middle q", "middle v", "node a", "before q", "before v", "before a"):
             self.places.add(name, self.n)
+        self.lay_out_passing()
 
     # --- inputs and outputs
 
@@ -74,6 +74,8 @@ class WatchMemory(Trajectory):
         self.put_lane_entry(f, "event", lane, f.const(-1.0))
         self.put_lane_entry(f, "share", lane, f.const(1.0))
         self.put_lane_entry(f, "slowest", lane, f.load(given, start))
+        if self.passing:
+            self.begin_record(f, lane, f.load(given, start + 1))
         for x in "qv":
             with f.each(self.n) as i:
                 self.put_lane_entry(f, f"sure {x}", lane, self.lane_entry(f, f"point3 {x}", lane, i), i)
@@ -87,6 +89,8 @@ class WatchMemory(Trajectory):
             self.copy_lane(f, to, Conditions.head, "condition side", k, count=self.conditions.count)
             for j, x in enumerate("qv"):
                 self.copy_lane(f, to, Conditions.head + self.conditions.count + j * self.n, f"sure {x}", k)
+            if self.passing:
+                self.end_record(f, k, member)
 
     # --- arrays of conditions and states
 

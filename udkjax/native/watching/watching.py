@@ -33,6 +33,8 @@ class Watching(WatchMemory):
         write_land(self)
         write_approach(self)
         self._write_watch()
+        if self.passing:
+            self.write_pass()
 
     def before_step(self, f: Function, s: Lane):
         with f.if_(f.any_of(s.landing > 0.5)):
@@ -42,6 +44,11 @@ class Watching(WatchMemory):
         f.call("watch", f.given["work"])
         with f.if_(f.any_of(s.landing > WANTED + 0.5)):
             f.call("land", f.given["work"])
+
+    def after_outputs(self, f: Function, s: Lane):
+        if self.passing:
+            with f.if_(f.any_of((s.active > 0.5) & s.code.is_(float(Status.CROSSED)))):
+                f.call("pass_kinks", f.given["work"], f.given["call"])
 
     def interpolates(self, f: Function, s: Lane) -> Value:
         return f.const(True, BOOL, f.width)  # for the conditions within each step
