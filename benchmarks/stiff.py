@@ -121,8 +121,8 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
     dampings, rounds, at_least = (DAMPINGS[::5], 1, 0.0) if smoke else (DAMPINGS, ROUNDS, 0.02)
     members = jnp.asarray(np.geomspace(DAMPINGS[0], DAMPINGS[-1], 4 if smoke else MEMBERS))
     ts = np.linspace(0.0, 2.0 if smoke else 20.0, OUTPUTS)
-    pendulum = udk.library.simple_pendulum()
-    stop = Bumper(pendulum.body_names[0], BUMPER, pendulum.q0[0, 2] - 0.5)
+    pendulum = udk.library.compound_pendulum()
+    stop = Bumper(pendulum.body_names[0], BUMPER, pendulum.q0[0, 2] - 1.0)  # it rebounds 19 times
     bumper = udk.Mechanism(pendulum.bodies, pendulum.joints, forces={"bumper": stop}, gravity=pendulum.gravity)
 
     def alone(scene: udk.Mechanism) -> Callable:

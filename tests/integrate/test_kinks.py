@@ -1,6 +1,7 @@
 """Jumps and kinks of forces that depend on the state are located. First and second derivatives pass through them."""
 
 # pyright: reportArgumentType=false, reportOptionalMemberAccess=false
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,9 @@ from scipy.special import gamma
 import udkjax as udk
 from udkjax.equations.smooth_loads import SmoothLoads
 from udkjax.expressions import scalar_program
+from udkjax.integrate.events.machine_system import MachineSystem
+from udkjax.integrate.events.phase_code import PhaseCode
+from udkjax.native.watching.passing import Passing
 
 
 class Of(udk.ForceElement):
@@ -218,6 +222,83 @@ def test_events_of_the_user_stay_apart_from_kinks():
     assert found.events.names[:1] == ("late",) and int(found.events.count) == 1
     assert float(found.events.time[0]) == pytest.approx(0.2 + (1 - np.sqrt(0.6)) / 2, abs=1e-13)
     assert int(found.stats["kinks"]) == 1
+
+
+class Stop(udk.ForceElement):
+    """An elastic stop, and a torque that jumps where another one has its kink."""
+
+    k: Float[Array, ""]
+
+    def loads(self, t, *frames):
+        angle, rate = frames[0].angle, frames[0].omega
+        jump = jnp.where(angle > -1.0, jnp.where(rate > 0.5, -0.3, 0.2), 0.1 * jnp.floor(3 * angle))
+        return [(0.0, 0.0, self.k * jnp.maximum(-1.2 - angle, 0.0) + jump)]
+
+
+def swinging(k=1e4, **more):
+    pendulum = udk.library.double_pendulum(**more)
+    return udk.Mechanism(pendulum.bodies, pendulum.joints, forces={"stop": Stop(["upper"], k=k)}, gravity=pendulum.gravity)
+
+
+def by_the_loop(monkeypatch):
+    """Leave all kinks to the loop of events."""
+    watch = MachineSystem._watch
+
+    def without_room(self, runs, which, members):
+        found = watch(self, runs, which, members)
+        found[:, -1] = 0
+        return found
+
+    monkeypatch.setattr(MachineSystem, "_watch", without_room)
+
+
+def counted(monkeypatch, run):
+    """Return the result of a run, and the number of its stretches."""
+    calls, stretch = [], PhaseCode.run
+    monkeypatch.setattr(PhaseCode, "run", lambda *given: calls.append(0) or stretch(*given))
+    return run(), len(calls)
+
+
+CASES = {
+    "default": {},
+    "Kvaerno5": {"solver": diffrax.Kvaerno5()},
+    "not projected": {"stabilization": udk.Baumgarte(5.0, 5.0)},
+    "few outputs": {"ts": [0.0, 3.0]},
+    "events": {"events": [udk.Event(lambda t, at: at["lower"].omega, udk.Log(), name="turns")]},
+    "impacts": {"events": [udk.Event(lambda t, at: at["lower"].angle + 2.0, udk.Impact(0.5), direction=-1, name="hit")]},
+}
+
+QUICK = ("default", "events")
+
+
+@pytest.mark.parametrize("case", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in CASES])
+def test_machine_code_passes_kinks_as_the_loop_of_events_does(case, monkeypatch):
+    options = {"ts": np.linspace(0.0, 3.0, 301), "rtol": 1e-8, "atol": 1e-8} | CASES[case]
+    run = lambda: udk.simulate(swinging(), **options)  # noqa: E731
+    with monkeypatch.context() as context:
+        found, calls = counted(context, run)
+    by_the_loop(monkeypatch)
+    expected, more_calls = counted(monkeypatch, run)
+    kinks, events = int(expected.stats["kinks"]), 0 if expected.events is None else int(expected.events.count)
+    assert more_calls > kinks / 2 > 10 and calls <= kinks / Passing.most + events + 5  # some kinks are simultaneous
+    np.testing.assert_array_equal(found.q, expected.q)
+    np.testing.assert_array_equal(found.v, expected.v)
+    assert found.stats == expected.stats
+    if expected.events is not None:
+        np.testing.assert_array_equal(found.events.time, expected.events.time)
+
+
+@pytest.mark.slow
+def test_members_pass_kinks_of_their_own(monkeypatch):
+    ts, ks = np.linspace(0.0, 2.0, 5), np.geomspace(1e2, 1e5, 6)
+    run = lambda k: udk.simulate(swinging(k), ts, rtol=1e-8, atol=1e-8)  # noqa: E731
+    found = jax.vmap(run)(jnp.asarray(ks))
+    assert len(set(found.stats["kinks"].tolist())) > 2
+    by_the_loop(monkeypatch)
+    for k, q, kinks in zip(ks, found.q, found.stats["kinks"], strict=True):
+        expected = run(k)
+        np.testing.assert_allclose(q, expected.q, atol=1e-11)
+        assert kinks == expected.stats["kinks"]
 
 
 def test_what_rests_where_its_force_jumps_is_told():

@@ -93,10 +93,13 @@ class RunStates(Operation):
         points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
 
-    def watching(self, conditions: Conditions, passing: Passing | None = None) -> "RunWatched":
-        """Return the operation that integrates up to the first crossing of conditions, but for the kinks that it passes."""
+    def watching(self, conditions: Conditions, **kinks: Any) -> "RunWatched":
+        """Return the operation that integrates up to the first crossing of conditions.
+
+        It passes `kinks`, the fields of `Passing`; without them, each ends the run.
+        """
         own = {item.name: getattr(self, item.name) for item in fields(self)}
-        return RunWatched(**own, conditions=conditions, passing=passing)
+        return RunWatched(**own, conditions=conditions, passing=Passing(**kinks) if kinks else None)
 
     @property
     def _for_derivatives(self) -> dict[str, Any]:

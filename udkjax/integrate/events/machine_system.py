@@ -15,7 +15,7 @@ from udkjax.integrate.events.crossings import NO_EVENT, ZERO
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import OPEN, Contacts
 from udkjax.integrate.events.kinks import FREE, MOST_KINKS, HeldElement
-from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
+from udkjax.integrate.events.phase_code import PassedKinks, PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.phases import SCENE, SWITCHED
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
@@ -23,7 +23,6 @@ from udkjax.integrate.outcome import failure
 from udkjax.integrate.solution import Result
 from udkjax.native.base.steps import Status
 from udkjax.native.runs import RunStates
-from udkjax.native.watching.passing import PassedKinks, Passing
 
 STATUS, TIME, COUNTS, WRITTEN, IMPLICIT = 0, 1, slice(2, 5), 5, 7  # of `RunStates.info_names`
 INFO = len(RunStates.info_names)
@@ -88,7 +87,7 @@ class MachineSystem:
         E = self.plan.count
         holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
         self._watched = [np.append(np.arange(E), E + holds[: x.force_count]) for x in plan.phases]
-        self._rooms = [x.number_count for x in plan.phases]
+        self._rooms, self._passed = [x.number_count for x in plan.phases], [x.run.passing for x in plan.phases]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
     def contacts(self, members: MemberIndices) -> Contacts:
@@ -285,8 +284,8 @@ class MachineSystem:
         watch[:, room : room + C] = runs.sides[members[:, None], where]
         watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, where]
         watch[:, room + 2 * C : room + 2 * C + E] = ZERO * runs.scale[members]
-        if self.plan.has_kinks:
-            watch[:, -1] = np.minimum(MOST_KINKS - 1 - runs.kink_count(self.plan, members), Passing.most)
+        if (passing := self._passed[which]) is not None:
+            watch[:, -1] = np.minimum(MOST_KINKS - 1 - runs.kink_count(self.plan, members), passing.most)
         return watch
 
     def _watch_before(self, plan: PhasePlan, watched: Int[np.ndarray, "C"]) -> Float[np.ndarray, "B K"]:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.added_joints import places_of_joints
+from udkjax.integrate.events.crossings import ZERO
 from udkjax.integrate.events.kinks import KinkPlaces, places_of_sides
 from udkjax.integrate.events.phases import SWITCHED, Phases, Switches
 from udkjax.integrate.events.runs import RunState
@@ -23,7 +24,6 @@ from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.primitive import MemberCalls
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
-from udkjax.native.watching.passing import PassedKinks, Passing, Renewal
 from udkjax.scene.mechanism import Mechanism
 
 INPUTS = RunWatched.input_names
@@ -88,7 +88,7 @@ def phase_plan(
     sides = places_of_sides(mechanism, phases.sided) if phases.sided else ()
     watched = conditions if which == SWITCHED else without  # nothing is held that could let go
     return PhasePlan(
-        run=run.watching(watched, _passing(phases, watched, of_kinks, sides)),
+        run=run.watching(watched, **_passed(phases, watched, of_kinks, sides)),
         states=run.accelerations.of_events(conditions if has_forces else without, tuple(directed)),
         marking=_marking(compiled.textbook) if run.code.marks_rows else None,
         projected=compiled.plan.projected,
@@ -99,24 +99,25 @@ def phase_plan(
     )
 
 
-def _passing(phases: Phases, conditions: Conditions, of_kinks: KinkPlaces, sides: tuple[int, ...]) -> Passing | None:
+def _passed(phases: Phases, conditions: Conditions, of_kinks: KinkPlaces, sides: tuple[int, ...]) -> dict[str, Any]:
     """Return the kinks that a run passes; `sides` are the places of all sides among the numbers of the scene."""
     if not phases.held:
-        return None
+        return {}
     first, turns, renewals = phases.held[0].first, [], []
     for held, numbers in zip(phases.held, of_kinks.elements, strict=True):
         turns += [(held.first - first + side, factor, shift) for side, factor, shift in held.smooth.turns]
         own = [("kink sides", held.first - first + k) for k in range(held.smooth.count)]
         q, v = ([(name, k) for k in held.coordinates] for name in ("state q", "result v"))
         given = held.smooth.inputs([("condition numbers", k) for k in numbers], ("state t", 0), q, v, own)
-        renewals.append(Renewal(held.smooth, tuple(given), held.first - first))
-    return Passing(
-        first=conditions.own_count - len(turns),
-        turns=tuple(turns),
-        of_conditions=tuple((place, side - first) for place, side in of_kinks.sides),
-        of_scene=tuple((place, side - first) for side, place in enumerate(sides) if side >= first and place >= 0),
-        renewals=tuple(renewals),
-    )
+        renewals.append((held.smooth, tuple(given), held.first - first))
+    return {
+        "first": conditions.own_count - len(turns),
+        "turns": tuple(turns),
+        "of_conditions": tuple((place, side - first) for place, side in of_kinks.sides),
+        "of_scene": tuple((place, side - first) for side, place in enumerate(sides) if side >= first and place >= 0),
+        "renewals": tuple(renewals),
+        "zero": ZERO,
+    }
 
 
 def _marking(textbook: Any) -> MarkRows:
@@ -137,6 +138,25 @@ def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> lis
         xp.reshape(xp.asarray(tol, float), (1, 1)),
         *inputs[len(INPUTS) :],
     ]
+
+
+class PassedKinks(NamedTuple):
+    """The kinks that runs have passed, K at most."""
+
+    count: Int[np.ndarray, "b"]
+    event: Float[np.ndarray, "b K"]
+    t: Float[np.ndarray, "b K"]
+    q: Float[np.ndarray, "b K n"]
+    v: Float[np.ndarray, "b K n"]
+    sides: Float[np.ndarray, "b K S"]  # of comparisons, after the kink
+
+    @classmethod
+    def of(cls, record: Float[np.ndarray, "b R"], most: int, sides: int, n: int) -> "PassedKinks":
+        """Return the kinks in the records of runs, which have room for `most`."""
+        count = record[:, 0].astype(int)
+        rows = record[:, 1:].reshape(len(record), most, -1)[:, : count.max(initial=0)]
+        event, t, q, v, sides_after, _ = np.split(rows, np.cumsum([1, 1, n, n, sides]), axis=2)
+        return cls(count, event[..., 0], t[..., 0], q, v, sides_after)
 
 
 class StretchEnd(NamedTuple):
@@ -218,7 +238,7 @@ class PhaseCode:
         (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
         q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
         passing = self.plan.run.passing
-        kinks = None if passing is None else PassedKinks.of(passing, *record, n)
+        kinks = None if passing is None else PassedKinks.of(record[0], passing.most, passing.count, n)
         return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, kinks)
 
     def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:

@@ -6,9 +6,7 @@ and the loop of events goes on.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
-
-import numpy as np
+from typing import Any, ClassVar
 
 from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.base.layout import INFO, Lane
@@ -18,15 +16,8 @@ from udkjax.native.base.steps import POINTS, Status
 from udkjax.native.run.trajectory import Trajectory
 
 COUNTS = ("tried", "accepted", "evaluations", "implicit")  # of all stretches of a run
+WATCHED = ("side", "floor")  # arrays of conditions that change at a kink
 KEPT = ("written", "lost", "worst", "turned")  # of a run that begins anew
-
-
-class Renewal(NamedTuple):
-    """The program of the sides of one force, which may depend on each other and on the state."""
-
-    smooth: Any  # has the program; compared by identity
-    inputs: tuple[tuple[str, int], ...]  # of the program: arrays of the module's memory, each with an index
-    first: int  # its first side
 
 
 @dataclass(frozen=True)
@@ -37,41 +28,25 @@ class Passing:
     turns: tuple[tuple[int, float, float], ...]  # of each kink: its side, which becomes `factor` times itself plus `shift`
     of_conditions: tuple[tuple[int, int], ...]  # places of sides among the numbers of conditions, each with its side
     of_scene: tuple[tuple[int, int], ...]  # the same among the numbers of the scene
-    renewals: tuple[Renewal, ...]
+    renewals: tuple[tuple[Any, tuple[tuple[str, int], ...], int], ...]
+    """For each force the `SmoothLoads` with the program of its sides, which may depend on each other and on the state; the inputs
+    of the program, arrays of the module's memory with indices; and the first of its sides."""
+    zero: float  # bound below which a condition is zero, relative to its scale
 
     most: ClassVar[int] = 16  # kinks that a call has room for: each takes memory in every call, and further kinks a further call
 
     @property
     def count(self) -> int:
         """The number of sides."""
-        return sum(renewal.smooth.count for renewal in self.renewals)
+        return sum(smooth.count for smooth, _, _ in self.renewals)
 
     def row_length(self, n: int, conditions: int) -> int:
-        """Return the length of the record of a kink: its condition, its time, q and v, the sides after it, and those of zero."""
-        return 2 + 2 * n + self.count + conditions
+        """Return the length of the record of a kink: its condition, its time, q and v, its sides, and the watched conditions."""
+        return 2 + 2 * n + self.count + len(WATCHED) * conditions
 
     def record_length(self, n: int, conditions: int) -> int:
         """Return the length of the record of a run: the number of kinks, and a row for each."""
         return 1 + self.most * self.row_length(n, conditions)
-
-
-class PassedKinks(NamedTuple):
-    """The kinks that runs have passed, K at most."""
-
-    count: np.ndarray  # (b,)
-    event: np.ndarray  # (b, K) index of the condition
-    t: np.ndarray  # (b, K)
-    q: np.ndarray  # (b, K, n)
-    v: np.ndarray  # (b, K, n)
-    sides: np.ndarray  # (b, K, S) after the kink
-
-    @classmethod
-    def of(cls, passing: Passing, record: np.ndarray, n: int) -> "PassedKinks":
-        """Return the kinks in the records of runs with n coordinates."""
-        count = record[:, 0].astype(int)
-        rows = record[:, 1:].reshape(len(record), passing.most, -1)[:, : count.max(initial=0)]
-        event, t, q, v, sides, _ = np.split(rows, np.cumsum([1, 1, n, n, passing.count]), axis=2)
-        return cls(count, event[..., 0], t[..., 0], q, v, sides)
 
 
 class PassingRuns(Trajectory):
@@ -138,31 +113,59 @@ class PassingRuns(Trajectory):
         """Write `pass_kinks(work, call)`: begin anew the runs that have ended at a kink."""
         passing, p = self.passing, self.places
         assert passing is not None
-        for i, renewal in enumerate(passing.renewals):
-            inputs = [("work", p[name] + k) for name, k in renewal.inputs]
-            outputs = [("work", p["renewed sides"] + renewal.first + k) for k in range(renewal.smooth.count)]
-            program = renewal.smooth.renewal
-            self.functions.append(write(program, f"renew_sides{i}", self.plan.width, ("work",), inputs, outputs, cold=True))
+        for i, (smooth, given, first) in enumerate(passing.renewals):
+            inputs = [("work", p[name] + k) for name, k in given]
+            outputs = [("work", p["renewed sides"] + first + k) for k in range(smooth.count)]
+            written = write(smooth.renewal, f"renew_sides{i}", self.plan.width, ("work",), inputs, outputs, cold=True)
+            self.functions.append(written)
         f, s = self.function("pass_kinks", [(POINTER, "work"), (POINTER, "call")])
-        work = f.given["work"]
-        setattr(s, "state t", s.sure_t)
-        self.copy(f, "sure q", "state q")
-        self.copy(f, "sure v", "result v")
-        f.call("conditions", work)
-        others = f.variable(f.const(False, BOOL, f.width), BOOL)
-        with f.each(self.conditions.count) as c:
-            on, g, floor = (self.entry(f, f"condition {x}", c) for x in ("on", "g", "floor"))
-            is_other = s.event.is_not(f.like(c, DOUBLE, f.width))
-            others.value = others.value | (is_other & (on > 0.5) & ~(f.abs(g) > floor))
         is_kink = (s.event >= float(passing.first)) & (s.event < float(self.conditions.own_count))
-        passes = (s.active > 0.5) & s.code.is_(float(Status.CROSSED)) & is_kink & (s.turned < s.room) & ~others.value
+        passes = (s.active > 0.5) & s.code.is_(float(Status.CROSSED)) & is_kink & (s.turned < s.room)
         with f.if_(f.any_of(passes)):
+            self._look_at_kink(f, s)
+            passes = passes & ~self._is_beside_others(f, s, turned=False)
             self._turn(f, s, passes)
+            self._look_at_kink(f, s)
+            passes = passes & ~self._is_beside_others(f, s, turned=True)
+            with f.each(self.conditions.count) as c:  # the condition of a kink is positive except where its side turns
+                here, floor = passes & s.event.is_(f.like(c, DOUBLE, f.width)), self._floor(f, s, c)
+                for name, new, mask in (("side", f.const(1.0, DOUBLE, f.width), here), ("floor", floor, passes)):
+                    self.put_entry(f, f"condition {name}", c, f.select(mask, new, self.entry(f, f"condition {name}", c)))
             with self.each_lane(f, passes) as k:
                 self._begin_anew(f, k, self._note(f, s, k))
 
+    def _look_at_kink(self, f: Function, s: Lane):
+        """Evaluate the conditions at the kink."""
+        setattr(s, "state t", s.sure_t)
+        self.copy(f, "sure q", "state q")
+        self.copy(f, "sure v", "result v")
+        f.call("conditions", f.given["work"])
+
+    def _floor(self, f: Function, s: Lane, c: Value) -> Value:
+        """Return below which distance from zero a condition is zero: its scale is no less than its change in a unit of time."""
+        assert self.passing is not None
+        rate, floor = (self.entry(f, f"condition {name}", c) for name in ("rate", "floor"))
+        return f.max(f.abs(rate) * self.passing.zero / s.omega, floor)
+
+    def _is_beside_others(self, f: Function, s: Lane, turned: bool) -> Value:
+        """Return the lanes in which another condition is zero, or beyond it.
+
+        Once sides have `turned`, it may be zero if it leaves zero: a step of a staircase begins where the one before ends.
+        """
+        found = f.variable(f.const(False, BOOL, f.width), BOOL)
+        with f.each(self.conditions.count) as c:
+            on, side, g, rate = (self.entry(f, f"condition {x}", c) for x in ("on", "side", "g", "rate"))
+            is_other, floor = s.event.is_not(f.like(c, DOUBLE, f.width)), self._floor(f, s, c)
+            is_free, is_near = g * side > floor, ~(f.abs(g) > floor)
+            if turned:
+                is_free = is_free | (is_near & (rate * side > floor * s.omega)) | (is_near & ~is_other)
+            else:
+                is_free = ~is_near | ~is_other
+            found.value = found.value | ((on > 0.5) & ~is_free)
+        return found.value
+
     def _turn(self, f: Function, s: Lane, passes: Value):
-        """Turn the sides of the kinks at which lanes are, and the sides of zero of their conditions."""
+        """Turn the sides of the kinks at which lanes are."""
         passing = self.passing
         assert passing is not None
         for j, (side, factor, shift) in enumerate(passing.turns):
@@ -173,10 +176,9 @@ class PassingRuns(Trajectory):
         with f.each(passing.count) as i:
             before, new = (self.entry(f, name, i) for name in ("kink sides", "renewed sides"))
             self.put_entry(f, "kink sides", i, f.select(passes, new, before))
-        one = f.const(1.0, DOUBLE, f.width)
-        with f.each(self.conditions.count) as c:  # the condition of a kink is positive except where its side turns
-            here, before = passes & s.event.is_(f.like(c, DOUBLE, f.width)), self.entry(f, "condition side", c)
-            self.put_entry(f, "condition side", c, f.select(here, one, before))
+        for place, side in passing.of_conditions:
+            before, new = self.entry(f, "condition numbers", place), self.entry(f, "kink sides", side)
+            self.put_entry(f, "condition numbers", place, f.select(passes, new, before))
 
     def _note(self, f: Function, s: Lane, k: Value) -> Value:
         """Note the kink of lane k; return the address of its record."""
@@ -185,7 +187,8 @@ class PassingRuns(Trajectory):
         row = f.at(record, self.to_int(f, f.lane(s.turned, k)) * self._row_length + 1)
         f.store(f.lane(s.event, k), row, 0)
         f.store(f.lane(s.sure_t, k), row, 1)
-        places = {"sure q": self.n, "sure v": self.n, "kink sides": self.passing.count, "condition side": self.conditions.count}
+        places = {"sure q": self.n, "sure v": self.n, "kink sides": self.passing.count}
+        places |= {f"condition {name}": self.conditions.count for name in WATCHED}
         start = 2
         for name, count in places.items():
             self.copy_lane(f, row, start, name, k, count=count)
@@ -221,8 +224,11 @@ class PassingRuns(Trajectory):
             self.put_lane_entry(f, "kink sides", k, f.load(row, i + start), i)
         for place, side in passing.of_conditions:
             self.put_lane_entry(f, "condition numbers", k, f.load(row, start + side), place)
+        start += passing.count
         with f.each(self.conditions.count) as i:
-            self.put_lane_entry(f, "condition side", k, f.load(row, i + (start + passing.count)), i)
+            for j, name in enumerate(WATCHED):
+                value = f.load(row, i + (start + j * self.conditions.count))
+                self.put_lane_entry(f, f"condition {name}", k, value, i)
         if not self.plan.breaks:
             f.call("enter", f.given["work"], f.given["call"], k)
             return
