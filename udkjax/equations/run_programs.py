@@ -32,6 +32,8 @@ class RunPrograms:
     """The reason why the programs are too long for machine code; empty if they are not."""
     has_mobility: bool = False
     """True if there is a program `mobility`, v1 = M^(-1) dv: M is not an input."""
+    has_loops: bool = True
+    """True if the programs can also be written as loops, which are compiled sooner."""
     rubs: bool = False
     """True if friction depends on the loads of joints: `accelerations` then report that these are `unsettled`."""
     FURTHER: ClassVar[str] = "accelerations_further"

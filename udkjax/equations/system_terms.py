@@ -18,7 +18,7 @@ from udkjax.pinv.rank_policy import RankPolicy
 class SystemTerms(RunPrograms):
     """The common terms of all programs of a system."""
 
-    is_small = True  # always unrolled
+    is_small, has_loops = True, False
     piece_count = 0
     has_mobility = True
     owner = "a function of the system"

@@ -35,7 +35,8 @@ class RowMarks(Module):
     results = ("marks",)
 
     def __init__(self, code: RunPrograms, width: int, vector: int):
-        plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=code.is_small, steps=False)
+        in_loops = code.has_loops or not code.is_small  # few calls do not pay for compiling unrolled programs
+        plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=not in_loops, steps=False)
         super().__init__(plan)
         self.places.add("independent", self.m)
 

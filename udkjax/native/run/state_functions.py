@@ -31,6 +31,7 @@ class StateFunction(Trajectory):
     """The text of a module whose `run` evaluates members at their states q and v at the time ts[0]."""
 
     closes = False
+    unrolls = True  # whether the programs of small scenes are unrolled: a loop takes longer to run, and less time to compile
     settings = ("length", "fallback_tol", "method")
     results = ("found",)
     found: ClassVar[tuple[str, ...]]  # arrays of coordinates that are returned, concatenated
@@ -46,7 +47,7 @@ class StateFunction(Trajectory):
                 breaks=False,
                 width=width,
                 vector=vector,
-                unrolled=code.is_small,
+                unrolled=code.is_small and (self.unrolls or not code.has_loops),
                 pseudoinverse=pseudoinverse,
                 formulation=formulation,
             )
@@ -106,6 +107,7 @@ class StateProjection(StateFunction):
     """The projection of states."""
 
     closes = True
+    unrolls = False
     found = ("state q", "result v")
 
     @property

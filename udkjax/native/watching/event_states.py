@@ -29,6 +29,7 @@ class EventStates(StateTangentPart, StateAccelerations):
 
     inputs = ("event_numbers",)
     found = ()
+    unrolls = False
 
     def __init__(
         self, code, conditions: Conditions, directed: tuple[int, ...], pseudoinverse, formulation, width: int, vector: int
