@@ -126,3 +126,35 @@ def test_what_rests_does_not_depend_on_how_it_fell():
     """The event at which the second foot comes to rest counts, however close it is to the previous one."""
     slopes = jax.jacfwd(lambda p: rocking_box(p).v[-1, 0])(jnp.array([0.6, 0.0, -1.0]))
     np.testing.assert_allclose(slopes, 0.0, atol=1e-12)
+
+
+class Drag(udk.ForceElement):
+    """Air resistance -coefficient |v| v, whose law has another branch after a rebound."""
+
+    coefficient: float
+
+    def loads(self, t, *frames):
+        v = frames[0].vy
+        return [(0.0, -self.coefficient * v * jnp.abs(v), 0.0)]
+
+
+@pytest.mark.slow
+def test_a_condition_that_an_impact_carries_across_zero_moves_with_the_impact():
+    """The rate of the ball jumps across zero as it hits the floor: its drag takes the other branch, and `turned` is recorded."""
+    events = [floor(0.5), udk.Event(lambda t, at: at["ball"].vy, udk.Log(), name="turned")]
+
+    def run(speed):
+        ball = {"ball": udk.Body(1.0, 0.1, position=[0.0, 1.0], velocity=jnp.stack([0 * speed, -speed]))}
+        air = {"air": Drag(["ball"], coefficient=0.4)}
+        sol = udk.simulate(udk.Mechanism(ball, forces=air, gravity=[0.0, 0.0]), [0.0, 1.0], events=events)
+        return jnp.stack([sol.q[-1, 0, 1], sol.v[-1, 0, 1], sol.events.time[1], sol.events.v_before[1, 0, 1]])
+
+    def exact(speed):
+        hit = jnp.expm1(0.4) / (0.4 * speed)
+        up = 0.5 * speed / (1 + 0.4 * speed * hit)
+        slowing = 1 + 0.4 * up * (1.0 - hit)
+        return jnp.stack([jnp.log(slowing) / 0.4, up / slowing, hit, up])
+
+    (found, slope), (expected, exact_slope) = (jax.jvp(f, (2.0,), (1.0,)) for f in (run, exact))
+    np.testing.assert_allclose(found, expected, rtol=1e-7)
+    np.testing.assert_allclose(slope, exact_slope, rtol=1e-6)

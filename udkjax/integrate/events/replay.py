@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.annotations import TreeDef
-from udkjax.integrate.events.crossings import NO_EVENT, ZERO_RATE
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ZERO_RATE
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.host_run import run_by_machine_code
 from udkjax.integrate.events.hybrid import Hybrid, rate_along
@@ -257,11 +257,14 @@ def _apply_at_fixed_time(
     if system.plan.held_at_rest.any() or system.plan.sticking:
         force = lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v))[k % E]  # noqa: E731
         h, rate = (jnp.where(k >= E, *x) for x in zip(rate_along(force, *state[:3], a), (h, rate), strict=True))
+    unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E])
+    is_transversal = jnp.abs(stop_gradients(rate)) > ZERO_RATE * unit * hybrid.rate
+    # An event at the same instant as the event before moves with that event if its condition is stationary, or if the jump of
+    # the event before has carried its condition beyond zero, further than the flow does within the shortest step.
+    by_flow = ZERO * unit + 2 * hybrid.smallest * jnp.abs(rate)
+    is_transversal &= ~(again & (jnp.abs(stop_gradients(h)) > stop_gradients(by_flow)))
     h = h - stop_gradients(h)
-    unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E]) * hybrid.rate
-    is_transversal = jnp.abs(stop_gradients(rate)) > ZERO_RATE * unit
     rate = jnp.where(is_transversal, rate, 1.0)
-    # If its condition is stationary, an event at the same instant as the event before moves with that event.
     d = jnp.where(is_transversal, -h / rate, jnp.where(again, shift, 0.0))
     _, of_h = _second_order(d, hybrid, state)
     d = d - jnp.where(is_transversal, of_h[k % E] / stop_gradients(rate), 0.0)
