@@ -15,7 +15,7 @@ from collections.abc import Callable, Hashable
 from contextlib import nullcontext
 from dataclasses import replace
 from threading import Lock
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.arrays import is_traced, number
+from udkjax.arrays import is_traced, make_module, number
 from udkjax.equations.redundancy import FoundRows, examine_rows
 from udkjax.equations.scales import Scales, concrete_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
@@ -185,7 +185,9 @@ def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
     with jax.ensure_compile_time_eval():  # also during a trace
         scales = concrete_scales(mechanism)
         rows = _rows_of(mechanism, kind).redundant
-        return Analysis(scales, 3 * len(mechanism.body_names), _row_names(mechanism), rows)
+        names, count = _row_names(mechanism), 3 * len(mechanism.body_names)
+        known: dict[str, Any] = {"coordinates": count, "row_names": names, "redundant_rows": rows, "only_switched": False}
+        return make_module(Analysis, scales=scales, **known)
 
 
 def _rows_of(mechanism: Mechanism, kind: Hashable) -> FoundRows:

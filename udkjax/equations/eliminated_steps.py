@@ -5,7 +5,6 @@ only where rows are clearly independent, and for structures that have been corre
 as long to generate as some hundred corrections by singular values.
 """
 
-import math
 from functools import lru_cache
 
 import numpy as np
@@ -46,20 +45,8 @@ class EliminatedSteps:
     def _make_arrays(
         kind: Structure, numbers: np.ndarray, redundant_rows: tuple[int, ...], length: float
     ) -> SceneArrays[np.ndarray]:
-        numbers, (masses, inertias) = numbers.copy(), _places(kind)
-        numbers[masses], numbers[inertias] = 1.0, length**2
-        return SceneArrays(programs_of_structure(*kind, redundant_rows), numbers, np)
-
-
-@lru_cache(maxsize=64)
-def _places(kind: Structure) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of masses and inertias among the numbers of a structure."""
-    tree, shapes = kind
-    ends = np.cumsum([math.prod(shape) for shape, _ in shapes]).tolist()
-    leaves = [np.arange(end - math.prod(shape), end).reshape(shape) for end, (shape, _) in zip(ends, shapes, strict=True)]
-    bodies = tree.unflatten(leaves).bodies.values()
-    masses, inertias = (np.array([getattr(body, name) for body in bodies], int) for name in ("mass", "inertia"))
-    return masses, inertias
+        programs = programs_of_structure(*kind, redundant_rows)
+        return SceneArrays(programs, programs.with_unit_masses(numbers, length), np)
 
 
 @lru_cache(maxsize=64)

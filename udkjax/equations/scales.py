@@ -14,10 +14,10 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import AnyArray
-from udkjax.arrays import ArrayLibrary, library_for, number, put_arrays
+from udkjax.arrays import ArrayLibrary, float_type, library_for, number, put_arrays
 from udkjax.equations.scale_program import ARM, LENGTH, MASS, RATE, ROWS, THRESHOLD
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.structure import join_concrete_numbers, numbers_as_vector
+from udkjax.equations.structure import concrete_numbers, join_concrete_numbers, numbers_as_vector
 from udkjax.expressions.array_loops import ArrayLoops
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
@@ -87,10 +87,10 @@ class UnitScales(Scales):
 
 def concrete_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism with concrete numbers, by NumPy."""
-    numbers = np.asarray(numbers_as_vector([*mechanism.at(0.0).numbers, *NO_THRESHOLDS]))
+    numbers = np.append(concrete_numbers(mechanism), NO_THRESHOLDS)
     found = _unpack(_evaluate(scene_programs(mechanism), numbers, np))
     with jax.ensure_compile_time_eval():  # concrete even while something else is traced
-        return put_arrays(jax.tree.map(lambda x: np.asarray(x, jnp.result_type(float)), found))
+        return put_arrays(jax.tree.map(lambda x: np.asarray(x, float_type()), found))
 
 
 def traced_scales(mechanism: Mechanism) -> Scales:

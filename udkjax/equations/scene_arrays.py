@@ -11,7 +11,7 @@ from udkjax.annotations import AnyArray, Time
 from udkjax.arrays import ArrayLibrary
 from udkjax.equations.rest_program import CURVATURE
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.structure import numbers_as_vector
+from udkjax.equations.structure import concrete_numbers
 from udkjax.expressions.array_loops import ArrayLoops
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
@@ -131,7 +131,7 @@ def _fixed_arrays(mechanism: Mechanism) -> SceneArrays[np.ndarray]:
 
 
 def _arrays_at(mechanism: Mechanism, t: Time) -> SceneArrays[np.ndarray]:
-    return SceneArrays(scene_programs(mechanism), np.asarray(numbers_as_vector(mechanism.at(t).numbers)), np)
+    return SceneArrays(scene_programs(mechanism), concrete_numbers(mechanism, t), np)
 
 
 def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:

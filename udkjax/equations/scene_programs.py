@@ -61,6 +61,13 @@ class ScenePrograms(RunPrograms):
         self._number_count = int(starts[-1])
         self._places: Mechanism = jax.tree.unflatten(tree, places)  # the index of each number of the scene
 
+    def with_unit_masses(self, numbers: np.ndarray, length: float) -> np.ndarray:
+        """Return the vector of all numbers with bodies of 1 kg and a radius of gyration (m)."""
+        numbers = numbers.copy()
+        for body in self._places.bodies.values():
+            numbers[body.mass], numbers[body.inertia] = 1.0, length**2
+        return numbers
+
     @property
     def stored_sizes(self) -> dict[str, int]:
         """The sizes of all arrays of a state that derivatives may need."""

@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from udkjax.annotations import Number, NumericArray, TreeDef
+from udkjax.annotations import Number, NumericArray, Time, TreeDef
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.element_setup import attached_bodies
@@ -63,6 +63,7 @@ def _structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 
+@cached_by_identity  # also for traced numbers
 def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
     """Return the structure of a mechanism with all of its samples, whose programs are functions of time throughout."""
     return _structure(mechanism.without_origin)
@@ -87,6 +88,17 @@ def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
         else:
             joined.append(np.concatenate([np.ravel(np.asarray(x, float)) for x in group]))
     return joined
+
+
+def concrete_numbers(mechanism: Mechanism, t: Time = 0.0) -> np.ndarray:
+    """Return the concrete numbers of a mechanism as one vector, which must not change; if sampled, those of time t (s)."""
+    return whole_numbers(mechanism.at(t) if mechanism.samples else mechanism)
+
+
+@cached_by_identity
+def whole_numbers(mechanism: Mechanism) -> np.ndarray:
+    """Return the concrete numbers of a mechanism with all of its samples as one vector, which must not change."""
+    return np.concatenate([np.asarray(x, float).ravel() for x in mechanism.numbers])
 
 
 class ElementStructure(NamedTuple):

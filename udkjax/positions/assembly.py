@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import ROUNDING, is_traced, is_within_jit, make_module, number, number_called, put_arrays
+from udkjax.arrays import ROUNDING, float_type, is_traced, is_within_jit, make_module, number, number_called, put_arrays
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.element_programs import has_rheonomic_joints
@@ -182,7 +182,7 @@ def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, an
         with np.errstate(all="ignore"):  # non-finite states are reported as open
             q, v, psi, psi_dot, rank = _close_concrete(mechanism, scales, t, q, v)
             closed = is_closed(jax.tree.map(np.asarray, scales), q, v, psi, psi_dot, np)
-        dtype = jnp.result_type(float)
+        dtype = float_type()
         floats = [np.array(x, dtype) for x in (q.reshape(-1, 3), v.reshape(-1, 3), psi, psi_dot)]
         q, v, psi, psi_dot, rank, closed = put_arrays([*floats, np.asarray(rank), np.asarray(closed)])
         return Closure(make_module(State, q=q, v=v), psi, psi_dot, rank, scales, closed)

@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
 from udkjax.annotations import Number, NumberLike
-from udkjax.arrays import is_traced, number, number_called
+from udkjax.arrays import is_traced, make_module, number, number_called
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseTerms, KinematicRows
@@ -213,7 +213,8 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
     mechanism = mechanism if mechanism.origin is None else mechanism.origin.mechanism
     with _at_once(mechanism):
         value = jax.lax.stop_gradient(value_of(mechanism, name)(mechanism.q0))
-        return mechanism.with_parameters({f"driver.{name}.motion.origin": value})
+        driver = make_module(Driver, **vars(mechanism.drivers[name]) | {"motion": ValueMotion(value)})
+        return with_drivers(mechanism, {**mechanism.drivers, name: driver})
 
 
 def _at_once(given: PyTree) -> AbstractContextManager:

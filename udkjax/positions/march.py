@@ -60,7 +60,7 @@ def march(
 
     The value of the driver replaces time; `unit` is the unit of the values.
     """
-    inputs = _inputs(_numbers(mechanism, analysis, jnp), analysis, unit, s, q, values, jnp)
+    inputs = _inputs(_numbers(mechanism, analysis), analysis, unit, s, q, values, jnp)
     return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
 
 
@@ -112,8 +112,8 @@ class _Prepared(NamedTuple):
     calls: MemberCalls
 
 
-def _numbers(mechanism: Mechanism, analysis: Analysis, xp: ModuleType) -> _Prepared:
-    numbers = _of_unit_masses(_without_loads(mechanism), analysis.scales.length, xp).numbers
+def _numbers(mechanism: Mechanism, analysis: Analysis) -> _Prepared:
+    numbers = _of_unit_masses(_without_loads(mechanism), analysis.scales.length).numbers
     operation = _operation(mechanism, analysis)
     return _Prepared(operation, [*numbers, DEPENDENT, 0.0], _calls(operation))
 
@@ -126,9 +126,11 @@ def _calls(operation: March) -> MemberCalls:
 @cached_by_identity
 def _numbers_of_concrete(mechanism: Mechanism, analysis: Analysis) -> tuple[_Prepared, Analysis]:
     """Return the numbers of a concrete mechanism as one array, and its analysis by NumPy."""
-    mechanism, analysis = jax.tree.map(_by_numpy, (mechanism, analysis))
-    prepared = _numbers(mechanism, analysis, np)
-    return prepared._replace(numbers=[np.concatenate([np.ravel(x) for x in prepared.numbers])]), analysis
+    analysis, scene, operation = jax.tree.map(_by_numpy, analysis), _without_loads(mechanism), _operation(mechanism, analysis)
+    numbers = np.concatenate([np.ravel(x) for x in scene.numbers])
+    programs = scene_programs(scene, analysis.redundant_rows or (), in_pieces=False)
+    numbers = programs.with_unit_masses(numbers, float(analysis.scales.length))
+    return _Prepared(operation, [np.append(numbers, [DEPENDENT, 0.0])], _calls(operation)), analysis
 
 
 def _inputs(
@@ -153,10 +155,10 @@ def _without_loads(mechanism: Mechanism) -> Mechanism:
     return mechanism.with_samples({key: with_row(x, np.zeros(row_size(x))) for key, x in loads.items()})
 
 
-def _of_unit_masses(mechanism: Mechanism, length: NumberLike, xp: ModuleType) -> Mechanism:
+def _of_unit_masses(mechanism: Mechanism, length: NumberLike) -> Mechanism:
     """Return the mechanism with bodies of 1 kg and the characteristic length as radius of gyration."""
     bodies = lambda m: [x for b in m.bodies.values() for x in (b.mass, b.inertia)]  # noqa: E731
-    unit_mass = xp.ones_like(length)
+    unit_mass = jnp.ones_like(length)
     return eqx.tree_at(bodies, mechanism, [unit_mass, length**2] * len(mechanism.body_names))
 
 

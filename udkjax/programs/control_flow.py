@@ -111,7 +111,7 @@ def solve(function: Callable[..., Result], *arguments: Any, put: bool = True) ->
     if any(_is_traced_module(x) if m else isinstance(x, Tracer) for x, m in zip(leaves, is_module, strict=True)):
         return _compiled(_by_jax, function, *arguments)
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
-        concrete = [_concrete_module(x) if m else _by_numpy(x) for x, m in zip(leaves, is_module, strict=True)]
+        concrete = [_by_numpy(x, m) for x, m in zip(leaves, is_module, strict=True)]
         found = function(*jax.tree.unflatten(tree, concrete), BY_NUMPY)
         return put_arrays(found) if put else found
 
@@ -119,7 +119,13 @@ def solve(function: Callable[..., Result], *arguments: Any, put: bool = True) ->
 _is_traced_module = cached_by_identity(is_traced)
 
 
-def _by_numpy(x: Any) -> Any:
+class ConvertsItself:
+    """A base of modules whose functions convert numbers by themselves, and store what they compute by the module's identity."""
+
+
+def _by_numpy(x: Any, is_module: bool = False) -> Any:
+    if is_module:
+        return x if isinstance(x, ConvertsItself) else _concrete_module(x)
     return np.asarray(x) if isinstance(x, jax.Array) else x
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, make_module, number
 from udkjax.printing import PrintedTable, PrintsTable
+from udkjax.programs.control_flow import ConvertsItself
 from udkjax.programs.identity_cache import cached_within_trace
 from udkjax.scene.bodies import Body, stack_coordinates
 from udkjax.scene.checks import SceneError, gravity_mistakes
@@ -51,7 +52,7 @@ Element = TypeVar("Element", bound=eqx.Module)
 Module = TypeVar("Module", bound=eqx.Module)
 
 
-class Mechanism(PrintsTable):
+class Mechanism(PrintsTable, ConvertsItself):
     """Bodies, joints, drivers and force elements by name, and gravity.
 
     It is only data; `udkjax.analyse` finds its properties, such as redundant rows. All independent numbers are leaves of the
