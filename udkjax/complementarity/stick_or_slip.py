@@ -37,7 +37,7 @@ from jaxtyping import Bool, Float, Int
 from udkjax.complementarity.linear import eliminate
 
 # Iterations for the limits, sweeps of a projected Gauss-Seidel method in each, and the change of the forces, as shares of their
-# limits, at which iterations end. They decide with which modes pivots begin, and so only the number of pivots.
+# limits, at which both end. They decide with which modes pivots begin, and so only the number of pivots.
 REPETITIONS, SWEEPS, SAME_SHARE = 10, 20, 1e-6
 # Pivots per joint: at first of all joints that violate their law, then only of the first such joint, which does not cycle.
 BLOCK_STEPS, SINGLE_STEPS = 2, 8
@@ -287,6 +287,8 @@ class JointsAtRest(NamedTuple):
         F, none, mobile = self.rest.shape[-1], self.rest & False, xp.diagonal(self.W, axis1=-2, axis2=-1) > 0
         held, active = self.contacts.held, self.contacts.active(self.contacts.held)
         rest = self.rest & active
+        acts, units = rest & mobile, np.eye(F)
+        rows = range(F) if xp is not np else np.flatnonzero(acts.reshape(-1, F).any(axis=0)).tolist()
 
         def improve(share: Any) -> Any:
             """Return the next iterate of the forces, as shares of the limits."""
@@ -297,17 +299,18 @@ class JointsAtRest(NamedTuple):
 
             def sweep(_: Any, state: tuple[Any, Any]) -> tuple[Any, Any]:
                 force, a = state
-                for i in range(F):
-                    new = xp.clip(force[..., i] + a[..., i], -limit[..., i], limit[..., i])
-                    change = xp.where(rest[..., i] & mobile[..., i], new - force[..., i], 0.0)
-                    force = force + xp.where(np.arange(F) == i, change[..., None], 0.0)
-                    a = a - self.W[..., :, i] * change[..., None]
+                for i in rows:
+                    new = xp.minimum(xp.maximum(force[..., i] + a[..., i], -limit[..., i]), limit[..., i])
+                    change = xp.where(acts[..., i], new - force[..., i], 0.0)[..., None]
+                    force, a = force + change * units[i], a - self.W[..., :, i] * change
                 return force, a
 
             state = force, a
             if xp is np:
                 for k in range(SWEEPS):
-                    state = sweep(k, state)
+                    before, state = state[0], sweep(k, state)
+                    if (abs(state[0] - before) <= SAME_SHARE * limit).all():
+                        break
             else:
                 state = jax.lax.fori_loop(0, SWEEPS, sweep, state)
             force = state[0]

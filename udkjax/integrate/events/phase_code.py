@@ -218,7 +218,7 @@ class PhaseCode:
         self._of_switches = np.array(plan.active, int).reshape(-1, 2).T
         self._run, self._evaluate = MemberCalls(plan.run), MemberCalls(plan.states).at_states
         self._mark_rows, self._project = (x and MemberCalls(x).at_states for x in (plan.marking, plan.project))
-        self._seen: tuple[np.ndarray, ...] = ()  # the states that were evaluated last, and their values
+        self._seen: tuple[bytes, ...] = ()  # the states that were evaluated last, and their values
         self._values: StateValues | None = None
         self._marks: dict[bytes, np.ndarray] = {}  # by the phase, of all members; NaN: not known yet
         self._no_marks = np.full((len(joints), plan.run.code.row_count), np.nan)
@@ -247,8 +247,8 @@ class PhaseCode:
         operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
         assert conditions is not None  # this code has conditions
         numbers = self._with_samples(members, t, self._with_marks(members, state))
-        given = members, t.copy(), q.copy(), v.copy(), numbers
-        if self._values is not None and all(map(np.array_equal, given, self._seen)):
+        given = tuple([x.tobytes() for x in (members, t, q, v, numbers)])
+        if self._values is not None and given == self._seen:
             return self._values
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
         inputs = numbers, np.stack([t, t], axis=1), q, v, *further
@@ -314,7 +314,7 @@ class PhaseCode:
             marks, here = self._marks.get(phase.tobytes()), ALL if is_one else (state.phase == phase).all(axis=1)
             if marks is None:
                 marks = self._marks[phase.tobytes()] = self._no_marks.copy()
-            unknown = here & np.isnan(marks[members]).any(axis=1)
+            unknown = here & np.isnan(marks[members, 0])  # all marks of a member become known together
             if unknown.any():
                 found = self._mark(members[unknown], numbers[unknown], state.where(unknown))
                 marks[members[unknown]] = found
