@@ -33,11 +33,16 @@ def multiplied(factor: float, *constants: str) -> Iterator[None]:
 
     Args:
         factor: The factor.
-        constants: Their names, such as `integrate.drift.DEPENDENT`.
+        constants: Their names, such as `integrate.drift.DEPENDENT`, or `equations.run_programs.RunPrograms.STAGES` of a class.
     """
     with pytest.MonkeyPatch.context() as patch:
         for path in constants:
             home, _, name = path.rpartition(".")
+            if home.rpartition(".")[2][0].isupper():
+                module, _, owner = home.rpartition(".")
+                kind = getattr(import_module(f"udkjax.{module}"), owner)
+                patch.setattr(kind, name, _multiplied(getattr(kind, name), factor))
+                continue
             value = getattr(import_module(f"udkjax.{home}"), name)
             for module in [m for key, m in list(sys.modules.items()) if key.startswith("udkjax.")]:
                 if vars(module).get(name) is value:

@@ -12,8 +12,10 @@ import udkjax as udk
 from tests.equations.test_rubbing import states
 from tests.equations.test_stationary_rows import rod_between_guides
 from tests.friction import cart, drawer, pendulum, rubbing
+from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, floor
 from tests.integrate.own_systems import G
 from tests.integrate.own_systems import pendulum as spatial_pendulum
+from tests.integrate.test_kinks import swinging
 from tests.integrate.test_matrices_in_forces import SolvedSpring
 from tests.integrate.test_own_system_events import coupled, swung
 from tests.integrate.test_sticking import block, oscillator, sticking
@@ -118,6 +120,32 @@ def stiff_runs() -> dict[str, Any]:
     return {name: (int(run.stats["implicit"]) > 0, run.q) for name, run in runs.items()}
 
 
+def located_events() -> dict[str, Any]:
+    """Impacts, joints that events add and cut, events at samples, and kinks: their times, and last places."""
+    swing = udk.Event(lambda t, at: at["link"].omega, udk.Log(), name="turns")
+    torque = udk.Torque(["ground", "link"], udk.Held(np.sin(np.arange(21.0)), 0.1))
+    driven = udk.Mechanism(PENDULUM.bodies, PENDULUM.joints, forces={"T": torque})
+    runs = {
+        "ball": udk.simulate(BALL, [0.0, 1.0, 2.0], **TIGHT, events=floor(0.7)),
+        "caught": udk.simulate(CATCH, [0.0, 0.5, 1.0], **TIGHT, events=CAUGHT),
+        "driven": udk.simulate(driven, [0.0, 1.0, 2.0], **TIGHT, events=swing),
+    }
+    found: dict[str, Any] = {name: (run.q, run.events.time) for name, run in runs.items() if run.events is not None}
+    run = udk.simulate(swinging(), [0.0, 0.5, 1.0], **TIGHT)
+    return found | {"kinks": (run.q, int(run.stats["kinks"]))}
+
+
+def rests() -> dict[str, Any]:
+    """Positions of rest, some with dependent rows; a turn of a crank, and the efforts that hold it."""
+    scenes = {name: getattr(udk.library, name)() for name in ("four_bar", "slider_crank", "parallelogram", "double_pendulum")}
+    scenes |= {"chain": udk.library.chain(6, 0.4)}
+    found: dict[str, Any] = {name: udk.equilibrium(x).q for name, x in scenes.items()}
+    crank = f"body.{scenes['four_bar'].body_names[0]}.angle"
+    turns = udk.kinematics(scenes["four_bar"], crank, np.linspace(1.0, 1.3, 4))
+    efforts = udk.holding_efforts(scenes["four_bar"], crank, [1.0, 1.2])
+    return found | {"turns": turns.q, "efforts": efforts.without_friction / 10}
+
+
 CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = {
     "FITS": (held_pins, ("equations.stationary_rows.FITS",), 0.0),
     "SMALL": (held_pins, ("equations.stationary_rows.SMALL",), 0.0),
@@ -136,6 +164,15 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     "LAST_CHANGE, of efforts": (held_mechanisms, ("transforms.newton_steps.LAST_CHANGE",), 1e-9),
     "MOST_STEPS, of efforts": (held_mechanisms, ("transforms.newton_steps.MOST_STEPS",), 1e-9),
     "LOCKED, STILL, STOPPED": (held_mechanisms, tuple(f"statics.holding.{x}" for x in ("LOCKED", "STILL", "STOPPED")), 1e-9),
+    "STAGES": (rubbing_joints, ("equations.run_programs.RunPrograms.STAGES",), 1e-8),
+    "MOST_AIMS": (located_events, ("native.watching.conditions.MOST_AIMS",), 1e-8),
+    "MOST_LANDINGS": (located_events, ("native.watching.conditions.MOST_LANDINGS",), 1e-8),
+    "LAST_CHANGE, of events": (located_events, ("native.watching.conditions.LAST_CHANGE",), 1e-8),
+    "LEAST_STEP": (located_events, ("native.watching.conditions.LEAST_STEP",), 1e-8),
+    "SHORT_STEP": (located_events, ("native.base.steps.SHORT_STEP",), 1e-8),
+    "WORTH": (rests, ("equations.eliminated_steps.WORTH",), 1e-9),
+    "CLEAR": (rests, ("equations.eliminated_steps.CLEAR",), 1e-9),
+    "FEW_OPERATIONS": (rests, ("expressions.float_loops.FEW_OPERATIONS",), 1e-9),
     "ROUNDS, of starts": (designs, ("synthesis.starts.ROUNDS",), 1e-6),
     "LEAST_FALL": (designs, ("synthesis.search.LEAST_FALL",), 1e-6),
     "JAMMING_TIMES": (jams, ("integrate.causes.jamming.JAMMING_TIMES",), 0.0),
