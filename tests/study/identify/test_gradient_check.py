@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
+from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
 from udkjax.integrate.solution import Result
 from udkjax.study.identify.fit_problem import FitProblem, build_problem
 from udkjax.study.identify.gradient_check import compare_gradients
@@ -218,3 +218,65 @@ def test_along_chaotic_motion_nothing_is_claimed_but_of_pieces():
     shooting = MultipleShooting(problem, np.zeros(2), (1e-9, 1e-9))  # pyright: ignore[reportPossiblyUnboundVariable]
     check = compare_gradients(shooting, shooting.guess, tol)
     assert check.ok and len(check.names) == 2 + 3 and (check.floor < 1e-6 * check.size).all(), str(check)
+
+
+# --- of second order, and along directions of one's own
+
+CURVED: dict[str, dict[str, float]] = {"heavier": {NAMES[0]: 1.0}, "heavier and slower": {NAMES[0]: 0.2, NAMES[1]: 0.1}}
+SWING = udk.Parameter(NAMES[1], bounds=(0.01, 1.0))
+
+
+@pytest.mark.slow
+def test_second_derivatives_agree_with_those_of_the_motion():
+    """d^T H d by JAX's own rules of the angle as a function of positive and bounded unknowns, with the same directions."""
+    check = udk.check_gradients(pendulum(*FIRST), DATA, [NAMES[0], SWING], tol=1e-9, order=2, directions=CURVED)
+    assert check.ok and check.order == 2 and check.names == tuple(CURVED), str(check)
+    assert "second derivatives" in str(check).splitlines()[0] and check.message.startswith("second derivatives agree")
+    scene, part = pendulum(*FIRST), (FIRST[1] - 0.01) / 0.99
+
+    def angles(z):
+        damping = 0.01 + 0.99 / (1.0 + (1.0 - part) / part * jax.numpy.exp(-z[1]))
+        changed = scene.with_parameters({NAMES[0]: FIRST[0] * jax.numpy.exp(z[0]), NAMES[1]: damping})
+        return udk.simulate(changed, TS, rtol=1e-11, atol=1e-11).q[:, 0, 2]
+
+    H = np.asarray(jax.jacfwd(jax.jacfwd(angles))(np.zeros(2)))
+    per_unit = np.array([1 / FIRST[0], 1 / (0.99 * part * (1 - part))])
+    for row, changes in zip(check.directions, CURVED.values(), strict=True):
+        d = per_unit * [changes.get(name, 0.0) for name in NAMES]
+        np.testing.assert_allclose(row, d / np.linalg.norm(d), rtol=1e-12)
+    sizes = [np.sqrt(np.mean((H @ d @ d) ** 2)) for d in check.directions]
+    np.testing.assert_allclose(check.size[:, 0], sizes, rtol=1e-6)
+    assert (check.floor < 1e-5 * check.size).all()
+
+
+def test_wrong_second_derivatives_are_found(monkeypatch):
+    right, given = FitProblem.second_derivatives, (pendulum(*FIRST), DATA, list(NAMES))
+    directions: dict[str, dict[str, float]] = {"both": dict.fromkeys(NAMES, 1.0)}
+    check = udk.check_gradients(*given, tol=1e-9, order=2, directions=directions)
+    assert check.ok and "second derivatives" in str(check).splitlines()[0]
+    monkeypatch.setattr(FitProblem, "second_derivatives", lambda *given: 1.001 * right(*given))
+    check = udk.check_gradients(*given, tol=1e-9, order=2, directions=directions)
+    assert not check.ok and "the second derivative is" in check.message
+
+
+def test_directions_are_combinations_of_unknowns():
+    estimate = identify(pendulum(*FIRST), {"time": TS, ANGLE: swing(pendulum())}, NAMES, progress=False)
+    check = estimate.check_gradients(directions={"both": {NAMES[0]: 0.375, NAMES[1]: 0.2}})
+    assert check.ok and check.names == ("both",)
+    np.testing.assert_allclose(check.directions, np.full((1, 2), np.sqrt(0.5)), rtol=1e-6)  # relative changes of both
+
+
+@pytest.mark.parametrize(
+    ("directions", "problem"),
+    [
+        ({"up": {"body.rod.inrtia": 1.0}}, f'directions: "up": no unknown "body.rod.inrtia"; did you mean "{NAMES[0]}"?'),
+        ({"up": {}}, 'directions: "up" must change an unknown by a finite number'),
+        ({"up": {NAMES[0]: 0.0}}, 'directions: "up" must change an unknown by a finite number'),
+        ({"up": {NAMES[0]: np.inf}}, 'directions: "up" must change an unknown by a finite number'),
+        ({}, "directions: there are none"),
+    ],
+)
+def test_directions_without_meaning_are_refused(directions, problem):
+    with pytest.raises(udk.IdentificationError) as caught:
+        udk.check_gradients(pendulum(*FIRST), DATA, NAMES, directions=directions)
+    assert caught.value.problems == [problem]

@@ -87,6 +87,8 @@ def test_slopes_against_differences(kinds):
     z, h = np.random.default_rng(1).normal(size=(7, 4)), 1e-6
     differences = (kinds.values(z + h) - kinds.values(z - h)) / (2 * h)
     assert kinds.dx_dz(z) == pytest.approx(differences, rel=1e-8)
+    differences = (kinds.dx_dz(z + h) - kinds.dx_dz(z - h)) / (2 * h)
+    assert kinds.d2x_dz2(z) == pytest.approx(differences, rel=1e-7, abs=1e-9)
 
 
 def test_what_values_may_be(kinds):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,7 @@ from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.fit_problem import FitProblem
-from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
+from udkjax.study.identify.gradient_check import Directions, GradientCheck, compare_gradients
 from udkjax.study.identify.optimizer import Loss, squares, weighted_residuals
 from udkjax.study.identify.outliers import Outlier, outlier_sentences
 from udkjax.study.identify.prediction import TolerancePair
@@ -163,9 +163,14 @@ class Estimate:
         evaluate = weighted_residuals(self.problem, self.tol, self.loss)
         return profile_likelihood(evaluate, self.problem.unknowns, self.z, self.uncertainty, name, level)
 
-    def check_gradients(self) -> GradientCheck:
-        """Compare the derivatives at the estimate with finite differences: see `udkjax.check_gradients`."""
-        return compare_gradients(self.problem, self.z, self.tol)
+    def check_gradients(self, order: Literal[1, 2] = 1, directions: Directions | None = None) -> GradientCheck:
+        """Compare the derivatives at the estimate with finite differences.
+
+        Args:
+            order: 1 for first derivatives, 2 for second ones, as of `udkjax.check_gradients`.
+            directions: changes of unknowns by name, by the name of the direction, as of `udkjax.check_gradients`.
+        """
+        return compare_gradients(self.problem, self.z, self.tol, order=order, directions=directions)
 
     # --- as a table
 

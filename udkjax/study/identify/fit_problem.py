@@ -198,6 +198,20 @@ class FitProblem:
         """Return the worst result of the runs of all records."""
         return max(int(block.code[0]) for block in self.row_blocks(z[None], tol))
 
+    def second_derivatives(
+        self, z: Float[np.ndarray, "K"], d: Float[np.ndarray, "K"], tol: TolerancePair
+    ) -> Float[np.ndarray, "R"]:
+        """Return the second derivatives of the predicted values along a direction, in the units of channels."""
+        P, found = len(self.unknowns.names), np.zeros(len(self.index))
+        first, second = self.unknowns.dx_dz(z[:P]) * d[:P], self.unknowns.d2x_dz2(z[:P]) * d[:P] ** 2
+        for run, columns in enumerate(self.columns):
+            along = np.append(first, np.where(columns < 0, 0.0, d[columns]))
+            curved = np.append(second, np.zeros(len(columns)))
+            y = self.predictor.second_derivatives(self.members(z[None], np.array([run])), tol, along[None], curved[None])[0]
+            rows = np.flatnonzero(self.run == run)
+            found[rows] = y[self.time[rows], self.index[rows, 2]]
+        return found
+
     @property
     def sets_together(self) -> int:
         """The number of sets of unknowns that may be evaluated together."""

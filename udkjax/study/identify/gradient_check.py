@@ -1,19 +1,20 @@
 """Check of the derivatives that identification uses against finite differences.
 
 With y(z) the values predicted with the unknowns z, J d is compared with differences of y along directions d: each unknown by
-itself, and some random combinations of all. Each evaluation closes the mechanism again. The integration error
-of J is estimated by its change at another tolerance. The floor up to which J d and differences can agree is the sum of this error
-and the errors of differences, noise and truncation (see `differences`), at the step where these are smallest. It does not depend
-on the discrepancy: if the discrepancy exceeds the floor, the derivative is wrong, or does not exist.
+itself, and some random combinations of all, unless directions are given. Second derivatives of y along d are compared with
+differences of J d. Each evaluation closes the mechanism again. The integration error of J is estimated by its change at another
+tolerance. The floor up to which J d and differences can agree is the sum of this error and the errors of differences, noise and
+truncation (see `differences`), at the step where these are smallest. It does not depend on the discrepancy: if the discrepancy
+exceeds the floor, the derivative is wrong, or does not exist.
 
 Along a chaotic motion even the smallest step leads to an entirely different motion, which cannot be compared. Steps are
 therefore excluded if h J d exceeds the values of a channel and the channel changes.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,7 +32,7 @@ from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.study.identify.residuals import Residuals
 from udkjax.study.identify.windows import BLOCK_BYTES
-from udkjax.wording import join_names
+from udkjax.wording import join_names, quote, suggestion
 
 AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
 # Steps with floors up to this factor above the smallest are used as well. Truncation is estimated from the next finer step, whose
@@ -43,6 +44,7 @@ OTHER_TOL = 0.01, 10.0  # tolerances, relative to the given one, to estimate err
 SMALLEST_TOL = 1e-14  # below this, the step controller responds to rounding errors
 
 
+Directions: TypeAlias = Mapping[str, Mapping[str, float]]  # changes of unknowns by name, by the name of the direction
 # The numbers (R,) of rows, the values (B, R) predicted with B sets of unknowns, and how their runs ended (B,).
 _Values: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -77,6 +79,7 @@ class GradientCheck:
         places: times of the worst disagreement (D, S).
         tol: tolerances of the integration.
         other_tol: tolerances at which errors were estimated.
+        order: 1 for derivatives, 2 for second derivatives along the directions, compared with differences of derivatives.
     """
 
     title: str
@@ -94,6 +97,7 @@ class GradientCheck:
     places: tuple[tuple[DisagreementPlace, ...], ...]
     tol: TolerancePair
     other_tol: TolerancePair
+    order: int = 1
 
     @property
     def ok(self) -> bool:
@@ -145,7 +149,8 @@ class GradientCheck:
     @property
     def message(self) -> str:
         """Remarks on the check, one sentence per line."""
-        return "\n".join(_sentences(self)) or "derivatives agree with finite differences, to within the errors of both"
+        kind = "second derivatives" if self.order == 2 else "derivatives"
+        return "\n".join(_sentences(self)) or f"{kind} agree with finite differences, to within the errors of both"
 
     def __str__(self) -> str:
         return text_table(table := _table(self), len(table.rows))
@@ -166,13 +171,17 @@ def check_gradients(
     tol: float = TIGHT_TOL,
     ignore: Sequence[str] = (),
     seed: int = 0,
+    order: Literal[1, 2] = 1,
+    directions: Directions | None = None,
     **settings: Any,
 ) -> GradientCheck:
     """Compare the derivatives that `identify` uses with finite differences, at the first guess of the parameters.
 
     The directions are each unknown by itself, so that each entry of the Jacobian is compared, and some random combinations; in
-    each direction, the mechanism is closed and simulated forty times. Memory holds a block of rows of the Jacobian, however long
-    the records are. For the same check at an estimate, see `Estimate.check_gradients`.
+    each direction, the mechanism is closed and simulated forty times. Of second order, the second derivative of the predicted
+    values along each direction is compared with differences of the first one: d^T H d with the Hessian H of each value. Memory
+    holds a block of rows of the Jacobian, however long the records are. For the same check at an estimate, see
+    `Estimate.check_gradients`.
 
     Args:
         mechanism: mechanism with the first guesses.
@@ -181,38 +190,47 @@ def check_gradients(
         tol: tolerance of the integration, relative and absolute.
         ignore: columns of tables that are not read.
         seed: seed of the random directions.
+        order: 1 for first derivatives, 2 for second ones.
+        directions: other directions by name, each the changes of unknowns by their names, in the units of these; other unknowns
+            do not change. The sizes of directions do not matter.
         settings: further arguments of `simulate`.
 
     Returns:
         The comparison; `ok` is True if all derivatives agree, and `print` shows a table.
 
     Raises:
-        IdentificationError: as for `identify`, or the motion cannot be simulated to its end.
+        IdentificationError: as for `identify`, the motion cannot be simulated to its end, or a direction names no unknown, or
+            changes none.
     """
     problem = build_problem(mechanism, data, parameters, settings, ignore=ignore, seed=seed)
-    return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed)
+    return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed, order, directions)
 
 
-def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, seed: int = 0) -> GradientCheck:
+def compare_gradients(
+    problem: FitProblem,
+    z: Float[np.ndarray, "K"],
+    tol: TolerancePair,
+    seed: int = 0,
+    order: int = 1,
+    directions: Directions | None = None,
+) -> GradientCheck:
     """Compare the derivatives of a problem at z with finite differences, at given tolerances of the integration."""
-    names = problem.all_names[: problem.K - problem.constrained]
+    names, d = _usual_directions(problem, seed) if directions is None else _given_directions(problem, z, directions)
     tol = _completed_tol(problem, z, [tol])
     smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
     tols = tol, _completed_tol(problem, z, [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger])
-    random = np.random.default_rng(seed).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
-    directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
     series, errors, found = problem.series(), [], list[Differences]()
     together = max(1, int(BLOCK_BYTES // (8 * len(tols) * len(problem.index))))
-    for first in range(0, len(directions), together):
-        some = directions[first : first + together]
-        for d, slopes in zip(some, _slopes(problem, z, some, tols), strict=True):
-            found.append(_compare(problem, z, d, slopes[0], tols, series))
+    for first in range(0, len(d), together):
+        some = d[first : first + together]
+        for along, slopes in zip(some, (_slopes if order == 1 else _curvatures)(problem, z, some, tols), strict=True):
+            found.append(_compare(problem, z, along, slopes[0], tols, series, order))
             errors.append([np.sqrt(np.mean((slopes[0, rows] - slopes[1, rows]) ** 2)) for rows in series])
     keys = [(int(problem.index[p[0], 0]), problem.channels[problem.index[p[0], 2]]) for p in series]
     return GradientCheck(
         title=problem.mechanism.name or "mechanism",
-        names=(*names, *(f"random direction {k + 1}" for k in range(len(random)))),
-        directions=directions,
+        names=names,
+        directions=d,
         series=tuple((k, channel.name) for k, channel in keys),
         labels=tuple(label_prefixes(problem.records)[k] + channel.name for k, channel in keys),
         units=tuple(channel.units for _, channel in keys),
@@ -225,7 +243,42 @@ def compare_gradients(problem: FitProblem, z: Float[np.ndarray, "K"], tol: Toler
         places=tuple(_places(problem, f) for f in found),
         tol=tol,
         other_tol=tols[1],
+        order=order,
     )
+
+
+def _usual_directions(problem: FitProblem, seed: int) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
+    """Return each unknown by itself, and some random combinations of all."""
+    names = problem.all_names[: problem.K - problem.constrained]
+    random = np.random.default_rng(seed).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
+    directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
+    return (*names, *(f"random direction {k + 1}" for k in range(len(random)))), directions
+
+
+def _given_directions(
+    problem: FitProblem, z: Float[np.ndarray, "K"], given: Directions
+) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
+    """Return directions of unit length from changes of unknowns in their units, by names."""
+    P, problems = len(problem.unknowns.names), []
+    per_unit = np.ones(problem.K)  # dz over the change of an unknown
+    per_unit[:P] = 1 / problem.unknowns.dx_dz(z[:P])
+    directions = np.zeros((len(given), problem.K))
+    for row, (name, changes) in zip(directions, given.items(), strict=True):
+        unknown = [key for key in changes if key not in problem.all_names]
+        problems += [f"directions: {quote(name)}: no unknown {quote(key)}{suggestion(key, problem.all_names)}" for key in unknown]
+        for key in changes.keys() - set(unknown):
+            k = problem.all_names.index(key)
+            row[k] = float(changes[key]) * per_unit[k]
+        size = np.linalg.norm(row)
+        if not unknown and not (np.isfinite(size) and size > 0):
+            problems.append(f"directions: {quote(name)} must change an unknown by a finite number")
+        else:
+            row /= size or 1.0
+    if not given:
+        problems.append("directions: there are none")
+    if problems:
+        raise IdentificationError(problems)
+    return tuple(given), directions
 
 
 def _completed_tol(problem: FitProblem, z: Float[np.ndarray, "K"], tols: Sequence[TolerancePair]) -> TolerancePair:
@@ -252,6 +305,13 @@ def _slopes(
     return slopes
 
 
+def _curvatures(
+    problem: FitProblem, z: Float[np.ndarray, "K"], directions: Float[np.ndarray, "D K"], tols: Sequence[TolerancePair]
+) -> Float[np.ndarray, "D tols R"]:
+    """Return the second derivatives of the predicted values along some directions, in the units of channels."""
+    return np.stack([[problem.second_derivatives(z, d, tol) for tol in tols] for d in directions])
+
+
 def _compare(
     problem: FitProblem,
     z: Float[np.ndarray, "K"],
@@ -259,8 +319,10 @@ def _compare(
     slopes: Float[np.ndarray, "R"],
     tols: Sequence[TolerancePair],
     series: Sequence[np.ndarray],
+    order: int,
 ) -> Differences:
     """Compare derivatives along a direction with differences, in blocks of rows."""
+    along = d if order == 2 else None
     series_of = np.full(len(problem.index), -1)
     series_of[np.concatenate(series)] = np.repeat(np.arange(len(series)), [len(rows) for rows in series])
     points = z + np.concatenate([DIFFERENCE_STEPS, -DIFFERENCE_STEPS])[:, None] * d
@@ -269,7 +331,7 @@ def _compare(
     size = max(n for n in range(1, len(points) + 1) if len(points) % n == 0 and n <= most)
     batches = [points[k : k + size] for k in range(0, len(points), size)]
     sums, failed = DifferenceSums(len(series)), np.zeros((len(tols), len(points)), bool)
-    for blocks in zip(*(_values(problem, batch, tol) for tol in tols for batch in batches), strict=True):
+    for blocks in zip(*(_values(problem, batch, tol, along) for tol in tols for batch in batches), strict=True):
         rows = blocks[0][0]
         used = series_of[rows] >= 0
         y, code = (np.concatenate(x).reshape(len(tols), len(points), -1) for x in list(zip(*blocks, strict=True))[1:])
@@ -279,14 +341,19 @@ def _compare(
     return leave_out_far_steps(sums.differences(failed.any(0).reshape(2, -1).T))
 
 
-def _values(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Iterator[_Values]:
+def _values(
+    problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair, along: Float[np.ndarray, "K"] | None
+) -> Iterator[_Values]:
     """Iterate over blocks of rows: their numbers, the predicted values of channels in their units, and how runs ended.
 
-    Derivatives, which are computed as well, are dropped at once: several such iterators are suspended together.
+    If a direction is given, the derivatives along it take the place of the values. Derivatives, which are computed in any case,
+    are dropped at once: several such iterators are suspended together.
     """
 
     def values(block: Residuals) -> _Values:
         rows = block.row_numbers[block.row_numbers < len(problem.index)]
+        if along is not None:
+            return rows, (block.J[:, : len(rows)] @ along) * problem.sigma[rows], block.code
         return rows, block.r[:, : len(rows)] * problem.sigma[rows] + problem.measured[rows], block.code
 
     return map(values, problem.row_blocks(z, tol))
@@ -323,7 +390,8 @@ def _sentence(check: GradientCheck, d: int, s: int) -> str:
     if not check.agrees[d, s]:
         place, times = check.places[d][s], check.ratio[d, s]
         of = f" of {check.labels[s]}" if len(check.series) > 1 else ""
-        values = f"the derivative is {place.derivative:.6g}, by differences {place.difference:.6g}"
+        kind = "second derivative" if check.order == 2 else "derivative"
+        values = f"the {kind} is {place.derivative:.6g}, by differences {place.difference:.6g}"
         remark = f": {times:.2g} times the discrepancy that the errors of both explain" if np.isfinite(times) else ""
         return f"at t = {place.time:.6g} s{of} {values}{remark}"
     if floor > size:
@@ -345,5 +413,6 @@ def _table(check: GradientCheck) -> PrintedTable:
         verdict = "agrees" if check.agrees[d, s] else "unknown" if check.best[d, s] < 0 else "DIFFERS"
         where = [check.labels[s]] if several else []
         cells.append((name, *where, f"{size:.3g} {check.units[s]}".rstrip(), *relative, f"{check.step[d, s]:.0e}", verdict))
-    title = f"{check.title}: derivatives against finite differences, at a tolerance of {check.tol[0]:.1g}"
+    kind = "second derivatives" if check.order == 2 else "derivatives"
+    title = f"{check.title}: {kind} against finite differences, at a tolerance of {check.tol[0]:.1g}"
     return PrintedTable(title, cells, heads, check.message.splitlines())

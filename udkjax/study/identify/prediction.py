@@ -100,6 +100,13 @@ class Predictor:
                 self._cache.popitem(last=False)
         return predicted
 
+    def second_derivatives(
+        self, members: Members, tol: TolerancePair, first: Float[np.ndarray, "M P+S"], second: Float[np.ndarray, "M P+S"]
+    ) -> Float[np.ndarray, "M T C"]:
+        """Return the second derivatives of the predicted values by s where (x, shift) change by first s + second s^2 / 2."""
+        inputs = [(jax.tree.map(lambda leaf, k=k: leaf[k], members), first[k], second[k]) for k in range(len(first))]
+        return np.stack([np.asarray(_second_derivative(self._run, (self._arrays, np.array(tol)), *x)) for x in inputs])
+
     def guess(self, members: Members, which: int) -> State:
         """Return the guess from which the initial state of a member is closed."""
         member = jax.tree.map(lambda leaf: leaf[which], members)
@@ -153,6 +160,14 @@ class _MemberRun:
 def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Program:
     del shapes
     return Program(run, slopes, piece)
+
+
+@on_host
+@partial(jax.jit, static_argnums=0)
+def _second_derivative(run: _MemberRun, shared: PyTree, member: Members, first: Array, second: Array) -> Array:
+    values = lambda s: run(shared, member, s * first + 0.5 * s * s * second)["y"]  # noqa: E731
+    slope = lambda s: jax.jvp(values, (s,), (jnp.ones(()),))[1]  # noqa: E731
+    return jax.jvp(slope, (jnp.zeros(()),), (jnp.ones(()),))[1]
 
 
 @on_host

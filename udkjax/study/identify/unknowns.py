@@ -91,12 +91,17 @@ class Unknowns:
         """Return dx/dz."""
         return self._values_and_slopes(z)[1]
 
+    def d2x_dz2(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
+        """Return d2x/dz2."""
+        return self._values_and_slopes(z)[2]
+
     @np.errstate(over="ignore", invalid="ignore")
-    def _values_and_slopes(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _values_and_slopes(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         width, x = self.high - self.low, self.guess * np.exp(z)
         part = expit(z + logit((self.guess - self.low) / width))
         values = self._by_kind(x, self.low + width * part, self.guess + self.scale * z)
-        return values, self._by_kind(x, width * part * (1.0 - part), self.scale)
+        slope = width * part * (1.0 - part)
+        return values, self._by_kind(x, slope, self.scale), self._by_kind(x, slope * (1.0 - 2.0 * part), np.zeros_like(x))
 
     @np.errstate(divide="ignore", invalid="ignore")
     def z_of(self, x: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
