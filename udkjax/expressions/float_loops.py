@@ -12,12 +12,12 @@ import numpy as np
 
 from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, SET
 from udkjax.expressions.scalar_program import ScalarProgram
-from udkjax.expressions.written_steps import PythonFunction
+from udkjax.expressions.written_steps import PythonFunction, written_as
 
 _UPDATES_OF_FLOATS = {  # NaN propagates
     ADD: operator.add,
-    MAXIMUM: lambda a, b: a if a >= b or a != a else b,
-    ALL: lambda a, b: a if a <= b or a != a else b,
+    MAXIMUM: written_as("{0} if {0} >= {1} or {0} != {0} else {1}", lambda a, b: a if a >= b or a != a else b),
+    ALL: written_as("{0} if {0} <= {1} or {0} != {0} else {1}", lambda a, b: a if a <= b or a != a else b),
 }
 _UPDATES_OF_ARRAYS = {ADD: operator.add, MAXIMUM: np.maximum, ALL: np.minimum}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)

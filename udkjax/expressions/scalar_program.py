@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.expressions.graph import BoundPrimitive, Graph, Node, Scalar
-from udkjax.expressions.written_steps import Operand, WrittenSteps
+from udkjax.expressions.written_steps import Operand, WrittenSteps, written_as
 from udkjax.programs.numpy_rules import RULES, UFUNCS
 
 _SINE_AND_COSINE = ("sin", "cos")
@@ -28,14 +28,15 @@ _NUMBER_FUNCTIONS: dict[str, Callable] = {
     "abs": abs,
     "floor": lambda x: float(math.floor(x)),
     "integer_pow": lambda x, y: x**y,
-    "max": lambda a, b: a if a > b or a != a else b,  # NaN if either is NaN
-    "min": lambda a, b: a if a < b or a != a else b,
+    "max": written_as("{0} if {0} > {1} or {0} != {0} else {1}", lambda a, b: a if a > b or a != a else b),  # NaN of either
+    "min": written_as("{0} if {0} < {1} or {0} != {0} else {1}", lambda a, b: a if a < b or a != a else b),
     "neg": operator.neg,
     "rem": math.fmod,
     "select_n": lambda which, *cases: cases[int(which)],
     "sign": lambda x: x if x != x else float((x > 0) - (x < 0)),
-    "square": lambda x: x * x,
+    "square": written_as("{0} * {0}", lambda x: x * x),
 }
+_SELECT_OF_TWO = written_as("{2} if {0} else {1}", lambda which, no, yes: yes if which else no)
 # The same on NumPy arrays, element by element.
 _ARRAY_FUNCTIONS: dict[str, Callable] = UFUNCS | {
     **{name.strip("_"): getattr(operator, name) for name in (*_COMMON_OPERATORS, "neg")},
@@ -232,6 +233,11 @@ def _evaluate(node: Node, values: list[Operand]) -> Operand:
 
 def _function_of_floats(node: Node) -> Callable:
     """Return the function that computes a node on Python floats; chosen once, because many programs run thousands of times."""
+    constant = node.detail if node.kind == "constant" else None
+    if constant is not None and type(constant) in (float, int, bool) and math.isfinite(constant):
+        return written_as(repr(constant), lambda: constant)
+    if node.kind == "apply" and node.detail.primitive.name == "select_n" and len(node.arguments) == 3:
+        return _SELECT_OF_TWO
     return _plain_function(node, math, _NUMBER_FUNCTIONS) or (lambda *values: _evaluate(node, list(values)))
 
 
@@ -255,7 +261,7 @@ def _plain_function(node: Node, library: ModuleType, others: Mapping[str, Callab
     name = node.detail.primitive.name if node.kind == "apply" else ""
     if name == "integer_pow":
         exponent = node.detail.parameters["y"]
-        return lambda x: x**exponent
+        return written_as(f"{{0}}**{exponent}", lambda x: x**exponent)
     return getattr(library, name) if name in _LIBRARY_FUNCTIONS else others.get(name)
 
 

@@ -7,10 +7,27 @@ from typing import Any, TypeAlias
 
 Operand: TypeAlias = Any  # a number or array of Python, NumPy or JAX, each with its own operators
 
-_SYMBOLS: dict[Callable, str] = {operator.add: "+", operator.sub: "-", operator.mul: "*", operator.truediv: "/"}
+_SYMBOLS: dict[Callable, str] = {
+    operator.add: "+",
+    operator.sub: "-",
+    operator.mul: "*",
+    operator.truediv: "/",
+    operator.lt: "<",
+    operator.le: "<=",
+    operator.gt: ">",
+    operator.ge: ">=",
+    operator.eq: "==",
+    operator.ne: "!=",
+}
 _NAME = re.compile(r"\bx\d+\b")
 # Runs of single steps that take as long as generating a Python function, which is three times as fast.
 _WORTH_WRITING = 20
+
+
+def written_as(text: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that is written as an expression of its arguments, {0}, {1} ..., where it would be called."""
+    function.text = text  # pyright: ignore[reportFunctionMemberAccess]
+    return function
 
 
 class PythonFunction:
@@ -39,6 +56,8 @@ class PythonFunction:
             return self.assign(f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}")
         if function is operator.neg:
             return self.assign(f"-{arguments[0]}")
+        if (text := getattr(function, "text", None)) is not None:
+            return self.assign(text.format(*arguments))
         key = f"f{id(function)}"
         self._known[key] = function
         return self.assign(f"{key}({', '.join(arguments)})")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import ArrayLibrary, library_for, make_module, number, stored
+from udkjax.arrays import ArrayLibrary, is_traced, library_for, make_module, number, stored
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.positions.assembly import State, close
@@ -138,7 +138,7 @@ def equilibrium(
     """
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
-    t = number(t)
+    t = np.asarray(t, float) if mechanism.is_concrete and not is_traced(t) else number(t)
     q = close(mechanism, t, state, analysis=analysis).state.q
     return solve(_equilibrium, mechanism.without_origin, analysis, t, library_for(q).ravel(q), free, stable)
 

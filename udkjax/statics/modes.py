@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import ArrayLibrary, library_for, number, stored
+from udkjax.arrays import ArrayLibrary, is_traced, library_for, number, stored
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
@@ -96,7 +96,8 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
         The `Modes` of the f degrees of freedom.
     """
     analysis = analyse(mechanism) if analysis is None else analysis
-    free, t = degrees_of_freedom(analysis), number(t)
+    free = degrees_of_freedom(analysis)
+    t = np.asarray(t, float) if mechanism.is_concrete and not is_traced(t) else number(t)
     state = equilibrium(mechanism, None, t, analysis=analysis).state if state is None else state
     found = solve(_modes, mechanism.without_origin, analysis, t, library_for(state.q).ravel(state.q), free)
     rubbing = [name for name, x in mechanism.forces.items() if isinstance(x, Friction) and (x.rubs or x.sticks)]
