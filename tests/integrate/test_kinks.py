@@ -326,3 +326,28 @@ def test_a_scene_without_kinks_has_none():
     spring = udk.Spring(["ground", "b"], [[0, 0], [0, 0]], 1.0, damping=0.1, length=0.1)
     found = udk.simulate(udk.Mechanism({"b": udk.Body(1.0, 0.1, position=[1.0, 0.0])}, forces={"s": spring}), [0.0, 0.1])
     assert "kinks" not in found.settings and "kinks" not in found.stats and found.unlocated is None
+
+
+class Ripples(udk.ForceElement):
+    """A force -100 |sin(400 x)| (N) with a kink each 8 mm."""
+
+    def loads(self, t, *frames):
+        return [(-100.0 * jnp.abs(jnp.sin(400.0 * frames[0].x)), 0.0, 0.0)]
+
+
+def test_sides_that_are_not_held_any_more_stay_free_after_an_event():
+    """After 256 kinks the force is evaluated as it is, before and after the rebound from a wall; energy tells its work."""
+
+    def energy(x, v):
+        whole = np.floor(400.0 * x / np.pi)
+        return v**2 / 2 + 0.25 * (2 * whole + 1 - np.cos(400.0 * x - np.pi * whole))
+
+    block = {"block": udk.Body(1.0, 0.1, velocity=[20.0, 0.0])}
+    guide = {"guide": udk.Prismatic(("ground", "block"), [[0, 0], [0, 0]], axis=0.0)}
+    wall = udk.Contact("block", through=[2.1, 0.0], normal=[-1.0, 0.0], restitution=0.9, name="wall")
+    scene = udk.Mechanism(block, guide, forces={"ripples": Ripples(["block"])}, gravity=[0.0, 0.0])
+    run = udk.simulate(scene, [0.0, 0.2], events=wall)
+    (hit,) = run.events.of("wall")
+    assert run.unlocated is not None and run.unlocated < hit < 0.19
+    after = energy(run.events.q_after[0, 0, 0], run.events.v_after[0, 0, 0])
+    assert abs(energy(run.q[-1, 0, 0], run.v[-1, 0, 0]) - after) < 1e-3  # as steps do not end at kinks any more

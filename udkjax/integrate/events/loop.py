@@ -106,6 +106,7 @@ def _jump(
     plan, xp, E, K = system.plan, system.xp, system.plan.count, system.plan.room
     k, before = take(runs.event, members), runs.state(members)
     sides, carried = take(runs.sides, members), take(runs.carried, members)
+    was_free = system.sides(members, before.joints) == FREE
     releases, e = k >= E, k % E
     held, acts = plan.held(before.phase, xp), releases | xp.asarray(plan.changes)[e]
     after, contacts, result = apply_event(system, members, k, before, values, state_values)
@@ -139,9 +140,9 @@ def _jump(
     is_kink = xp.asarray(plan.kinks)[e] & ~releases
     kinks, turned = runs.kink_count(plan, members), system.sides(members, after.joints)
     is_full = (count - kinks + total > plan.max_events) & ~is_kink
-    # So many kinks are a force that chatters: its comparisons are no longer held.
+    # So many kinks are a force that chatters: its comparisons are not held any more, also after later events.
     chatters = (is_kink & (kinks + 1 >= MOST_KINKS))[:, None]
-    turned = xp.where(chatters & (np.arange(plan.side_count) >= plan.first_kink_side), FREE, turned)
+    turned = xp.where((chatters | was_free) & (np.arange(plan.side_count) >= plan.first_kink_side), FREE, turned)
     after = after._replace(joints=system.with_sides(members, after.joints, turned))
     carried = _carried(system, members, carried, after.joints)
     code = xp.where(is_full, Result.event_limit, code)
