@@ -52,10 +52,14 @@ Result = TypeVar("Result")
 AnyElement = TypeVar("AnyElement", bound=eqx.Module)
 
 
-@cached_by_identity  # also for traced numbers: the result contains no numbers
 def structure(mechanism: Mechanism) -> Structure:
     """Return the tree of a mechanism and the shape and dtype of each of its numbers; equal for any number of samples."""
-    return _structure(mechanism.without_origin.without_samples)
+    return _structure_of_elements(mechanism.without_origin)
+
+
+@cached_by_identity  # also for traced numbers: the result contains no numbers
+def _structure_of_elements(mechanism: Mechanism) -> Structure:
+    return _structure(mechanism.without_samples)
 
 
 def _structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
@@ -63,10 +67,12 @@ def _structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
     return tree, tuple((np.shape(leaf), np.dtype(getattr(leaf, "dtype", float))) for leaf in leaves)
 
 
-@cached_by_identity  # also for traced numbers
 def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
     """Return the structure of a mechanism with all of its samples, whose programs are functions of time throughout."""
-    return _structure(mechanism.without_origin)
+    return _whole_structure_of_elements(mechanism.without_origin)
+
+
+_whole_structure_of_elements = cached_by_identity(lambda mechanism: _structure(mechanism))
 
 
 def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
@@ -92,7 +98,7 @@ def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
 
 def concrete_numbers(mechanism: Mechanism, t: Time = 0.0) -> np.ndarray:
     """Return the concrete numbers of a mechanism as one vector, which must not change; if sampled, those of time t (s)."""
-    return whole_numbers(mechanism.at(t) if mechanism.samples else mechanism)
+    return whole_numbers(mechanism.at(t) if mechanism.samples else mechanism.without_origin)
 
 
 @cached_by_identity

@@ -41,6 +41,7 @@ from udkjax.scene.number_fields import (
     ElementGroups,
     parameters_in,
     parameters_of,
+    parameters_of_drawing,
     replace_numbers,
     require_values,
     split_index,
@@ -343,7 +344,7 @@ class Mechanism(PrintsTable, ConvertsItself):
 
     def _redrawn(self, source: Drawn, values: Mapping[str, Any], origin: Origin | None) -> "Mechanism":
         drawing, known, groups = source.drawing, parameters_of(self), self.groups
-        drawn = parameters_in(drawing.groups) | {"gravity": known["gravity"]}
+        drawn = {**parameters_of_drawing(drawing), "gravity": known["gravity"]}
         of_drawing = {name: value for name, value in values.items() if split_index(name, known)[0] in drawn}
         direct = {name: value for name, value in values.items() if name not in of_drawing}
         elements = groups

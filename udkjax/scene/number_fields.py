@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -9,6 +10,7 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers
 from udkjax.arrays import make_module, number
+from udkjax.programs.identity_cache import cached_within_trace
 from udkjax.scene.checks import SceneError
 from udkjax.scene.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.held import Held, given_sampled
@@ -58,14 +60,23 @@ class NamesNumbers(Protocol):
     def number_fields(self) -> dict[str, NumberField]: ...
 
 
-def parameters_of(mechanism: Sections | NamesNumbers) -> dict[str, NumberField]:
+def parameters_of(mechanism: Sections | NamesNumbers) -> Mapping[str, NumberField]:
     """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
     scene: Any = mechanism
-    if hasattr(scene, "number_fields"):
-        return scene.number_fields()
-    drawn = {} if scene.drawing is None else parameters_in(scene.drawing.groups)
+    return scene.number_fields() if hasattr(scene, "number_fields") else _parameters_of_scene(scene)
+
+
+@cached_within_trace  # a loop over values of a number asks for all names each time
+def _parameters_of_scene(scene: Any) -> Mapping[str, NumberField]:
+    drawn = {} if scene.drawing is None else parameters_of_drawing(scene.drawing)
     gravity = {"gravity": NumberField("", "", (), scene.gravity, scene.gravity.shape)}
-    return gravity | drawn | parameters_in(scene.groups)
+    return MappingProxyType({**gravity, **drawn, **parameters_in(scene.groups)})
+
+
+@cached_within_trace
+def parameters_of_drawing(drawing: ElementsOfDrawing) -> Mapping[str, NumberField]:
+    """Return every number of a drawing by name, including absent ones."""
+    return MappingProxyType(parameters_in(drawing.groups))
 
 
 def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
