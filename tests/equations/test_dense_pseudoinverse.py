@@ -1,11 +1,13 @@
 import sys
 
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations.dense_pseudoinverse import FEW_ROWS, FactoredPseudoinverse, TruncatedPseudoinverse, dense_pseudoinverse
+from udkjax.equations.state_arrays import StateArrays
 
 TOL = 1e-4
 
@@ -31,7 +33,7 @@ CASES = [
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_a_factored_pseudoinverse_is_that_of_singular_values(m, n, values, scale):
     D = scale * matrix(m, n, list(values))
-    plus, expected = FactoredPseudoinverse.of(D, TOL), np.linalg.pinv(D, TOL)
+    plus, expected = FactoredPseudoinverse.of(D, TOL, with_null_space=True), np.linalg.pinv(D, TOL)
     assert plus is not None and plus.rank == len(values)
     rng = np.random.default_rng(1)
     b, many, x = rng.normal(size=m), rng.normal(size=(m, 3)), rng.normal(size=n)
@@ -43,6 +45,9 @@ def test_a_factored_pseudoinverse_is_that_of_singular_values(m, n, values, scale
     assert N.shape == (n, n - len(values))
     assert_allclose(N.T @ N, np.eye(n - len(values)), atol=1e-13)
     assert_allclose(D @ N, 0.0, atol=1e-13 * scale * max(values))
+    alone = FactoredPseudoinverse.of(D, TOL)
+    assert alone is not None
+    assert_allclose(alone @ b, plus @ b, rtol=1e-11, atol=size)
 
 
 @pytest.mark.parametrize("least", [3e-4, 1.1e-4, 0.9e-4, 1e-7, 1e-12])
@@ -75,3 +80,17 @@ def test_equilibrium_of_a_long_chain_is_that_by_singular_values(monkeypatch):
     assert_allclose(fast.q, slow.q, atol=1e-12)
     assert_allclose(fast.omega2, slow.omega2, rtol=1e-9)
     assert_allclose(fast.multipliers, slow.multipliers, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("build", [lambda: udk.library.chain(14), lambda: udk.library.n_four_bar(6)], ids=["chain", "loops"])
+def test_reactions_of_large_scenes_are_those_by_singular_values(build, monkeypatch):
+    mechanism, found = build(), []
+    solution = udk.simulate(mechanism, np.linspace(0.0, 0.02, 4))
+    for few in (10**6, FEW_ROWS):
+        monkeypatch.setattr(sys.modules[FactoredPseudoinverse.__module__], "FEW_ROWS", few)
+        monkeypatch.setattr(sys.modules[StateArrays.__module__], "FEW_ROWS", few)
+        found.append(udk.reactions(mechanism, solution))
+    slow, fast = map(jax.tree.leaves, found)
+    for a, b in zip(slow, fast, strict=True):
+        assert_allclose(b, a, rtol=1e-8, atol=1e-9 * np.nanmax(np.abs(a), initial=0.0))

@@ -59,27 +59,28 @@ FEW_ROWS = 24  # up to which singular values take less time, as functions of Num
 class FactoredPseudoinverse(NamedTuple):
     """D^+ = Q_1 A with A = S^(-1) W^T."""
 
-    Q: np.ndarray  # (n, n)
+    Q: np.ndarray  # (n, n), or its first columns (n, r or more)
     A: np.ndarray  # (r, m)
 
     @classmethod
-    def of(cls, D: np.ndarray, tol: float) -> "FactoredPseudoinverse | None":
+    def of(cls, D: np.ndarray, tol: float, with_null_space: bool = False) -> "FactoredPseudoinverse | None":
         """Return D^+; None if singular values beyond the rank are not rounding errors, or others may be below `tol`."""
+        mode = "complete" if with_null_space else "reduced"
         if not D.size or not np.isfinite(D).all():
             return None
-        Q, R = np.linalg.qr(D.T, mode="complete")
+        Q, R = np.linalg.qr(D.T, mode=mode)
         zero = ROUNDING * math.sqrt(D.size) * np.abs(D).max()
         independent = np.zeros(len(D), bool)  # of the rows before
-        independent[: len(Q)] = np.abs(R.diagonal()) > zero
+        independent[: len(R)] = np.abs(R.diagonal()) > zero
         r = int(independent.sum())
         if r == len(D):
             A = np.linalg.inv(R[:r]).T
         else:
-            Q = np.linalg.qr(D[independent].T, mode="complete")[0]
-            rows = D @ Q
-            if not r or np.abs(rows[:, r:]).max(initial=0.0) > zero:
+            Q = np.linalg.qr(D[independent].T, mode=mode)[0]
+            rows = D @ Q[:, :r]
+            if not r or np.abs(D - rows @ Q[:, :r].T).max() > zero:
                 return None
-            W, S = np.linalg.qr(rows[:, :r])
+            W, S = np.linalg.qr(rows)
             A = np.linalg.inv(S) @ W.T
         if not _bound(D) * _bound(A) * tol < 1.0:  # the largest over the smallest singular value that counts, or more
             return None
@@ -120,7 +121,13 @@ def dense_pseudoinverse(
         free: number of columns of `null_space` that will be asked for; None: of none.
         with_values: whether the reciprocals of the singular values are needed, `inverse`.
     """
-    found = FactoredPseudoinverse.of(D, tol) if min(D.shape) > FEW_ROWS and not with_values else None
+    found = FactoredPseudoinverse.of(D, tol, free is not None) if min(D.shape) > FEW_ROWS and not with_values else None
     if found is not None and free in (None, D.shape[1] - found.rank):
         return found
     return TruncatedPseudoinverse.of(D, tol, full=free is not None)
+
+
+def has_independent_rows(D: np.ndarray, tol: float) -> bool:
+    """Return True if the rows of a large matrix are known to be independent; those of a small one are not examined."""
+    found = FactoredPseudoinverse.of(D, tol) if min(D.shape) > FEW_ROWS else None
+    return found is not None and found.rank == len(D)

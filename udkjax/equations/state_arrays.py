@@ -15,6 +15,7 @@ from jaxtyping import PyTree
 from udkjax.arrays import is_traced, is_within_jit
 from udkjax.equations.abstract_system import HistoryLike
 from udkjax.equations.analysis import Analysis
+from udkjax.equations.dense_pseudoinverse import FEW_ROWS, dense_pseudoinverse, has_independent_rows
 from udkjax.equations.loads import mass_of
 from udkjax.equations.rest_program import LOADS
 from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
@@ -143,6 +144,8 @@ class StateArrays:
         _, rows, columns = J.shape
         if not J[0].size:
             return np.tile(np.eye(rows), (len(t), 1, 1)), np.zeros(len(t), int)
+        if all(has_independent_rows(x, rank_tol) for x in J):
+            return np.zeros((len(t), rows, rows)), np.full(len(t), rows)
         u, sigma, _ = np.linalg.svd(np.pad(J, ((0, 0), (0, 0), (0, max(0, rows - columns)))), full_matrices=False)
         zero = (sigma <= rank_tol * sigma[:, :1]) & np.isfinite(q).all(1, keepdims=True)
         return np.where(zero[:, None, :], u, 0.0), rows - zero.sum(1)
@@ -173,17 +176,28 @@ class StateArrays:
         tol = float(analysis.scales.rank_tol if method is None or method.rank_tol is None else method.rank_tol)
         D = w[:, None] * self.dense(entries) * self.root
         reached = np.isfinite(D).all((1, 2)) & np.isfinite(b).all(0)
-        u, sigma, vt = np.linalg.svd(np.where(reached[:, None, None], D, 0.0), full_matrices=False)
-        counts = sigma > tol * sigma[:, :1]
-        inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)
-        y = inverse * np.einsum("tmk,tm->tk", u, b.T * w)
-        a = free.T + self.root * np.einsum("tkn,tk->tn", vt, y)
-        multipliers = -w * np.einsum("tmk,tk->tm", u, inverse * y)
-        lost = ~reached[:, None]
+        x, z = _least_norm(np.where(reached[:, None, None], D, 0.0), b.T * w, tol)
+        a, multipliers, lost = free.T + self.root * x, -w * z, ~reached[:, None]
         return Multipliers(np.where(lost, np.nan, a), np.where(lost, np.nan, multipliers), entries)
 
     def _along(self, quantity: Callable[..., np.ndarray], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.concatenate([self._evaluate(quantity, t[p], q[p], v[p]).T for p in self.pieces(len(t), dense=False)])
+
+
+def _least_norm(D: np.ndarray, b: np.ndarray, tol: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return x = D^+ b (T, n) and (D^+)^T x (T, m) of matrices (T, m, n)."""
+    if min(D.shape[1:]) > FEW_ROWS:  # one by one, since each takes memory
+        x, z = np.empty((len(D), D.shape[2])), np.empty(b.shape)
+        for k, A in enumerate(D):
+            plus = dense_pseudoinverse(A, tol)
+            x[k] = plus @ b[k]
+            z[k] = plus.transposed_times(x[k])
+        return x, z
+    u, sigma, vt = np.linalg.svd(D, full_matrices=False)
+    counts = sigma > tol * sigma[:, :1]
+    inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)
+    y = inverse * np.einsum("tmk,tm->tk", u, b)
+    return np.einsum("tkn,tk->tn", vt, y), np.einsum("tmk,tk->tm", u, inverse * y)
 
 
 @cached_by_identity
