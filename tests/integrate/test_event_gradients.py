@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.friction import rubbing
 from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, ROOM, TS, G, floor
 from tests.integrate.exact_motions import Table
 
@@ -158,3 +159,27 @@ def test_a_condition_that_an_impact_carries_across_zero_moves_with_the_impact():
     (found, slope), (expected, exact_slope) = (jax.jvp(f, (2.0,), (1.0,)) for f in (run, exact))
     np.testing.assert_allclose(found, expected, rtol=1e-7)
     np.testing.assert_allclose(slope, exact_slope, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "most"), [("sticking joints", 27_000), ("a contact", 13_000)])
+def test_the_program_of_derivatives_is_short(scene, most):
+    """Its length decides how long a user waits for the first gradient."""
+
+    def final(number):
+        if scene == "a contact":
+            return udk.simulate(BALL, [0.0, 2.0], events=floor(number)).q[-1, 0, 1]
+        linkage = rubbing(udk.library.four_bar(), 1.0, law="set-valued")
+        return udk.simulate(linkage.with_parameters({f"force.{linkage.force_names[0]}.coefficient": number}), [0.0, 2.0]).q[
+            -1, 0, 2
+        ]
+
+    def count(jaxpr):
+        inner = [
+            x for e in jaxpr.eqns for p in e.params.values() for x in jax.tree.leaves(p, is_leaf=lambda x: hasattr(x, "eqns"))
+        ]
+        jaxprs = [getattr(x, "jaxpr", x) for x in inner]
+        return len(jaxpr.eqns) + sum(count(x) for x in jaxprs if hasattr(x, "eqns"))
+
+    operations = [count(jax.make_jaxpr(derivative(final))(0.15).jaxpr) for derivative in (jax.jacfwd, jax.grad)]
+    assert max(operations) < most

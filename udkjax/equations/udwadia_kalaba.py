@@ -125,7 +125,8 @@ def project(
             pseudoinverse(method, D(mechanism, t, q, w)) @ weigh(w, constraints.psi(mechanism, t, q))
         )
 
-    q = jnp.asarray(jax.lax.fori_loop(0, steps, newton, vector(q)))
+    q = vector(q)
+    q = newton(q, q) if steps == 1 else jnp.asarray(jax.lax.fori_loop(0, steps, newton, q))
     rate = weigh(w, constraints.psi_dot(mechanism, t, q, v))
     return q, vector(v) - inverse_sqrt_mass(mechanism) * (pseudoinverse(method, D(mechanism, t, q, w)) @ rate)
 

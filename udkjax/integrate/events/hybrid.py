@@ -60,6 +60,7 @@ class Hybrid(eqx.Module):
     formulation: Formulation | None
     plan: EventPlan = eqx.field(static=True)
     plans: tuple[RunPlan, ...] = eqx.field(static=True)  # for each mechanism
+    replays: bool = eqx.field(static=True, default=False)  # whether only derivatives are computed
 
     # --- events
 
@@ -129,9 +130,16 @@ class Hybrid(eqx.Module):
                 return differentiable(problem)
             return native_engine.integrate(problem)
 
-        return self.in_phase(state.phase, of_mechanism, ts, state)
+        return self.in_phase(state.phase, of_mechanism, ts, state, integrates=True)
 
-    def in_phase(self, phase: Bool[Array, "C"], function: Callable[..., T], *arguments: object, is_free: bool = False) -> T:
+    def in_phase(
+        self,
+        phase: Bool[Array, "C"],
+        function: Callable[..., T],
+        *arguments: object,
+        is_free: bool = False,
+        integrates: bool = False,
+    ) -> T:
         """Return `function(which, *arguments)`, with the mechanism of a phase, SCENE or SWITCHED, as `which`.
 
         Args:
@@ -139,9 +147,13 @@ class Hybrid(eqx.Module):
             function: function to compute.
             *arguments: its arrays.
             is_free: whether the phase is known to have no contact at rest.
+            integrates: whether the function integrates, which takes less time with the mechanism of the scene. All else is traced
+                once for a replay, with the mechanism whose contacts and locks are all off in the phase of the scene.
         """
         if len(self.phases.mechanisms) == 1 or (is_free and self.plan.has_only_contacts):
             return function(SCENE, *arguments)
+        if self.replays and not integrates and self.plan.has_only_contacts:
+            return function(SWITCHED, *arguments)
         branches = [lambda *x, which=which: function(which, *x) for which in (SWITCHED, SCENE)]
         return jax.lax.switch(self.plan.is_first(phase).astype(int), branches, *arguments)
 
@@ -193,14 +205,17 @@ class Hybrid(eqx.Module):
         forces = self.forces(at) if has_forces else jnp.ones(self.count)
         return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions, mobilities, forces)
 
+    def accelerations(self, at: RunState) -> Float[Array, "n"]:
+        """Return the accelerations in a state."""
+        return self.in_phase(at.phase, lambda which, x: self.textbook(which, x).accelerations(*x[:3]), at)
+
     def second_rates(self, at: RunState) -> tuple[Float[Array, "n"], Float[Array, "E"]]:
         """Return the rate of the accelerations along the motion, and the second rates of all conditions, at a state."""
-        t, q, v, phase, added = at
+        t, q, v, _, added = at
         conditions = self.conditions(added)
 
         def accelerations(t: Array, q: Array, v: Array) -> Array:
-            state = at._replace(t=t, q=q, v=v)
-            return self.in_phase(phase, lambda which, x: self.textbook(which, x).accelerations(*x[:3]), state)
+            return self.accelerations(at._replace(t=t, q=q, v=v))
 
         def rates(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
             a = accelerations(t, q, v)

@@ -93,14 +93,17 @@ class PlainSystem:
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
         """Return positions and velocities that the phase of a state allows."""
+        hybrid = self.hybrid
+        # A replay without joints that move bodies as they are attached corrects nothing: one step has all derivatives.
+        steps = 1 if hybrid.replays and hybrid.plan.has_only_contacts else 2
 
         def of_mechanism(which: int, at: RunState) -> tuple[Array, Array]:
             # Velocities jump, so `equations.project`, whose derivatives hold for small corrections, cannot be used.
-            equations = self.hybrid.textbook(which, at)
-            return uk.project(equations.mechanism, *at[:3], equations.method, equations.weights)
+            equations = hybrid.textbook(which, at)
+            return uk.project(equations.mechanism, *at[:3], equations.method, equations.weights, steps)
 
         state = without_member(at)
-        q, v = self.hybrid.in_phase(state.phase, of_mechanism, state, is_free=is_free)
+        q, v = hybrid.in_phase(state.phase, of_mechanism, state, is_free=is_free)
         return q[None], v[None]
 
     def add_joints(self, members: MemberIndices, new: Bool[Array, "1 A"], q: Float[Array, "1 n"], joints: Added) -> Added:

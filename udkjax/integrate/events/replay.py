@@ -1,6 +1,7 @@
 """A run with events, as a function of all its numbers: its loop, and its derivatives through the events."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -77,10 +78,21 @@ def _(primals, tangents):
         xs = [_differentiate_once(x) for x in xs]
 
     def replay_from(*active: Array) -> tuple[Array, ...]:
-        return _replay(fixed, replaced(xs, has_tangent, active), stop_gradients(found))
+        return _replay(fixed, replaced(xs, has_tangent, active), stop_gradients(found), _zero(active[0]))
 
     change = jax.jvp(replay_from, select(xs, has_tangent), select(tangents[1], has_tangent))[1]
     return found, EventRun._make([*change, *(None for _ in found[len(change) :])])
+
+
+@jax.custom_jvp
+def _zero(x: Array) -> Float[Array, ""]:
+    """Return zero with derivatives, which are zero, too."""
+    return jnp.zeros(())
+
+
+@_zero.defjvp
+def _(primals, tangents):
+    return _zero(*primals), 0.0 * jnp.ravel(tangents[0])[0]
 
 
 @jax.custom_jvp
@@ -162,12 +174,17 @@ class PieceOutput(NamedTuple):
 
 
 @deferred
-def _replay(fixed: FixedPart, xs: Sequence[Array], found: EventRun) -> tuple[Array, ...]:
-    return replay(fixed.combine(xs), found)
+def _replay(fixed: FixedPart, xs: Sequence[Array], found: EventRun, zero: Float[Array, ""]) -> tuple[Array, ...]:
+    return replay(fixed.combine(xs), found, zero)
 
 
-def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
-    """Return the smooth results of a run with their first derivatives: the first fields of `EventRun`."""
+def replay(hybrid: Hybrid, found: EventRun, zero: Float[Array, ""]) -> tuple[Array, ...]:
+    """Return the smooth results of a run with their first derivatives: the first fields of `EventRun`.
+
+    States at the start have the derivatives of `zero`: JAX otherwise differentiates the loop twice, first for a loop whose first
+    state has none.
+    """
+    hybrid = replace(hybrid, replays=True)
     system = PlainSystem(hybrid)
     ts, T, K, n = stop_gradients(hybrid.ts), len(hybrid.ts), len(found.event_time), len(hybrid.q)
     width = min(OUTPUTS, T)
@@ -186,7 +203,9 @@ def replay(hybrid: Hybrid, found: EventRun) -> tuple[Array, ...]:
         began = with_member(state._replace(phase=found.first_phase, joints=(*state.joints[:-1], found.first_sides)))
         start, _ = settle_friction(system, None, with_member(state), jnp.array([NO_EVENT]), modes_of(system, None, began))
         state = without_member(start)
-    end, out = jax.lax.scan(piece, PieceStart(state, jnp.array(0), jnp.array(0), jnp.zeros(())), None, length=pieces)
+    q, v, *joints = (x + zero if eqx.is_inexact_array(x) else x for x in (state.q, state.v, *jax.tree.leaves(state.joints)))
+    state = state._replace(q=q, v=v, joints=jax.tree.unflatten(jax.tree.structure(state.joints), joints))
+    end, out = jax.lax.scan(piece, PieceStart(state, jnp.array(0), jnp.array(0), zero), None, length=pieces)
     rows = out.rows.ravel()
     q, v = (jnp.full((T, n), jnp.inf).at[rows].set(x.reshape(-1, n), mode="drop") for x in (out.q, out.v))
     last = (ts == found.time)[:, None]
@@ -252,11 +271,17 @@ def _apply_at_fixed_time(
     """
     hybrid, E, index = system.hybrid, system.plan.count, found.event_index[j]
     k = jnp.where(index >= 2 * E, index - 2 * E, index)
-    values, _ = condition_values(system, None, with_member(state))
+    # As d is zero, rates and accelerations count with their values alone in first derivatives.
+    first_only = system.plan.changes.any()
+    fixed, at = (PlainSystem(stop_gradients(hybrid)), stop_gradients(state)) if first_only else (system, state)
+    values, _ = condition_values(fixed, None, with_member(at))
     h, rate, a = values.h[0, k % E], values.rate[0, k % E], values.a[0]
+    if first_only:
+        h = hybrid.conditions(state.joints)(*state[:3])[k % E]
     if system.plan.held_at_rest.any() or system.plan.sticking:
-        force = lambda t, q, v: hybrid.forces(state._replace(t=t, q=q, v=v))[k % E]  # noqa: E731
-        h, rate = (jnp.where(k >= E, *x) for x in zip(rate_along(force, *state[:3], a), (h, rate), strict=True))
+        force = lambda t, q, v: fixed.hybrid.forces(at._replace(t=t, q=q, v=v))[k % E]  # noqa: E731
+        of_force = hybrid.forces(state)[k % E], rate_along(force, *at[:3], a)[1]
+        h, rate = (jnp.where(k >= E, *x) for x in zip(of_force, (h, rate), strict=True))
     unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E])
     is_transversal = jnp.abs(stop_gradients(rate)) > ZERO_RATE * unit * hybrid.rate
     # An event at the same instant as the event before moves with that event if its condition is stationary, or if the jump of
@@ -269,15 +294,16 @@ def _apply_at_fixed_time(
     _, of_h = _second_order(d, hybrid, state)
     d = d - jnp.where(is_transversal, of_h[k % E] / stop_gradients(rate), 0.0)
     before = with_member(_moved(hybrid, state, d, a))
-    values = condition_values(system, None, before)
+    values = condition_values(system if system.plan.impacts.any() else fixed, None, before)
     at_end = with_member(state._replace(phase=found.event_phase[j], joints=(*state.joints[:-1], found.sides[j])))
     modes = modes_of(system, None, at_end) if system.plan.sticking else None
     after = apply_event(system, None, k[None], before, *values, found.closed[j][None], modes).state
     after = without_member(after)._replace(phase=found.event_phase[j])
     after = after._replace(joints=(*after.joints[:-1], found.sides[j]))
-    fixed = _moved(hybrid, after, -d, hybrid.values(after).a)._replace(t=state.t)
+    a_after = fixed.hybrid.accelerations(stop_gradients(after) if first_only else after)
+    at_time = _moved(hybrid, after, -d, a_after)._replace(t=state.t)
     before = without_member(before)
-    return fixed, d, (before.t, jnp.stack([before.q, after.q]), jnp.stack([before.v, after.v]))
+    return at_time, d, (before.t, jnp.stack([before.q, after.q]), jnp.stack([before.v, after.v]))
 
 
 def _moved(hybrid: Hybrid, state: RunState, d: Float[Array, ""], a: Float[Array, "n"]) -> RunState:
