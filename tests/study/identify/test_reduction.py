@@ -94,8 +94,9 @@ def test_fits_agree_whatever_the_value_of_an_unknown_at_its_bound():
 
 
 PEAK = """
-import resource, sys
+import sys
 import numpy as np, udkjax as udk
+from tests.fresh_process import peak_memory
 from udkjax.study.identify import fit_problem
 from udkjax.study.identify.optimizer import Minimizer
 
@@ -108,7 +109,7 @@ values = {f"body.{b}.angle": np.sin(ts) for b in scene.bodies}
 names = [f"force.{s}.{number}" for s in springs for number in ("stiffness", "damping", "length")]
 problem = fit_problem.build_problem(mech, [udk.Record(ts, values, noise=0.1)] * 2, names, {}, tol=1e-7)
 Minimizer().minimize(problem, np.zeros(problem.K), (1e-7, 1e-7), None, 1)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+print(peak_memory())
 """
 
 
@@ -126,8 +127,8 @@ def test_memory_holds_residuals_but_no_jacobian():
 
 
 SIZE = """
-import resource, sys
 import numpy as np, udkjax as udk
+from tests.fresh_process import peak_memory
 
 links, ts, rng = 25, np.linspace(0.0, 0.5, 100), np.random.default_rng(0)
 bodies, joints, springs, before = {}, {}, {}, "ground"
@@ -150,7 +151,7 @@ found = udk.identify(first, records, list(values), progress=False)
 assert found.success and len(values) == 50
 errors = (found.values - list(values.values())) / found.uncertainty.standard_errors
 print(np.sqrt(np.mean(errors**2)), np.abs(errors).max())
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+print(peak_memory())
 """
 
 
