@@ -35,9 +35,10 @@ class RowMarks(Module):
     results = ("marks",)
 
     def __init__(self, code: RunPrograms, width: int, vector: int):
-        in_loops = code.has_loops or not code.is_small  # few calls do not pay for compiling unrolled programs
-        plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=not in_loops, steps=False)
-        super().__init__(plan)
+        unrolled = code.is_small and not code.has_loops  # a single call does not pay for compiling unrolled programs
+        super().__init__(
+            Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=unrolled, steps=False)
+        )
         self.places.add("independent", self.m)
 
     def write_functions(self):

@@ -93,9 +93,7 @@ MOST_JUMPS = 3  # maximum number of jumps before intervals regain their length; 
 MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
 MOST_STUCK = 4  # maximum number of successive refinements; before a jump, some finer intervals are resolved
 FIRST, SECOND, THIRD = range(3)  # the next node of two intervals
-LAST_CHANGE = (
-    1e-8  # largest final correction of the event time, in T; as a Taylor step it has an error of its square, a rounding error
-)
+LAST_CHANGE = 1e-8  # largest final correction of the event time, in T; the error of this Taylor step, its square, is rounding
 MOST_AIMS = 12  # maximum number of Newton's steps to a crossing on the polynomial, before bisection goes on
 MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; usually one
 LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long

@@ -15,8 +15,9 @@ from udkjax.integrate.solution import scene_text, versions
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.identify.directions import Directions
 from udkjax.study.identify.fit_problem import FitProblem
-from udkjax.study.identify.gradient_check import Directions, GradientCheck, compare_gradients
+from udkjax.study.identify.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.optimizer import Loss, squares, weighted_residuals
 from udkjax.study.identify.outliers import Outlier, outlier_sentences
 from udkjax.study.identify.prediction import TolerancePair

@@ -11,7 +11,7 @@ Along a chaotic motion even the smallest step leads to an entirely different mot
 therefore excluded if h J d exceeds the values of a channel and the channel changes.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -25,6 +25,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, DifferenceSums, best_steps, leave_out_far_steps
 from udkjax.study.identify import prediction
+from udkjax.study.identify.directions import Directions, given_directions, usual_directions
 from udkjax.study.identify.fit_problem import FitProblem, build_problem
 from udkjax.study.identify.parameters import ParametersLike
 from udkjax.study.identify.prediction import TIGHT_TOL, TolerancePair
@@ -32,19 +33,17 @@ from udkjax.study.identify.record_reader import Data
 from udkjax.study.identify.records import IdentificationError, label_prefixes
 from udkjax.study.identify.residuals import Residuals
 from udkjax.study.identify.windows import BLOCK_BYTES
-from udkjax.wording import join_names, quote, suggestion
+from udkjax.wording import join_names
 
 AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
 # Steps with floors up to this factor above the smallest are used as well. Truncation is estimated from the next finer step, whose
 # noise is four times as large, so smaller truncation errors are unknown.
 ALIKE = 4.5
 USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which agreement is meaningful
-RANDOM_DIRECTIONS = 3  # number of directions in which all unknowns change
 OTHER_TOL = 0.01, 10.0  # tolerances, relative to the given one, to estimate errors; the second is used if runs fail at the first
 SMALLEST_TOL = 1e-14  # below this, the step controller responds to rounding errors
 
 
-Directions: TypeAlias = Mapping[str, Mapping[str, float]]  # changes of unknowns by name, by the name of the direction
 # The numbers (R,) of rows, the values (B, R) predicted with B sets of unknowns, and how their runs ended (B,).
 _Values: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -215,7 +214,7 @@ def compare_gradients(
     directions: Directions | None = None,
 ) -> GradientCheck:
     """Compare the derivatives of a problem at z with finite differences, at given tolerances of the integration."""
-    names, d = _usual_directions(problem, seed) if directions is None else _given_directions(problem, z, directions)
+    names, d = usual_directions(problem, seed) if directions is None else given_directions(problem, z, directions)
     tol = _completed_tol(problem, z, [tol])
     smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
     tols = tol, _completed_tol(problem, z, [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger])
@@ -245,40 +244,6 @@ def compare_gradients(
         other_tol=tols[1],
         order=order,
     )
-
-
-def _usual_directions(problem: FitProblem, seed: int) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
-    """Return each unknown by itself, and some random combinations of all."""
-    names = problem.all_names[: problem.K - problem.constrained]
-    random = np.random.default_rng(seed).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
-    directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
-    return (*names, *(f"random direction {k + 1}" for k in range(len(random)))), directions
-
-
-def _given_directions(
-    problem: FitProblem, z: Float[np.ndarray, "K"], given: Directions
-) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
-    """Return directions of unit length from changes of unknowns in their units, by names."""
-    P, problems = len(problem.unknowns.names), []
-    per_unit = np.ones(problem.K)  # dz over the change of an unknown
-    per_unit[:P] = 1 / problem.unknowns.dx_dz(z[:P])
-    directions = np.zeros((len(given), problem.K))
-    for row, (name, changes) in zip(directions, given.items(), strict=True):
-        unknown = [key for key in changes if key not in problem.all_names]
-        problems += [f"directions: {quote(name)}: no unknown {quote(key)}{suggestion(key, problem.all_names)}" for key in unknown]
-        for key in changes.keys() - set(unknown):
-            k = problem.all_names.index(key)
-            row[k] = float(changes[key]) * per_unit[k]
-        size = np.linalg.norm(row)
-        if not unknown and not (np.isfinite(size) and size > 0):
-            problems.append(f"directions: {quote(name)} must change an unknown by a finite number")
-        else:
-            row /= size or 1.0
-    if not given:
-        problems.append("directions: there are none")
-    if problems:
-        raise IdentificationError(problems)
-    return tuple(given), directions
 
 
 def _completed_tol(problem: FitProblem, z: Float[np.ndarray, "K"], tols: Sequence[TolerancePair]) -> TolerancePair:
