@@ -285,3 +285,38 @@ def test_an_event_and_the_end_may_be_at_a_breakpoint(engine, end):
     later = end - 0.3
     assert_allclose(found.q[-1, 0, 0], 0.045 + 0.3 * later - 2.5 * later**2, atol=1e-12)
     assert found.stats["steps"] < 60  # not one window after another up to the breakpoint
+
+
+class Staircase(udk.ForceElement):
+    """A force that is held between samples, and grows in steps with the place: kinks beside breakpoints are not located."""
+
+    held: Any
+    growth: float
+
+    def loads(self, t, *frames):
+        return [(self.held(t) + self.growth * jnp.floor(frames[0].x * 10.0), 0.0, 0.0)]
+
+
+@pytest.mark.parametrize("tol", [1e-5, 1e-8])
+def test_sudden_changes_beside_breakpoints(tol):
+    """Steps as short as these changes require say nothing of the motion before them: a velocity there was 1e14 m/s."""
+    cases = (
+        ([10.0, -30.0], 2.0),
+        ([10.0, -30.0], 5.0),
+        ([7995.0, -5794.0, -2903.0, 4103.0, 215.0, 8786.0], 8.11),
+    )
+    for forces, growth in cases:
+        steps = Staircase(["ball"], udk.Held(np.array(forces), 0.1), growth)
+        ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1)}, forces={"steps": steps}, gravity=(0.0, 0.0))
+        ts = np.linspace(0.0, 0.5, 51)
+        run = udk.simulate(ball, ts, rtol=tol, atol=tol)
+        q, v = run.q[:, 0, 0], run.v[:, 0, 0]
+        # The change of v in an interval, with x from Hermite's cubic: floor(10 x) differs from 10 x - 1/2 by at most 1/2.
+        held, h = np.array(forces)[np.minimum((ts[:-1] * 10.0 + 1e-9).astype(int), len(forces) - 1)], np.diff(ts)
+        mean_x = (q[1:] + q[:-1]) / 2 - np.diff(v) * h / 12
+        within = 20 * tol * np.abs(v).max()
+        assert_allclose(np.diff(v), h * (held + growth * (10.0 * mean_x - 0.5)), rtol=0.0, atol=growth * h[0] / 2 + within)
+        for k in (10, 20, 30):
+            clock = udk.Event(lambda t, at, time=ts[k]: t - time, udk.Stop(), name="clock")
+            stopped = udk.simulate(ball, ts[::10], events=clock, rtol=tol, atol=tol)
+            assert_allclose(stopped.events.v_before[0, 0, 0], v[k], rtol=0.0, atol=within)

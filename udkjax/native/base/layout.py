@@ -157,6 +157,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "diverged": "whether a stage of the attempted step did not converge",
     "next": "next output time (s)",
     "until": "time up to which outputs are due (s)",
+    "abrupt": "whether the next attempt is so short that all outputs before it are due",
     "due": "whether the called function applies to the lane",
     "tried": "attempts so far",
     "accepted": "accepted steps so far",

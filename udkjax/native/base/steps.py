@@ -80,7 +80,7 @@ POINTS = 4  # states that the interpolating polynomial passes through; with thre
 # first step are interpolated after the second, and interpolation through two close points amplifies rounding errors: to 1e-4 m/s
 # if the last step is 1/300 of the step before it.
 SHORTEST_LAST = 0.25
-STRETCH = 12.0  # largest ratio of the last step to those before: steps grow at most tenfold
+STRETCH = 12.0  # largest ratio of the last step to those before, and of a step to the next attempt: steps grow at most tenfold
 # Length of a step, in T, below which the change of a position follows from velocities and accelerations at its ends: the error is
 # of the fifth order, while the rounding errors of the positions would add as many units of rounding to a velocity, divided by it.
 SHORT_STEP = 1e-6

@@ -37,6 +37,7 @@ from udkjax.native.base.steps import (
     SLOPE,
     SLOPE_IN_LANES,
     STABLE,
+    STRETCH,
     SURE,
     UNPAID,
     Status,
@@ -94,7 +95,10 @@ def write_decide(module: Module):
     cost = where(begin, f.const(1.0, DOUBLE, f.width), per_step)
     cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
-    s.until = _due_until(module, f, s, accept, stepping & begin)
+    # Points beyond a sudden change, which shorten steps again and again, say nothing of the motion before.
+    abrupt = stepping & ~accept & (s.h * STRETCH < s.point3_t - s.point2_t)
+    s.abrupt = where(abrupt, yes, 0.0)
+    s.until = where(abrupt, s.point3_t, _due_until(module, f, s, accept, stepping & begin))
     s.where(accept, accepted=s.accepted + 1.0)
     if module.implicit:
         s.where(accept & implicit, implicit=s.implicit + 1.0)

@@ -36,7 +36,9 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
 def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int], Value], list[Value | None]]:
     """Return the inverse of the time between any two points, and whether the polynomial uses each point (None: always).
 
-    Accelerations from an implicit method carry errors of steps before, which a polynomial of high degree would multiply.
+    A polynomial of high degree through points that are close beside the last step would multiply rounding errors, a jump of the
+    accelerations, as between the two states at a breakpoint, and the errors of steps before in accelerations from an implicit
+    method.
     """
     times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
     step = times[0] - times[1]
@@ -46,12 +48,12 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
             d = times[j] - times[i]
             inverse[i, j] = module.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
     used: list[Value | None] = [None, None]
-    all_near: Value | None = f.const(False, BOOL, f.width) if module.method.is_implicit else None
+    all_near = f.const(not module.method.is_implicit, BOOL, f.width)
     for k in range(1, POINTS - 1):
         near = (times[k] - times[k + 1]) * STRETCH >= step
         if module.plan.stiff:
             near = near & (getattr(s, f"point{POINTS - k}_solved") + getattr(s, f"point{POINTS - k - 1}_solved") < 0.5)
-        all_near = near if all_near is None else all_near & near
+        all_near = all_near & near
         used.append(all_near)
     return inverse, used
 

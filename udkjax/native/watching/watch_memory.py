@@ -125,8 +125,9 @@ class WatchMemory(PassingRuns):
         turn = s.turn + TURN
         turn = turn - f.intrinsic("floor", turn)
         span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / RESOLUTION.per_time) * s.share / f.max(fastest, s.slowest)
-        # Not longer than the next step: a later refinement needs the points on both sides of the first node.
-        span = f.min(span, s.h)
+        # A later refinement needs the points on both sides of the first node: intervals are not longer than the next step, and
+        # end with the last one if they begin before it, as after the first steps of a run, whose outputs wait for each other.
+        span = f.min(span, f.select(start < s.point2_t, s.point3_t - start, s.h))
         span = f.select(span * 2.0 < rest, span, f.select(span < rest, rest * 0.5, rest))
         inf = f.const(float("inf"), DOUBLE, f.width)
         goes_on = rest > s.smallest * (4 * UNIT)

@@ -141,8 +141,11 @@ class Watching(WatchMemory):
             self.put(f, "node a", r, a)
 
     def _cut_intervals(self, f: Function, s: Lane):
-        """Cut two intervals that cross the breakpoint, or the end of a piece, at which a step has ended."""
-        ends, end = s.lands > 0.5, s.t1
+        """Cut two intervals that cross the breakpoint, the end of a piece or the sudden change at which a step has ended."""
+        abrupt = s.abrupt > 0.5
+        ends, end = abrupt, s.point3_t
+        if self.plan.breaks:
+            ends, end = abrupt | (s.lands > 0.5), f.select(abrupt, s.point3_t, s.t1)
         if self.pieces:
             across = self.steps_across_next(s)
             ends, end = ends | across, f.select(across, s.point3_t, end)
@@ -159,8 +162,7 @@ class Watching(WatchMemory):
         s.where(s.landing > 0.5, until=-float("inf"))
 
         def due() -> Value:
-            if self.plan.breaks:
-                self._cut_intervals(f, s)
+            self._cut_intervals(f, s)
             goes_on = s.code.is_(float(Status.RUNNING)) | s.code.is_(float(Status.DONE))
             s.due = f.select((s.active > 0.5) & goes_on & (s.node <= s.until), one, 0.0)
             return f.any_of(s.due > 0.5)
