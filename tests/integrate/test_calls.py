@@ -7,6 +7,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -86,6 +87,25 @@ def test_an_eager_derivative_takes_few_programs(compilations, count, transform):
     transform(lambda x: 2.0 * x)(1.5)  # what JAX compiles for any function
     assert len([seconds for seconds in compilations(lambda: transform(last)(1.5)) if seconds]) <= 16
     assert compilations(lambda: transform(last)(1.7)) == []
+
+
+class Stop(udk.ForceElement):
+    """An elastic stop at -0.1 rad."""
+
+    def loads(self, t, *frames):
+        return [(0.0, 0.0, 1e3 * jnp.maximum(-0.1 - frames[0].angle, 0.0))]
+
+
+def test_an_eager_derivative_of_a_run_with_kinks_takes_few_programs(compilations):
+    """Nor are the events of a run listed by single operations."""
+    mechanism = pendulums(1)
+    mechanism = udk.Mechanism(mechanism.bodies, mechanism.joints, forces={"stop": Stop(["b0"])})
+
+    def last(mass):
+        return udk.simulate(mechanism.with_parameters({"body.b0.mass": mass}), 5.0 * TS).q[-1, 0, 2]
+
+    jax.grad(lambda x: 2.0 * x)(1.5)
+    assert len([seconds for seconds in compilations(lambda: jax.grad(last)(1.5)) if seconds]) <= 16
 
 
 def test_an_eager_batch_takes_few_programs(compilations):

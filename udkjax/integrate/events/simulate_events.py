@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,7 +31,7 @@ from udkjax.integrate.events.event_plan import event_plan
 from udkjax.integrate.events.host_run import HostRun, concrete_plan, event_arrays
 from udkjax.integrate.events.hybrid import Hybrid
 from udkjax.integrate.events.kinks import FREE, renewed_sides, with_held_forces
-from udkjax.integrate.events.listing import Listing, listing, names_of_events
+from udkjax.integrate.events.listing import listing, names_of_events
 from udkjax.integrate.events.phases import SCENE, Phases, phases_of
 from udkjax.integrate.events.replay import run_events
 from udkjax.integrate.events.runs import EventRun
@@ -101,17 +102,14 @@ def simulate_events(
         given = given._replace(ts=number(ts), choices=choices.arrays())
         found = (_run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run)(given)
     found, reasons = found
-    names = tuple(e.name for e in listed if e.action.turn is None)
-    seen = given.ts, listed, phases, max_events
     if is_within_jit() or is_traced(given):
-        solution = _solution if is_within_jit() else _compiled_solution
-        return solution(mechanism, given, listing(found, *seen, jnp), reasons, None)
+        return (_solution if is_within_jit() else _compiled_solution)(mechanism, given, found, reasons)
     found = jax.tree.map(np.asarray, found)  # JAX would compile a program for each operation
+    names = tuple(e.name for e in listed if e.action.turn is None)
     if np.isfinite(found.unresolved[: len(names)]).any():
         fast = [f"{quote(name)} from {t:.6g} s on" for name, t in zip(names, found.unresolved) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
-    found = listing(found, *seen, np)
-    return put_arrays(_solution(mechanism, given, found, reasons, int(found.run.count)))
+    return put_arrays(_solution(mechanism, given, found, reasons, np))
 
 
 def _run_at_once(mechanism: Any, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
@@ -219,10 +217,11 @@ def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
 _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
 
 
-def _solution(mechanism: Any, given: Given, listed: Listing, reasons: tuple[str, ...], count: int | None) -> Solution:
-    """Return the solution with `count` events, or, for a traced count (None), padded to `max_events`."""
-    (found, kinks, sticking), names = listed, names_of_events(given.events, given.phases)
-    xp: Any = jnp if count is None else np
+def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str, ...], xp: ModuleType = jnp) -> Solution:
+    """Return the solution with the events that are listed; by jax.numpy, whose count is traced, padded to `max_events`."""
+    names = names_of_events(given.events, given.phases)
+    found, kinks, sticking = listing(found, given.ts, given.events, given.phases, given.max_events, xp)
+    count = int(found.count) if xp is np else None
     names_of_bodies, choices = bodies_of(mechanism), given.choices
     bodies = (-1, coordinate_count(mechanism)) if names_of_bodies is None else (-1, len(names_of_bodies), 3)
 
@@ -233,7 +232,7 @@ def _solution(mechanism: Any, given: Given, listed: Listing, reasons: tuple[str,
         return jnp.where(is_event, x, padding)
 
     event_q, event_v = trim(found.event_q), trim(found.event_v)
-    listing = Events(
+    events = Events(
         time=trim(found.event_time),
         index=trim(found.event_index, -1),
         q_before=event_q[:, 0].reshape(*bodies),
@@ -272,7 +271,7 @@ def _solution(mechanism: Any, given: Given, listed: Listing, reasons: tuple[str,
         atol=choices.atol,
         bodies=names_of_bodies or (),
         choices=tuple(settings.items()),
-        events=listing if names else None,
+        events=events if names else None,
         unlocated=None if kinks is None else kinks.unlocated,
         sticking=sticking,
     )
