@@ -87,7 +87,9 @@ class MachineSystem:
         E = self.plan.count
         holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
         self._watched = [np.append(np.arange(E), E + holds[: x.force_count]) for x in plan.phases]
-        self._rooms, self._passed = [x.number_count for x in plan.phases], [x.run.passing for x in plan.phases]
+        self._rooms = [x.number_count for x in plan.phases]
+        passings = [(x.run.passing, len(watched)) for x, watched in zip(plan.phases, self._watched, strict=True)]
+        self._most_passed = [None if x is None else x.most(n, count) for x, count in passings]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
     def contacts(self, members: MemberIndices) -> Contacts:
@@ -284,8 +286,8 @@ class MachineSystem:
         watch[:, room : room + C] = runs.sides[members[:, None], where]
         watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, where]
         watch[:, room + 2 * C : room + 2 * C + E] = ZERO * runs.scale[members]
-        if (passing := self._passed[which]) is not None:
-            watch[:, -1] = np.minimum(MOST_KINKS - 1 - runs.kink_count(self.plan, members), passing.most)
+        if (most := self._most_passed[which]) is not None:
+            watch[:, -1] = np.minimum(MOST_KINKS - 1 - runs.kink_count(self.plan, members), most)
         return watch
 
     def _watch_before(self, plan: PhasePlan, watched: Int[np.ndarray, "C"]) -> Float[np.ndarray, "B K"]:

@@ -238,7 +238,7 @@ class PhaseCode:
         (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
         q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
         passing = self.plan.run.passing
-        kinks = None if passing is None else PassedKinks.of(record[0], passing.most, passing.count, n)
+        kinks = None if passing is None else PassedKinks.of(record[0], passing.most(n, conditions.count), passing.count, n)
         return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, kinks)
 
     def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:

@@ -33,7 +33,7 @@ class Passing:
     of the program, arrays of the module's memory with indices; and the first of its sides."""
     zero: float  # bound below which a condition is zero, relative to its scale
 
-    most: ClassVar[int] = 16  # kinks that a call has room for: each takes memory in every call, and further kinks a further call
+    room: ClassVar[int] = 512  # numbers in a record: each member has one, and further kinks take a further call
 
     @property
     def count(self) -> int:
@@ -44,9 +44,13 @@ class Passing:
         """Return the length of the record of a kink: its condition, its time, q and v, its sides, and the watched conditions."""
         return 2 + 2 * n + self.count + len(WATCHED) * conditions
 
+    def most(self, n: int, conditions: int) -> int:
+        """Return the largest number of kinks that a call passes."""
+        return max(1, self.room // self.row_length(n, conditions))
+
     def record_length(self, n: int, conditions: int) -> int:
         """Return the length of the record of a run: the number of kinks, and a row for each."""
-        return 1 + self.most * self.row_length(n, conditions)
+        return 1 + self.most(n, conditions) * self.row_length(n, conditions)
 
 
 class PassingRuns(Trajectory):
