@@ -209,3 +209,27 @@ def test_second_derivatives_of_outputs_in_a_batch(stabilization):
     expected = differences(jax.jit(jax.jacfwd(states)), x, 1e-3)
     assert_allclose(batch[0], expected, atol=1e-6 * np.abs(expected).max())
     assert_allclose(batch[2], jax.jit(jax.jacfwd(jax.jacfwd(states)))(x + jnp.array([0.2, 0.01])), rtol=1e-7, atol=1e-9)
+
+
+ENDS_EARLY = {
+    "step limit": {"max_steps": 20},
+    "drift": {"stabilization": None, "drift_tol": 1e-6, "rtol": 1e-4, "atol": 1e-4},
+}
+
+
+@pytest.mark.parametrize("transform", [jax.grad, jax.jacfwd])
+@pytest.mark.parametrize("reason", ENDS_EARLY)
+def test_outputs_that_are_not_kept_have_no_derivatives(reason, transform):
+    """They are NaN. Machine code ignores their cotangents, and their tangents are zero."""
+    ts, mechanism = np.linspace(0.0, 4.0, 41), udk.library.parallelogram()
+
+    def rates(mass):
+        found = mechanism.with_parameters({"body.coupler.mass": mass})
+        return udk.simulate(found, ts, throw=False, **ENDS_EARLY[reason]).v[:, 0, 2]
+
+    kept = np.isfinite(rates(2.0))
+    assert 1 < kept.sum() < len(ts)
+    total = lambda mass: jnp.nansum(rates(mass) ** 2)  # noqa: E731
+    expected = jax.jacfwd(lambda mass: jnp.sum(rates(mass)[np.flatnonzero(kept)] ** 2))(2.0)
+    assert_allclose(transform(total)(2.0), expected, rtol=1e-9)
+    assert_allclose(expected, (total(2.0 + 1e-5) - total(2.0 - 1e-5)) / 2e-5, rtol=1e-4)

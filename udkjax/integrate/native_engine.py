@@ -57,7 +57,6 @@ class RecordedRun(NamedTuple):
     steps: Array  # accepted steps (1,)
     record: Array
     states: tuple[Array, ...]  # q and v (T, n) if T > 2, else empty
-    kept: Array  # `IntegratorOutput.kept`
 
 
 def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, RecordedRun]:
@@ -66,7 +65,7 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
     empty = (np.zeros(shape) for shape in ((1, 0), (1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     results = native_p.bind(*run_inputs(problem, operation), *empty, operation=operation, times=times)
     raw = _output(results[: RunStates.results])
-    return raw, RecordedRun(raw.accepted.astype(float)[None], results[-1][0], (raw.q, raw.v) if times > 2 else (), raw.kept)
+    return raw, RecordedRun(raw.accepted.astype(float)[None], results[-1][0], (raw.q, raw.v) if times > 2 else ())
 
 
 def serves_derivatives(active: Problem) -> bool:
@@ -113,16 +112,14 @@ def _integrate_along(
         operation=operation,
         times=len(problem.ts),
     )
-    raw = _output(results)
-    dys = jnp.where(raw.kept[:, None], dys[0, 0], 0.0)
-    return raw, (dys[:, :n], dys[:, n:], dend[0, 0])
+    return _output(results), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
 
 def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) -> Problem:
     """Return the cotangents of the `active` numbers, from cotangents of the output states (T, 2n) and of the end (2n,)."""
-    operation, kept = _operation(problem, active, reverse=True), run.kept[:, None]
-    states: Any = [jnp.where(kept, x, x[0]) for x in run.states] or [np.zeros((len(problem.ts), len(problem.q)))] * 2
-    inputs = [x[None] for x in (run.steps, run.record, *states, jnp.where(kept, ys, 0.0), end)]
+    operation = _operation(problem, active, reverse=True)
+    states: Any = run.states or [np.zeros((len(problem.ts), len(problem.q)))] * 2
+    inputs = [x[None] for x in (run.steps, run.record, *states, ys, end)]
     results = native_p.bind(*run_inputs(problem, operation), *inputs, operation=operation, times=len(problem.ts))
     numbersbar, qbar, vbar = results[RunStates.results : RunStates.results + 3]
     no_cotangents = jax.tree.map(lambda m: None, active, is_leaf=lambda x: x is None)

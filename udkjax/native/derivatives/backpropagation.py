@@ -23,7 +23,7 @@ from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
 from udkjax.native.base.running import Repeat
 from udkjax.native.base.samples import ARGUMENTS, count_breakpoints, numbers_of_row
-from udkjax.native.base.steps import POINTS, Status
+from udkjax.native.base.steps import POINTS
 from udkjax.native.base.tableau import Method
 from udkjax.native.derivatives.record import Recorded
 from udkjax.native.run.dense_output import write_differences_back
@@ -239,7 +239,7 @@ class Reverse(Recorded):
                     self.put_entry(f, name, i, 0.0)
         with self.each_lane(f, s.ready > 0.5) as k:
             self._add_state(f, k, self.member_address(f, "endbar", self.lane_entry(f, "member", k)), "bar point3")
-            with f.if_(self.lane_entry(f, "code", k).is_(float(Status.DONE))):
+            with f.if_(self.to_int(f, self.lane_entry(f, "kept", k)) >= times):
                 self._add_output(f, k, times - 1, "bar point3")
             for j in range(POINTS):
                 self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1 - j), f"point{j}")
@@ -265,9 +265,12 @@ class Reverse(Recorded):
         with self.each_lane(f, mask) as k:
             number, member = self.to_int(f, self.lane_entry(f, "written", k)), self.lane_entry(f, "member", k)
             self.put_lane_entry(f, "next", k, self.input_number(f, "ts", member, number))
-            self._add_output(f, k, number, "bar result")
+            is_kept = self.lane_entry(f, "written", k) < self.lane_entry(f, "kept", k)
+            with f.if_(is_kept):
+                self._add_output(f, k, number, "bar result")
+            of_state = f.select(is_kept, number, f.const(0, INT))  # the state of an output that is not kept is NaN
             for x in "qv":
-                state = f.at(self.member_address(f, f"given {x}s", member), number * n)
+                state = f.at(self.member_address(f, f"given {x}s", member), of_state * n)
                 with f.each(n) as i:
                     self.put_lane_entry(f, f"state {x}", k, f.load(state, i), i)
         setattr(s, "state t", s.next)

@@ -15,11 +15,12 @@ from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.running import Repeat
 from udkjax.native.base.samples import ARGUMENTS
 from udkjax.native.derivatives.differentiated import Differentiated
+from udkjax.native.run.members import kept_outputs
 
 STORED = 200  # capacity in points of the record passed to the second call: as much memory as 300 outputs
 PER_BREAKPOINT = 3  # additional capacity for each breakpoint: the beginning of a new run, and two steps
 FIRST_POINTS = 2  # points before the first step: the state as given, and projected
-TITLE = 3  # numbers of a record before its points: the number of points, how the run ended, the number of outputs written
+TITLE = ("points", "kept", "written")  # before the points: their number, and the numbers of outputs that are kept and written
 HEAD = 3  # numbers of a point before its state: its time, the number of outputs before its step, `begin` of its step (layout.py)
 BEGIN = 2  # place of the last of them
 # For threads of a GPU, whose records are in one buffer: its address, the capacity of each record, and the first of its members.
@@ -28,7 +29,7 @@ BUFFER = ("records", "capacity", "first")
 
 def record_length(n: int, points: int) -> int:
     """Return the length of a record of `points` points with n coordinates."""
-    return TITLE + points * row_length(n)
+    return len(TITLE) + points * row_length(n)
 
 
 def row_length(n: int) -> int:
@@ -44,7 +45,7 @@ class Recorded(Differentiated):
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan, active)
-        for name in ("record", "capacity", "points", "at", "ready", "given"):
+        for name in ("record", "capacity", "points", "kept", "at", "ready", "given"):
             self.places.add(name)
         self.row = row_length(self.n)
 
@@ -70,9 +71,9 @@ class Recorded(Differentiated):
         with f.if_(self.field(f, "given record length") > 0):
             given = self.member_address(f, "given record", member)
             with f.if_(f.load(given) > 0.0):
-                for k, name in enumerate(("points", "code", "written")):
+                for k, name in enumerate(TITLE):
                     self.put_lane_entry(f, name, lane, f.load(given, k))
-                self.put_lane_entry(f, "record", lane, f.at(given, TITLE), base=POINTER)
+                self.put_lane_entry(f, "record", lane, f.at(given, len(TITLE)), base=POINTER)
                 if self.plan.leaves:
                     self._leave_for_implicit_steps(f, lane)
                 for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
@@ -98,6 +99,8 @@ class Recorded(Differentiated):
             self._store_point(f, s, k)
 
     def end_members(self, f: Function, s: Lane):
+        with self.each_lane(f, s.due) as k:
+            self.put_lane_entry(f, "kept", k, f.like(kept_outputs(self, f, s, k), DOUBLE, 1))
         with f.if_(self.backpropagates(f)):
             s.where(s.due > 0.5, ready=1.0)
         with f.if_(self._returns_record(f)), self.each_lane(f, s.due) as k:
@@ -107,8 +110,8 @@ class Recorded(Differentiated):
 
     def _place_in_output(self, f: Function, k: Value, member: Value):
         length = self.field(f, "record length")
-        self.put_lane_entry(f, "record", k, f.at(self.result_address(f, "record", member, length), TITLE), base=POINTER)
-        self.put_lane_entry(f, "capacity", k, f.like(f.arithmetic("div", length - TITLE, self.row), DOUBLE, 1))
+        self.put_lane_entry(f, "record", k, f.at(self.result_address(f, "record", member, length), len(TITLE)), base=POINTER)
+        self.put_lane_entry(f, "capacity", k, f.like(f.arithmetic("div", length - len(TITLE), self.row), DOUBLE, 1))
 
     def write_end_record(self):
         """Write `end_record(work, call, lane)`: the title of a record in the output, without points if they did not fit.
@@ -122,9 +125,9 @@ class Recorded(Differentiated):
         self.put_lane_entry(f, "points", k, f.select(fits, self.lane_entry(f, "points", k), 0.0))
         length = self.field(f, "record length")
         to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
-        for j, name in enumerate(("points", "code", "written")):
+        for j, name in enumerate(TITLE):
             f.store(self.lane_entry(f, name, k), to, j)
-        start = self.to_int(f, self.lane_entry(f, "points", k)) * self.row + TITLE
+        start = self.to_int(f, self.lane_entry(f, "points", k)) * self.row + len(TITLE)
         registers = f.arithmetic("div", length - start, vector)
         with f.each(registers) as r:
             f.store(0.0, to, r * vector + start, vector)

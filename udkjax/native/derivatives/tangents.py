@@ -25,6 +25,7 @@ from udkjax.native.base.steps import POINTS
 from udkjax.native.base.tableau import Method
 from udkjax.native.derivatives.differentiated import Differentiated
 from udkjax.native.run.dense_output import write_between, write_differences
+from udkjax.native.run.members import kept_outputs
 
 
 class Forward(Differentiated):
@@ -313,7 +314,7 @@ class Forward(Differentiated):
                     f.store(change, tangent, place + self.place(f"{array} {x}", i, "tangent"))
 
     def end_members(self, f: Function, s: Lane):
-        """Write the tangents of the initial state, as given, and of the last state."""
+        """Write the tangents of the initial state, as given, and of the last state; outputs that are not kept have none."""
         way, times = self.ways[-1], self.field(f, "times")
         with self._each_group(f) as p, self.each_lane(f, s.due) as k:
             f.given["tangent"], member = self._way(f, way), self.to_int(f, f.lane(s.member, k))
@@ -324,3 +325,9 @@ class Forward(Differentiated):
                 self.copy_lane(f, to, self.n, "point3 v", lane, "tangent")
             self._write_change(f, s, k, p, f.const(0, INT), "state q", "state v")
             self._write_change(f, s, k, p, times - 1, "point3 q", "point3 v")
+            kept = kept_outputs(self, f, s, k)
+            with self._each_direction(f, p, k) as (direction, _):
+                row = (member * self.field(f, "directions") + direction) * times + kept
+                to = self.result_address(f, "dys", row, 2 * self.n)
+                with f.each((times - kept) * (2 * self.n)) as i:
+                    f.store(0.0, to, i)

@@ -150,14 +150,19 @@ def _find_cause(module: Module, f: Function, s: Lane):
             s.where(stopped & total.value.is_not(0.0), code=Status.NOT_FINITE)
 
 
-def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
-    """Set to NaN the outputs of lane k that its run did not reach, or that follow the first lost output."""
-    times, nan = module.field(f, "times"), f.const(np.nan)
+def kept_outputs(module: Module, f: Function, s: Lane, k: Value) -> Value:
+    """Return the number of outputs of lane k that its run has reached, up to the first lost one."""
+    times = module.field(f, "times")
     is_done = f.lane(s.code, k).is_(float(Status.DONE))
     reached = f.select(is_done, f.op(f"sitofp i64 {times.name} to double", DOUBLE), f.lane(s.written, k) + 1.0)
-    valid = module.to_int(f, f.min(f.lane(s.lost, k) + 1.0, reached))
-    row = module.to_int(f, f.lane(s.member, k)) * times + valid
+    return module.to_int(f, f.min(f.lane(s.lost, k) + 1.0, reached))
+
+
+def _clear_outputs(module: Module, f: Function, s: Lane, k: Value):
+    """Set to NaN the outputs of lane k that are not kept."""
+    times, nan, kept = module.field(f, "times"), f.const(np.nan), kept_outputs(module, f, s, k)
+    row = module.to_int(f, f.lane(s.member, k)) * times + kept
     to = [module.result_address(f, name, row, module.n) for name in ("qs", "vs")]
-    with f.each((times - valid) * module.n) as i:
+    with f.each((times - kept) * module.n) as i:
         for address in to:
             f.store(nan, address, i)
