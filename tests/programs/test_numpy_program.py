@@ -166,6 +166,27 @@ def test_operations_on_shapes_are_those_of_xla(name):
     _agree(SHAPED[name], X, K)
 
 
+def _count(function, *arguments):
+    meter = Meter(10**6)
+    numpy_program(jax.jit(function).trace(*arguments).jaxpr)(meter, [np.asarray(x) for x in arguments])
+    return meter.count
+
+
+def test_the_same_operations_are_evaluated_once_and_unused_ones_never():
+    """Functions that compute the same are traced anew at each call, with all they call."""
+
+    def slopes(x):
+        return jax.jacfwd(lambda x: jnp.sin(x) * jnp.sum(x[K[0] % 4] ** 2))(x)
+
+    def again(x):
+        unused = jnp.linalg.svd(slopes(x) + 1.0)
+        return (slopes(x) + 0.0 * slopes(x)) * jnp.where(x > 0.0, 2.0, 2.0), unused[0].shape[0]
+
+    _agree(lambda x: again(x)[0], X[0, :4])
+    _agree(lambda x: (jnp.zeros(3).at[0].set(x[0]), jnp.zeros(3).at[1].set(x[0]), -0.0 * x, 0.0 * x, 0 * x), X[0])
+    assert _count(lambda x: again(x)[0], X[0, :4]) <= _count(slopes, X[0, :4]) + 10
+
+
 @pytest.fixture
 def programs(monkeypatch):
     """Count the programs that are compiled because they have often been called."""

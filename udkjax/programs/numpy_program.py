@@ -57,24 +57,39 @@ class NumpyProgram:
         self._memory: list[Any] = []
         self._inputs = [self._place(v) for v in jaxpr.invars]
         for v, x in zip(jaxpr.constvars, constants, strict=True):
-            self._memory[self._place(v)] = np.asarray(x)
+            self._places[v] = self._place_of_value(np.asarray(x))
         self._steps: list[Step] = []
-        for equation in jaxpr.eqns:
+        self._cost = 0
+        known: dict[Any, list[int]] = {}  # the places of the results, by operation
+        for equation in _needed(jaxpr):
             inputs = [self._place(v) for v in equation.invars]
+            key = _operation(equation, inputs)
+            if key in known:  # functions that are called one after another compute the same: JAX traces each of them anew
+                self._places.update(zip(equation.outvars, known[key], strict=True))
+                continue
             outputs = [self._place(v) for v in equation.outvars]
             function = _step_of(equation)
             self._steps.append((function, inputs, outputs if equation.primitive.multiple_results else outputs[0]))
+            self._cost += 1 + sum(_type(v).size for v in equation.outvars) // ENTRIES
+            if key is not None:
+                known[key] = outputs
         self._outputs = [self._place(v) for v in jaxpr.outvars]
-        self._cost = sum(1 + sum(_type(v).size for v in e.outvars) // ENTRIES for e in jaxpr.eqns)
 
     def _place(self, v: Any) -> int:
         if isinstance(v, Literal):
-            self._memory.append(np.asarray(v.val, _type(v).dtype)[()])
-            return len(self._memory) - 1
+            return self._place_of_value(np.asarray(v.val, _type(v).dtype)[()])
         if v not in self._places:
             self._places[v] = len(self._memory)
             self._memory.append(None)
         return self._places[v]
+
+    def _place_of_value(self, value: Any) -> int:
+        """Return the place of a constant, the same for the same content."""
+        key = value.dtype, value.shape, value.tobytes()
+        if key not in self._places:
+            self._places[key] = len(self._memory)
+            self._memory.append(value)
+        return self._places[key]
 
     def __call__(self, meter: Meter, inputs: Sequence[Any]) -> list[Any]:
         """Return the results for inputs that are NumPy arrays."""
@@ -90,6 +105,28 @@ class NumpyProgram:
                 for k, x in zip(results, values, strict=True):
                     memory[k] = x
         return [memory[k] for k in self._outputs]
+
+
+def _needed(jaxpr: Jaxpr) -> list[Any]:
+    """Return the operations on which a result depends, or that have effects, in their order."""
+    used, needed = set[Any](v for v in jaxpr.outvars if not isinstance(v, Literal)), list[Any]()
+    for equation in reversed(jaxpr.eqns):
+        if equation.effects or not used.isdisjoint(equation.outvars):
+            used.update(v for v in equation.invars if not isinstance(v, Literal))
+            needed.append(equation)
+    return needed[::-1]
+
+
+def _operation(equation: Any, inputs: Sequence[int]) -> Any:
+    """Return a key that only operations with the same results share; None if their parameters cannot be compared."""
+    if equation.effects:
+        return None
+    key = equation.primitive, tuple(inputs), tuple(equation.params.items())
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
 
 
 def _type(v: Any) -> Any:
