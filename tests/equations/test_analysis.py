@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.choices import fast
 from udkjax.equations import dense_rows, position_closure, position_rows, redundancy, scale_program, scales, sparse_rows
+from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_programs import _scene_programs as scene_program_cache
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
@@ -167,6 +168,18 @@ def test_what_drivers_cannot_reach_is_given_up_soon(monkeypatch, large):
         solved.clear()
     assert redundancy.redundant_rows(row_of_cranks(4, 1.0, contradicted=True)) is None
     assert len(solved) < 400
+
+
+def test_a_closure_computes_psi_once_at_each_position(monkeypatch):
+    mechanism, seen = row_of_cranks(4, 1.0), []
+    rows, run = redundancy.kinematic_rows(mechanism), SceneArrays._run
+    start = rows.close(0.0, np.asarray(mechanism.q0, float).ravel())
+    monkeypatch.setattr(
+        SceneArrays, "_run", lambda *given, **more: seen.append((given[1], given[3].tobytes())) or run(*given, **more)
+    )
+    closed = rows.close(0.0, start.q + 0.1 * np.random.default_rng(0).standard_normal(start.q.shape))
+    assert closed is not None and len({q for _, q in seen}) > 3
+    assert len(set(seen)) == len(seen)
 
 
 MODULES = position_closure, position_rows, dense_rows, redundancy, scale_program, sparse_rows

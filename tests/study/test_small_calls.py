@@ -45,9 +45,16 @@ MOTORS = {
 
 
 def calls_of(question):
-    """Return how many functions are called when a question is asked for the 100th time."""
+    """Return how many functions are called when a question is asked for the 100th time, or one of the next two times.
+
+    One of the three may generate a function that is worth it by now.
+    """
     for _ in range(99):
         question()
+    return min(_calls_now(question) for _ in range(3))
+
+
+def _calls_now(question):
     count = 0
 
     def listen(frame, event, argument):
@@ -81,6 +88,30 @@ def test_calls_of_a_position_of_rest():
     assert calls_of(lambda: udk.equilibrium(linkage)) < 3_000
     state = udk.equilibrium(linkage).state
     assert calls_of(lambda: udk.modes(linkage, state)) < 1_800
+
+
+def test_calls_of_diagnosis_and_derivation():
+    """A path of a hundred positions, and the symbols of one state, each computed once."""
+    four_bar = udk.library.four_bar()
+    assert calls_of(lambda: udk.diagnose(four_bar)) < 52_000
+    assert calls_of(lambda: udk.explain(four_bar)) < 12_500
+    assert calls_of(lambda: udk.holding_efforts(four_bar, "body.crank.angle", ANGLES)) < 11_500
+
+
+@pytest.mark.parametrize("mechanism", [udk.library.four_bar, udk.library.slider_crank, lambda: LINKAGE, udk.library.peaucellier])
+def test_a_diagnosis_by_elimination_is_that_by_singular_values(mechanism, monkeypatch):
+    """Also across the singular positions of redundant rows, where branches meet."""
+    scene, found = mechanism(), []
+    name = f"body.{scene.body_names[0]}.mass"
+    for worth in (10**6, 0):
+        monkeypatch.setattr(eliminated_steps, "WORTH", worth)
+        found.append(udk.diagnose(scene.with_parameters({name: 1.1})))
+    slow, fast = found
+    assert str(slow) == str(fast)
+    assert_allclose(fast.clearance.searched, slow.clearance.searched, rtol=1e-12)
+    assert (slow.clearance.nearest is None) == (fast.clearance.nearest is None)
+    if slow.clearance.nearest is not None:
+        assert_allclose(fast.clearance.nearest.q, slow.clearance.nearest.q, atol=1e-9)
 
 
 @pytest.mark.parametrize("mechanism", [sprung_four_bar, lambda: LOADED], ids=["four_bar", "redundant rows"])

@@ -42,6 +42,7 @@ class RowTerms:
         self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
         self._arrays_at = arrays_in_time(mechanism)
         self._latest: tuple[Any, bytes, Any] = ((), b"", None)  # the programs' inputs and results at the last state
+        self._latest_psi: tuple[Any, Any] = ((), None)  # the last position where Psi alone was needed, and Psi
 
     def geometry(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return Psi (m,), Psi_dot (m,) and the entries of Psi_q; the result at the last state is cached."""
@@ -52,9 +53,13 @@ class RowTerms:
         return latest[2]
 
     def psi(self, t: Time, q: np.ndarray) -> np.ndarray:
-        """Return Psi (m,)."""
-        position, _, results = self._latest
-        return results[0] if position == _key(t, q) else self._arrays_at(t).psi(t, q)
+        """Return Psi (m,); the result at the last position is cached, as an accepted step of a closure asks for it again."""
+        key = _key(t, q)
+        if self._latest[0] == key:
+            return self._latest[2][0]
+        if self._latest_psi[0] != key:
+            self._latest_psi = key, self._arrays_at(t).psi(t, q)
+        return self._latest_psi[1]
 
 
 class RestingLoads(NamedTuple):
@@ -216,6 +221,15 @@ class KinematicRows(DenseRows, PositionRows[DensePosition]):
         super().__init__(mechanism, concrete_scales(mechanism))
         self.metric = np.tile([float(self.scales.arm), float(self.scales.arm), 1.0], self.size // 3)
         self.driver_time_step = driver_time_step(self.scales)
+        self._steps: EliminatedSteps | None = None
+
+    def leave_out(self, redundant_rows: tuple[int, ...]) -> None:
+        """Eliminate coordinates in corrections where all other rows are clearly independent; the steps are the same."""
+        self._steps = self.eliminated_steps(redundant_rows, float(self.scales.arm))
+
+    def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
+        found = self._steps and self._steps(np.asarray(t, float).item(), q)
+        return super().correction(t, q) if not found else found[0] - q
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         D = self.jacobian(t, q) * self.metric

@@ -7,6 +7,8 @@ a step, to stay on the branch of the guess, and is halved until the residual fal
 are closed by NumPy, without compilation; traced numbers take the same steps in JAX.
 """
 
+import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -18,7 +20,6 @@ from jaxtyping import ArrayLike
 from udkjax.annotations import AnyArray, Time
 from udkjax.arrays import ArrayLibrary
 from udkjax.equations.scales import Scales
-from udkjax.programs.control_flow import control_flow
 
 
 class ClosingRule(NamedTuple):
@@ -66,7 +67,7 @@ class Rows(Protocol[AnyArray]):
 
 def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """Return the residual that rounding of the coordinates causes."""
-    return CLOSURE.rounding * float(jnp.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
+    return CLOSURE.rounding * float(np.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
 
 
 def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: AnyArray, xp: ArrayLibrary) -> AnyArray:
@@ -76,11 +77,11 @@ def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: 
     return (scales.violation(psi, xp) <= open_by) & (scales.violation(psi_dot, xp) <= open_by * rate)
 
 
-def limited_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
+def limited_step(rows: Rows[jax.Array], t: Time, q: jax.Array) -> jax.Array:
     """Return a Gauss-Newton step, shortened so that no coordinate changes by more than `CLOSURE.longest_step`."""
     step = rows.correction(t, q)
-    longest = rows.scales.size(step, xp)
-    return step * CLOSURE.shortening(longest, xp)
+    longest = rows.scales.size(step)
+    return step * CLOSURE.shortening(longest, jnp)
 
 
 def _fixed(x: Any) -> Any:
@@ -88,40 +89,67 @@ def _fixed(x: Any) -> Any:
     return jax.lax.stop_gradient(x) if eqx.is_array(x) else x
 
 
-def damped_step(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> tuple[AnyArray, Any]:
+def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Take one step, halved until the residual falls; return whether it does. At rounding level no step is taken."""
-    held: tuple[Rows[AnyArray], AnyArray] = (rows, q) if xp is np else jax.tree.map(_fixed, (rows, q))
-    fixed, current = held
-    size = xp.linalg.norm(fixed.residual(t, current))
-    is_open = size > rounding(rows.scales, current, xp)
-    if xp is np and not is_open:
-        return q, is_open
-    step = limited_step(rows, t, q, xp)
-    fixed_step = step if xp is np else jax.lax.stop_gradient(step)
+    fixed, current = jax.tree.map(_fixed, (rows, q))
+    size = jnp.linalg.norm(fixed.residual(t, current))
+    is_open = size > rounding(rows.scales, current, jnp)
+    step = limited_step(rows, t, q)
+    fixed_step = jax.lax.stop_gradient(step)
 
-    def is_worse(trial: tuple[AnyArray, Any]) -> ArrayLike:
+    def is_worse(trial: tuple[jax.Array, Any]) -> jax.Array:
         scale, k = trial
         residual = fixed.residual(t, current + scale * fixed_step)
-        return is_open & (k < CLOSURE.halvings) & ~(xp.linalg.norm(residual) < size)
+        return is_open & (k < CLOSURE.halvings) & ~(jnp.linalg.norm(residual) < size)
 
     halve = lambda trial: (0.5 * trial[0], trial[1] + 1)  # noqa: E731
-    scale, k = control_flow(xp).while_loop(is_worse, halve, (xp.ones(()), 0))
+    scale, k = jax.lax.while_loop(is_worse, halve, (jnp.ones(()), 0))
     improves = (k < CLOSURE.halvings) & is_open
-    return xp.where(improves, q + scale * step, q), improves
+    return jnp.where(improves, q + scale * step, q), improves
 
 
-def close_position(rows: Rows[AnyArray], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
+def close_position(rows: Rows[Any], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
     """Take steps until the residual is at rounding level, or no step lowers it."""
+    if xp is np:
+        *_, (closed, _) = _positions_by_numpy(rows, t, q)
+        return closed
 
-    def goes_on(state: tuple[AnyArray, Any, int]) -> ArrayLike:
+    def goes_on(state: tuple[Any, jax.Array, int]) -> jax.Array:
         _, improves, k = state
         return improves & (k < CLOSURE.steps)
 
-    def body(state: tuple[AnyArray, Any, int]) -> tuple[AnyArray, Any, int]:
+    def body(state: tuple[Any, jax.Array, int]) -> tuple[Any, jax.Array, int]:
         q, _, k = state
-        return *damped_step(rows, t, q, xp), k + 1
+        return *damped_step(rows, t, q), k + 1
 
-    return control_flow(xp).while_loop(goes_on, body, (q, xp.asarray(True), 0))[0]
+    return jax.lax.while_loop(goes_on, body, (q, jnp.asarray(True), 0))[0]
+
+
+def _positions_by_numpy(rows: Rows[Any], t: Time, q: Any) -> Iterator[tuple[Any, float]]:
+    """Take the steps of `close_position` by NumPy; return the first position and that after each step, with their residuals."""
+    size = _norm(rows.residual(t, q))
+    yield q, size
+    for _ in range(CLOSURE.steps):
+        if not size > rounding(rows.scales, q, np):
+            return
+        step = rows.correction(t, q)
+        longest = rows.scales.size(step, np)
+        if longest > CLOSURE.longest_step:
+            step = step * (CLOSURE.longest_step / longest)
+        for _ in range(CLOSURE.halvings):
+            moved = q + step
+            left = _norm(rows.residual(t, moved))
+            if left < size:
+                break
+            step = 0.5 * step
+        else:
+            return
+        q, size = moved, left
+        yield q, size
+
+
+def _norm(x: np.ndarray) -> float:
+    return math.sqrt(x @ x)
 
 
 def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
@@ -130,13 +158,14 @@ def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
     A successful closure converges fastest in its last steps. If the position does not exist, the residual keeps falling, but ever
     more slowly.
     """
-    sizes, improves = [float(np.linalg.norm(rows.residual(t, q)))], True
-    while improves and len(sizes) <= CLOSURE.steps:
-        q, improves = damped_step(rows, t, q, np)
-        sizes.append(float(np.linalg.norm(rows.residual(t, q))))
+    sizes = list[float]()
+    for position, size in _positions_by_numpy(rows, t, q):
+        q = position
+        sizes.append(size)
         if len(sizes) > CLOSURE.pace_steps:
             fall = (sizes[-1 - CLOSURE.pace_steps] - sizes[-1]) / CLOSURE.pace_steps
-            improves &= sizes[-1] <= fall * (CLOSURE.steps + 1 - len(sizes))
+            if not sizes[-1] <= fall * (CLOSURE.steps + 1 - len(sizes)):
+                break
     return q
 
 

@@ -66,7 +66,7 @@ class Scales(NamedTuple):
     def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
         """Return the largest component of a change of coordinates (n,): lengths divided by L, angles in rad."""
         x = xp.abs(q.reshape(-1, 3))
-        return xp.maximum(xp.max(x[:, :2], initial=0.0) / self.length, xp.max(x[:, 2], initial=0.0))
+        return xp.maximum(x[:, :2].max(initial=0.0) / self.length, x[:, 2].max(initial=0.0))
 
     def violation(self, psi: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
         """Return the largest component of a violation (m,) of Psi, each row divided by its scale."""

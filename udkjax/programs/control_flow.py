@@ -96,11 +96,6 @@ BY_JAX = ControlFlow(jnp, jax.lax.while_loop, jax.lax.cond, jax.lax.scan, jax.la
 BY_NUMPY = ControlFlow(np, _while_loop, _cond, _scan, _map, _vmap, _put, _call_compiled)
 
 
-def control_flow(xp: ArrayLibrary) -> ControlFlow:
-    """Return the control flow of an array library."""
-    return BY_NUMPY if xp is np else BY_JAX
-
-
 def solve(function: Callable[..., Result], *arguments: Any, put: bool = True) -> Result:
     """Return function(*arguments, flow), by NumPy's control flow if all numbers are concrete, else by JAX's in one program.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from udkjax.equations.analysis import analyse
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSURE, close_position, is_closed
 from udkjax.equations.position_rows import PositionRows
@@ -195,15 +196,31 @@ class RankedPositions:
 
     @cached_property
     def _closing(self) -> PositionRows:
-        return kinematic_rows(self._mechanism)  # sparse in large scenes
+        return kinematic_rows(self._mechanism) if self._is_large else self.rows  # sparse in large scenes
+
+    @cached_property
+    def _by_elimination(self) -> KinematicRows | None:
+        """The rows without those that `analyse` leaves out; None in large scenes, and if it does not know which."""
+        redundant = None if self._is_large else analyse(self._mechanism).redundant_rows
+        if redundant is None:
+            return None
+        rows = KinematicRows(self._mechanism)
+        rows.leave_out(redundant)
+        return rows
 
     def near(self, t: float, q: np.ndarray) -> Configuration | None:
-        """Return the closed position nearest to q, or None."""
+        """Return the closed position nearest to q, or None.
+
+        The rows that are left out hold where the others do, unless branches meet: there all rows are closed together.
+        """
         if not self.rows.count:
             return self.at(t, q)
-        q = close_position(self._closing, t, q, np)
-        psi = self.rows.psi(t, q)
-        return self.at(t, q) if is_closed(self.rows.scales, q, 0 * q, psi, 0 * psi, np) else None
+        for closing in filter(None, (self._by_elimination, self._closing)):
+            closed = close_position(closing, t, q, np)
+            psi = self.rows.psi(t, closed)
+            if is_closed(self.rows.scales, closed, 0 * closed, psi, 0 * psi, np):
+                return self.at(t, closed)
+        return None
 
     def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
         """Displace `start` by a step along a direction in scaled coordinates; return the nearest closed position, or None."""
