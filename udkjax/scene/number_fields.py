@@ -53,6 +53,10 @@ class NumberField(NamedTuple):
     value: Array | None  # None: absent
     shape: tuple[int, ...] | None  # None: absent, any shape
 
+    def holder(self, groups: Mapping[str, Mapping[str, Any]]) -> Any:
+        """Return the element, or its part such as a `Held`, that contains the number."""
+        return _at(groups[self.section][self.owner], self.path[:-1])
+
 
 class NamesNumbers(Protocol):
     """A model that names its own numbers, as a user-defined system does."""
@@ -171,17 +175,6 @@ def held_names(known: Collection[str]) -> list[str]:
 
 def _field_of_held(values: NumberField) -> NumberField:
     return values._replace(path=values.path[:-1], shape=None)
-
-
-def value_of(known: Mapping[str, NumberField], name: str, groups: Mapping[str, Mapping[str, Any]]) -> Any:
-    """Return the value of a number, or of one of its entries, by name; a `Held` if the number is sampled."""
-    if name in held_names(known):
-        section, owner, path, *_ = _field_of_held(known[f"{name}.values"])
-        return _at(groups[section][owner], path)
-    parameter, index = split_index(name, known)
-    value = known[parameter].value
-    assert value is not None  # only existing numbers have been set
-    return value[index] if index else value
 
 
 def _fit(

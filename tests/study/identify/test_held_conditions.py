@@ -34,3 +34,24 @@ def test_samples_that_do_not_fit_together_are_named():
     vectors = udk.Record(TS, first.values, conditions={SETPOINT: udk.Held(np.zeros((3, 2)), 0.1)})
     with pytest.raises(udk.IdentificationError, match=r"must be of shape \(\) at each sample"):
         conditions_of(pendulum(), [vectors])
+
+
+@pytest.mark.parametrize("usual", [udk.Held(np.zeros(3), 0.15), 0.0], ids=["sampled", "constant"])
+def test_a_number_that_the_scene_samples_may_be_given_too(usual):
+    """Its samples in the scene are those of the records that do not give any; a constant one may be held in some records."""
+    scene = pendulum().with_parameters({SETPOINT: usual})
+    given = record(udk.Held(SAMPLES, 0.15))
+    other = udk.Record(TS, given.values, 0.01)
+    found = conditions_of(scene, [given, other])[SETPOINT]
+    assert (found.dt, found.t0) == (0.15, 0.0)
+    np.testing.assert_array_equal(found.values, [SAMPLES, np.zeros(12)])
+    constant = udk.Record(TS, given.values, 0.01, conditions={SETPOINT: 0.3})
+    np.testing.assert_array_equal(conditions_of(scene, [given, constant])[SETPOINT].values[1], np.full(12, 0.3))
+    np.testing.assert_array_equal(conditions_of(scene, [constant])[SETPOINT], [0.3])
+    entry = udk.Record(TS, given.values, 0.01, conditions={f"{SETPOINT}.values": SAMPLES})
+    if isinstance(usual, udk.Held):
+        samples = udk.Record(TS, given.values, 0.01, conditions={f"{SETPOINT}.values": SAMPLES[:3]})
+        np.testing.assert_array_equal(conditions_of(scene, [samples])[f"{SETPOINT}.values"], [SAMPLES[:3]])
+    else:
+        with pytest.raises(udk.IdentificationError, match="no parameter"):
+            conditions_of(scene, [entry])

@@ -16,7 +16,8 @@ from scipy.special import expit, logit
 from udkjax.arrays import make_module
 from udkjax.positions.assembly import State
 from udkjax.scene.held import Held
-from udkjax.scene.number_fields import parameters_of, split_index
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.number_fields import NumberField, parameters_of, split_index
 from udkjax.study.identify.records import IdentificationError, Record
 from udkjax.study.quantities import Setter, StudyModel, parameter_value
 from udkjax.wording import quote
@@ -205,20 +206,28 @@ def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str,
     conditions: dict[str, np.ndarray | Held] = {}
     for name in dict.fromkeys(name for record in records for name in record.conditions):
         owner, index = split_index(name, numbers)
-        if owner not in numbers or numbers[owner].value is None:
+        usual = _held_in_scene(mechanism, numbers.get(f"{name}.values"))
+        if usual is None and (owner not in numbers or numbers[owner].value is None):
             problems.append(f"conditions: no parameter {quote(name)}")
             continue
-        field = numbers[owner]
-        usual = field.value if isinstance(field.value, Held) else np.asarray(field.value)[index]
+        shape = (numbers[owner].shape or ()) if usual is None else np.shape(usual.values)[1:]
+        if usual is None:
+            usual = np.asarray(numbers[owner].value)[index]
         values = [record.conditions.get(name, usual) for record in records]
         try:
             is_sampled = any(isinstance(value, Held) for value in values)
-            conditions[name] = _held_together(values, field.shape or ()) if is_sampled else _stacked(values, np.shape(usual))
+            conditions[name] = _held_together(values, shape) if is_sampled else _stacked(values, shape[len(index) :])
         except ValueError as mistake:
             problems.append(f"conditions: {quote(name)} must be {mistake}")
     if problems:
         raise IdentificationError(problems)
     return conditions
+
+
+def _held_in_scene(mechanism: StudyModel, samples: NumberField | None) -> Held | None:
+    """Return the `Held` of these samples, if that is what they are."""
+    holder = samples.holder(mechanism.groups) if samples is not None and isinstance(mechanism, Mechanism) else None
+    return holder if isinstance(holder, Held) else None
 
 
 def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
