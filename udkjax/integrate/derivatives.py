@@ -28,15 +28,15 @@ CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the 
 SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # indices of fields with derivatives
 
 
-def differentiable(problem: Problem, has_concrete_times: bool = False) -> IntegratorOutput:
+def differentiable(problem: Problem, has_fixed_times: bool = False) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
     There are no derivatives with respect to the numbers of the step controller (the sizes of steps are held constant), nor with
-    respect to times that were concrete before the problem was traced.
+    respect to fixed times: those that were concrete before the problem was traced, or do not change.
     """
     control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
     problem = replace(problem, **control)
-    has_varying_times = isinstance(problem.ts, Tracer) and not has_concrete_times
+    has_varying_times = isinstance(problem.ts, Tracer) and not has_fixed_times
     return run_of_times(_integrate, problem) if has_varying_times else _integrate(problem)
 
 

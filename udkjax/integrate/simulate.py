@@ -289,14 +289,14 @@ def _simulate(
     state: State | None,
     closure: Closure | None,
     choices: Choices,
-    has_concrete_times: bool,
+    has_fixed_times: bool,
 ) -> tuple[Solution, Any, Any, Any]:
     compiled = compile_mechanism(system, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, closure, choices)
     if choices.adjoint is not None or choices.meter is not None:
         raw = integrate_by_diffrax(run.problem, choices.adjoint, choices.meter)
     else:
-        raw = differentiable(run.problem, has_concrete_times)
+        raw = differentiable(run.problem, has_fixed_times)
     return _finish(run, raw, getattr(system, "body_names", ()), choices)
 
 

@@ -74,14 +74,14 @@ def step(
     if inputs and isinstance(mechanism, ConstrainedSystem):
         raise ValueError("inputs are for mechanisms: make a ConstrainedSystem of functions that hold the inputs of the interval")
     moved: Any = mechanism.traced(np.size(state.q)) if isinstance(mechanism, ConstrainedSystem) else mechanism
-    values, has_concrete_times = dict(inputs or {}), not (isinstance(t, Tracer) or isinstance(dt, Tracer))
+    values, has_fixed_times = dict(inputs or {}), not (isinstance(t, Tracer) or isinstance(dt, Tracer))
     numbers = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((moved, state, values, numbers, analysis))):
         analysis = analysis or _analysis_of(moved)
         if is_within_jit():
-            return _advance(moved, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
+            return _advance(moved, analysis, state, values, numbers, max_steps, engine, has_fixed_times)
         values, numbers = ({name: number(x) for name, x in given.items()} for given in (values, numbers))
-        return _advance_at_once(moved.without_origin, analysis, state, values, numbers, max_steps, engine, has_concrete_times)
+        return _advance_at_once(moved.without_origin, analysis, state, values, numbers, max_steps, engine, has_fixed_times)
     split = _parts(moved, analysis)
     run = _program(split.form, max_steps, engine)
     q, v = run(split.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
@@ -102,7 +102,7 @@ def _advance(
     numbers: Mapping[str, NumberLike],
     max_steps: int,
     engine: str,
-    has_concrete_times: bool,
+    has_fixed_times: bool,
 ) -> State:
     dt, t, rtol, atol = (number(numbers[name]) for name in ("dt", "t", "rtol", "atol"))
     moved = mechanism.with_parameters(values).without_origin if values else mechanism.without_origin
@@ -111,7 +111,7 @@ def _advance(
     choices = Choices(rtol, atol, DRIFT_PROJECTED, dt, AUTO, Projection(), max_steps=max_steps, engine=engine)
     compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, None, choices)
-    raw = differentiable(replace(run.problem, points=STORED_POINTS), has_concrete_times)
+    raw = differentiable(replace(run.problem, points=STORED_POINTS), has_fixed_times)
     good = stop_gradients(run.is_usable & raw.reached[-1] & jnp.isinf(raw.lost))
     failed = jnp.where(good, 0.0, jnp.nan)  # added, since `where` would store one more array for reverse mode
     return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
@@ -145,7 +145,7 @@ def _program(form: Any, max_steps: int, engine: str) -> Callable[..., tuple[Arra
 
     def run(leaves: list[Array], q: Array, v: Array, values: dict[str, Array], numbers: dict[str, Array]) -> tuple[Array, Array]:
         mechanism, analysis = jax.tree.unflatten(form, leaves)
-        end = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_concrete_times=False)
+        end = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_fixed_times=False)
         return end.q, end.v  # pyright: ignore[reportReturnType]
 
     return on_host(jax.jit(run))

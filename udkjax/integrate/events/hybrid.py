@@ -125,7 +125,7 @@ class Hybrid(eqx.Module):
         def of_mechanism(which: int, ts: Array, state: RunState) -> IntegratorOutput:
             problem = self.problem(which, ts, state)
             if derivatives:  # the run is known to continue, whatever its drift
-                return differentiable(replace(problem, drift_tol=jnp.inf))
+                return differentiable(replace(problem, drift_tol=jnp.inf), has_fixed_times=True)
             if not self.plans[which].is_native:
                 return differentiable(problem)
             return native_engine.integrate(problem)

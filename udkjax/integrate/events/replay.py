@@ -274,7 +274,8 @@ def _apply_at_fixed_time(
     # As d is zero, rates and accelerations count with their values alone in first derivatives.
     first_only = system.plan.changes.any()
     fixed, at = (PlainSystem(stop_gradients(hybrid)), stop_gradients(state)) if first_only else (system, state)
-    values, _ = condition_values(fixed, None, with_member(at))
+    evaluated = condition_values(fixed, None, with_member(at))
+    values, _ = evaluated
     h, rate, a = values.h[0, k % E], values.rate[0, k % E], values.a[0]
     if first_only:
         h = hybrid.conditions(state.joints)(*state[:3])[k % E]
@@ -294,10 +295,11 @@ def _apply_at_fixed_time(
     _, of_h = _second_order(d, hybrid, state)
     d = d - jnp.where(is_transversal, of_h[k % E] / stop_gradients(rate), 0.0)
     before = with_member(_moved(hybrid, state, d, a))
-    values = condition_values(system if system.plan.impacts.any() else fixed, None, before)
+    if system.plan.impacts.any():  # whose impulses depend on the conditions' derivatives
+        evaluated = condition_values(system, None, before)
     at_end = with_member(state._replace(phase=found.event_phase[j], joints=(*state.joints[:-1], found.sides[j])))
     modes = modes_of(system, None, at_end) if system.plan.sticking else None
-    after = apply_event(system, None, k[None], before, *values, found.closed[j][None], modes).state
+    after = apply_event(system, None, k[None], before, *evaluated, found.closed[j][None], modes).state
     after = without_member(after)._replace(phase=found.event_phase[j])
     after = after._replace(joints=(*after.joints[:-1], found.sides[j]))
     a_after = fixed.hybrid.accelerations(stop_gradients(after) if first_only else after)
