@@ -105,6 +105,7 @@ def test_a_latin_hypercube_has_one_member_in_each_part():
         ({"method": [udk.SVD()]}, {"design": udk.Sobol(4)}, "no axis is a range"),
         ({"time": udk.Axis([1e-8], of="rtol")}, {}, "choose another"),
         ({"tolerance": udk.Axis([1e-8], of="rtol")}, {}, "data.sel(tolerance=...) of xarray has another meaning; choose another"),
+        ({"self": udk.Axis([1e-8], of="rtol")}, {}, "data.sel(self=...) of xarray has another meaning; choose another"),
         ({"method": [udk.SVD()], "pseudoinverse": udk.Axis([1e-8], of="rtol")}, {}, 'the dimension of "method" has this name'),
         ({"alpha": [1.0, np.nan]}, {}, "alpha must be finite numbers"),
         ({"z": udk.Zipped({"alpha": [1.0, np.nan], "stabilization": [None, udk.Baumgarte()]})}, {}, "NaN is for members without"),
@@ -129,6 +130,21 @@ def test_a_latin_hypercube_has_one_member_in_each_part():
 def test_mistakes_are_named(linkage, axes, arguments, message):
     (problem,) = problems(linkage, axes, **arguments)
     assert message in problem
+
+
+@pytest.mark.parametrize(
+    ("axes", "measure", "name"),
+    [
+        ({"q_end": udk.Axis([1e-8], of="rtol")}, "final", "q_end"),
+        ({"z": udk.Zipped({"v_end": udk.Axis([1e-8], of="rtol")})}, "final", "v_end"),
+        ({"rtol": [1e-4]}, lambda mechanism, solution: {"rtol": solution.q[-1, 0, 0]}, "rtol"),
+        ({"rtol": [1e-4]}, lambda mechanism, solution: {"body": solution.q[-1, 0, 0]}, "body"),
+    ],
+)
+def test_a_variable_and_an_axis_have_different_names(linkage, axes, measure, name):
+    """Otherwise the dataset has one of the two alone."""
+    with pytest.raises(udk.SweepError, match=f'"{name}" is both a variable of a measure and an axis'):
+        udk.sweep(linkage, axes, TS, measure=measure, progress=False)
 
 
 def test_all_mistakes_are_named_at_once(linkage):

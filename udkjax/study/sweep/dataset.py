@@ -80,6 +80,10 @@ def variables_of(plan: SweepPlan) -> Mapping[str, StoredVariable]:
     own = found.keys() - LABELS.keys() - {name for measure in plan.measures for name in measure.labels}
     if unknown := [name for name in plan.units if name not in own]:
         raise SweepError([f"units: no measure of your own stores {quote(name)}{suggestion(name, own)}" for name in unknown])
+    axes = {d.name for d in plan.dimensions} | {column.name for column in plan.columns} | {"time", "body", "coordinate"}
+    if both := [name for name in found if name in axes]:  # the dataset would have one of the two alone
+        cure = "choose another name for the one, or for the other, with of=..."
+        raise SweepError([f"{quote(name)} is both a variable of a measure and an axis: {cure}" for name in both])
     return found
 
 

@@ -44,7 +44,7 @@ TOGETHER = ("solver", "stepsize_controller", "dt0")
 # Dimensions and variables of the dataset, whose names a dimension of the sweep cannot have.
 TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
 # Arguments of `sel`, `isel` and `interp` of xarray: `data.sel(method="SVD")` would not select anything, without an error.
-XARRAY_ARGUMENTS = ("method", "tolerance", "drop", "indexers", "missing_dims", "coords", "assume_sorted", "kwargs")
+XARRAY_ARGUMENTS = ("method", "tolerance", "drop", "indexers", "missing_dims", "coords", "assume_sorted", "kwargs", "self")
 RENAMED = {"method": "pseudoinverse"}  # dimensions of settings whose names xarray has taken
 
 
