@@ -1,5 +1,7 @@
 """Positions over the range of a driver, compared with closed forms."""
 
+from importlib import import_module
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,6 +97,47 @@ def test_travel_has_two_ends_and_exact_derivatives():
     np.testing.assert_allclose(slopes, [-jax.grad(upper)(g), jax.grad(upper)(g)], atol=1e-12)
     free = udk.travel(udk.library.four_bar(np.pi / 3, **CRANK_ROCKER), "body.crank.angle")
     assert (float(free.lower), float(free.upper)) == (-np.inf, np.inf)
+
+
+def geared_five_bar():
+    """The second crank makes half a turn where the first makes a whole one, after which the linkage is another."""
+    crank, other, left, right = 0.54296171, 0.21343423, 1.01075881, 0.62295893
+    tips = np.array([crank * np.exp(2.179j), 1.0 + other * np.exp(-1.2j)])
+    apart = tips[1] - tips[0]
+    along = (left**2 - right**2 + abs(apart) ** 2) / (2 * abs(apart))
+    knee = tips[0] + apart / abs(apart) * (along + 1j * np.sqrt(left**2 - along**2))
+    bars = {"first": (0.0, tips[0]), "second": (1.0, tips[1]), "left": (tips[0], knee), "right": (tips[1], knee)}
+    bodies = {
+        name: udk.Body(1.0, 0.1, [(a + b).real / 2, (a + b).imag / 2], float(np.angle(b - a))) for name, (a, b) in bars.items()
+    }
+    half = {name: abs(b - a) / 2 for name, (a, b) in bars.items()}
+    pin = lambda a, at, b, end: udk.Revolute([a, b], [at, [end * half[b], 0]])  # noqa: E731
+    joints = {
+        "O": pin("ground", [0, 0], "first", -1),
+        "E": pin("ground", [1, 0], "second", -1),
+        "A": pin("first", [half["first"], 0], "left", -1),
+        "B": pin("second", [half["second"], 0], "right", -1),
+        "P": pin("left", [half["left"], 0], "right", 1),
+        "gear": udk.Gear(["first", "second"], [1 / 3, 2 / 3]),
+    }
+    return udk.Mechanism(bodies, joints)
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "driver", "limits"),
+    [
+        (udk.library.four_bar, "body.crank.angle", (False, False)),
+        (udk.library.four_bar, "body.rocker.angle", (True, True)),
+        (geared_five_bar, "body.first.angle", (False, True)),
+    ],
+)
+def test_travel_without_a_limit_is_followed_once_if_a_turn_leads_back(mechanism, driver, limits, monkeypatch):
+    found = udk.travel(mechanism(), driver)
+    assert tuple(bool(np.isfinite(x)) for x in (found.lower, found.upper)) == limits
+    monkeypatch.setattr(import_module("udkjax.positions.kinematics"), "_returns", lambda *given: False)
+    both_ways = udk.travel(mechanism(), driver)
+    for name in ("lower", "upper", "lower_q", "upper_q", "status"):
+        np.testing.assert_allclose(getattr(found, name), getattr(both_ways, name), rtol=1e-12)
 
 
 @pytest.mark.parametrize("stages", fast([3], [1, 2, 3, 4, 5]))

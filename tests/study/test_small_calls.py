@@ -95,6 +95,7 @@ def test_calls_of_diagnosis_and_derivation():
     four_bar = udk.library.four_bar()
     assert calls_of(lambda: udk.diagnose(four_bar)) < 52_000
     assert calls_of(lambda: udk.explain(four_bar)) < 12_500
+    assert calls_of(lambda: udk.travel(four_bar, "body.crank.angle")) < 24_000  # one whole turn, as it leads back
     assert calls_of(lambda: udk.holding_efforts(four_bar, "body.crank.angle", ANGLES)) < 11_500
 
 

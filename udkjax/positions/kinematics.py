@@ -279,12 +279,28 @@ def _kinematics(
 
 def _travel(driven: Driven, q: Float[Array, "n"], far: NumberLike, by: ControlFlow) -> Travel:
     xp, s = by.xp, driven.value(q)
-    ways = xp.array([-1.0, 1.0])
-    down_up = by.vmap(lambda way: _solve(driven, s, q, stop_gradients(xp.asarray(s + way * far)[None]), by, False))(ways)
-    down, up = (jax.tree.map(lambda x, k=k: x[k], down_up) for k in (0, 1))
+
+    def towards(way: Array) -> Points:
+        return _solve(driven, s, q, stop_gradients(xp.asarray(s + way * far)[None]), by, False)
+
+    if xp is np:
+        down = towards(np.asarray(-1.0))
+        up = down if driven.is_angle and _returns(driven, q, down) else towards(np.asarray(1.0))
+    else:
+        down_up = by.vmap(towards)(xp.array([-1.0, 1.0]))
+        down, up = (jax.tree.map(lambda x, k=k: x[k], down_up) for k in (0, 1))
     lower, upper = (xp.where(p.status[0] == Reached.beyond_limit, p.limit, way * np.inf) for p, way in ((down, -1), (up, 1)))
     lower_q, upper_q = (p.limit_q.reshape(-1, 3) for p in (down, up))
     return Travel(lower, upper, lower_q, upper_q, xp.stack([down.status[0], up.status[0]]), driven.value_unit)
+
+
+def _returns(driven: Driven, q: np.ndarray, points: Points) -> bool:
+    """Return True if a whole turn leads back to the position q, so that the motion has no limit in the other direction either."""
+    if points.status[0] != Reached.closed:
+        return False
+    moved = (points.q[0] - q) / driven.analysis.scales.coordinates(len(q))
+    moved[2::3] -= 2 * np.pi * np.round(moved[2::3] / (2 * np.pi))
+    return bool(np.max(np.abs(moved)) <= SAME_POSITION)
 
 
 def _start(

@@ -44,7 +44,7 @@ class Configuration:
         """The singular values, without the vectors, whose computation takes several times as long."""
         return singular_values(self.J)
 
-    @property
+    @cached_property
     def rank(self) -> int:
         """Number of nonzero singular values."""
         return count_rank(self.sigma, self._rank_tol)
@@ -130,7 +130,7 @@ class LargeConfiguration(Configuration):
     def shape(self) -> tuple[int, int]:
         return self.sparse.shape
 
-    @property
+    @cached_property
     def rank(self) -> int:
         return self.shape[0] - self._small.zero_count
 
