@@ -3,6 +3,7 @@
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -353,3 +354,40 @@ def test_a_driven_joint_begins_to_slide_with_its_driver():
     assert solution.events.of("A turns round") == pytest.approx([1.875], abs=1e-9)  # where the rate of the driver is zero
     assert solution.events.of("B slips")[0] > 0.1
     assert solution.settings["engine"] == "native"
+
+
+class Bumper(udk.ForceElement):
+    """A stiff spring (N/m) with a damper (N s/m), which a point below 0.3 m compresses."""
+
+    stiffness: float
+    damping: Any
+
+    def loads(self, t, *frames):
+        depth = -0.3 - frames[0].y
+        return [(0.0, jnp.where(depth > 0.0, self.stiffness * depth - self.damping * frames[0].vy, 0.0), 0.0)]
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Kvaerno5()])
+@pytest.mark.parametrize("damping", [1e4, 1e5, 1e6])
+def test_a_joint_that_creeps_into_a_stiff_bumper_does_not_reverse_again_and_again(damping, solver):
+    """Its speed decays to errors of the steps, which are no reversals; the rod comes to rest within the friction of its pin."""
+    mu, radius, along = 0.2, 0.02, np.sqrt(1 - 0.2**2)
+    bodies = {
+        "rod": udk.Body(1.0, 1 / 12, position=[0.5 * along, -0.1], angle=np.arcsin(-0.2)),
+        "tip": udk.Body(0.5, 0.01, position=[along, -0.2]),
+    }
+    joints = {
+        "A": udk.Revolute(["ground", "rod"], [[0.0, 0.0], [-0.5, 0.0]]),
+        "B": udk.Revolute(["rod", "tip"], [[0.5, 0.0], [0.0, 0.0]]),
+    }
+    forces = {
+        "rub": udk.Friction("A", coefficient=mu, radius=radius, law="set-valued"),
+        "bumper": Bumper(["tip"], 1e7, jnp.asarray(damping)),
+    }
+    chosen = {} if solver is None else {"solver": solver}
+    run = udk.simulate(udk.Mechanism(bodies, joints, forces=forces), [0.0, 4.0], **chosen)
+    assert run.events.counts["A turns round"] <= 2
+    assert len(run.events.unresolved) == 0
+    # About the pin, with the arm sqrt(1 - 0.3^2) m of the bumper: its force less the weights, at most mu r |R|.
+    force, weight, arm = 1e7 * (-0.3 - run.q[-1, 1, 1]), 9.81 * 1.5, np.sqrt(1 - 0.3**2)
+    assert abs(arm * (force - 9.81 * 1.0)) <= mu * radius * (weight - force) * (1 + 1e-3)

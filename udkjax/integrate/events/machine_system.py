@@ -285,7 +285,9 @@ class MachineSystem:
         room, C = self._rooms[which], len(where)
         watch[:, room : room + C] = runs.sides[members[:, None], where]
         watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, where]
-        watch[:, room + 2 * C : room + 2 * C + E] = ZERO * runs.scale[members]
+        # Steps leave errors of their tolerance in the speed of a joint that hardly moves: they are no reversals.
+        zero = np.where(self.plan.slides, np.maximum(self._phases[which].atol(members), ZERO), ZERO)
+        watch[:, room + 2 * C : room + 2 * C + E] = zero * runs.scale[members]
         if (most := self._most_passed[which]) is not None:
             watch[:, -1] = np.minimum(MOST_KINKS - 1 - runs.kink_count(self.plan, members), most)
         return watch

@@ -223,6 +223,10 @@ class PhaseCode:
         self._marks: dict[bytes, np.ndarray] = {}  # by the phase, of all members; NaN: not known yet
         self._no_marks = np.full((len(joints), plan.run.code.row_count), np.nan)
 
+    def atol(self, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "#b 1"]:
+        """Return the absolute tolerance of members, in units of the scene."""
+        return _of(self._settings, members)[:, [self.plan.run.all_settings.index("atol")]]
+
     def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray) -> StretchEnd:
         """Run members over times (b, T) to the first crossing; `watch` describes the conditions, with room for their numbers."""
         _, q, v, *_ = state

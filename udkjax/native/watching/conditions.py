@@ -69,7 +69,8 @@ class Resolution(NamedTuple):
         high = arithmetic.max(arithmetic.max(a, b), arithmetic.max(second, fourth))
         low, high = arithmetic.min(low, middle - e), arithmetic.max(high, middle + e)
         is_resolved = error <= (high - low) * self.resolved
-        is_away = (low >= -floor) & (is_resolved | (low >= error * self.far - floor))
+        # An error below the distance that counts as zero hides no crossing.
+        is_away = (low >= -floor) & (is_resolved | (error <= floor) | (low >= error * self.far - floor))
 
         def changes_once(x: Any) -> Any:
             signs = [second > 0.0, x > 0.0, fourth > 0.0, b > 0.0]  # the coefficient before them counts as positive

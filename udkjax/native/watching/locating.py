@@ -6,7 +6,7 @@ the other bound, and bisection replaces steps that leave the bounds.
 
 from udkjax.native.base.ir import DOUBLE, Value
 from udkjax.native.base.steps import POINTS, UNIT, Status
-from udkjax.native.watching.conditions import LAST_CHANGE, LEAST_STEP, MOST_AIMS, MOST_LANDINGS, UNDER_WAY, WANTED
+from udkjax.native.watching.conditions import FIRST, LAST_CHANGE, LEAST_STEP, MOST_AIMS, MOST_LANDINGS, UNDER_WAY, WANTED
 from udkjax.native.watching.watch_memory import WatchMemory
 
 
@@ -84,7 +84,11 @@ def write_approach(module: WatchMemory):
 
 
 def write_land(module: WatchMemory):
-    """Write `land(work)`: end or correct the landing of lanes whose step has ended at its target."""
+    """Write `land(work)`: end or correct the landing of lanes whose step has ended at its target.
+
+    Where the condition does not reach zero at the ends of such steps either, the crossing was an error of the polynomial, for
+    instance after a fast decay that an implicit step has passed in one step: then the run goes on from there.
+    """
     f, s = module.function("land")
     arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(Status.RUNNING))
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
@@ -92,16 +96,21 @@ def write_land(module: WatchMemory):
     for source, to in (("point3 q", "state q"), ("point3 v", "result v"), ("point3 a", "node a")):
         module.copy(f, source, to)
     f.call("conditions", f.given["work"])
-    g, rate = f.variable(0.0), f.variable(0.0)
+    g, rate, before = f.variable(0.0), f.variable(0.0), f.variable(0.0)
     with f.each(module.conditions.count) as c:
-        is_event = s.event.is_(f.like(c, DOUBLE, f.width))
+        is_event, size = s.event.is_(f.like(c, DOUBLE, f.width)), f.abs(module.condition(f, "g", c))
         g.where(is_event, module.condition(f, "g", c))
         rate.where(is_event, module.condition(f, "rate", c))
+        before.where(is_event & (size > module.condition(f, "floor", c)), module.condition(f, "side", c))
     change = -(g.value / f.select(rate.value.is_(0.0), one, rate.value))
     is_small = f.abs(change) * s.omega <= LAST_CHANGE
     goes_on = arrived & ~is_small & (s.landings < float(MOST_LANDINGS)) & (f.abs(change) < s.target - s.point2_t)
     s.where(goes_on, landing=float(WANTED), target=s.target + change, landings=s.landings + 1.0)
-    is_complete, change = arrived & ~goes_on, f.select(is_small, change, zero)
+    is_false = arrived & ~goes_on & ~is_small & (g.value * before.value > 0.0)
+    module.copy_state(f, is_false, ("point3 q", "point3 v"), "sure")
+    s.where(is_false, sure_t=s.point3_t, first_t=s.point3_t, fresh=s.point3_t, node=s.point3_t, which=float(FIRST))
+    s.where(is_false, event=-1.0, landing=0.0, landings=0.0)
+    is_complete, change = arrived & ~goes_on & ~is_false, f.select(is_small, change, zero)
     change = f.max(change, s.fresh - s.point3_t)  # with a slow condition the corrected time may precede the start
     ahead = module.broadcast(f, change)
     is_exact = is_complete & is_small
