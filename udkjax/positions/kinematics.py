@@ -280,7 +280,7 @@ def _kinematics(
 def _travel(driven: Driven, q: Float[Array, "n"], far: NumberLike, by: ControlFlow) -> Travel:
     xp, s = by.xp, driven.value(q)
 
-    def towards(way: Array) -> Points:
+    def towards(way: Any) -> Points:
         return _solve(driven, s, q, stop_gradients(xp.asarray(s + way * far)[None]), by, False)
 
     if xp is np:
@@ -294,7 +294,7 @@ def _travel(driven: Driven, q: Float[Array, "n"], far: NumberLike, by: ControlFl
     return Travel(lower, upper, lower_q, upper_q, xp.stack([down.status[0], up.status[0]]), driven.value_unit)
 
 
-def _returns(driven: Driven, q: np.ndarray, points: Points) -> bool:
+def _returns(driven: Driven, q: Any, points: Points) -> bool:
     """Return True if a whole turn leads back to the position q, so that the motion has no limit in the other direction either."""
     if points.status[0] != Reached.closed:
         return False
