@@ -242,11 +242,16 @@ def _integrate_piece(
     at_end = RunState(end, q[-1], v[-1], state.phase, state.joints)
 
     def jump() -> tuple[RunState, Array, tuple[Array, Array, Array, Array]]:
-        found_state = at_end._replace(q=_with_value(at_end.q, found.event_q[j, 0]), v=_with_value(at_end.v, found.event_v[j, 0]))
-        after, d, (t, qs, vs) = _apply_at_fixed_time(system, found, j, found_state, shift, is_short)
-        return after, d, (j, t, qs, vs)
+        states = (found.event_q[j], at_end.q), (found.event_v[j], at_end.v)
+        qs, vs = (jnp.where(jnp.isfinite(x), x, y) for x, y in states)  # finite also where `vmap` evaluates both branches
+        before = at_end._replace(q=_with_value(at_end.q, qs[0]), v=_with_value(at_end.v, vs[0]))
+        after, d, (t, *record) = _apply_at_fixed_time(system, found, j, before, shift, is_short)
+        # With values that are known, a first pass of reverse mode needs nothing of the jump.
+        after = after._replace(q=_with_value(after.q, qs[1]), v=_with_value(after.v, vs[1]))
+        return after, _with_value(d, jnp.zeros(())), (j, t, *record)
 
-    after, shift, record = jax.lax.cond(happens, jump, lambda: (at_end, shift, _no_event(len(state.q), K)))
+    # Without a checkpoint, the loop over pieces would store all intermediate results of jumps, and zeros of pieces without one.
+    after, shift, record = jax.lax.cond(happens, jax.checkpoint(jump), lambda: (at_end, shift, _no_event(len(state.q), K)))
     group = jnp.cumsum(~found.together)
     event = event + jnp.where(happens, jnp.sum((group == group[j]) & (jnp.arange(K) < found.count)), 0)
     following = PieceStart(after, written + jnp.sum(rows < T), event, shift)
@@ -319,6 +324,13 @@ def _no_event(n: int, K: int) -> tuple[Array, Array, Array, Array]:
     return jnp.array(K), jnp.zeros(()), jnp.zeros((2, n)), jnp.zeros((2, n))
 
 
+@jax.custom_jvp
 def _with_value(x: Array, value: Array) -> Array:
     """Return `value` with the derivatives of x."""
-    return x + stop_gradients(jnp.where(jnp.isfinite(value), value, x) - x)
+    del x
+    return value
+
+
+@_with_value.defjvp
+def _(primals, tangents):
+    return _with_value(*primals), tangents[0]
