@@ -251,7 +251,10 @@ def _integrate_piece(
         return after, _with_value(d, jnp.zeros(())), (j, t, *record)
 
     # Without a checkpoint, the loop over pieces would store all intermediate results of jumps, and zeros of pieces without one.
-    after, shift, record = jax.lax.cond(happens, jax.checkpoint(jump), lambda: (at_end, shift, _no_event(len(state.q), K)))
+    # Its body is no place for barriers against common subexpressions: reverse mode has a loop of its own.
+    after, shift, record = jax.lax.cond(
+        happens, jax.checkpoint(jump, prevent_cse=False), lambda: (at_end, shift, _no_event(len(state.q), K))
+    )
     group = jnp.cumsum(~found.together)
     event = event + jnp.where(happens, jnp.sum((group == group[j]) & (jnp.arange(K) < found.count)), 0)
     following = PieceStart(after, written + jnp.sum(rows < T), event, shift)
