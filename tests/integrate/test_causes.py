@@ -135,6 +135,17 @@ def test_initial_states_that_are_open_or_not_finite(pendulum, events):
     assert 'the initial state is open (m, rad): "pin" (0.1)' in single.cause
 
 
+def test_an_open_state_of_a_system_is_measured():
+    """Without advice to assemble it, which is for mechanisms."""
+    bead = udk.ConstrainedSystem(
+        mass=lambda q: jnp.eye(3),
+        force=lambda t, q, v: jnp.array([0.0, 0.0, -9.81]),
+        constraint=lambda t, q: jnp.array([q @ q - 1.0]),
+    )
+    off = failed(bead, TS, udk.State(np.array([2.0, 0, 0]), np.zeros(3)))
+    assert "the initial state is open: constraint[0] is 3;" in off.cause and "assemble" not in off.cause
+
+
 def test_what_nothing_stabilizes_says_so_and_what_is_left_out_too(pendulum):
     loose = failed(pendulum, rtol=1e-4, atol=1e-4, stabilization=None, drift_tol=1e-6)
     assert '"pin"' in loose.cause and "stabilize them, by Projection()" in loose.cause

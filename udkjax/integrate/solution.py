@@ -68,8 +68,7 @@ CAUSES = {
     Result.drift: "the constraints are violated by more than `drift_tol`: drivers ask for what the joints do not allow, or no "
     "`Projection()` stabilizes the run, or rows that its analysis found redundant are independent with the present numbers",
     Result.could_not_assemble: "the initial state cannot be closed; call `assemble` for what stays open",
-    Result.initial_state_open: "the initial state that was given violates the constraints by more than `drift_tol`; `assemble` "
-    "closes that of a mechanism",
+    Result.initial_state_open: "the initial state that was given violates the constraints by more than `drift_tol`",
     Result.event_stop: "an event stopped the run",
     Result.at_rest: 'a contact whose impacts have at_rest="stop" came to rest',
     Result.event_limit: "there were more events than `max_events`: raise it, or look for what makes them follow so closely",

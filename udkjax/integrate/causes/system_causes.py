@@ -1,4 +1,4 @@
-"""The causes of failed runs of user-defined systems: a singular mass matrix, or a function that is not finite."""
+"""The causes of failed runs of user-defined systems: a singular mass matrix, a function that is not finite, or an open state."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from udkjax.integrate.causes.find import FoundCause
-from udkjax.integrate.solution import Solution
+from udkjax.integrate.solution import Result, Solution
 from udkjax.programs.deferred import deferred
 
+MOST_ROWS = 3  # rows of constraints that a cause names, those with the largest violations
 SINGULAR = 1e-12  # M is singular if its smallest eigenvalue is at most this, relative to the largest
 
 
@@ -20,6 +21,10 @@ def explained_system(solution: Solution, system: Any, end: tuple[Any, Any]) -> S
     t, (q, v) = np.asarray(end[0]), np.split(np.asarray(end[1]), 2)
     with jax.ensure_compile_time_eval():
         text = cause_of(_values(system, t, q, v))
+        is_open = int(np.asarray(solution.code)) == Result.initial_state_open
+        if not text and is_open and system.constraint is not None:
+            psi = _psi(system, np.asarray(solution.ts[0]), np.asarray(solution.q[0]))
+            text = cause_of_opening(np.ravel(psi))
     return replace(solution, found_cause=FoundCause.of(solution, text)) if text else solution
 
 
@@ -30,6 +35,18 @@ def _values(system: Any, t: Any, q: Any, v: Any) -> dict[str, Array]:
     values |= {name: function(t, q) for name in ("constraint", "potential") if (function := getattr(system, name)) is not None}
     names = "force", "velocity_constraint"
     return values | {name: function(t, q, v) for name in names if (function := getattr(system, name)) is not None}
+
+
+@deferred
+def _psi(system: Any, t: Any, q: Any) -> Array:
+    return system.constraint(t, q)
+
+
+def cause_of_opening(psi: np.ndarray) -> str:
+    """Return which rows of the constraint of a system an initial state violates most, with the cure."""
+    largest = [k for k in np.argsort(-np.abs(psi))[:MOST_ROWS].tolist() if psi[k]]
+    found = ", ".join(f"constraint[{k}] is {psi[k]:.3g}" for k in largest)
+    return f"the initial state is open: {found}; give a `State` at which constraints are zero" if found else ""
 
 
 def cause_of(values: Mapping[str, ArrayLike]) -> str:
