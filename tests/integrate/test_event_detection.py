@@ -232,7 +232,9 @@ def test_events_within_a_step_that_reaches_a_sample(engine):
         for end in (0.625, 1.0, 1.375):
             found, rejected = times(-before, start, end)
             expected = [start + before, 0.5 + (0.5 - start - before) / 5.0]
-            np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
+            np.testing.assert_allclose(
+                found, expected, rtol=0.0, atol=1e-13
+            )  # rounding of interpolation: 1e-14 on some processors
             assert int(rejected) == 0
             np.testing.assert_allclose(rates(-before, start, end), [-1.0, 0.2], atol=1e-12)
 

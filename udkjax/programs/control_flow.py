@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit, put_arrays
 from udkjax.programs.deferred import deferred
@@ -131,6 +131,30 @@ def _concrete_module(module: eqx.Module) -> eqx.Module:
 
 def _by_jax(function: Callable[..., Result], *arguments: Any) -> Result:
     return function(*arguments, BY_JAX)  # compared by identity: as an argument of a compiled function it would be a copy
+
+
+@jax.custom_batching.custom_vmap
+def _any_member(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Return the condition; in a batch, whether it holds for any member."""
+    return condition
+
+
+@_any_member.def_vmap
+def _(axis_size: int, batched: Any, condition: Bool[Array, "B"]) -> tuple[Bool[Array, ""], bool]:
+    del axis_size, batched
+    return jnp.any(condition), False
+
+
+def cond(condition: Bool[Array, ""], function: Callable[[], Result], otherwise: Callable[[], Result]) -> Result:
+    """Return function() if the condition holds, else otherwise(), which takes little time.
+
+    A batch computes the function where the condition holds for any member; for `jax.lax.cond` it always computes both.
+    """
+
+    def selected() -> Result:
+        return jax.tree.map(lambda x, y: jnp.where(condition, x, y), function(), otherwise())
+
+    return jax.lax.cond(_any_member(condition), selected, otherwise)
 
 
 def sequential(function: Callable[..., Result], *arguments: PyTree) -> Result:
