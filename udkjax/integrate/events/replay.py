@@ -246,10 +246,10 @@ def _integrate_piece(
         states = (found.event_q[j], at_end.q), (found.event_v[j], at_end.v)
         qs, vs = (jnp.where(jnp.isfinite(x), x, y) for x, y in states)  # finite also where `vmap` evaluates both branches
         before = at_end._replace(q=_with_value(at_end.q, qs[0]), v=_with_value(at_end.v, vs[0]))
-        after, d, (t, *record) = _apply_at_fixed_time(system, found, j, before, shift, is_short)
+        after, d, (t, at_q, at_v) = _apply_at_fixed_time(system, found, j, before, shift, is_short)
         # With values that are known, a first pass of reverse mode needs nothing of the jump.
         after = after._replace(q=_with_value(after.q, qs[1]), v=_with_value(after.v, vs[1]))
-        return after, _with_value(d, jnp.zeros(())), (j, t, *record)
+        return after, _with_value(d, jnp.zeros(())), (j, t, at_q, at_v)
 
     # Without a checkpoint, the loop over pieces would store all intermediate results of jumps, and zeros of pieces without one.
     # Its body is no place for barriers against common subexpressions: reverse mode has a loop of its own.
