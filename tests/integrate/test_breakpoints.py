@@ -319,4 +319,5 @@ def test_sudden_changes_beside_breakpoints(tol):
         for k in (10, 20, 30):
             clock = udk.Event(lambda t, at, time=ts[k]: t - time, udk.Stop(), name="clock")
             stopped = udk.simulate(ball, ts[::10], events=clock, rtol=tol, atol=tol)
+            assert stopped.events is not None
             assert_allclose(stopped.events.v_before[0, 0, 0], v[k], rtol=0.0, atol=within)

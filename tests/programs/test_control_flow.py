@@ -14,7 +14,7 @@ def growing(x):
     """Grow to 3 x in at most twenty steps."""
 
     def step(y, _):
-        return cond(y < 3 * x, lambda: 1.5 * y + x * jnp.sin(y), lambda: y), None
+        return cond(y < 3 * x, lambda: 1.5 * y + 0.1 * x * jnp.sin(y), lambda: y), None
 
     return jax.lax.scan(step, jnp.ones(()), None, length=20)[0]
 

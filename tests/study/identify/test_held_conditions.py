@@ -1,5 +1,7 @@
 """Records in which a number of the scene was held between samples, each with its own."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -42,11 +44,12 @@ def test_a_number_that_the_scene_samples_may_be_given_too(usual):
     scene = pendulum().with_parameters({SETPOINT: usual})
     given = record(udk.Held(SAMPLES, 0.15))
     other = udk.Record(TS, given.values, 0.01)
-    found = conditions_of(scene, [given, other])[SETPOINT]
+    found: Any = conditions_of(scene, [given, other])[SETPOINT]
     assert (found.dt, found.t0) == (0.15, 0.0)
     np.testing.assert_array_equal(found.values, [SAMPLES, np.zeros(12)])
     constant = udk.Record(TS, given.values, 0.01, conditions={SETPOINT: 0.3})
-    np.testing.assert_array_equal(conditions_of(scene, [given, constant])[SETPOINT].values[1], np.full(12, 0.3))
+    found = conditions_of(scene, [given, constant])[SETPOINT]
+    np.testing.assert_array_equal(found.values[1], np.full(12, 0.3))
     np.testing.assert_array_equal(conditions_of(scene, [constant])[SETPOINT], [0.3])
     entry = udk.Record(TS, given.values, 0.01, conditions={f"{SETPOINT}.values": SAMPLES})
     if isinstance(usual, udk.Held):
