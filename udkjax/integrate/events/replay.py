@@ -244,7 +244,7 @@ def _integrate_piece(
 
     def jump() -> tuple[RunState, Array, tuple[Array, Array, Array, Array]]:
         states = (found.event_q[j], at_end.q), (found.event_v[j], at_end.v)
-        qs, vs = (jnp.where(jnp.isfinite(x), x, y) for x, y in states)  # finite also where `vmap` evaluates both branches
+        qs, vs = (jnp.where(jnp.isfinite(x), x, y) for x, y in states)  # finite also in a batch's members without an event
         before = at_end._replace(q=_with_value(at_end.q, qs[0]), v=_with_value(at_end.v, vs[0]))
         after, d, (t, at_q, at_v) = _apply_at_fixed_time(system, found, j, before, shift, is_short)
         # With values that are known, a first pass of reverse mode needs nothing of the jump.
