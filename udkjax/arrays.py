@@ -75,19 +75,22 @@ def put_arrays(arrays: Any) -> Any:
     if _calls[shapes] <= _WORTH_A_PROGRAM or jax.config.jax_debug_nans or jax.config.jax_debug_infs:
         return jax.device_put(arrays)
     leaves = [np.asarray(x) for x in leaves]
-    has_words = jax.config.jax_enable_x64 and all(x.dtype in (np.float64, np.int64) for x in leaves)
+    has_words = jax.config.jax_enable_x64 and all(x.dtype in (np.float64, np.int64, np.bool_) for x in leaves)
     if not has_words or (jax.default_backend() == "cpu" and sum(x.size for x in leaves) > _FEW_NUMBERS):
         return jax.tree.unflatten(tree, _put_together(*leaves))
-    words = np.concatenate([x.ravel().view(np.float64) for x in leaves])
+    words = np.concatenate([(x.astype(int) if x.dtype == bool else x).ravel().view(np.float64) for x in leaves])
     return jax.tree.unflatten(tree, _unpacked(words, tuple([(x.shape, x.dtype) for x in leaves])))
 
 
 @partial(jax.jit, static_argnums=1)
 def _unpacked(words: Float[Array, "N"], kinds: Sequence[tuple[tuple[int, ...], np.dtype]]) -> list[Array]:
-    """Return arrays of 64-bit numbers from one vector, since each argument takes some 5 us, and 10 us on a graphics card."""
+    """Return arrays from one vector of 64-bit words, since each argument takes some 5 us, and 10 us on a graphics card."""
     ends = np.cumsum([math.prod(shape) for shape, _ in kinds])[:-1]
     parts = zip(jnp.split(words, ends), kinds, strict=True)
-    return [jax.lax.bitcast_convert_type(part, kind).reshape(shape) for part, (shape, kind) in parts]
+    return [
+        jax.lax.bitcast_convert_type(part, np.int64 if kind == np.bool_ else kind).astype(kind).reshape(shape)
+        for part, (shape, kind) in parts
+    ]
 
 
 def make_module(cls: type[Module], **fields: Any) -> Module:

@@ -2,6 +2,7 @@
 
 import gc
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,6 +62,47 @@ def test_what_is_decided_of_a_mechanism_is_decided_once():
     udk.simulate(mechanism, TS)
     names = {name for _, name in called(lambda: udk.simulate(mechanism, 2.0 * TS, rtol=1e-6))}
     assert not names & {"structure", "scene_programs", "compile_mechanism", "has_pieces", "_analyse"}
+
+
+def visited(function: Callable[[], object]) -> Counter[str]:
+    """Return the types of the trees whose numbers are listed meanwhile, and how often arrays are put on a device."""
+    seen: Counter[str] = Counter()
+
+    def listen(frame, event, _):
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith("<generated_flatten_"):
+            seen[code.co_filename[len("<generated_flatten_") : -1]] += 1
+        if event == "call" and code.co_name == "device_put" and code.co_filename.endswith("api.py"):
+            seen["device_put"] += 1
+
+    gc.disable()
+    sys.setprofile(listen)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+        gc.enable()
+    return seen
+
+
+@pytest.mark.parametrize(
+    "friction, events",
+    [
+        ({"rubs": udk.Friction("j0", coefficient=0.1, radius=0.01, law="set-valued")}, None),
+        ({}, udk.JointLimit("j0", lower=0.0, restitution=0.5)),
+        ({}, udk.Event(lambda t, frames: frames["b0"].angle + 0.1, udk.Stop())),
+    ],
+    ids=["friction that sticks", "impacts", "stop"],
+)
+def test_a_repeated_run_with_events_visits_no_number_of_the_scene(friction, events):
+    """It is decided once whether the numbers of a mechanism and of events are traced, and what follows from them."""
+    mechanism = pendulums(1)
+    mechanism = udk.Mechanism(mechanism.bodies, mechanism.joints, forces=friction)
+    run = lambda: udk.simulate(mechanism, 5.0 * TS, events=events)  # noqa: E731
+    assert visited(run)["Body"]  # a new mechanism is visited
+    seen = visited(run)
+    assert seen.keys() <= {"Solution", "Events", "Auto", "Projection", "device_put"}
+    assert seen["device_put"] <= 1  # all results at once
 
 
 @pytest.mark.parametrize("of_run", [lambda run: run, jax.jacfwd, jax.grad])

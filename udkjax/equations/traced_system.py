@@ -26,7 +26,7 @@ from udkjax.annotations import Time, Vector
 from udkjax.equations.elements import choose_shorter, gamma_by_entries
 from udkjax.expressions import Differential, Graph, Scalar, may_have_kinks, trace
 from udkjax.expressions.differential import SparseRow
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.requirements import ArgumentError
 
 FUNCTIONS = {"mass": "q", "force": "tqv", "constraint": "tq", "velocity_constraint": "tqv", "potential": "tq"}  # and arguments
@@ -241,7 +241,7 @@ class TracedSystem(eqx.Module):
     @property
     def is_concrete(self) -> bool:
         """True if no number is traced."""
-        return not any(isinstance(x, Tracer) for x in jax.tree.leaves(self))
+        return is_concrete(self)
 
 
 @cached_by_identity

@@ -15,6 +15,7 @@ from udkjax.programs.deferred import traced_once as traced_once
 from udkjax.programs.identity_cache import cached_by_identity as cached_by_identity
 from udkjax.programs.identity_cache import cached_by_size as cached_by_size
 from udkjax.programs.identity_cache import cached_within_trace as cached_within_trace
+from udkjax.programs.identity_cache import is_concrete as is_concrete
 from udkjax.programs.numpy_program import Meter as Meter
 from udkjax.programs.numpy_program import TooLongError as TooLongError
 from udkjax.programs.numpy_program import evaluate_as as evaluate_as

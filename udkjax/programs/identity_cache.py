@@ -18,6 +18,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from udkjax.arrays import is_traced
+
 Arguments = ParamSpec("Arguments")
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -56,7 +58,7 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
                     cache.move_to_end(key)
             return stored[1]
         result = function(*args, **kwargs)
-        if any(isinstance(x, Tracer) for x in jax.tree.leaves(result)):
+        if is_traced(result):
             return result
         references = [_reference(x, lambda _: forget(key)) for x in objects]
         with lock:
@@ -66,6 +68,12 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
         return result
 
     return call
+
+
+@cached_by_identity
+def is_concrete(*trees: Any) -> bool:
+    """Return True if no number of immutable trees is traced; the answer is stored."""
+    return not is_traced(trees)
 
 
 class FunctionOfTree(Protocol[Argument_contra, Known]):

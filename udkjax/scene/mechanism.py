@@ -16,7 +16,7 @@ from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, make_module, number
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.programs.control_flow import ConvertsItself
-from udkjax.programs.identity_cache import cached_within_trace
+from udkjax.programs.identity_cache import cached_within_trace, is_concrete
 from udkjax.scene.bodies import Body, stack_coordinates
 from udkjax.scene.checks import SceneError, gravity_mistakes
 from udkjax.scene.description import mechanism_table
@@ -35,7 +35,7 @@ from udkjax.scene.forces import ForceElement
 from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.joints import Constraint, Joint
-from udkjax.scene.mechanism_fields import fields_of, is_concrete
+from udkjax.scene.mechanism_fields import fields_of
 from udkjax.scene.number_fields import (
     SECTIONS,
     ElementGroups,

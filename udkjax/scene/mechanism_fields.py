@@ -5,8 +5,7 @@ from typing import Any
 
 from jaxtyping import Array
 
-from udkjax.arrays import is_traced
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import is_concrete
 from udkjax.scene.element_setup import constants_of, without_constants
 from udkjax.scene.number_fields import SECTIONS
 from udkjax.scene.origin import Origin
@@ -25,9 +24,3 @@ def fields_of(
     source = (ElementsWithConstants if has_constants else Elements).of(gravity, elements, **more)
     static = dict(zip((f"{section}_names" for section in SECTIONS), names, strict=True))
     return {"name": name, **static, "origin": None if is_concrete(source) else origin, "_source": source}
-
-
-@cached_by_identity
-def is_concrete(tree: Any) -> bool:
-    """Return True if no number of a tree is traced; the answer is stored."""
-    return not is_traced(tree)

@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.expressions import Graph, ScalarProgram, cotangents, read_jaxpr, tangents
@@ -20,7 +19,7 @@ from udkjax.integrate.events.phases import Switches
 from udkjax.integrate.events.sticking_joints import forces_of
 from udkjax.native.base.program import UnsupportedError, vector_function
 from udkjax.native.watching.conditions import Conditions
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -31,8 +30,7 @@ def condition_numbers(events: Sequence[Event]) -> list[Array]:
 
 def watched_conditions(events: Sequence[Event], mechanism: Any) -> Conditions | None:
     """Return the conditions of the events of a mechanism as programs; None if machine code lacks an instruction for one."""
-    is_concrete = not any(isinstance(x, Tracer) for x in condition_numbers(events))
-    return _concrete_conditions(mechanism, *events) if is_concrete and mechanism.is_concrete else _conditions(mechanism, *events)
+    return (_concrete_conditions if is_concrete(mechanism, *events) else _conditions)(mechanism, *events)
 
 
 def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
@@ -137,8 +135,18 @@ def with_cached_functions(events: Sequence[Event], programs: Conditions) -> tupl
 
     A function defined within another is a new object in each call.
     """
+    return (_share_concrete_functions if is_concrete(*events) else _share_functions)(programs, *events)
+
+
+def _share_functions(programs: Conditions, *events: Event) -> tuple[Event, ...]:
     first = _first_of_equals(_Functions(events, programs)).functions
-    return tuple(e if f is None else eqx.tree_at(lambda e: e.condition, e, f) for e, f in zip(events, first, strict=True))
+    return tuple(
+        e if f is None or f is e.condition else eqx.tree_at(lambda e: e.condition, e, f)
+        for e, f in zip(events, first, strict=True)
+    )
+
+
+_share_concrete_functions = cached_by_identity(_share_functions)
 
 
 def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:

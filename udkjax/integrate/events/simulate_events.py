@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from udkjax.arrays import is_traced, is_within_jit, number, put_arrays
+from udkjax.arrays import is_within_jit, make_module, number, put_arrays
 from udkjax.complementarity.stick_or_slip import SIDES
 from udkjax.devices import computing_on_host, on_host
 from udkjax.equations.analysis import Analysis
@@ -44,7 +44,7 @@ from udkjax.integrate.time_derivatives import moved
 from udkjax.native.watching.conditions import Conditions
 from udkjax.positions.assembly import Closure, State
 from udkjax.programs.deferred import deferred
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.wording import quote
 
@@ -74,6 +74,7 @@ def simulate_events(
     closure: Closure | None,
     choices: Choices,
     max_events: int,
+    all_concrete: bool,
 ) -> Solution:
     """Run a mechanism with events.
 
@@ -86,25 +87,27 @@ def simulate_events(
         closure: the assembled initial guess.
         choices: the other arguments of `simulate`.
         max_events: the largest number of events.
+        all_concrete: whether no number of the other arguments, except the events, is traced.
 
     Raises:
         ValueError: the events do not fit the mechanism, or machine code was requested but cannot run the system.
     """
     listed, phases = _prepare(mechanism, events, analysis)
+    runs_at_once = all_concrete and not is_within_jit() and is_concrete(phases, *listed)
     conditions = None if choices.take_diffrax else watched_conditions(listed, phases.mechanisms[SCENE])
     if conditions is not None:
         listed = with_cached_functions(listed, conditions)
     ts = ts if isinstance(ts, Tracer) else np.asarray(ts, float)
     moves = isinstance(ts, Tracer) and events is None
     given = Given(phases, listed, ts, state, closure, choices, max_events, conditions, moves)
-    found = _run_at_once(mechanism, given)
-    if found is None:
+    result = _run_at_once(given) if runs_at_once else None
+    if result is None:
         given = given._replace(ts=number(ts), choices=choices.arrays())
-        found = (_run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run)(given)
-    found, reasons = found
-    if is_within_jit() or is_traced(given):
+        result = (_run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run)(given)
+    found, reasons = result
+    if not runs_at_once:
         return (_solution if is_within_jit() else _compiled_solution)(mechanism, given, found, reasons)
-    found = jax.tree.map(np.asarray, found)  # JAX would compile a program for each operation
+    found = EventRun(*map(np.asarray, found))  # JAX would compile a program for each operation
     names = tuple(e.name for e in listed if e.action.turn is None)
     if np.isfinite(found.unresolved[: len(names)]).any():
         fast = [f"{quote(name)} from {t:.6g} s on" for name, t in zip(names, found.unresolved) if np.isfinite(t)]
@@ -112,10 +115,9 @@ def simulate_events(
     return put_arrays(_solution(mechanism, given, found, reasons, np))
 
 
-def _run_at_once(mechanism: Any, given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
+def _run_at_once(given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
     """Return the result of `_run` for concrete numbers; None if machine code alone cannot compute it."""
-    is_concrete = mechanism.is_concrete and not is_within_jit() and not is_traced(given)
-    if given.conditions is None or not is_concrete or jax.config.jax_disable_jit:
+    if given.conditions is None or jax.config.jax_disable_jit:
         return None
     phases, choices = given.phases, given.choices
     compiled = [compile_concrete(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
@@ -138,7 +140,7 @@ Prepared = tuple[tuple[Event, ...], Phases]
 def _prepare(mechanism: Any, events: ExpandsToEvents | Sequence[ExpandsToEvents] | None, analysis: Analysis | None) -> Prepared:
     """Return all events, with unique names, and the phases that they lead to; cached if all numbers are concrete."""
     listed = events if events is None else tuple(events) if isinstance(events, Sequence) else (events,)
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves((mechanism, listed, analysis))):
+    if not is_concrete(mechanism, analysis, *(listed or ())):
         return _expand(mechanism, listed, analysis)
     return _expand_concrete(mechanism, analysis, listed is None, *(listed or ()))
 
@@ -232,7 +234,8 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
         return jnp.where(is_event, x, padding)
 
     event_q, event_v = trim(found.event_q), trim(found.event_v)
-    events = Events(
+    events = make_module(
+        Events,
         time=trim(found.event_time),
         index=trim(found.event_index, -1),
         q_before=event_q[:, 0].reshape(*bodies),
@@ -260,7 +263,8 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
     settings |= {"max_events": str(given.max_events)} if names else {}
     with jax.debug_nans(False):  # NaN stands for outputs after the end of a run
         q, v = (xp.where(xp.isinf(x), xp.nan, x).reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
-    return Solution(
+    return make_module(
+        Solution,
         ts=given.ts,
         q=q,
         v=v,
@@ -274,6 +278,7 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
         events=events if names else None,
         unlocated=None if kinks is None else kinks.unlocated,
         sticking=sticking,
+        found_cause=None,
     )
 
 
