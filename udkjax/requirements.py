@@ -1,9 +1,10 @@
 """Requirements on arguments (real, finite, shape, sign), with errors that state the argument and its value."""
 
 from collections.abc import Callable, Mapping
-from inspect import isclass
+from functools import wraps
+from inspect import isclass, signature
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,8 @@ GivenArguments = Mapping[str, Any]  # all arguments of a call by name, including
 ArgumentCheck = Callable[..., None]  # (name, value, given): an argument, and all arguments of the call
 Sign = Literal["any", "positive", "not negative"]
 NOTHING: GivenArguments = MappingProxyType({})
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
 class ArgumentError(ValueError):
@@ -76,13 +79,13 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
         raise ArgumentError(f"{name} must be {condition}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
 
 
-def require_count(name: str, value: Any, least: int = 1, given: GivenArguments = NOTHING) -> None:
+def require_count(name: str, value: Any, least: float = 1, given: GivenArguments = NOTHING) -> None:
     """Require an integer, at least `least`; of a traced number, only shape and dtype are checked."""
     number = None if isinstance(value, bool | np.bool_) else array(name, value)
     if number is None or number.shape != () or not jnp.issubdtype(number.dtype, jnp.integer):
         raise ArgumentTypeError(f"{name} must be a whole number, {describe(value)}")
     if not isinstance(number, Tracer) and int(number) < least:
-        raise ArgumentError(f"{name} must be at least {least}, not {int(number)}")
+        raise ArgumentError(f"{name} must be at least {least:g}, not {int(number)}")
 
 
 def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: GivenArguments = NOTHING) -> None:
@@ -114,3 +117,33 @@ def require_output_times(name: str, value: Any) -> None:
         k = int(np.argmin(steps))
         pair = f"{name}[{k + 1}] = {times[k + 1]:g} s follows {times[k]:g} s"
         raise ArgumentError(f"{name} must increase from each output time to the next: {pair}")
+
+
+def concrete_only(instead: str = "") -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Return a decorator of functions that compute with NumPy; an argument with a traced number raises a `TypeError`.
+
+    Args:
+        instead: The functions to use under jit and vmap, for the message; empty: there are none.
+    """
+
+    def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        parameters = signature(function)
+        cure = f"under jit and vmap use {instead}" if instead else "call it outside of jit, vmap and grad"
+
+        @wraps(function)
+        def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            for name, value in parameters.bind(*args, **kwargs).arguments.items():
+                if _has_traced_numbers(value):
+                    problem = f"{name} must be concrete, not traced: {function.__name__} needs concrete numbers"
+                    raise ArgumentTypeError(f"{problem}; {cure}")
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def _has_traced_numbers(value: Any) -> bool:
+    if isinstance(value, Mapping):  # its keys need not be comparable, as they must be in a pytree
+        return any(map(_has_traced_numbers, value.values()))
+    return not getattr(value, "is_concrete", True) or is_traced(value)

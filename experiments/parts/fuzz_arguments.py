@@ -78,6 +78,13 @@ def scene() -> udk.Mechanism:
 
 
 @functools.cache
+def chain() -> udk.Mechanism:
+    """Return a scene with the bodies of `scene` and two degrees of freedom: a double pendulum."""
+    joints = {name: joint for name, joint in scene().joints.items() if name != "guide"}
+    return udk.Mechanism(scene().bodies, joints)
+
+
+@functools.cache
 def other() -> udk.Mechanism:
     """Return a scene that is another one."""
     return udk.library.simple_pendulum()
@@ -111,6 +118,8 @@ def fitting() -> dict[str, Any]:
         "output": "body.c.angle",
         "parameters": "body.b.mass",
         "data": {"time": ts, "body.b.angle": 0 * ts},
+        "channels": ["body.b.angle"],
+        "noise": 0.1,
         "candidates": [{"gravity": [0.0, -1.0]}],
         "state": udk.State(q, 0 * q),
         "analysis": udk.analyse(scene()),
@@ -181,6 +190,9 @@ def bad_values() -> list[Any]:
         ["nobody"],
         {"nobody": 1.0},
         {"b": np.nan},
+        {"b": {}},
+        {"b": []},
+        {"b": 1j},
         {3: 1.0},
         udk.Log(),
         udk.Contact("nobody"),
@@ -215,6 +227,8 @@ def targets() -> list[tuple[str, Callable[..., Any], dict[str, Any]]]:
             given = {p.name: fitting()[p.name] for p in needed}
             if name == "mechanical_advantage":
                 given["motion"] = fitting()["turning"]
+            if name == "workspace":
+                given["mechanism"] = chain()
             if name == "inverse_dynamics":
                 given |= {"motion": fitting()["motion"], "drivers": ["body.b.angle"]}
             found += [(name, function, given)] * (1 if name in SELDOM else 12)
@@ -273,30 +287,47 @@ def _method(name: str, **given: Any) -> Any:
 def draw(rng: np.random.Generator) -> Case:
     """Draw a call with one wrong argument, or two."""
     name, function, given = targets()[rng.integers(len(targets()))]
-    known = [
-        p.name for p in inspect.signature(function).parameters.values() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
-    ] if not isinstance(function, functools.partial) and function not in (_state, _gains) else list(given)  # fmt: skip
-    known = [p for p in known if p not in ("progress", "adjoint", "throw")] or known
+    known = parameters_of(function, given)
     places = rng.choice(known, 1 if rng.random() < 0.8 or len(known) == 1 else 2, replace=False)
     pool = bad_values()
     wrong = {str(place): pool[rng.integers(len(pool))] for place in places}
+    traced = [p for p, value in wrong.items() if is_traceable(value)]
+    return case_of(name, function, given, wrong, traced[0] if traced and rng.random() < 0.3 else "")
+
+
+def parameters_of(function: Callable[..., Any], given: dict[str, Any]) -> list[str]:
+    """Return the names of the arguments of a target that can be wrong; a wrong `progress`, for example, fails nothing."""
+    if isinstance(function, functools.partial) or function in (_state, _gains):
+        return list(given)
+    known = inspect.signature(function).parameters.values()
+    names = [p.name for p in known if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
+    return [p for p in names if p not in ("progress", "adjoint", "throw")] or names
+
+
+def is_traceable(value: Any) -> bool:
+    """Return True for an array of numbers, which may also be an argument of a function that JAX traces."""
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fic"
+
+
+def case_of(name: str, function: Callable[..., Any], given: dict[str, Any], wrong: dict[str, Any], traced: str = "") -> Case:
+    """Return the call of a target with wrong arguments, one of which may be traced."""
     given = given | wrong
     if name == "simulate":
         given.setdefault("max_steps", 100)
-    traced = [p for p, value in wrong.items() if isinstance(value, np.ndarray) and value.dtype.kind in "fic"]
     about = f"{name}({', '.join(wrong)})"
     # An argument that is valid alone but does not fit the others may be reported under any name.
     mismatched = any(isinstance(value, udk.Mechanism | udk.Analysis | udk.State | SimpleNamespace) for value in wrong.values())
     names = [] if mismatched else _names(wrong)
-    if traced and rng.random() < 0.3:
-        return Case(f"{about} traced", functools.partial(_traced, function, given, traced[0]), names)
+    if traced:
+        return Case(f"{about} traced", functools.partial(_traced, function, given, traced), names)
     return Case(about, functools.partial(_call, function, given), names)
 
 
 def _names(wrong: dict[str, Any]) -> list[str]:
-    """Return how a message may call what is wrong: the arguments, texts among their values, and what they name."""
+    """Return how a message may call what is wrong: the arguments, texts, keys and items of their values, and what they name."""
     called = {"values": ["parameter"], "bodies": ["body"], "value": ["mass"], "driver": ["drivers"]}
-    texts = [quote(value).strip('"') for value in wrong.values() if isinstance(value, str) and value.strip()]
+    parts = [part for value in wrong.values() if isinstance(value, dict | list) for part in value]
+    texts = [quote(x).strip('"') for x in (*wrong.values(), *parts) if isinstance(x, str) and x.strip()]
     return [*wrong, *texts, *(other for p in wrong for other in called.get(p, ()))]
 
 

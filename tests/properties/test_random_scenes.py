@@ -1,7 +1,9 @@
 """A part of `python -m experiments properties`, with another seed, few mechanisms and little input, but the same checks."""
 
+import functools
 import json
 import math
+from typing import Any
 
 import jax
 import numpy as np
@@ -238,6 +240,47 @@ def test_every_number_is_named(make, name):
     for wrong in (object(), "text", udk.SVD):
         with pytest.raises((TypeError, udk.SceneError), match=name):
             make(wrong)
+
+
+KINDS_OF_VALUES: dict[str, Any] = {
+    "an object": object(),
+    "a complex number": 1j,
+    "an empty list": [],
+    "an empty mapping": {},
+    "a mapping without names": {3: 1.0},
+    "a mapping to a mapping": {"b": {}},
+    "a mapping to a complex number": {"b": 1j},
+    "a number": np.array(1.0),
+    "a vector": np.ones(3),
+    "flat coordinates": np.zeros(6),
+    "coordinates": np.zeros((2, 3)),
+    "complex coordinates": np.zeros((2, 3), complex),
+    "an integer": np.array(2),
+}
+FUNCTIONS = {name: (function, given) for name, function, given in fuzz_arguments.targets() if "mechanism" in given}
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in fuzz_arguments.SELDOM)) for x in FUNCTIONS])
+def test_every_argument_of_a_wrong_kind_is_named(name):
+    """A value of another kind than the argument's is accepted, or the error names the argument; traced values likewise."""
+    function, given = FUNCTIONS[name]
+    found = {}
+    for parameter in fuzz_arguments.parameters_of(function, given):
+        for kind, value in KINDS_OF_VALUES.items():
+            for traced in ["", parameter] if fuzz_arguments.is_traceable(value) else [""]:
+                case = fuzz_arguments.case_of(name, function, given, {parameter: value}, traced)
+                if (answer := verdict(case))[0]:
+                    found[case.about, kind] = answer
+    assert not found, found
+
+
+def test_traced_mechanisms_are_refused_by_functions_of_concrete_numbers():
+    def traced(function: Any, given: dict[str, Any], mass: Any) -> Any:
+        return function(**(given | {"mechanism": given["mechanism"].with_parameters({"body.b.mass": mass})}))
+
+    for name in ("branches", "check", "equilibria", "identify", "check_gradients", "design_experiment", "sweep"):
+        with pytest.raises(TypeError, match=f"^mechanism must be concrete, not traced: {name} "):
+            jax.eval_shape(functools.partial(traced, *FUNCTIONS[name]), 1.0)
 
 
 def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, capsys):

@@ -150,7 +150,7 @@ MISTAKES = [
     ),
     (
         ONE + CAM + "profile = {angle = [0, 1, 2], radius = [1, 1]}",
-        WHERE + ".profile.radius: must have 3 entries, like the list before it, not [1, 1]",
+        WHERE + ".profile.radius: must have 3 entries, like angle, not [1, 1]",
     ),
     (ONE + GEAR + "internal = 1", WHERE + ".internal: must be true or false, not 1"),
     (ONE + GEAR + 'carrier = "arm"', WHERE + '.carrier: no body named "arm"'),

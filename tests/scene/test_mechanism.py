@@ -174,7 +174,7 @@ def test_all_mistakes_at_once():
             'driver "A" (driver[0]).name: taken by joint[0]; names must be unique',
             'driver "A" (driver[0]).coordinate: must be one of "angle", "x", "y", "distance", not "angel"; did you mean "angle"?',
             'driver "A" (driver[0]).motion.times[2]: must be greater than the entry before, not 1.0',
-            'driver "A" (driver[0]).motion.values: must have 3 entries, like the list before it, not [0.0, 1.0]',
+            'driver "A" (driver[0]).motion.values: must have 3 entries, like times, not [0.0, 1.0]',
             'force "f" (force[0]).torque: must be >= 0, not -1.0',
             'force "f" (force[0]).torque: a slot does not turn: give a coefficient',
             'force "g" (force[1]).joint: no joint named "Q"',

@@ -14,11 +14,13 @@ from udkjax.equations.scales import Scales
 from udkjax.positions.assembly import State, close
 from udkjax.positions.drive import Drive, drive
 from udkjax.programs.deferred import deferred
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 
 @checked
+@concrete_only()
 def branches(
     mechanism: Mechanism,
     driver: Drive,
@@ -72,7 +74,7 @@ SAME_POSITION = 1e-5  # tolerance, relative to the characteristic length or in r
 
 def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
     """Return the given position, and others with random angles and places of bodies within the size of the mechanism."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(int(seed))
     q = np.asarray(mechanism.q0 if state is None else state.q)
     positions = np.tile(q, (count, 1, 1))
     spread = max(float(np.ptp(q[:, :2], axis=0).max()), float(analyse(mechanism).length))

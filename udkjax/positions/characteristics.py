@@ -15,6 +15,7 @@ from udkjax.positions.linkage_type import FourBarType, Mobility, four_bars, mobi
 from udkjax.positions.pressure import pressure_angles
 from udkjax.positions.turning_points import Combination, Cycle, TurningPoint
 from udkjax.printing import PrintedTable, PrintsTable, format_number
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Cam, Gear, Prismatic, Revolute, Slot
@@ -227,6 +228,7 @@ class InstantCentre(NamedTuple):
 
 
 @checked
+@concrete_only()
 def instant_centres(
     mechanism: Mechanism, q: Float[ArrayLike, "bodies 3"], v: Float[ArrayLike, "bodies 3"]
 ) -> Mapping[tuple[str, str], InstantCentre]:
@@ -237,13 +239,13 @@ def instant_centres(
 
     Args:
         mechanism: the mechanism.
-        q: coordinates of its bodies (m, m, rad), (bodies, 3).
-        v: their rates (m/s, m/s, rad/s).
+        q: coordinates of its bodies (m, m, rad), (bodies, 3) or flat.
+        v: their rates (m/s, m/s, rad/s), of the same shape.
 
     Returns:
         The centres by pairs of names.
     """
-    q, v = np.asarray(q), np.asarray(v)
+    q, v = (np.reshape(x, (-1, 3)) for x in (q, v))
     at_origin = np.stack([v[:, 0] + v[:, 2] * q[:, 1], v[:, 1] - v[:, 2] * q[:, 0], v[:, 2]], 1)
     motions = {GROUND: np.zeros(3)} | dict(zip(mechanism.body_names, at_origin, strict=True))
     names, found = list(motions), {}

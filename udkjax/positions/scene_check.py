@@ -11,6 +11,7 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.redundancy import dependent_constraints
 from udkjax.positions.assembly import close, moves_of_assembly
 from udkjax.printing import PrintedTable, format_number, prints_table
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import suspicions
@@ -41,6 +42,7 @@ class Check(NamedTuple):
 
 
 @checked
+@concrete_only()
 def check(mechanism: Mechanism) -> Check:
     """Count rows, rank and degrees of freedom, name redundant rows, and measure how well the initial guess closes.
 

@@ -2,20 +2,30 @@
 
 `@checked` reads the annotations and names of a function's parameters. An argument must be an instance of an annotated class, or a
 choice of a `Literal`. Arrays are recognized by their names (named_arguments.py): shapes must fit the mechanism, numbers must be
-real, finite and of the right sign. For traced values only shapes and dtypes are checked.
+real, finite and of the right sign. Other integers, numbers and lists of names are recognized by their annotations. For traced
+values only shapes and dtypes are checked; `concrete_only` (udkjax/requirements.py) refuses them.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import wraps
+from functools import partial, wraps
 from inspect import BoundArguments, Parameter, Signature, isclass, signature
 from types import UnionType
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
-from udkjax.requirements import ArgumentCheck, ArgumentError, ArgumentTypeError, GivenArguments, describe
+from udkjax.requirements import (
+    ArgumentCheck,
+    ArgumentError,
+    ArgumentTypeError,
+    GivenArguments,
+    describe,
+    require_count,
+    require_number,
+)
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.named_arguments import CHECKS, require_history
+from udkjax.scene.named_arguments import CHECKS, require_history, require_name_or_names, require_names
 from udkjax.wording import article, quote, suggestion
 
 Arguments = ParamSpec("Arguments")
@@ -115,23 +125,58 @@ def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
     checks = CHECKS | {"mechanism": require_single}
     for name, parameter in signature(function).parameters.items():
         annotation = parameter.annotation
-        if get_origin(annotation) is Literal:
-            parameter_checks.append(ParameterCheck(name, _choice(get_args(annotation))))
-        elif classes := _classes(annotation):
-            parameter_checks.append(ParameterCheck(name, _instance(classes)))
+        if by_type := _check_of_type(annotation):
+            parameter_checks.append(ParameterCheck(name, by_type))
         if name in ("solution", "motion") and parameter.default is parameter.empty:
             parameter_checks.append(ParameterCheck(name, require_history))
-        elif name in checks:
-            may_be_none = parameter.default is None or type(None) in get_args(annotation)
-            parameter_checks.append(ParameterCheck(name, checks[name], "passes" if may_be_none else "refuses"))
+        elif check := checks.get(name, _check_of_kind(annotation)):
+            may_be_none = parameter.default is None or type(None) in _alternatives(annotation)
+            parameter_checks.append(ParameterCheck(name, check, "passes" if may_be_none else "refuses"))
     return parameter_checks
+
+
+def _check_of_type(annotation: Any) -> ArgumentCheck | None:
+    """Return the check of an annotation that consists of classes, or of choices; None for any other."""
+    alternatives = _alternatives(annotation)
+    choices = [choice for x in alternatives if get_origin(x) is Literal for choice in get_args(x)]
+    classes = tuple(x for x in alternatives if get_origin(x) is not Literal)
+    if not choices:
+        return _instance(classes) if (classes := _classes(annotation)) else None
+    if not classes:
+        return _choice(tuple(choices))
+    is_instance, is_choice = _instance(classes), _choice(tuple(choices))
+
+    def check(name: str, value: Any, given: GivenArguments):
+        (is_choice if isinstance(value, str) else is_instance)(name, value, given=given)
+
+    return check if _are_ours(classes) else None
+
+
+def _check_of_kind(annotation: Any) -> ArgumentCheck | None:
+    """Return the check of an integer, a number or names, whatever the name of the argument; None for anything else."""
+    kinds = {x for x in _alternatives(annotation) if x is not type(None)}
+    if kinds == {int}:
+        return partial(require_count, least=-math.inf)
+    if kinds == {float}:
+        return require_number
+    if kinds == {str, Sequence[str]}:
+        return require_name_or_names
+    return require_names if kinds == {Sequence[str]} else None
+
+
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
+    annotation = getattr(annotation, "__value__", annotation)  # of a `TypeAliasType`
+    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
 
 
 def _classes(annotation: Any) -> tuple[type, ...]:
     """Return the classes that an annotation allows; empty unless it consists of classes only."""
-    alternatives = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-    classes = [x for x in alternatives if isclass(x) and (x in (bool, type(None), str) or _is_ours(x))]
-    return tuple(classes) if len(classes) == len(alternatives) and any(x is not type(None) for x in classes) else ()
+    classes = _alternatives(annotation)
+    return classes if _are_ours(classes) and any(x is not type(None) for x in classes) else ()
+
+
+def _are_ours(classes: Sequence[Any]) -> bool:
+    return all(isclass(x) and (x in (bool, type(None), str) or _is_ours(x)) for x in classes)
 
 
 def _is_ours(x: type) -> bool:

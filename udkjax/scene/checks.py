@@ -24,6 +24,7 @@ from udkjax.scene.profiles import AbstractProfile, LawProfile, profile_class
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
+ListSizes = dict[str, tuple[int, str]]  # by named dimension: its length, and the name of the list that has it
 KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements, by kind (body, revolute) and by name
 
 
@@ -156,7 +157,7 @@ def _short(key: Any) -> str:
 
 def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> Iterator[str]:
     """Iterate over the mistakes in a table that describes an element of class `cls`."""
-    expected, sizes = keys(cls), {}
+    expected, sizes = keys(cls), ListSizes()
     for name in table:
         if name not in expected:
             yield f"{where}.{_short(name)}: {unknown_key(name, expected)}"
@@ -176,7 +177,7 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
         yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table))
 
 
-def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
+def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: ListSizes) -> Iterator[str]:
     """Iterate over the mistakes in one value. `sizes` collects the lengths of the named dimensions."""
     value = value.value if isinstance(value, StaticValue) else value
     if get_origin(annotation) is UnionType:  # a number, or samples of it
@@ -251,7 +252,7 @@ def find_class(path: str, choices: Mapping[str, type], table: TomlTable) -> tupl
     )
 
 
-def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: dict[str, int]) -> Iterator[str]:
+def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: ListSizes) -> Iterator[str]:
     """Iterate over the mistakes in a number: its type, its shape and, if concrete, its value."""
     traced = is_traced(value)
     array = jnp.asarray(value) if traced else _as_array(value)
@@ -263,8 +264,8 @@ def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMet
         yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, not {abbreviate(value)}"
         return
     for dim, size in zip(dims, array.shape, strict=True):
-        if not dim.isdigit() and sizes.setdefault(dim, size) != size:
-            yield f"{path}: must have {sizes[dim]} entries, like the list before it, not {abbreviate(value)}"
+        if not dim.isdigit() and (known := sizes.setdefault(dim, (size, path.rpartition(".")[2])))[0] != size:
+            yield f"{path}: must have {known[0]} entries, like {known[1]}, not {abbreviate(value)}"
             return
     if array.ndim and len(array) < metadata.get("at_least", 0):
         yield f"{path}: needs at least {metadata.get('at_least')} entries, not {abbreviate(value)}"

@@ -150,14 +150,53 @@ def _are_names(x: Any) -> bool:
     return isinstance(x, Sequence) and not isinstance(x, str) and all(isinstance(name, str) for name in x)
 
 
+require_names = _of_kind("be a list of names", _are_names)
+require_name_or_names = _of_kind("be a name, or a list of names", lambda x: isinstance(x, str) or _are_names(x))
 _require_mapping = _of_kind(
     "map names to numbers, such as {name: number}",
     lambda x: isinstance(x, Mapping) and all(isinstance(name, str) for name in x),
 )
+
+
+def _require_numbers_by_name(name: str, value: Any, given: GivenArguments) -> None:
+    _require_mapping(name, value, given)
+    for key, number in value.items():
+        require_number(f"{name}[{key!r}]", number)
+
+
+def _require_arrays_by_name(name: str, value: Any, given: GivenArguments) -> None:
+    _require_mapping(name, value, given)
+    for key, numbers in value.items():
+        require_finite(f"{name}[{key!r}]", numbers)
+
+
+def _require_noise(name: str, value: Any, given: GivenArguments) -> None:
+    """Require numbers for all channels, or by channel, where None leaves a channel out."""
+    by_channel = {f"{name}[{str(key)!r}]": x for key, x in value.items()} if isinstance(value, Mapping) else {name: value}
+    for place, numbers in by_channel.items():
+        if numbers is not None:
+            array(place, numbers)
+
+
+def _require_directions(name: str, value: Any, given: GivenArguments) -> None:
+    if not isinstance(value, Mapping) or not all(isinstance(x, str) and isinstance(y, Mapping) for x, y in value.items()):
+        example = '{"both": {"body.a.mass": 1.0, "body.b.mass": -1.0}}'
+        raise ArgumentTypeError(f"{name} must map names to changes of unknowns, such as {example}, {describe(value)}")
+    for direction, changes in value.items():
+        for unknown, change in changes.items():
+            require_number(f"{name}[{direction!r}][{unknown!r}]", change, infinite=True)
+
+
 _require_units = _of_kind(
     'map names to units, such as {name: "m"}',
     lambda x: isinstance(x, Mapping) and all(isinstance(text, str) for pair in x.items() for text in pair),
 )
+
+
+def _are_channels(x: Any) -> bool:
+    """Return True for a list of names of channels, and of user-defined quantities."""
+    is_list = isinstance(x, Sequence) and not isinstance(x, str) and len(x) > 0
+    return is_list and all(isinstance(channel, str) or hasattr(channel, "name") for channel in x)
 
 
 def _is_coordinate(x: Any) -> bool:
@@ -167,7 +206,8 @@ def _is_coordinate(x: Any) -> bool:
 
 def _is_parameter(x: Any) -> bool:
     """Return True for the name of a parameter, a `Parameter`, or names of tied parameters."""
-    return isinstance(x, str | list | tuple) or callable(x) or dataclasses.is_dataclass(x)
+    is_tie = isinstance(x, list | tuple) and all(isinstance(name, str) for name in x)
+    return isinstance(x, str) or is_tie or callable(x) or dataclasses.is_dataclass(x)
 
 
 def _require_point(name: str, value: Any, given: GivenArguments) -> None:
@@ -186,7 +226,7 @@ def _require_rate(name: str, value: Any, given: GivenArguments) -> None:
 
 def _require_drivers(name: str, value: Any, given: GivenArguments) -> None:
     """Check a mapping of drivers to values, or a list of names of drivers where they have no values."""
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) and all(map(_is_coordinate, value)):
         for driver, values in value.items():
             require_finite(f"{name}[{driver!r}]", values)
     elif (
@@ -205,9 +245,13 @@ CHECKS: dict[str, ArgumentCheck] = {
     "drivers": _require_drivers,
     "parameters": _of_kind(
         "be the name of a parameter, a Parameter, or a list of these",
-        lambda x: _is_parameter(x) and (not isinstance(x, list | tuple) or all(map(_is_parameter, x))),
+        lambda x: all(map(_is_parameter, x)) if isinstance(x, list | tuple) else _is_parameter(x),
     ),
-    "ignore": _of_kind("be a list of names", _are_names),
+    "ignore": require_names,
+    "directions": _require_directions,
+    "noise": _require_noise,
+    "candidates": _of_kind("be a list of candidates", lambda x: isinstance(x, Sequence) and not isinstance(x, str)),
+    "channels": _of_kind("be a list of channels, by name or as a Quantity", _are_channels),
     "output": _of_kind("be the name of a coordinate, such as body.crank.angle, or a Coordinate", _is_coordinate),
     "guesses": require_finite,
     "tol": partial(require_number, sign="not negative"),
@@ -215,7 +259,7 @@ CHECKS: dict[str, ArgumentCheck] = {
         'be a name, such as "huber", or a function', lambda x: isinstance(x, str) or (callable(x) and not isclass(x))
     ),
     "client": _of_kind("be a dask.distributed.Client, or None", _has("submit")),
-    "optimizer": _of_kind("be an optax optimizer, or None", lambda x: isinstance(x, str) or _has("update")(x)),
+    "optimizer": _of_kind("be an optax optimizer, or None", lambda x: _has("init")(x) and _has("update")(x)),
     "method": _check_thresholds,
     "stabilization": _check_thresholds,
     "t": require_number,
@@ -246,10 +290,10 @@ CHECKS: dict[str, ArgumentCheck] = {
     "length": partial(require_number, sign="positive"),
     "angle": require_number,
     "angular_velocity": require_number,
-    "held": _require_mapping,
+    "held": _require_numbers_by_name,
     "inputs": _require_mapping,
-    "weights": _require_mapping,
-    "compliances": _require_mapping,
+    "weights": _require_numbers_by_name,
+    "compliances": _require_arrays_by_name,
     "point": _require_point,
     "bodies": _of_kind("be the name of a body, or a list of names", lambda x: isinstance(x, str) or _are_names(x)),
     "solver": _check_solver,

@@ -182,7 +182,7 @@ def _fit(
 ) -> tuple[Array | None, str]:
     """Return the new value of a parameter, or None and the reason why it does not fit."""
     try:
-        new = None if isinstance(value, bool) else number(value)
+        new = None if value is None or isinstance(value, bool) else number(value)
     except (TypeError, ValueError, OverflowError):
         new = None
     if new is None:

@@ -19,6 +19,7 @@ from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
 from udkjax.positions.drive import Driven
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
 from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
@@ -144,6 +145,7 @@ def equilibrium(
 
 
 @checked
+@concrete_only()
 def equilibria(
     mechanism: Mechanism, starts: int = 64, seed: int = 0, t: NumberLike = 0.0, state: State | None = None
 ) -> list[Equilibrium]:

@@ -19,6 +19,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD
 from udkjax.positions.assembly import State, assemble
 from udkjax.programs.deferred import deferred
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
@@ -29,6 +30,7 @@ N_RIVALS = 200  # number of random feasible accelerations to compare a with
 
 
 @checked
+@concrete_only(instead="accelerations and uniqueness, which are pure")
 def explain(
     mechanism: Mechanism, t: float = 0.0, state: State | None = None, stabilization: Baumgarte | None = None
 ) -> Explanation:
@@ -52,8 +54,6 @@ def explain(
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005, section 3.
     """
-    if not mechanism.is_concrete:
-        raise ValueError("explain needs concrete numbers; under jit and vmap use accelerations and uniqueness, which are pure")
     state = assemble(mechanism, t, state)
     analysis = analyse(mechanism)
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)

@@ -170,6 +170,8 @@ def inverse_dynamics(
     """
     times: Any = number(ts) if is_traced(ts) else np.array(ts, float)
     computed = None
+    if motion is None and not mechanism.drivers and analyse(mechanism).degrees_of_freedom != 0:
+        raise SceneError(["motion is None, and the scene has no driver that prescribes a motion"], mechanism.name)
     if motion is None:
         motion = computed = motion_in_time(mechanism, times)
     chosen = list(mechanism.driver_names) if drivers is None else list(drivers)

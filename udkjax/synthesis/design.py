@@ -114,7 +114,7 @@ class DesignSearch:
             require_count(name, value)
         require_count("seed", seed, 0)
         problem = self.problem
-        trials = find_starts(problem, starts, SAMPLES * starts, np.random.default_rng(seed), threads)
+        trials = find_starts(problem, starts, SAMPLES * starts, np.random.default_rng(int(seed)), threads)
         if not len(trials.x):
             what = "makes a whole turn" if problem.rotation else "has all positions of the goal"
             reason = f"no random mechanism within the bounds {what}: change the bounds or the structure"

@@ -121,7 +121,7 @@ def test_mistakes_are_told(candidates):
         design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, "X")  # pyright: ignore[reportArgumentType]
     with pytest.raises(udk.IdentificationError, match="candidates: the list is empty"):
         design_experiment(scene(), [], NAMES, [CHANNEL], TS, NOISE)
-    with pytest.raises(udk.IdentificationError, match="candidate 1: must be a Candidate, conditions or a start, not int"):
+    with pytest.raises(udk.IdentificationError, match=r"candidates\[0\]: must be a Candidate, conditions or a start, not int"):
         design_experiment(scene(), [3], NAMES, [CHANNEL], TS, NOISE)  # pyright: ignore[reportArgumentType]
     with pytest.raises(udk.IdentificationError, match="of: mass is not among the parameters"):
         design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, of=["mass"])

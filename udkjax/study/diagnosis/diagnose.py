@@ -12,6 +12,7 @@ from udkjax.equations.textbook import prepare
 from udkjax.pinv import SVD
 from udkjax.positions.assembly import Closure, State, close, require_closed
 from udkjax.positions.channels import StateHistory
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
@@ -37,6 +38,7 @@ def diagnose(mechanism: ConstrainedSystem, state: State | None = None, *argument
 
 
 @checked
+@concrete_only(instead="uniqueness and singular_values, which are pure")
 def diagnose(
     mechanism: Mechanism | ConstrainedSystem,
     state: State | None = None,
@@ -73,8 +75,6 @@ def diagnose(
         state, t = State(solution.q[0], solution.v[0]), float(solution.ts[0])
     if isinstance(mechanism, ConstrainedSystem):
         return diagnose_system(mechanism, state, float(t), rank_tol, solution, time_tol)
-    if not mechanism.is_concrete:
-        raise ValueError("diagnose needs concrete numbers: under jit and vmap use uniqueness and singular_values, which are pure")
     closure = close(mechanism, t, state)
     require_closed(mechanism, _at_rest(closure))  # the diagnosis does not depend on velocities
     q = np.asarray(closure.state.q, float)

@@ -17,7 +17,7 @@ Directions: TypeAlias = Mapping[str, Mapping[str, float]]  # changes of unknowns
 def usual_directions(problem: FitProblem, seed: int) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
     """Return each unknown by itself, and some random combinations of all."""
     names = problem.all_names[: problem.K - problem.constrained]
-    random = np.random.default_rng(seed).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
+    random = np.random.default_rng(int(seed)).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
     directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
     return (*names, *(f"random direction {k + 1}" for k in range(len(random)))), directions
 

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from udkjax.annotations import Numbers
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, prints_table
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.estimate import Estimate
@@ -84,6 +85,7 @@ class Design(NamedTuple):
 
 
 @checked
+@concrete_only()
 def design_experiment(
     mechanism: Mechanism,
     candidates: Sequence[Candidate | Mapping[str, Numbers] | Start | State],
@@ -93,7 +95,7 @@ def design_experiment(
     noise: Noise,
     criterion: Criterion = "D",
     pick: int = 1,
-    of: Sequence[str] | None = None,
+    of: str | Sequence[str] | None = None,
     given: Estimate | None = None,
     tol: float = MEDIUM_TOL,
     **settings: Any,
@@ -122,11 +124,13 @@ def design_experiment(
     """
     experiments = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
     problems = [] if experiments else ["candidates: the list is empty"]
+    ts = np.asarray(ts, float)
+    if not np.all(np.diff(ts) > 0):
+        problems.append("ts: must increase")
     if not 1 <= pick <= max(len(experiments), 1):
         problems.append(f"pick must be from 1 to {len(experiments)}, the number of candidates, not {pick}")
     if problems:
         raise IdentificationError(problems)
-    ts = np.asarray(ts, float)
     records = [
         Record(ts, dict.fromkeys(channels, np.zeros(ts.shape)), noise, c.initial_state, None, c.conditions, c.name)
         for c in experiments
@@ -136,7 +140,7 @@ def design_experiment(
     wanted = _select_parameters(names, of)
     prior_rows = _prior_information(problem, given)
     dx_dz = problem.unknowns.dx_dz(np.zeros(len(names)))[wanted]
-    roots = _information_of_records(problem, (tol, tol))
+    roots = _information_of_records(problem, (float(tol), float(tol)))
     floor = INVISIBLE_RATIO * np.linalg.norm(np.concatenate([prior_rows, *roots]), 2)
 
     def evaluate(which: Sequence[int]) -> tuple[tuple[int, float], np.ndarray]:
@@ -169,11 +173,11 @@ def _candidate(given: Candidate | Mapping[str, Numbers] | Start | State, k: int)
     elif isinstance(given, Start | State):
         candidate = Candidate(initial_state=given)
     if candidate is None:
-        raise IdentificationError([f"candidate {k + 1}: must be a Candidate, conditions or a start, not {type(given).__name__}"])
+        raise IdentificationError([f"candidates[{k}]: must be a Candidate, conditions or a start, not {type(given).__name__}"])
     return candidate if candidate.name else Candidate(candidate.conditions, candidate.initial_state, f"candidate {k + 1}")
 
 
-def _select_parameters(names: Sequence[str], of: Sequence[str] | None) -> np.ndarray:
+def _select_parameters(names: Sequence[str], of: str | Sequence[str] | None) -> np.ndarray:
     wanted = names if of is None else [of] if isinstance(of, str) else of
     problems = [f"of: {name} is not among the parameters{suggestion(name, names)}" for name in wanted if name not in names]
     if problems or not wanted:

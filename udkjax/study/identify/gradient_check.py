@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.printing import PrintedTable, html_table, text_table
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.differences import DIFFERENCE_STEPS, Differences, DifferenceSums, best_steps, leave_out_far_steps
@@ -162,6 +163,7 @@ class GradientCheck:
 
 
 @checked
+@concrete_only()
 def check_gradients(
     mechanism: Mechanism,
     data: Data,
@@ -201,7 +203,7 @@ def check_gradients(
         IdentificationError: as for `identify`, the motion cannot be simulated to its end, or a direction names no unknown, or
             changes none.
     """
-    problem = build_problem(mechanism, data, parameters, settings, ignore=ignore, seed=seed)
+    problem, tol = build_problem(mechanism, data, parameters, settings, ignore=ignore, seed=seed), float(tol)
     return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed, order, directions)
 
 

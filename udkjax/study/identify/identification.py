@@ -10,6 +10,7 @@ from jaxtyping import Float
 from udkjax.annotations import Numbers
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.progress import ProgressOption, report_progress
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.study.identify.estimate import Estimate
 from udkjax.study.identify.fit_problem import FitProblem, Strategy, build_problem
@@ -42,6 +43,7 @@ INTEGRATION_ERROR = 1e-8  # residuals below this, relative to a channel's scale,
 
 
 @checked
+@concrete_only()
 def identify(
     mechanism: StudyModel,
     data: Data,
@@ -98,7 +100,7 @@ def identify(
     Raises:
         IdentificationError: lists every mistake, including parameters that would open a loop with redundant constraints.
     """
-    start = time.perf_counter()
+    start, tol = time.perf_counter(), float(tol)
     problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, strategy, initial_state, tol)
     first = _first_guesses(problem, n_starts, guesses)
     residual_loss = squares if callable(loss) else named_loss(loss, len(problem.index))

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import TypeAlias, TypeVar, cast
 
+import jax
 import numpy as np
 
 from udkjax.annotations import Numbers
@@ -217,7 +218,8 @@ class _DataReader:
             for k, item in enumerate(data):
                 yield from self.read(item, f"{source}[{k}]")
         else:
-            if not isinstance(data, str | os.PathLike) and isinstance(data, Iterable):  # may name quantities
+            if isinstance(data, Iterable) and not isinstance(data, str | os.PathLike | np.ndarray | jax.Array):
+                # Its columns may be quantities.
                 self.quantities |= _quantities_by_name(cast("Iterable[Hashable]", data))
             for table in read_tables(cast(TableData, data), body_names(self.mechanism), source, self.problems):
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()

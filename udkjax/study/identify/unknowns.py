@@ -176,7 +176,7 @@ def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int
 
 def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray, "B K"]:
     """Sample points of the unit cube, one in each of `count` parts of every coordinate; SciPy's function is slow to import."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(int(seed))
     parts = random.permuted(np.tile(np.arange(count), (dimensions, 1)), axis=1).T
     return (parts + random.random((count, dimensions))) / count
 

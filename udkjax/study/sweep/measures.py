@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from inspect import isclass
 from typing import Any, NamedTuple, TypeAlias, cast
 
 import jax
@@ -134,7 +135,7 @@ def _measure(key: str, given: OneMeasure, mechanism: StudyModel) -> Measure:
             raise ValueError(f"measure {quote(given)}: {problem}") from None
         label = Label(("time",), channel.units, channel.name)
         return Measure(channel.name, partial(_evaluate_channel, channel), {channel.name: label})
-    if not callable(given):
+    if not callable(given) or isclass(given):
         raise ValueError(f"measure {quote(key or str(given))}: must be a name or a function of (mechanism, solution)")
     name = key or getattr(given, "__name__", "measure").strip("<>")
     return Measure(name, partial(_call, given, name), function=given)

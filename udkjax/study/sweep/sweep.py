@@ -14,6 +14,7 @@ from udkjax.annotations import Numbers
 from udkjax.extras import require
 from udkjax.integrate.solution import Result
 from udkjax.progress import Progress, ProgressOption, report_progress
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import AxisValues, SweepDesign
@@ -34,6 +35,7 @@ Engine = Literal["auto", "devices", "dask"]
 
 
 @checked
+@concrete_only()
 def sweep(
     mechanism: StudyModel,
     axes: Mapping[str, AxisValues],
