@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.programs.control_flow import cond
+from udkjax.programs.control_flow import cond_of_batch
 
 XS = jnp.array([0.5, 1.0, 2.0])
 
@@ -14,7 +14,7 @@ def growing(x):
     """Grow to 3 x in at most twenty steps."""
 
     def step(y, _):
-        return cond(y < 3 * x, lambda: 1.5 * y + 0.1 * x * jnp.sin(y), lambda: y), None
+        return cond_of_batch(y < 3 * x, lambda: 1.5 * y + 0.1 * x * jnp.sin(y), lambda: y), None
 
     return jax.lax.scan(step, jnp.ones(()), None, length=20)[0]
 
@@ -36,7 +36,7 @@ def test_a_batch_computes_what_a_member_needs():
             jax.debug.callback(lambda _: calls.append(0), x)
             return 2 * x
 
-        return cond(x > 1.0, function, lambda: x)
+        return cond_of_batch(x > 1.0, function, lambda: x)
 
     np.testing.assert_array_equal(jax.jit(jax.vmap(counted))(XS), [0.5, 1.0, 4.0])
     jax.effects_barrier()

@@ -145,7 +145,7 @@ def _(axis_size: int, batched: Any, condition: Bool[Array, "B"]) -> tuple[Bool[A
     return jnp.any(condition), False
 
 
-def cond(condition: Bool[Array, ""], function: Callable[[], Result], otherwise: Callable[[], Result]) -> Result:
+def cond_of_batch(condition: Bool[Array, ""], function: Callable[[], Result], otherwise: Callable[[], Result]) -> Result:
     """Return function() if the condition holds, else otherwise(), which takes little time.
 
     A batch computes the function where the condition holds for any member; for `jax.lax.cond` it always computes both.

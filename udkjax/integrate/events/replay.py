@@ -22,7 +22,7 @@ from udkjax.integrate.events.sticking import modes_of, settle_friction
 from udkjax.integrate.events.system import condition_values
 from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import Conditions
-from udkjax.programs.control_flow import cond
+from udkjax.programs.control_flow import cond_of_batch
 from udkjax.programs.deferred import deferred
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.traced_numbers import replaced, select
@@ -197,7 +197,7 @@ def replay(hybrid: Hybrid, found: EventRun, zero: Float[Array, ""]) -> tuple[Arr
             return start, PieceOutput(*rows, *_no_event(n, K))
 
         goes_on = (start.state.t < found.time) | (start.event < found.count)
-        return cond(goes_on, lambda: _integrate_piece(system, ts, found, width, start), skip)
+        return cond_of_batch(goes_on, lambda: _integrate_piece(system, ts, found, width, start), skip)
 
     state = hybrid.first_state()._replace(t=ts[0])
     if system.plan.sticking:
@@ -253,7 +253,7 @@ def _integrate_piece(
 
     # Without a checkpoint, the loop over pieces would store all intermediate results of jumps, and zeros of pieces without one.
     # Its body is no place for barriers against common subexpressions: reverse mode has a loop of its own.
-    after, shift, record = cond(
+    after, shift, record = cond_of_batch(
         happens, jax.checkpoint(jump, prevent_cse=False), lambda: (at_end, shift, _no_event(len(state.q), K))
     )
     group = jnp.cumsum(~found.together)
