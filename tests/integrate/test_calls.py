@@ -85,12 +85,15 @@ def visited(function: Callable[[], object]) -> Counter[str]:
     return seen
 
 
+FRICTION = udk.Friction("j0", coefficient=0.1, radius=0.01, law="set-valued")
+
+
 @pytest.mark.parametrize(
     "friction, events",
     [
-        ({"rubs": udk.Friction("j0", coefficient=0.1, radius=0.01, law="set-valued")}, None),
+        ({"rubs": FRICTION}, None),
         ({}, udk.JointLimit("j0", lower=0.0, restitution=0.5)),
-        ({}, udk.Event(lambda t, frames: frames["b0"].angle + 0.1, udk.Stop())),
+        ({}, udk.Event(lambda t, frames: frames["b0"].angle + 0.05, udk.Stop())),
     ],
     ids=["friction that sticks", "impacts", "stop"],
 )
@@ -103,6 +106,51 @@ def test_a_repeated_run_with_events_visits_no_number_of_the_scene(friction, even
     seen = visited(run)
     assert seen.keys() <= {"Solution", "Events", "Auto", "Projection", "device_put"}
     assert seen["device_put"] <= 1  # all results at once
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda mechanism, k: (mechanism.with_parameters({"force.rubs.coefficient": 0.1 + 0.01 * k}), None),
+        lambda mechanism, k: (mechanism, udk.JointLimit("j0", lower=0.01 * k)),
+        lambda mechanism, k: (mechanism, udk.Contact("b0", [0.0, -0.6], [0.0, -1.099 - 2e-4 * k], coefficient=0.3)),
+    ],
+    ids=["friction", "limit", "contact"],
+)
+def test_other_numbers_of_events_need_no_other_programs(changed):
+    """Conditions, forces, joints that events add, and their places among all numbers follow from the structure."""
+    mechanism = pendulums(1)
+    mechanism = udk.Mechanism(mechanism.bodies, mechanism.joints, forces={"rubs": FRICTION})
+
+    def run(k: int) -> None:
+        scene, events = changed(mechanism, k)
+        solutions.append(udk.simulate(scene, 5.0 * TS, events=events))
+
+    solutions: list[udk.Solution] = []
+    run(0)
+    names = {name for _, name in called(lambda: run(1))}
+    assert "run_loop" in names
+    assert not names & {"_conditions", "with_forces", "added_joints", "phase_plan", "read_jaxpr", "places_of_sides", "trace"}
+    for solution in solutions:
+        assert solution.settings["engine"] == "native"
+        assert int(solution.stats["events"]) > 0
+
+
+LEVEL = [0.0]
+
+
+def falls_below_level(t, frames):
+    return frames["b0"].angle - LEVEL[0]
+
+
+def test_a_new_event_is_traced_anew():
+    """Its condition is the same function, and may read something that has changed."""
+
+    mechanism, found = pendulums(1), []
+    for level in (0.0, -0.05):
+        LEVEL[0] = level
+        found.append(np.asarray(udk.simulate(mechanism, 5.0 * TS, events=udk.Event(falls_below_level, udk.Stop())).time))
+    assert found[0] < found[1] < 5.0 * TS[-1]
 
 
 @pytest.mark.parametrize("of_run", [lambda run: run, jax.jacfwd, jax.grad])

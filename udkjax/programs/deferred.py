@@ -15,6 +15,7 @@ All means of avoiding repeated work in the package, and their uses:
     control_flow.solve              an algorithm too long to trace: Python loops if everything is concrete, else one program
     native call_seldom              a rarely reached part of a compiled program: NumPy evaluates it there
     cached_by_identity              a result that does not depend on numbers: cached by the identity of objects
+    cached_by_structure             a result for all values of numbers: cached by the structure of objects
     cached_within_trace             a result whose numbers may be traced: cached likewise, within the trace
     cached_by_size                  programs and machine code, which take megabytes: bounded by their memory in all
 """
@@ -92,7 +93,7 @@ def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Argume
 
     call: Callable[..., Any] = function
 
-    def with_concrete(leaves: list[Any], tree: Any, concrete: tuple["_ConcreteLeaf", ...]) -> Any:
+    def with_concrete(leaves: list[Any], tree: Any, concrete: tuple["ConcreteLeaf", ...]) -> Any:
         numbers = iter(concrete)
         values = [x if _is_traced(x) else next(numbers).value for x in leaves]
         args, kwargs = jax.tree.unflatten(tree, values)
@@ -106,7 +107,7 @@ def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Argume
         leaves, tree = jax.tree.flatten((args, kwargs))
         if deferred_p is None or not any(map(_is_traced, leaves)):
             return function(*args, **kwargs)
-        concrete = tuple(_ConcreteLeaf(x) for x in leaves if not _is_traced(x))
+        concrete = tuple(ConcreteLeaf(x) for x in leaves if not _is_traced(x))
         traced, rest = program([x if _is_traced(x) else None for x in leaves], tree, concrete)
         return eqx.combine(traced, rest.value)
 
@@ -135,7 +136,7 @@ def _as_traced(value: Any) -> Any:
     return jnp.asarray(value, jnp.result_type(float))
 
 
-class _ConcreteLeaf:
+class ConcreteLeaf:
     """A concrete number or any other object, compared by content, so that equal ones share traces."""
 
     def __init__(self, value: Any):
@@ -146,7 +147,7 @@ class _ConcreteLeaf:
         self._key = content if isinstance(content, Hashable) else id(content)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ConcreteLeaf) and type(self.value) is type(other.value) and self._key == other._key
+        return isinstance(other, ConcreteLeaf) and type(self.value) is type(other.value) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)

@@ -13,13 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.expressions import Graph, ScalarProgram, cotangents, read_jaxpr, tangents
-from udkjax.integrate.events.conditions import frames_of, sees_velocity
+from udkjax.integrate.events.conditions import BodyCondition, frames_of, sees_velocity
 from udkjax.integrate.events.event import Event
+from udkjax.integrate.events.kinks import Kink
 from udkjax.integrate.events.phases import Switches
 from udkjax.integrate.events.sticking_joints import forces_of
 from udkjax.native.base.program import UnsupportedError, vector_function
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
+from udkjax.programs.structure_cache import cached_by_structure
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -66,7 +68,15 @@ def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
     return Conditions(text, watched, at_state, len(numbers), by_velocity)
 
 
-_concrete_conditions = cached_by_identity(_conditions)
+_conditions_for_structure = cached_by_structure(_conditions)
+
+
+@cached_by_identity
+def _concrete_conditions(mechanism: Any, *events: Event) -> Conditions | None:
+    # Other conditions are functions, which may read anything: they are traced for each new event.
+    if isinstance(mechanism, Mechanism) and all(isinstance(e.condition, BodyCondition | Kink) for e in events):
+        return _conditions_for_structure(mechanism.without_origin, *events)
+    return _conditions(mechanism, *events)
 
 
 def with_forces(conditions: Conditions, events: Sequence[Event], switches: Switches, m: int) -> Conditions:

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -55,6 +55,8 @@ class JointCoordinate(eqx.Module):
 
 class BodyCondition(eqx.Module):
     """A condition that sees the frames of its `bodies` alone."""
+
+    by_velocity: ClassVar[bool] = False  # whether it depends on velocities
 
     @abstractmethod
     def of_bodies(self, names: tuple[str, ...]) -> Self:
@@ -122,6 +124,8 @@ def probe_arguments(model: Any, moving: bool = True) -> tuple[Any, ...]:
 
 def sees_velocity(condition: Callable[..., Any], model: Any) -> bool:
     """Return whether a condition depends on velocities: it then fails without them."""
+    if isinstance(condition, BodyCondition):
+        return condition.by_velocity
     try:
         return condition(0.0, *probe_arguments(model, moving=False)) is None
     except (TypeError, AttributeError, ValueError):  # errors of arithmetic with None, in Python, JAX or NumPy

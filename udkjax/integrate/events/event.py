@@ -32,6 +32,7 @@ from udkjax.integrate.events.checks import (
     require_vector,
 )
 from udkjax.integrate.events.conditions import (
+    BodyCondition,
     Gap,
     WithinLimit,
     joint_coordinate,
@@ -288,6 +289,21 @@ def _check(event: Event, mechanism: Any) -> None:
     if not callable(event.condition):
         arguments = "(t, frames)" if isinstance(mechanism, Mechanism) else "(t, q, v)"
         raise ValueError(f"{where}: the condition must be a function {arguments}, not a {type(event.condition).__name__}")
+    if not isinstance(event.condition, BodyCondition):  # a trial would take milliseconds, for each new number
+        _try_condition(event, mechanism, where)
+    if action.is_impact:
+        if event.direction == 1:
+            cure = "turn the condition's sign, and leave the direction out"
+            raise ValueError(f"{where}: an Impact is where its condition falls to zero, and not where direction=1: {cure}")
+        if sees_velocity(event.condition, mechanism):
+            raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
+    if isinstance(mechanism, Mechanism):
+        action.check(mechanism, where)
+    else:
+        action.check_for_system(where)
+
+
+def _try_condition(event: Event, mechanism: Any, where: str) -> None:
     has_traced = is_traced(event)
     try:
         with nullcontext() if has_traced else jax.ensure_compile_time_eval():
@@ -302,13 +318,3 @@ def _check(event: Event, mechanism: Any) -> None:
         raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
     if shape := np.shape(value):
         raise ValueError(f"{where}: the condition must return one number, not an array of shape {shape}")
-    if action.is_impact:
-        if event.direction == 1:
-            cure = "turn the condition's sign, and leave the direction out"
-            raise ValueError(f"{where}: an Impact is where its condition falls to zero, and not where direction=1: {cure}")
-        if sees_velocity(event.condition, mechanism):
-            raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
-    if isinstance(mechanism, Mechanism):
-        action.check(mechanism, where)
-    else:
-        action.check_for_system(where)

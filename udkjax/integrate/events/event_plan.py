@@ -14,7 +14,7 @@ from udkjax.integrate.events.actions import Action
 from udkjax.integrate.events.conditions import sees_velocity
 from udkjax.integrate.events.event import Event
 from udkjax.integrate.events.kinks import MOST_KINKS
-from udkjax.integrate.events.phases import Phases, Switches
+from udkjax.integrate.events.phases import SCENE, Phases, Switches
 from udkjax.integrate.events.sticking_joints import StickingJoint
 from udkjax.scene.mechanism import Mechanism
 
@@ -252,7 +252,9 @@ class EventPlan:
         return xp.concatenate([~held & ~carried, held], axis=-1)
 
 
-def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_events: int) -> EventPlan:
+def event_plan(
+    phases: Phases, events: Sequence[Event], max_steps: int, max_events: int, by_velocity: tuple[bool, ...] | None = None
+) -> EventPlan:
     """Return the plan of a run.
 
     Args:
@@ -260,11 +262,14 @@ def event_plan(phases: Phases, events: Sequence[Event], max_steps: int, max_even
         events: all events.
         max_steps: the largest number of steps that are tried.
         max_events: the largest number of events.
+        by_velocity: mask of the conditions that depend on velocities; None: they are tried.
     """
+    if by_velocity is None:
+        by_velocity = tuple(sees_velocity(e.condition, phases.mechanisms[SCENE]) for e in events)
     return EventPlan(
         switches=phases.switches,
         directions=tuple(e.direction for e in events),
-        by_velocity=tuple(sees_velocity(e.condition, phases.mechanisms[0]) for e in events),
+        by_velocity=by_velocity,
         actions=tuple(type(e.action) for e in events),
         at_rest=tuple(e.action.rest for e in events),
         max_steps=max_steps,

@@ -31,6 +31,7 @@ from udkjax.native.base.host_function import call_host
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.numpy_program import Meter, numpy_program
+from udkjax.programs.structure_cache import cached_by_structure
 from udkjax.transforms.gradients import stop_gradients
 
 SHARED, NUMBERS = 9, 5  # number of arrays before those of the phases, and index of the numbers of conditions
@@ -152,12 +153,16 @@ def machine_plan(
     return MachinePlan(plan, tuple(plans), added_joints(phases), tuple(zip(phases.held, of_kinks.elements, strict=True)))
 
 
+_plan_for_structure = cached_by_structure(machine_plan)
+
+
 @cached_by_identity
 def concrete_plan(phases: Phases, conditions: Conditions, max_steps: int, max_events: int, *others: Any) -> MachinePlan:
     """Return the plan from all events, then the compiled mechanisms; their numbers are concrete."""
     count = len(others) - len(phases.mechanisms)
-    plan = event_plan(phases, others[:count], max_steps, max_events)
-    return machine_plan(plan, phases, others[:count], others[count:], conditions)
+    events, compiled = others[:count], others[count:]
+    plan = event_plan(phases, events, max_steps, max_events, conditions.by_velocity)
+    return _plan_for_structure(plan, phases, events, compiled, conditions)
 
 
 def event_arrays(

@@ -41,6 +41,8 @@ class SlidingSpeed(BodyCondition):
     friction: Friction
     sign: Float[Array, ""]
 
+    by_velocity = True
+
     def of_bodies(self, names):
         return make_module(SlidingSpeed, **vars(self) | {"bodies": names})
 
