@@ -11,9 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import ClosedJaxpr
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.expressions import read_jaxpr
+from udkjax.integrate.events import condition_program
 from udkjax.native import primitive
 from udkjax.programs.deferred import _trace, deferred_p
 
@@ -134,6 +137,27 @@ def test_other_numbers_of_events_need_no_other_programs(changed):
     for solution in solutions:
         assert solution.settings["engine"] == "native"
         assert int(solution.stats["events"]) > 0
+
+
+def test_the_trace_of_a_condition_has_its_own_operations_and_those_of_frames(monkeypatch):
+    """Bodies that it does not name cost a cosine and a sine each, and no reading of coordinates."""
+
+    def operations(count: int) -> int:
+        mechanism = pendulums(count)
+        event = udk.Event(lambda t, frames: frames["b0"].angle * frames["b0"].omega, udk.Log())
+        traced.clear()
+        udk.simulate(mechanism, TS, events=event)
+        (closed,) = traced
+        return len(closed.eqns)
+
+    def read(graph, closed, arguments):
+        traced.append(closed)
+        return read_jaxpr(graph, closed, arguments)
+
+    traced: list[ClosedJaxpr] = []
+    monkeypatch.setattr(condition_program, "read_jaxpr", read)
+    assert operations(1) <= 5
+    assert operations(4) == operations(1) + 3 * 2
 
 
 LEVEL = [0.0]

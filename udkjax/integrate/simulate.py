@@ -212,7 +212,9 @@ def simulate(
 
         most = (MAX_EVENTS_STICKING if sticks else MAX_EVENTS) if max_events is None else max_events
         solution = simulate_events(system, events, analysis, ts, state, closure, choices, most, all_concrete)
-        if not _has_failed(solution.code) or not is_concrete or int(solution.stats.get("events", 0)):
+        if not _has_failed(solution.code):
+            return solution
+        if not is_concrete or int(solution.stats.get("events", 0)):
             return _required(solution, throw)  # events may have changed what moved
         if events is not None and isinstance(mechanism, ConstrainedSystem):
             return _required(solution, throw)

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.expressions import Graph, ScalarProgram, read_jaxpr
-from udkjax.integrate.events.condition_program import bodies_of, input_array
+from udkjax.expressions import Graph, ScalarProgram
+from udkjax.integrate.events.condition_program import bodies_of, input_array, trace_scalars
 from udkjax.integrate.events.conditions import frames_of
 from udkjax.integrate.events.phases import SCENE, Phases
 from udkjax.scene.mechanism import Mechanism
@@ -39,14 +39,13 @@ def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
         arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten(arrays)
 
-        def numbers(q: Array, *numbers: Array, tree=tree, rest=rest) -> list[Array]:
+        def numbers(q: list[Array], *numbers: Array, tree=tree, rest=rest) -> list[Array]:
             joint, frames = eqx.combine(jax.tree.unflatten(tree, numbers), rest), frames_of(names, q)
             return jax.tree.leaves(joint.complete(*(frames[name] for name in joint.frame_names)))
 
         shapes, graph = [(3 * len(names),), *(np.shape(x) for x in leaves)], Graph()
-        closed = jax.make_jaxpr(numbers)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
         inputs = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
-        outputs = [x for array in read_jaxpr(graph, closed, inputs) for x in array.flat]
+        outputs = [x for array in trace_scalars(graph, numbers, inputs, (0,)) for x in array.flat]
         joints.append(AddedJoint(ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs)))
     return tuple(joints)
 

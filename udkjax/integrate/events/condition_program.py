@@ -1,6 +1,6 @@
 """Conditions of events as programs of scalars, for machine code."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from types import FunctionType
@@ -41,13 +41,12 @@ def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
     leaves, tree = jax.tree.flatten(arrays)
     n, graph = coordinate_count(mechanism), Graph()
 
-    def evaluate(t: Array, q: Array, v: Array, *numbers: Array) -> Array:
+    def evaluate(t: Array, q: Any, v: Any, *numbers: Array) -> Array:
         return conditions_of(eqx.combine(jax.tree.unflatten(tree, numbers), rest), names, t, q, v)
 
     shapes = [(), (n,), (n,), *(np.shape(x) for x in leaves)]
     arguments = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
-    closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
-    g = list(read_jaxpr(graph, closed, arguments)[0].flat)
+    g = list(trace_scalars(graph, evaluate, arguments, () if names is None else (1, 2))[0].flat)
     (t,), q, v = (list(x.flat) for x in arguments[:3])
     a, numbers = list(input_array(graph, -1, (n,)).flat), [x for array in arguments[3:] for x in array.flat]
     one, zero = graph.constant(1.0), graph.constant(0.0)
@@ -94,14 +93,13 @@ def with_forces(conditions: Conditions, events: Sequence[Event], switches: Switc
     leaves, tree = jax.tree.flatten(arrays)
     graph = Graph()
 
-    def evaluate(multipliers: Array, *numbers: Array) -> Array:
+    def evaluate(multipliers: list[Array], *numbers: Array) -> Array:
         found = eqx.combine(jax.tree.unflatten(tree, numbers), rest)
         return jnp.stack(list(forces_of(found, switches.rows, switches.joint_rows, multipliers).values()))
 
     shapes = [(m,), *(np.shape(x) for x in leaves)]
     arguments = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
-    closed = jax.make_jaxpr(evaluate)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
-    outputs = list(read_jaxpr(graph, closed, arguments)[0].flat)
+    outputs = list(trace_scalars(graph, evaluate, arguments, (0,))[0].flat)
     multipliers, *numbers = (list(array.flat) for array in arguments)
     program = ScalarProgram(graph, [x for array in (*numbers, multipliers) for x in array], outputs)
     return replace(conditions, forces=program, force_key=_text(program))
@@ -167,11 +165,27 @@ def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
+def trace_scalars(
+    graph: Graph, function: Callable[..., Any], arguments: Sequence[np.ndarray], listed: Sequence[int]
+) -> list[np.ndarray]:
+    """Return the outputs of a function as arrays of scalars of a graph.
+
+    Args:
+        graph: The graph.
+        function: The function of arrays.
+        arguments: Its arguments as arrays of scalars.
+        listed: The positions of arguments that the function receives as lists of numbers, whose entries take no operations.
+    """
+    given = [[np.asarray(x, object) for x in array] if k in listed else array for k, array in enumerate(arguments)]
+    closed = jax.make_jaxpr(function)(*jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, float), given))
+    return read_jaxpr(graph, closed, jax.tree.leaves(given))
+
+
 def _text(program: ScalarProgram) -> str:
     return vector_function(program, "conditions", "in", "out").text()
 
 
-def conditions_of(events: Sequence[Event], names: tuple[str, ...] | None, t: Array, q: Array, v: Array) -> Float[Array, "E"]:
+def conditions_of(events: Sequence[Event], names: tuple[str, ...] | None, t: Array, q: Any, v: Any) -> Float[Array, "E"]:
     """Return the conditions of all events at a state, with the names of the bodies; None for those of a system."""
     arguments = (q, v) if names is None else (frames_of(names, q, v),)
     return jnp.stack([jnp.asarray(e.condition(t, *arguments), float) for e in events])

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
-from udkjax.arrays import library_for
+from udkjax.arrays import ArrayLibrary, library_for
 from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame, Point, between
 from udkjax.scene.joints import Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
@@ -21,15 +21,24 @@ from udkjax.wording import quote, suggestion
 Frames = Mapping[str, Frame]
 
 
-def frames_of(names: Sequence[str], q: Array | np.ndarray, v: Array | np.ndarray | None = None) -> dict[str, Frame]:
-    """Return the frames of all bodies and the ground by name, from flat q and v; without v they have no velocities."""
+Coordinates = Array | np.ndarray | list[Any]
+
+
+def frames_of(names: Sequence[str], q: Coordinates, v: Coordinates | None = None) -> dict[str, Frame]:
+    """Return the frames of all bodies and the ground by name, from flat q and v; without v they have no velocities.
+
+    While a program is traced, lists of numbers take half the time of arrays, whose entries are operations each.
+    """
     xp = library_for((q, v))
-    q = xp.asarray(q).reshape(-1, 3)
-    rates = [()] * len(names) if v is None else xp.asarray(v).reshape(-1, 3)
+    rates = [()] * len(names) if v is None else _by_body(v, xp)
     frames: dict[str, Frame] = {GROUND: GROUND_FRAME_AT_REST}
-    for name, x, dx in zip(names, q, rates, strict=True):
+    for name, x, dx in zip(names, _by_body(q, xp), rates, strict=True):
         frames[name] = Frame(x[0], x[1], x[2], xp.cos(x[2]), xp.sin(x[2]), *dx)
     return frames
+
+
+def _by_body(x: Coordinates, xp: ArrayLibrary) -> Any:
+    return [x[k : k + 3] for k in range(0, len(x), 3)] if isinstance(x, list) else xp.asarray(x).reshape(-1, 3)
 
 
 @cache

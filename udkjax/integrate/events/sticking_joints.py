@@ -138,7 +138,7 @@ def lock_of(joint: Any) -> Joint:
 
 
 def forces_of(
-    events: Sequence[Event], rows: Sequence[int], joint_rows: Sequence[tuple[int, ...]], multipliers: Float[Array, "m"]
+    events: Sequence[Event], rows: Sequence[int], joint_rows: Sequence[tuple[int, ...]], multipliers: Sequence[Number]
 ) -> dict[int, Number]:
     """Return, by the index of its event, the force of each contact at rest, and the reserve of each sticking joint.
 

@@ -23,6 +23,7 @@ from udkjax.native.base.ffi import (
     API,
     ARGUMENTS,
     BUFFERS,
+    COUNT,
     CREATE_ERROR,
     DATA,
     DIMS,
@@ -192,19 +193,21 @@ def _word(address: int) -> int:
     return ctypes.c_int64.from_address(address).value
 
 
+def _words(address: int, count: int) -> list[int]:
+    return (ctypes.c_int64 * count).from_address(address)[:] if count else []
+
+
 def _buffers(block: int) -> list[np.ndarray]:
     """Return the arrays of the arguments, or of the results, of a frame."""
-    count, pointers = _word(block + 16), _word(block + BUFFERS)
-    return [_array(_word(pointers + 8 * k)) for k in range(count)]
+    return [_array(buffer) for buffer in _words(_word(block + BUFFERS), _word(block + COUNT))]
 
 
 def _array(buffer: int) -> np.ndarray:
-    rank, dims = _word(buffer + RANK), _word(buffer + DIMS)
-    shape = [_word(dims + 8 * k) for k in range(rank)]
+    shape = _words(_word(buffer + DIMS), _word(buffer + RANK))
     size = math.prod(shape)
     if not size:
         return np.zeros(shape)
-    return np.frombuffer((ctypes.c_double * size).from_address(_word(buffer + DATA)), float).reshape(shape)
+    return np.ndarray(shape, float, (ctypes.c_double * size).from_address(_word(buffer + DATA)))
 
 
 def _error(api: int, text: str) -> int:
