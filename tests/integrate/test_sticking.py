@@ -24,7 +24,7 @@ def block(angle: float, uphill: float = 0.0, **friction: Any) -> udk.Mechanism:
     return udk.Mechanism(
         {"block": udk.Body(1.0, 0.01, [0.0, 0.0], angle, velocity=uphill * along)},
         {"S": udk.Prismatic(["ground", "block"], [[0.0, 0.0], [0.0, 0.0]], angle)},
-        forces={"rub": udk.Friction("S", **friction, **STICKS)},
+        forces={"rub": udk.Friction("S", **(STICKS | friction))},
     )
 
 
@@ -96,6 +96,21 @@ def test_a_stop_takes_few_calls_of_machine_code(monkeypatch):
     monkeypatch.setattr(PreparedCall, "__call__", lambda self: (calls.append(self), call(self))[1])
     solution = udk.simulate(scene, [0.0, 2.0], **TOL)
     assert solution.events.counts["S sticks"] == 1 and len(calls) <= 9
+
+
+@pytest.mark.parametrize("law", ["smooth", "set-valued"])
+def test_friction_of_rest_below_that_of_sliding_is_refused(law):
+    """Stribeck's curve falls from rest to sliding; a joint that sticks by less than it slides by could neither start nor stop."""
+    rub = {"coefficient": 0.3, "static_coefficient": 0.2, "law": law}
+    pattern = r'"rub" \(force\[0\]\)\.static_coefficient: must be at least the coefficient of sliding, 0\.3, not 0\.2'
+    with pytest.raises(udk.SceneError, match=pattern):
+        block(0.1, **rub)
+    equal = block(0.1, **(rub | {"static_coefficient": 0.3}))
+    with pytest.raises(udk.SceneError, match=pattern):
+        equal.with_parameters({"force.rub.static_coefficient": 0.2})
+    contact = udk.Contact("block", coefficient=0.3, static_coefficient=0.2)
+    with pytest.raises(ValueError, match=r"block on ground.*static_coefficient: must be at least the coefficient of sliding"):
+        udk.simulate(equal, [0.0, 0.1], events=contact)
 
 
 def test_mistakes():

@@ -250,6 +250,52 @@ def test_invalid_leaves_are_named_where_they_are_used():
             use(negative)
 
 
+def rod_on_a_string():
+    """A rod by a string from its pin, with friction in the pin."""
+    bodies = {"rod": udk.Body(1.0, 0.1, [0.5, 0.0]), "bob": udk.Body(1.0, 0.1, [1.5, 0.0])}
+    joints = {"pin": udk.Revolute(["ground", "rod"], [[0, 0], [-0.5, 0]])}
+    string = {"string": udk.Distance(["rod", "bob"], [[0.5, 0], [0, 0]], length=0.5)}
+    rub = udk.Friction("pin", torque=0.1, velocity=0.1, coefficient=0.1, radius=0.01)
+    return udk.Mechanism(bodies, joints | string, {}, {"rub": rub})
+
+
+@pytest.mark.parametrize(
+    ("make", "select", "place"),
+    [
+        (rod_on_a_string, lambda m: m.bodies["rod"].mass, r'body "rod" \(body\[0\]\)\.mass'),
+        (rod_on_a_string, lambda m: m.bodies["bob"].inertia, r'body "bob" \(body\[1\]\)\.inertia'),
+        (rod_on_a_string, lambda m: m.joints["string"].length, r'joint "string" \(joint\[1\]\)\.length'),
+        (rod_on_a_string, lambda m: m.forces["rub"].velocity, r'force "rub" \(force\[0\]\)\.velocity'),
+        (rod_on_a_string, lambda m: m.forces["rub"].radius, r'force "rub" \(force\[0\]\)\.radius'),
+        (four_bar, lambda m: m.drawing.links["coupler"].mass, r'body "coupler" \(body\[1\]\)\.mass'),
+    ],
+)
+def test_leaves_without_meaning_are_named_by_every_function(make, select, place):
+    """Here as in a file, a negative mass or length is refused; a negative damping, as of finite differences, is not."""
+    scene = make()
+    run = udk.simulate(scene, TS)
+    negative = eqx.tree_at(select, scene, jnp.asarray(-0.5))
+    uses = {
+        "simulate": lambda m: udk.simulate(m, TS),
+        "simulate without throwing": lambda m: udk.simulate(m, TS, throw=False),
+        "accelerations": lambda m: udk.accelerations(m, 0.0, m.q0, m.v0),
+        "energy": lambda m: udk.energy(m, run),
+        "analyse": udk.analyse,
+        "assemble": udk.assemble,
+    }
+    for use in uses.values():
+        with pytest.raises(udk.SceneError, match=f"{place}: must be > 0, not "):
+            use(negative)
+    code = eqx.filter_jit(lambda m: udk.simulate(m, TS, throw=False).code)(negative)
+    assert code == udk.Result.invalid_argument
+
+
+def test_a_concrete_leaf_without_meaning_beside_a_traced_one_is_an_invalid_argument():
+    negative = eqx.tree_at(lambda m: m.joints["string"].length, rod_on_a_string(), jnp.asarray(-0.5))
+    run = jax.jit(lambda g: udk.simulate(eqx.tree_at(lambda m: m.gravity, negative, g), TS, throw=False).code)
+    assert run(jnp.array([0.0, -9.81])) == udk.Result.invalid_argument
+
+
 def test_constants_of_gears_follow_from_their_radii(tmp_path):
     """If a radius is changed as a leaf, the run is the same as with a file that has this radius."""
     mechanism = library.planetary_gear()

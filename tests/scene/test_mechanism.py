@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import udkjax.scene as udk
 from tests.elements import P
 from udkjax.scene import element_setup, library
-from udkjax.scene.checks import traced_numbers_are_valid
+from udkjax.scene.checks import numbers_are_valid
 
 
 def test_the_order_is_the_users(everything):
@@ -263,7 +263,7 @@ def _requiring(element):
 
 def test_traced_numbers_are_checked_as_concrete_ones_are(everything):
     """A number that must be positive is not; numbers that must increase do not."""
-    hold = jax.jit(lambda element: traced_numbers_are_valid([element]))
+    hold = jax.jit(lambda element: numbers_are_valid([element]))
     found = [one for element in everything.elements for one in _requiring(element)]
     assert len({(type(owner), name) for owner, name in found}) == 10
     for owner, name in {(type(owner), name): (owner, name) for owner, name in found}.values():

@@ -26,7 +26,7 @@ from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentTypeError, describe
-from udkjax.scene.checks import traced_numbers_are_valid
+from udkjax.scene.checks import numbers_are_valid
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
@@ -206,7 +206,7 @@ def prepare_run(
         state: The initial state; None: the state of `closure`.
         closure: The assembled initial guess.
         choices: All other arguments of `simulate`.
-        xp: jax.numpy, or NumPy if all numbers are concrete (they are then checked already).
+        xp: jax.numpy, or NumPy if all numbers are concrete (`checked` has checked them).
 
     Returns:
         The run. If it is unusable or open, it gets loose tolerances, so as not to delay other members of a batch.
@@ -217,7 +217,7 @@ def prepare_run(
         numbers: Any = (start.q, start.v, rtol, atol, choices.drift_tol, choices.dt0)
         good = usable(*stop_gradients(numbers)) | ~start.is_closed
         if analysis is not None:
-            good = good & stop_gradients(traced_numbers_are_valid(compiled.textbook.mechanism.elements))
+            good = good & stop_gradients(jnp.asarray(numbers_are_valid(compiled.textbook.mechanism.elements)))
             good = good & jnp.isfinite(compiled.textbook.scales.mass)
     if isinstance(ts, Tracer):
         in_order = increases(stop_gradients(ts))

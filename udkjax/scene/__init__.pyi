@@ -15,7 +15,7 @@ from udkjax.scene.bodies import between as between
 from udkjax.scene.bodies import frame_over_time as frame_over_time
 from udkjax.scene.checks import Mistakes as Mistakes
 from udkjax.scene.checks import SceneError as SceneError
-from udkjax.scene.checks import traced_numbers_are_valid as traced_numbers_are_valid
+from udkjax.scene.checks import numbers_are_valid as numbers_are_valid
 from udkjax.scene.description import format_pose as format_pose
 from udkjax.scene.description import size_of as size_of
 from udkjax.scene.drawing import Drawing as Drawing

@@ -24,7 +24,7 @@ from udkjax.requirements import (
     require_count,
     require_number,
 )
-from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.mechanism import Mechanism, require_valid_numbers
 from udkjax.scene.named_arguments import CHECKS, require_history, require_name_or_names, require_names
 from udkjax.wording import article, quote, suggestion
 
@@ -122,7 +122,7 @@ class ParameterCheck(NamedTuple):
 
 def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
     parameter_checks: list[ParameterCheck] = []
-    checks = CHECKS | {"mechanism": require_single}
+    checks = CHECKS | {"mechanism": _require_usable}
     for name, parameter in signature(function).parameters.items():
         annotation = parameter.annotation
         if by_type := _check_of_type(annotation):
@@ -233,11 +233,14 @@ def _choice(known: tuple[Any, ...]) -> ArgumentCheck:
     return check
 
 
-def require_single(name: str, value: Any, given: GivenArguments) -> None:
-    """Require a single mechanism, not a batch."""
-    if isinstance(value, Mechanism) and (shape := np.shape(value._source.gravity)) != (2,):
+def _require_usable(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a single mechanism, not a batch, whose numbers have a meaning."""
+    if not isinstance(value, Mechanism):
+        return
+    if (shape := np.shape(value._source.gravity)) != (2,):
         cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
         raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
+    require_valid_numbers(value)
 
 
 def require_mechanism(value: Any) -> Mechanism:

@@ -3,6 +3,7 @@
 import dataclasses
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from types import UnionType
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool
 from udkjax.annotations import TomlTable
 from udkjax.arrays import is_traced
 from udkjax.scene.bodies import GROUND
-from udkjax.scene.fields import FieldMetadata, StaticValue
+from udkjax.scene.fields import FieldMetadata, Requirement, StaticValue
 from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Cam, Prismatic, Revolute, Slot
@@ -130,19 +131,32 @@ def name_mistake(name: object) -> str:
     )
 
 
-def traced_numbers_are_valid(elements: Iterable[eqx.Module]) -> Bool[Array, ""]:
-    """Return True if traced numbers meet the strict requirements of their fields; concrete numbers are checked on input."""
-    conditions = [jnp.array(True)]
+def numbers_are_valid(elements: Iterable[eqx.Module]) -> Bool[Array, ""] | bool:
+    """Return True if all numbers meet the strict requirements of their fields; concrete numbers lead to a concrete answer."""
+    conditions = list(_strict_conditions(elements))
+    traced = [x for x in conditions if isinstance(x, Tracer)]
+    concrete = all(x for x in conditions if not isinstance(x, Tracer))
+    return jnp.all(jnp.stack([jnp.array(concrete), *traced])) if traced else concrete
+
+
+def _strict_conditions(elements: Iterable[eqx.Module]) -> Iterator[Any]:
     for element in elements:
-        for field in dataclasses.fields(element):
-            value = getattr(element, field.name)
-            if isinstance(value, eqx.Module):
-                conditions.append(traced_numbers_are_valid([value]))
-            elif isinstance(value, Tracer):
-                conditions += [
-                    jnp.all(requirement.holds(value)) for requirement in field.metadata.get("require", ()) if requirement.strict
-                ]
-    return jnp.all(jnp.stack(conditions))
+        required = _strict_requirements(type(element))
+        for name, value in vars(element).items():
+            if value is None or isinstance(value, str | tuple):
+                continue
+            if name in required and isinstance(value, Tracer | jax.Array | np.ndarray):
+                array = value if isinstance(value, Tracer) else np.asarray(value)
+                yield from (x.holds(array).all() for x in required[name])
+            elif not isinstance(value, Tracer | jax.Array) and isinstance(value, eqx.Module):
+                yield from _strict_conditions([value])
+
+
+@cache
+def _strict_requirements(cls: type) -> dict[str, list[Requirement]]:
+    """Return the strict requirements on the fields of a class that have any."""
+    strict = {x.name: [r for r in x.metadata.get("require", ()) if r.strict] for x in dataclasses.fields(cls)}
+    return {name: required for name, required in strict.items() if required}
 
 
 def gravity_mistakes(gravity: object) -> list[str]:

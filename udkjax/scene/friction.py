@@ -1,10 +1,13 @@
 """Friction in joints: smooth, or set-valued, so that joints stick."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal, TypeGuard
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
@@ -14,6 +17,13 @@ from udkjax.scene.forces import ForceElement, Wrench, couple, load_at
 from udkjax.scene.joints import Joint, Prismatic, Revolute, Slot
 
 SLIDING_SPEED = 1e-3  # default speed of sliding at which smooth friction is largest (m/s)
+
+
+def _is_concrete_number(x: Any) -> TypeGuard[float]:
+    if isinstance(x, Tracer) or not isinstance(x, int | float | np.generic | np.ndarray | jax.Array):
+        return False
+    array = np.asarray(x)
+    return array.shape == () and array.dtype.kind in "fiu"
 
 
 class Friction(ForceElement):
@@ -46,8 +56,8 @@ class Friction(ForceElement):
         velocity: relative angular velocity over which the constant torque is smoothed (rad/s), greater than zero.
         coefficient: coefficient of friction while sliding, not negative.
         radius: radius of the pin (m), greater than zero; for a revolute joint with a coefficient.
-        static_coefficient: largest coefficient, reached at `speed` or, in the set-valued law, at rest; not negative; by default
-            `coefficient`.
+        static_coefficient: largest coefficient, reached at `speed` or, in the set-valued law, at rest; at least `coefficient`,
+            which is the default.
         speed: speed of sliding at which the smooth coefficient is largest (m/s), greater than zero; by default 0.001.
         viscous: growth of the coefficient with the speed of sliding (s/m), not negative.
         length: length of the guide of a prismatic joint (m), greater than zero; by default only |N| counts.
@@ -110,6 +120,8 @@ class Friction(ForceElement):
         for name in ("radius", "static_coefficient", "viscous", "length"):
             if name in given and not rubs:
                 yield f"{name}: it belongs to a coefficient, which is missing"
+        if rubs and "static_coefficient" in given:
+            yield from Friction.mistakes_of_coefficients(given["coefficient"], given["static_coefficient"])
         if joint is None:
             return
         if has_torque and not turns:
@@ -118,6 +130,13 @@ class Friction(ForceElement):
             yield "radius: " + ("missing: the radius of the pin" if turns else "it belongs to a revolute joint")
         if "length" in given and not issubclass(joint, Prismatic):
             yield "length: it belongs to a prismatic joint"
+
+    @staticmethod
+    def mistakes_of_coefficients(sliding: object, static: object) -> Iterator[str]:
+        """Iterate over the mistakes in two coefficients: friction of rest is at least that of sliding, or nothing could start."""
+        numbers = [float(x) for x in (sliding, static) if _is_concrete_number(x)]
+        if len(numbers) == 2 and numbers[1] < numbers[0]:
+            yield f"static_coefficient: must be at least the coefficient of sliding, {numbers[0]:g}, not {numbers[1]:g}"
 
     def loads(self, t, *frames):
         if self.torque is None:

@@ -18,7 +18,7 @@ from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.programs.control_flow import ConvertsItself
 from udkjax.programs.identity_cache import cached_within_trace, is_concrete
 from udkjax.scene.bodies import Body, stack_coordinates
-from udkjax.scene.checks import SceneError, gravity_mistakes
+from udkjax.scene.checks import SceneError, gravity_mistakes, numbers_are_valid
 from udkjax.scene.description import mechanism_table
 from udkjax.scene.direct_numbers import DirectNumbers
 from udkjax.scene.drivers import Driver
@@ -359,6 +359,7 @@ class Mechanism(PrintsTable, ConvertsItself):
 
 
 _VALID: WeakValueDictionary[int, Source] = WeakValueDictionary()  # sources of mechanisms that were checked, by their identities
+_USABLE: WeakValueDictionary[int, Source] = WeakValueDictionary()  # sources of mechanisms that `require_valid_numbers` accepts
 
 
 def _checked(mechanism: Mechanism) -> Mechanism:
@@ -369,6 +370,19 @@ def _checked(mechanism: Mechanism) -> Mechanism:
 
 def _is_checked(mechanism: Mechanism) -> bool:
     return _VALID.get(id(mechanism._source)) is mechanism._source
+
+
+def require_valid_numbers(mechanism: Mechanism) -> None:
+    """Raise a `SceneError` that names concrete numbers without meaning, such as a negative mass.
+
+    Only leaves that an optimizer or `tree_at` changed can be meaningless. Binding a method of Equinox would take longer.
+    """
+    source = mechanism._source
+    if _VALID.get(id(source)) is source or _USABLE.get(id(source)) is source or not is_concrete(mechanism):
+        return
+    if not numbers_are_valid(mechanism.elements):
+        mechanism.with_parameters({})  # raises the error
+    _USABLE[id(source)] = source
 
 
 def _copy(module: Module, changes: dict[str, object]) -> Module:

@@ -8,6 +8,7 @@ from jax.core import Tracer
 
 from udkjax.arrays import number
 from udkjax.requirements import ArgumentTypeError, array, describe, require_finite, require_number
+from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Joint
 
 
@@ -57,6 +58,8 @@ def require_friction(where: str, coefficient: Any, static_coefficient: Any, at_r
         require_number(f"{where}: {name}", value)
         if not isinstance(value, Tracer) and float(value) < 0:
             raise ValueError(f"{where}: {name} must not be negative, not {float(value):g}")
+    for mistake in Friction.mistakes_of_coefficients(coefficient, static_coefficient):
+        raise ValueError(f"{where}: {mistake}")
     if at_rest != "hold":
         raise ValueError(f'{where}: a contact with a coefficient of friction rests: at_rest="hold"')
 

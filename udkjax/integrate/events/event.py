@@ -131,7 +131,7 @@ class Contact(PrintsLine):
         at_rest: "hold": rest in contact; "stop": end the run.
         name: name in lists.
         coefficient: coefficient of friction while sliding, not negative; by default there is no friction.
-        static_coefficient: coefficient of friction while sticking, not negative; by default `coefficient`.
+        static_coefficient: coefficient of friction while sticking, at least `coefficient`, which is the default.
     """
 
     body: str = eqx.field(static=True)
