@@ -1,6 +1,7 @@
 """Invalid arguments of public functions are refused by name before anything is computed; traced ones lead to a result code."""
 
 import inspect
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -157,6 +158,30 @@ CHOICES = [
 @pytest.mark.parametrize(("name", "wrong", "text"), CHOICES, ids=[f"{x[0]}-{k}" for k, x in enumerate(CHOICES)])
 def test_choices_of_a_wrong_type_are_refused(name, wrong, text):
     assert text in message(udk.simulate, MECH, TS, **{name: wrong})
+
+
+RECORD: dict[str, Any] = {"times": TS, "values": {"body.coupler.angle": 0 * TS}}
+CONSTRUCTORS: list[tuple[Any, dict[str, Any], str, str]] = [
+    (udk.Record, RECORD, "values", "values: must map channels to numbers"),
+    (udk.Record, RECORD, "noise", "noise of .*: must be real numbers|noise of .*: must be an array of numbers"),
+    (udk.Record, RECORD, "initial_state", "initial_state: must be a State or a Start"),
+    (udk.Record, RECORD, "t0", "t0: must be"),
+    (udk.Record, RECORD, "conditions", "conditions: must map names of parameters to values"),
+    (udk.Start, {}, "state", "initial_state: must be a State or a Start"),
+    (udk.Start, {}, "estimate", "estimate must be one of"),
+    (udk.Axis, {"values": [1.0]}, "of", "of must be a name, a list of names or a function"),
+    (udk.Sobol, {"n": 4}, "n", "n must be"),
+    (udk.Random, {"n": 4}, "seed", "seed must be"),
+    (udk.Adams, {}, "min_order", "min_order must be"),
+    (udk.BDF, {}, "max_order", "max_order must be"),
+    (udk.Coordinate, {}, "bodies", "bodies must be a name, or a list of names"),
+]
+
+
+@pytest.mark.parametrize(("make", "given", "name", "text"), CONSTRUCTORS, ids=[f"{x[0].__name__}-{x[2]}" for x in CONSTRUCTORS])
+def test_values_of_the_wrong_kind_are_refused_by_constructors(make, given, name, text):
+    for wrong in (object(), 1j, np.zeros((2, 3), complex), [object()], np.array(2.5 + 1j)):
+        assert re.search(text, message(make, **(given | {name: wrong})))
 
 
 def test_a_solver_without_an_error_estimate_is_refused_with_the_cure():

@@ -14,6 +14,7 @@ from udkjax.annotations import Numbers
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.positions.channels import channel_of, point_of_pin
 from udkjax.printing import PrintsLine
+from udkjax.requirements import ArgumentTypeError, describe
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial, effort_unit
@@ -23,6 +24,13 @@ from udkjax.wording import quote, suggestion
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
+
+
+def _names_of_bodies(value: Any) -> tuple[str, ...]:
+    try:
+        return names(value)
+    except TypeError:
+        raise ArgumentTypeError(f"bodies must be a name, or a list of names, {describe(value)}") from None
 
 
 class Coordinate(PrintsLine):
@@ -37,7 +45,7 @@ class Coordinate(PrintsLine):
         axis: for x and y: the direction of x in body 1's frame (rad); by default that of the frame.
     """
 
-    bodies: tuple[str, ...] = eqx.field(static=True, converter=names)
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=_names_of_bodies)
     coordinate: CoordinateName = eqx.field(static=True, default="angle")
     points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
     axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)

@@ -5,6 +5,7 @@ error estimate of fixed order. `steer_error` therefore returns an error from whi
 that the method has chosen.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -15,6 +16,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+
+from udkjax.requirements import require_count
 
 Flag = Bool[ArrayLike, ""]
 Unravel = Callable[[Float[Array, "n"]], PyTree[Array]]
@@ -68,6 +71,8 @@ def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Float[Array, ""], y: Py
 
 def check_orders(least: int, most: int, highest: int) -> None:
     """Raise ValueError for orders that a family of methods lacks."""
+    for name, order in (("min_order", least), ("max_order", most)):
+        require_count(name, order, least=-math.inf)
     if not 1 <= least <= most <= highest:
         raise ValueError(f"orders must satisfy 1 <= min_order <= max_order <= {highest}, not min_order={least}, max_order={most}")
 

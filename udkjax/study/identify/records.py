@@ -1,6 +1,6 @@
 """Records: times, measured values, and the initial state of the motion."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args
 
@@ -12,7 +12,7 @@ from udkjax.annotations import Numbers
 from udkjax.extras import OptionalImport
 from udkjax.positions.assembly import State
 from udkjax.positions.channels import Channel, Quantity
-from udkjax.requirements import describe
+from udkjax.requirements import array, describe, require_number
 from udkjax.scene.checks import Mistakes
 from udkjax.scene.held import Held
 from udkjax.wording import quote
@@ -57,7 +57,9 @@ class Start:
     name: str = ""
 
     def __post_init__(self):
-        if self.estimate not in get_args(Estimated):
+        if not (self.state is None or (hasattr(self.state, "q") and hasattr(self.state, "v"))):
+            raise IdentificationError([f"initial_state: must be a State or a Start, {describe(self.state)}"])
+        if not isinstance(self.estimate, str) or self.estimate not in get_args(Estimated):
             raise IdentificationError(
                 [f"initial_state: estimate must be one of {', '.join(get_args(Estimated))}, {describe(self.estimate)}"]
             )
@@ -92,8 +94,10 @@ class Record:
         conditions: Mapping[str, Numbers | Held] | None = None,
         name: str = "",
     ):
-        problems: list[str] = []
+        problems = list(_mistakes_of_kind(values, t0, conditions))
         self.name = name
+        if problems:
+            raise IdentificationError([self.place + problem for problem in problems])
         self.times: Float[np.ndarray, "T"] = _numbers("time", times, None, problems)
         self._check_times(t0, problems)
         self.values: dict[ChannelKey, np.ndarray] = {
@@ -148,7 +152,11 @@ class Record:
             if channel not in self.values:
                 problems.append(f"noise: {quote(str(channel))} is not among the channels")
             elif sigma is not None:
-                sigma = np.asarray(sigma, float)
+                try:
+                    sigma = np.asarray(array(f"noise of {quote(str(channel))}:", sigma), float)
+                except ValueError as error:
+                    problems.append(str(error))
+                    continue
                 sigma = sigma if sigma.ndim else np.full(self.times.shape, sigma)
                 shapes = self.times.shape, sigma.shape
                 used = sigma[np.isfinite(self.values[channel])] if sigma.shape == self.times.shape else sigma
@@ -158,6 +166,26 @@ class Record:
                     problems.append(f"noise of {quote(str(channel))}: a standard deviation must be a finite number > 0")
                 found[channel] = sigma
         return found
+
+
+def _mistakes_of_kind(values: object, t0: object, conditions: object) -> Iterator[str]:
+    """Iterate over the arguments of a record that are of another kind than they must be."""
+    if not isinstance(values, Mapping):
+        yield f"values: must map channels to numbers, {describe(values)}"
+    try:
+        if t0 is not None:
+            require_number("t0:", t0)
+    except ValueError as error:
+        yield str(error)
+    if conditions is not None and not isinstance(conditions, Mapping):
+        yield f"conditions: must map names of parameters to values, {describe(conditions)}"
+        return
+    for name, value in (conditions or {}).items():
+        try:
+            if not isinstance(value, Held):
+                array(f"conditions: {name}", value)
+        except ValueError as error:
+            yield str(error)
 
 
 def labels(records: Sequence[Record]) -> list[str]:

@@ -23,6 +23,7 @@ from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.pinv import Auto, Dense, Elimination, OneOf
 from udkjax.positions.assembly import State
+from udkjax.requirements import ArgumentTypeError, describe, require_count
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.choices import Choice
 from udkjax.study.quantities import Setter, StudyModel
@@ -66,6 +67,9 @@ class Axis:
 
     def __init__(self, values: Values, of: str | Sequence[str] | Setter | None = None, units: str | None = None):
         self.values, self.units = values, units
+        is_list = isinstance(of, Sequence) and all(isinstance(name, str) for name in of)
+        if not (of is None or callable(of) or is_list):
+            raise ArgumentTypeError(f"of must be a name, a list of names or a function of (mechanism, value), {describe(of)}")
         self.of = (of,) if isinstance(of, str) else of if of is None or callable(of) else tuple(of)
 
     def __repr__(self) -> str:
@@ -220,8 +224,8 @@ class SweepDesign(abc.ABC):
     seed: int = 0
 
     def __post_init__(self):
-        if self.n < 1:
-            raise ValueError(f"a design needs at least one member, not {self.n}")
+        require_count("n", self.n)
+        require_count("seed", self.seed, least=0)
 
     @abc.abstractmethod
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
