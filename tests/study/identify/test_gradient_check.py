@@ -261,6 +261,10 @@ def test_wrong_second_derivatives_are_found(monkeypatch):
 
 def test_directions_are_combinations_of_unknowns():
     estimate = identify(pendulum(*FIRST), {"time": TS, ANGLE: swing(pendulum())}, NAMES, progress=False)
+    wrong: Any
+    for wrong in ([], 1j, {"both": 1.0}, {"both": {NAMES[0]: []}}):
+        with pytest.raises(ValueError, match=r"^directions.* must "):
+            estimate.check_gradients(directions=wrong)
     check = estimate.check_gradients(directions={"both": {NAMES[0]: 0.375, NAMES[1]: 0.2}})
     assert check.ok and check.names == ("both",)
     np.testing.assert_allclose(check.directions, np.full((1, 2), np.sqrt(0.5)), rtol=1e-6)  # relative changes of both

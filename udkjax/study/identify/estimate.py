@@ -14,6 +14,7 @@ from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import scene_text, versions
 from udkjax.positions.assembly import State
 from udkjax.printing import PrintedTable, html_table, text_table
+from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.directions import Directions
 from udkjax.study.identify.fit_problem import FitProblem
@@ -164,6 +165,7 @@ class Estimate:
         evaluate = weighted_residuals(self.problem, self.tol, self.loss)
         return profile_likelihood(evaluate, self.problem.unknowns, self.z, self.uncertainty, name, level)
 
+    @checked
     def check_gradients(self, order: Literal[1, 2] = 1, directions: Directions | None = None) -> GradientCheck:
         """Compare the derivatives at the estimate with finite differences.
 
