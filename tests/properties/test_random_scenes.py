@@ -244,6 +244,7 @@ def test_every_number_is_named(make, name):
 
 KINDS_OF_VALUES: dict[str, Any] = {
     "an object": object(),
+    "settings": udk.Baumgarte(),
     "a complex number": 1j,
     "an empty list": [],
     "an empty mapping": {},

@@ -207,7 +207,7 @@ def _is_coordinate(x: Any) -> bool:
 def _is_parameter(x: Any) -> bool:
     """Return True for the name of a parameter, a `Parameter`, or names of tied parameters."""
     is_tie = isinstance(x, list | tuple) and all(isinstance(name, str) for name in x)
-    return isinstance(x, str) or is_tie or callable(x) or dataclasses.is_dataclass(x)
+    return isinstance(x, str) or is_tie or callable(x) or hasattr(x, "of")
 
 
 def _require_point(name: str, value: Any, given: GivenArguments) -> None:
