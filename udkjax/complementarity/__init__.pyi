@@ -7,7 +7,9 @@ from udkjax.complementarity.linear import solve_general_complementarity as solve
 from udkjax.complementarity.linear import solve_rows as solve_rows
 from udkjax.complementarity.linear import times as times
 from udkjax.complementarity.stick_or_slip import AT_REST as AT_REST
+from udkjax.complementarity.stick_or_slip import BLOCK_STEPS as BLOCK_STEPS
 from udkjax.complementarity.stick_or_slip import SIDES as SIDES
+from udkjax.complementarity.stick_or_slip import SINGLE_STEPS as SINGLE_STEPS
 from udkjax.complementarity.stick_or_slip import ContactsAtRest as ContactsAtRest
 from udkjax.complementarity.stick_or_slip import FrictionModes as FrictionModes
 from udkjax.complementarity.stick_or_slip import JointsAtRest as JointsAtRest

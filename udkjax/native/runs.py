@@ -16,7 +16,7 @@ from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import Conditions
-from udkjax.native.watching.passing import Passing
+from udkjax.native.watching.passed_events import Passing, SlideLock, Sliding, Turning
 from udkjax.native.watching.watching import Watching
 
 
@@ -93,13 +93,22 @@ class RunStates(Operation):
         points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
 
-    def watching(self, conditions: Conditions, **kinks: Any) -> "RunWatched":
+    def watching(
+        self, conditions: Conditions, kinks: dict[str, Any] | None = None, slides: dict[str, Any] | None = None, **passing: Any
+    ) -> "RunWatched":
         """Return the operation that integrates up to the first crossing of conditions.
 
-        It passes `kinks`, the fields of `Passing`; without them, each ends the run.
+        Args:
+            conditions: The conditions.
+            kinks: The fields of `Turning`; None: each kink ends the run.
+            slides: The fields of `Sliding`; None: each event of a joint that may stick ends the run.
+            passing: The other fields of `Passing`.
         """
         own = {item.name: getattr(self, item.name) for item in fields(self)}
-        return RunWatched(**own, conditions=conditions, passing=Passing(**kinks) if kinks else None)
+        turning = None if kinks is None else Turning(**kinks)
+        sliding = None if slides is None else _sliding(**slides)
+        passes = turning is not None or sliding is not None
+        return RunWatched(**own, conditions=conditions, passing=Passing(turning, sliding, **passing) if passes else None)
 
     @property
     def _for_derivatives(self) -> dict[str, Any]:
@@ -120,7 +129,7 @@ class RunWatched(RunStates):
     """Integrate up to the first crossing of conditions, or until a crossing cannot be ruled out."""
 
     conditions: Conditions | None = None
-    passing: Passing | None = None  # kinks that are recorded, and do not end the run
+    passing: Passing | None = None  # events that are recorded, and do not end the run
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         assert self.conditions is not None
@@ -129,8 +138,8 @@ class RunWatched(RunStates):
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         assert self.conditions is not None
         n = self.code.coordinate_count
-        kinks = [(self.passing.record_length(n, self.conditions.count),)] if self.passing else []
-        return [*super().outputs(inputs, times), (self.conditions.output_count(n),), *kinks]
+        passed = [(self.passing.record_length(n),)] if self.passing else []
+        return [*super().outputs(inputs, times), (self.conditions.output_count(n),), *passed]
 
 
 @dataclass(frozen=True)
@@ -190,6 +199,10 @@ class RunCotangents(RunStates):
         if goes_back(inputs):
             return [*map(_empty, results), *bars, (0,)]
         return [*results, *map(_empty, bars), (self.record_length,)]
+
+
+def _sliding(locks: Sequence[dict[str, Any]], **others: Any) -> Sliding:
+    return Sliding(locks=tuple(SlideLock(**x) for x in locks), **others)
 
 
 def goes_back(inputs: Sequence[Any]) -> bool:

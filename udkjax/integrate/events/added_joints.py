@@ -19,6 +19,7 @@ class AddedJoint(NamedTuple):
     """A joint that an event adds."""
 
     program: ScalarProgram  # computes all numbers of the joint from q and its constant numbers
+    changing: tuple[int, ...]  # indices of the numbers that depend on q
 
 
 class NumberOf(NamedTuple):
@@ -46,7 +47,9 @@ def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
         shapes, graph = [(3 * len(names),), *(np.shape(x) for x in leaves)], Graph()
         inputs = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
         outputs = [x for array in trace_scalars(graph, numbers, inputs, (0,)) for x in array.flat]
-        joints.append(AddedJoint(ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs)))
+        constant = {x.index for array in inputs[1:] for x in array.flat}
+        changing = tuple(i for i, x in enumerate(outputs) if x.index not in constant)
+        joints.append(AddedJoint(ScalarProgram(graph, [x for array in inputs for x in array.flat], outputs), changing))
     return tuple(joints)
 
 

@@ -145,12 +145,11 @@ def machine_plan(
         compiled: the mechanisms of the phases.
         conditions: conditions of all events.
     """
-    directed = [int(k) for k in (*np.flatnonzero(plan.impacts), *plan.forwards)]
-    of_kinks = places_of_kinks(events, phases.held)
+    added, of_kinks = added_joints(phases), places_of_kinks(events, phases.held)
     rows = [x.plan.operation.code.row_count for x in compiled if x.plan.operation is not None]
     with_rows = [with_forces(conditions, events, phases.switches, m) for m in rows]
-    plans = [phase_plan(which, phases, m, with_rows[which], directed, of_kinks) for which, m in enumerate(compiled)]
-    return MachinePlan(plan, tuple(plans), added_joints(phases), tuple(zip(phases.held, of_kinks.elements, strict=True)))
+    plans = [phase_plan(which, plan, phases, m, with_rows[which], added, of_kinks) for which, m in enumerate(compiled)]
+    return MachinePlan(plan, tuple(plans), added, tuple(zip(phases.held, of_kinks.elements, strict=True)))
 
 
 _plan_for_structure = cached_by_structure(machine_plan)

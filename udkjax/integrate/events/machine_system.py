@@ -15,7 +15,8 @@ from udkjax.integrate.events.crossings import NO_EVENT, ZERO
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import OPEN, Contacts
 from udkjax.integrate.events.kinks import FREE, MOST_KINKS, HeldElement
-from udkjax.integrate.events.phase_code import PassedKinks, PhaseCode, PhasePlan, StretchEnd
+from udkjax.integrate.events.passed_events import PassedEvents, put_locks
+from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.phases import SCENE, SWITCHED
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
@@ -88,8 +89,7 @@ class MachineSystem:
         holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
         self._watched = [np.append(np.arange(E), E + holds[: x.force_count]) for x in plan.phases]
         self._rooms = [x.number_count for x in plan.phases]
-        passings = [(x.run.passing, len(watched)) for x, watched in zip(plan.phases, self._watched, strict=True)]
-        self._most_passed = [None if x is None else x.most(n, count) for x, count in passings]
+        self._most_passed = [None if x.run.passing is None else x.run.passing.most(n) for x in plan.phases]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
     def contacts(self, members: MemberIndices) -> Contacts:
@@ -236,25 +236,30 @@ class MachineSystem:
             runs.t[drifting], runs.q[drifting], runs.v[drifting] = (x[drifts, last_kept] for x in (times, stretch.q, stretch.v))
             is_open = drifts & lost[:, 0] & (start == ts[:, 0])
             runs.code[members[is_open]], runs.t[members[is_open]] = Result.initial_state_open, start[is_open]
-        if stretch.kinks is not None:
-            self._note_kinks(runs, members, stretch.kinks)
+        if stretch.passed is not None:
+            self._note_passed(runs, which, members, stretch.passed)
 
-    def _note_kinks(self, runs: MemberRuns, members: Int[np.ndarray, "b"], kinks: PassedKinks):
-        """Record the kinks that machine code has passed."""
-        noted = (np.arange(kinks.t.shape[1]) < kinks.count[:, None]) & (kinks.t <= runs.t[members, None])
+    def _note_passed(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"], passed: PassedEvents):
+        """Record the events that machine code has passed, and what they have changed."""
+        noted = (np.arange(passed.t.shape[1]) < passed.count[:, None]) & (passed.t <= runs.t[members, None])
         b, k = np.nonzero(noted)
         if not b.size:
             return
-        first, here = self.plan.first_kink_side, members[b]
-        sides = runs.joints[-1][here]
-        sides[:, first:] = kinks.sides[b, k]
-        q, v = (np.stack([x[b, k]] * 2, axis=1) for x in (kinks.q, kinks.v))
-        new = kinks.t[b, k], q, v, kinks.event[b, k], runs.phase[here], False, OPEN, sides
+        plan, here, sides, phase = self.plan, members[b], passed.sides[b, k], runs.phase[members[b]]
+        if passed.locked.shape[2]:
+            phase = plan.with_locks(phase, passed.locked[b, k], np)
+        q, v = (np.stack([x[b, k], y[b, k]], axis=1) for x, y in ((passed.q, passed.q), (passed.v, passed.v_after)))
+        new = passed.t[b, k], q, v, self._watched[which][passed.event[b, k]], phase, False, OPEN, sides
         for array, x in zip(runs.record, new, strict=True):
             array[here, runs.count[here] + k] = x
         last = k == noted.sum(1)[b] - 1
-        runs.joints[-1][here[last]] = sides[last]
+        ended = here[last]
+        runs.joints[-1][ended], runs.phase[ended] = sides[last], phase[last]
         runs.count[members] += noted.sum(1)
+        if plan.sticking:
+            runs.carried[ended] = (runs.carried[ended] & ~plan.slides) | plan.not_sliding(sides[last], np)
+        if passed.locked.shape[2]:
+            put_locks(plan, self._added, runs.joints, ended, passed.locks[b[last]])
 
     def _fail(
         self,
@@ -289,8 +294,13 @@ class MachineSystem:
         zero = np.where(self.plan.slides, np.maximum(self._phases[which].atol(members), ZERO), ZERO)
         watch[:, room + 2 * C : room + 2 * C + E] = zero * runs.scale[members]
         if (most := self._most_passed[which]) is not None:
-            watch[:, -1] = np.minimum(MOST_KINKS - 1 - runs.kink_count(self.plan, members), most)
+            watch[:, room + 4 * C + 1] = self._events_to_pass(runs, members, most)
         return watch
+
+    def _events_to_pass(self, runs: MemberRuns, members: Int[np.ndarray, "b"], most: int) -> Int[np.ndarray, "b"]:
+        """Return the number of events that the next call may pass: `most`, or those left of the limits of events and kinks."""
+        kinks = runs.kink_count(self.plan, members)
+        return np.minimum(np.minimum(MOST_KINKS - 1 - kinks, self.plan.max_events - (runs.count[members] - kinks)), most)
 
     def _watch_before(self, plan: PhasePlan, watched: Int[np.ndarray, "C"]) -> Float[np.ndarray, "B K"]:
         """Return the array of `_watch` before a run, with the entries that stay constant."""
@@ -298,4 +308,9 @@ class MachineSystem:
         room, ones = plan.number_count + 2 * len(watched), np.ones((B, 1))
         force = ZERO * units.mass * units.length * units.rate**2
         constants = force[:, None] * np.ones(len(watched)), self.plan.both_directions[watched] * ones, units.scene_rate[:, None]
-        return np.concatenate([np.zeros((B, room)), *constants, np.zeros((B, int(plan.run.passing is not None)))], axis=1)
+        of_passing = []
+        if plan.run.passing is not None:  # the locks of joints that stick are the last of the joints that events add
+            count, numbers = plan.run.passing.constants(self.inverse_mass.shape[1]), self._joint_numbers
+            locks = numbers[:, numbers.shape[1] - count :]
+            of_passing = [np.zeros((B, 1)), np.broadcast_to(locks, (B, count))]
+        return np.concatenate([np.zeros((B, room)), *constants, *of_passing], axis=1)

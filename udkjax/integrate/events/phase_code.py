@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
-from udkjax.integrate.events.added_joints import places_of_joints
-from udkjax.integrate.events.crossings import ZERO
+from udkjax.integrate.events.added_joints import AddedJoint, places_of_joints
+from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.kinks import KinkPlaces, places_of_sides
+from udkjax.integrate.events.passed_events import NumberPlaces, PassedEvents, passed_events
 from udkjax.integrate.events.phases import SWITCHED, Phases, Switches
 from udkjax.integrate.events.runs import RunState
 from udkjax.integrate.events.switched import places_of_switches
@@ -62,34 +63,39 @@ class PhasePlan(NamedTuple):
 
 def phase_plan(
     which: int,
+    plan: EventPlan,
     phases: Phases,
     compiled: CompiledMechanism,
     conditions: Conditions,
-    directed: Sequence[int],
+    added: Sequence[AddedJoint],
     of_kinks: KinkPlaces,
 ) -> PhasePlan:
     """Return the operations of the phases of the mechanism `which`, SCENE or SWITCHED.
 
     Args:
         which: the mechanism.
+        plan: the events.
         phases: all phases.
         compiled: the mechanism, compiled.
         conditions: conditions of all events, with forces.
-        directed: the events whose directions of impulses are needed.
+        added: the joints that events add.
         of_kinks: the places of kinks among the numbers of events.
     """
-    run, added, active = compiled.plan.operation, [name for _, name in phases.added_by], ()
+    run, names, active = compiled.plan.operation, [name for _, name in phases.added_by], ()
     assert run is not None  # checked by the caller
     mechanism, joints = compiled.samples.stand_in(compiled.textbook.mechanism), [()] * len(added)
+    directed = tuple(int(k) for k in (*np.flatnonzero(plan.impacts), *plan.forwards))  # with directions of impulses
     without = replace(conditions, forces=None, force_key="")
     has_forces = any(which == SWITCHED or x.contact < 0 for x in phases.sticking)
     if which == SWITCHED:
-        active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, added)
+        active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, names)
     sides = places_of_sides(mechanism, phases.sided) if phases.sided else ()
     watched = conditions if which == SWITCHED else without  # nothing is held that could let go
+    first_mark = run.code.number_count - 2 - run.code.row_count if run.code.marks_rows else -1
+    places = NumberPlaces(sides, joints, active, first_mark)
     return PhasePlan(
-        run=run.watching(watched, **_passed(phases, watched, of_kinks, sides)),
-        states=run.accelerations.of_events(conditions if has_forces else without, tuple(directed)),
+        run=run.watching(watched, **passed_events(plan, phases, watched, of_kinks, added, places)),
+        states=run.accelerations.of_events(conditions if has_forces else without, directed),
         marking=_marking(compiled.textbook) if run.code.marks_rows else None,
         projected=compiled.plan.projected,
         project=run.accelerations.projection if added else None,
@@ -97,27 +103,6 @@ def phase_plan(
         active=active,
         sides_of_events=of_kinks.sides,
     )
-
-
-def _passed(phases: Phases, conditions: Conditions, of_kinks: KinkPlaces, sides: tuple[int, ...]) -> dict[str, Any]:
-    """Return the kinks that a run passes; `sides` are the places of all sides among the numbers of the scene."""
-    if not phases.held:
-        return {}
-    first, turns, renewals = phases.held[0].first, [], []
-    for held, numbers in zip(phases.held, of_kinks.elements, strict=True):
-        turns += [(held.first - first + side, factor, shift) for side, factor, shift in held.smooth.turns]
-        own = [("kink sides", held.first - first + k) for k in range(held.smooth.count)]
-        q, v = ([(name, k) for k in held.coordinates] for name in ("state q", "result v"))
-        given = held.smooth.inputs([("condition numbers", k) for k in numbers], ("state t", 0), q, v, own)
-        renewals.append((held.smooth, tuple(given), held.first - first))
-    return {
-        "first": conditions.own_count - len(turns),
-        "turns": tuple(turns),
-        "of_conditions": tuple((place, side - first) for place, side in of_kinks.sides),
-        "of_scene": tuple((place, side - first) for side, place in enumerate(sides) if side >= first and place >= 0),
-        "renewals": tuple(renewals),
-        "zero": ZERO,
-    }
 
 
 def _marking(textbook: Any) -> MarkRows:
@@ -140,25 +125,6 @@ def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> lis
     ]
 
 
-class PassedKinks(NamedTuple):
-    """The kinks that runs have passed, K at most."""
-
-    count: Int[np.ndarray, "b"]
-    event: Float[np.ndarray, "b K"]
-    t: Float[np.ndarray, "b K"]
-    q: Float[np.ndarray, "b K n"]
-    v: Float[np.ndarray, "b K n"]
-    sides: Float[np.ndarray, "b K S"]  # of comparisons, after the kink
-
-    @classmethod
-    def of(cls, record: Float[np.ndarray, "b R"], most: int, sides: int, n: int) -> "PassedKinks":
-        """Return the kinks in the records of runs, which have room for `most`."""
-        count = record[:, 0].astype(int)
-        rows = record[:, 1:].reshape(len(record), most, -1)[:, : count.max(initial=0)]
-        event, t, q, v, sides_after, _ = np.split(rows, np.cumsum([1, 1, n, n, sides]), axis=2)
-        return cls(count, event[..., 0], t[..., 0], q, v, sides_after)
-
-
 class StretchEnd(NamedTuple):
     """The ends of runs, at a crossing or elsewhere, and their outputs; integers are stored as floats."""
 
@@ -172,7 +138,7 @@ class StretchEnd(NamedTuple):
     sides: Float[np.ndarray, "b C"]
     q_end: Float[np.ndarray, "b n"]  # at t
     v_end: Float[np.ndarray, "b n"]
-    kinks: PassedKinks | None  # None if the scene has none
+    passed: PassedEvents | None  # None if runs pass no events
 
 
 class PhaseCode:
@@ -242,8 +208,8 @@ class PhaseCode:
         (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
         q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
         passing = self.plan.run.passing
-        kinks = None if passing is None else PassedKinks.of(record[0], passing.most(n, conditions.count), passing.count, n)
-        return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, kinks)
+        passed = None if passing is None else PassedEvents.of(record[0], passing, n)
+        return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, passed)
 
     def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:
         """Evaluate the conditions of members at states."""

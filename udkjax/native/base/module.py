@@ -336,6 +336,9 @@ class Module(Running):
         """Return the address of the numbers with which the constants of a lane are computed; by default those given."""
         return numbers
 
+    def enter_start(self, f: Function, lane: Value, member: Value):
+        """Set the constants of a lane again as they were at the start of its member; by default they are so yet."""
+
     def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
         """Hook: called with the addresses of the numbers and constants of a lane when they have changed."""
 

@@ -99,8 +99,7 @@ def write_finish(module: Module):
         with f.each(module.n) as i:
             for name, x in (("state q", q), ("result v", v)):
                 module.put_lane_entry(f, name, k, f.load(x, i), i)
-        if module.plan.sampled:
-            enter_first_row(module, f, k, member)
+        module.enter_start(f, k, member)
     setattr(s, "state t", s.start)
     with f.each(module.rowcount) as r:
         module.put(f, "state v", r, module.vector(f, "result v", r))

@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.module import Module
-from udkjax.native.base.samples import write_next_breakpoint
+from udkjax.native.base.samples import enter_first_row, write_next_breakpoint
 from udkjax.native.base.steps import Status
 from udkjax.native.run.breakpoints import aim
 from udkjax.native.run.controller import write_decide
@@ -86,6 +86,10 @@ class Trajectory(Module):
             self.copy(f, "result v", "state v")
             self.invoke(f, FORMULATE, "result a")
             self.copy(f, "saved v", "state v")
+
+    def enter_start(self, f: Function, lane: Value, member: Value):
+        if self.plan.sampled:
+            enter_first_row(self, f, lane, member)
 
     def before_step(self, f: Function, s: Lane):
         """Hook: called before each attempt at a step, after `t1` has been set."""

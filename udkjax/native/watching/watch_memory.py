@@ -4,7 +4,8 @@ from udkjax.native.base.ir import DOUBLE, Function, Value
 from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.steps import UNIT, Status
 from udkjax.native.watching.conditions import MIDDLE, RESOLUTION, SECOND, TURN, VARIES, Conditions
-from udkjax.native.watching.passing import Passing, PassingRuns
+from udkjax.native.watching.passed_events import Passing
+from udkjax.native.watching.passing import PassingRuns
 
 LANE_NUMBERS = {
     "node": "time of the next node (s); infinite if there is none",
@@ -40,7 +41,7 @@ class WatchMemory(PassingRuns):
     def __init__(self, plan: Plan, conditions: Conditions, passing: Passing | None = None):
         self.conditions, self.passing = conditions, passing
         super().__init__(plan)
-        self.outputs = ("crossing", "kinks") if passing else ("crossing",)
+        self.outputs = ("crossing", "passed") if passing else ("crossing",)
         self.inputs = (*self.inputs, "watch")
         for name in LANE_NUMBERS:
             self.places.add(name)
@@ -76,6 +77,9 @@ class WatchMemory(PassingRuns):
         self.put_lane_entry(f, "slowest", lane, f.load(given, start))
         if self.passing:
             self.begin_record(f, lane, f.load(given, start + 1))
+            if "lock constants" in self.places.places:
+                with f.each(self.passing.constants(self.n)) as i:
+                    self.put_lane_entry(f, "lock constants", lane, f.load(given, i + (start + 2)), i)
         for x in "qv":
             with f.each(self.n) as i:
                 self.put_lane_entry(f, f"sure {x}", lane, self.lane_entry(f, f"point3 {x}", lane, i), i)

@@ -18,6 +18,8 @@ from udkjax.native.run.manifold import project_output
 from udkjax.native.watching.condition_intervals import write_classification
 from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, MIDDLE, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate
+from udkjax.native.watching.sliding import write_slide
+from udkjax.native.watching.turning import write_turn
 from udkjax.native.watching.watch_memory import WatchMemory
 from udkjax.native.watching.watched_forces import write_forces
 
@@ -33,8 +35,10 @@ class Watching(WatchMemory):
         write_land(self)
         write_approach(self)
         self._write_watch()
-        if self.passing:
-            self.write_pass()
+        if self.passing and self.passing.kinks:
+            write_turn(self, self.passing.kinks)
+        if self.passing and self.passing.slides:
+            write_slide(self, self.passing.slides)
 
     def before_step(self, f: Function, s: Lane):
         with f.if_(f.any_of(s.landing > 0.5)):
@@ -47,8 +51,11 @@ class Watching(WatchMemory):
 
     def after_outputs(self, f: Function, s: Lane):
         if self.passing:
-            with f.if_(f.any_of((s.active > 0.5) & s.code.is_(float(Status.CROSSED)))):
-                f.call("pass_kinks", f.given["work"], f.given["call"])
+            with f.if_(f.any_of(self.may_pass(f, s))):
+                if self.passing.kinks:
+                    f.call("pass_kinks", f.given["work"], f.given["call"])
+                if self.passing.slides:
+                    f.call("pass_slides", f.given["work"], f.given["call"])
 
     def interpolates(self, f: Function, s: Lane) -> Value:
         return f.const(True, BOOL, f.width)  # for the conditions within each step

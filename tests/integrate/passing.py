@@ -1,0 +1,19 @@
+"""Counts of the calls of machine code in runs with events, and runs whose events are all left to the loop of events."""
+
+import numpy as np
+
+from udkjax.integrate.events.machine_system import MachineSystem
+from udkjax.integrate.events.phase_code import PhaseCode
+
+
+def by_the_loop(monkeypatch):
+    """Leave all events to the loop of events."""
+    monkeypatch.setattr(MachineSystem, "_events_to_pass", lambda self, runs, members, most: np.zeros(len(members), int))
+
+
+def counted(monkeypatch, run):
+    """Return the result of a run, the number of its stretches, and the most events that one of them passes."""
+    calls, stretch = [], PhaseCode.run
+    monkeypatch.setattr(PhaseCode, "run", lambda *given: calls.append(given) or stretch(*given))
+    found, plan, n = run(), calls[0][0].plan.run, calls[0][3].q.shape[1]
+    return found, len(calls), plan.passing.most(n)

@@ -1,0 +1,295 @@
+"""Joints with set-valued friction that stop, stick or slip while a run goes on.
+
+The modes of the joints follow by the pivots of complementarity/stick_or_slip.py: the equations of motion are solved in given
+modes; a joint that sticks with a force beyond its limit slides next, one that accelerates against its direction sticks again. In
+the mechanism of the scene, which lacks the locks, a joint that stops can only go on in one of both directions.
+
+All other decisions are left to the loop of events: where several joints come to rest together, where joints that stick depend on
+each other, where both directions obey the law of friction, and where pivots do not end.
+"""
+
+from collections.abc import Callable
+
+from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.base.layout import Lane
+from udkjax.native.base.program import write
+from udkjax.native.run.manifold import project_output
+from udkjax.native.watching.passed_events import Sliding
+from udkjax.native.watching.passing import PassingRuns
+
+
+def write_slide(module: PassingRuns, slides: Sliding):
+    """Write `pass_slides(work, call)`: begin anew the runs that have ended where a joint stops or slips."""
+    _write_locks(module, slides)
+    f, s = module.function("pass_slides", [(POINTER, "work"), (POINTER, "call")])
+    first_force = module.conditions.own_count + slides.first_force
+    stops = module.may_pass(f, s) & _is_among(s.event, slides.first, slides.count)
+    leaves = module.may_pass(f, s) & _is_among(s.event, first_force, slides.count if slides.locks else 0)
+    with f.if_(f.any_of(stops | leaves)):
+        event = s.event - f.select(leaves, f.const(float(first_force), DOUBLE, f.width), float(slides.first))
+        joint = f.intrinsic("floor", event * 0.5)
+        sign = 1.0 - (event - joint * 2.0) * 2.0
+        (_Choice if slides.locks else _ChoiceWithoutLocks)(module, slides, f, s, joint).pass_events(stops, leaves, sign)
+
+
+def _is_among(event: Value, first: int, count: int) -> Value:
+    return (event >= float(first)) & (event < float(first + 2 * count))
+
+
+def _write_locks(module: PassingRuns, slides: Sliding):
+    """Write `lock<j>(work)`: the numbers of the lock of joint j at `state q` that depend on it, among the `new locks`."""
+    p, constants, place = module.places, 0, 2 * len(slides.locks)
+    for j, lock in enumerate(slides.locks):
+        count = lock.constants(module.n)
+        inputs = [("work", p["state q"] + i) for i in range(module.n)]
+        inputs += [("work", p["lock constants"] + constants + i) for i in range(count)]
+        outputs = [("work", p["new locks"] + place + i) for i in range(len(lock.program.outputs))]
+        written = write(lock.program, f"lock{j}", module.plan.width, ("work",), inputs, outputs, cold=True)
+        module.functions.append(written)
+        constants, place = constants + count, place + len(lock.program.outputs)
+
+
+class _Modes:
+    """The code that chooses the modes of the joints at an event, and begins runs anew in these."""
+
+    def __init__(self, module: PassingRuns, slides: Sliding, f: Function, s: Lane, joint: Value):
+        self._module, self._slides, self._f, self._s, self._joint = module, slides, f, s, joint
+        self._zero, self._one = (f.const(x, DOUBLE, f.width) for x in (0.0, 1.0))
+
+    def pass_events(self, stops: Value, leaves: Value, sign: Value):
+        """Pass the events of lanes in which the joint of the event `stops`, or `leaves` its lock in the direction `sign`."""
+        f, s, module = self._f, self._s, self._module
+        self._look("sure v")
+        module.look_at_event(f, s)
+        asked = (stops | leaves) & ~self._is_beside_others()
+        for name in ("sides", "locks"):
+            self._copy_numbers(name, f"kept {name}", asked)
+        found = self._choose(stops & asked, leaves & asked, sign)
+        self._look("after v")
+        module.look_at_event(f, s, "after v")
+        passes = found & ~self._others_are_beyond()
+        fails = asked & ~passes
+        with f.if_(f.any_of(fails)):
+            for name in ("sides", "locks"):
+                self._copy_numbers(f"kept {name}", name, fails)
+            self._enter(fails)
+        self._watch(passes)
+        module.begin_anew(f, s, passes)
+
+    def _choose(self, stops: Value, leaves: Value, sign: Value) -> Value:
+        """Choose the modes and `after v`; return the lanes in which they obey the law of friction."""
+        raise NotImplementedError
+
+    # --- numbers and conditions
+
+    def _each_joint(self, do: Callable[[Value, Value], None]):
+        """Run `do` for each joint j, with the mask of the lanes whose event is its own."""
+        with self._f.each(self._slides.count) as j:
+            do(j, self._joint.is_(self._f.like(j, DOUBLE, self._f.width)))
+
+    def _entry(self, name: str, i: Value) -> Value:
+        return self._module.entry(self._f, name, i)
+
+    def _put(self, name: str, i: Value, new: Value, mask: Value):
+        self._module.put_entry(self._f, name, i, self._f.select(mask, new, self._entry(name, i)))
+
+    def _copy_numbers(self, source: str, to: str, mask: Value):
+        with self._f.each(self._module.places_of(to.removeprefix("kept "))) as i:
+            self._put(to, i, self._entry(source, i), mask)
+
+    def _enter(self, mask: Value):
+        """Compute the constants of the masked lanes from their numbers."""
+        with self._module.each_lane(self._f, mask) as k:
+            self._f.call("enter", self._f.given["work"], self._f.given["call"], k)
+
+    def _is_of_joint(self, c: Value) -> Value:
+        """Return whether a condition belongs to a joint that may stick."""
+        f, slides = self._f, self._slides
+        found = (c >= slides.first) & (c < slides.first + 2 * slides.count)
+        if slides.locks:
+            first = self._module.conditions.own_count + slides.first_force
+            found = found | ((c >= first) & (c < first + 2 * slides.count))
+        return f.like(found, BOOL, f.width)
+
+    def _is_beside_others(self) -> Value:
+        """Return the lanes in which another condition is zero, another joint stops, or one is at rest that nothing locks."""
+        f, s, module, slides = self._f, self._s, self._module, self._slides
+        is_near = module.any_condition(f, lambda c, g, _, floor: ~(f.abs(g) > floor) & ~self._is_of_joint(c))
+        found = f.variable(is_near, BOOL)
+        wider = f.max(slides.closed / f.max(s.atol, slides.zero), self._one)
+
+        def look(j: Value, here: Value):
+            c = j * 2 + slides.first
+            is_slow = ~(f.abs(self._entry("condition g", c)) > module.floor_of(f, s, c) * wider) & ~here
+            if slides.locks:
+                is_slow = is_slow & (self._entry("locks", j) < 0.5)
+            found.value = found.value | is_slow | (self._entry("sides", j * 2 + 1) > 0.5)
+
+        self._each_joint(look)
+        return found.value
+
+    def _others_are_beyond(self) -> Value:
+        """Return the lanes in which another condition is not clearly on its side."""
+        return self._module.any_condition(self._f, lambda c, g, side, floor: ~(g * side > floor) & ~self._is_of_joint(c))
+
+    def _watch(self, mask: Value):
+        """Watch the conditions of the joints in their modes."""
+        slides, zero, one = self._slides, self._zero, self._one
+        f = self._f
+
+        def put(j: Value, _: Value):
+            direction = self._entry("sides", j * 2)
+            starts = [(slides.first, (direction > 0.5, direction < -0.5))]
+            if slides.locks:
+                sticks = self._entry("locks", j) > 0.5
+                starts.append((self._module.conditions.own_count + slides.first_force, (sticks, sticks)))
+            for start, masks in starts:
+                for k, is_on in enumerate(masks):
+                    c = j * 2 + (start + k)
+                    self._put("condition on", c, f.select(is_on, one, zero), mask)
+                    self._put("condition side", c, one, mask)
+
+        self._each_joint(put)
+
+    # --- the equations of motion
+
+    def _look(self, v: str):
+        """Compute the accelerations at the event, for the conditions and the law of friction."""
+        f, s, module = self._f, self._s, self._module
+        setattr(s, "state t", s.sure_t)
+        module.copy(f, "sure q", "state q")
+        module.copy(f, v, "state v")
+        module.copy(f, v, "result v")
+        module.accelerate(f, "result a")
+        module.copy(f, "result a", "node a")
+
+    def _respond(self, mask: Value) -> tuple[Value, Value]:
+        """Solve the equations of motion; return the lanes that have a solution, and the largest acceleration of a joint."""
+        f, s, module, slides = self._f, self._s, self._module, self._slides
+        self._enter(mask)
+        self._look("sure v")
+        f.call("own_conditions", f.given["work"])
+        largest, total = f.variable(0.0), f.variable(0.0)
+        with f.each(slides.count) as j:
+            largest.value = f.max(f.abs(self._acceleration(j)), largest.value)
+        with f.each(module.n) as i:  # NaN if the loads of joints have not settled
+            total.value = f.fma(self._entry("result a", i), 0.0, total.value)
+        is_known = total.value.is_(0.0)
+        return (is_known & (s.safe > 0.5) if module.falls_back else is_known), largest.value
+
+    def _acceleration(self, j: Value) -> Value:
+        return self._entry("condition rate", j * 2 + self._slides.first)
+
+
+class _ChoiceWithoutLocks(_Modes):
+    """The choice between both directions in the mechanism of the scene."""
+
+    def _choose(self, stops, leaves, sign):
+        f, module = self._f, self._module
+        ahead = self._try(self._one, stops)
+        back = self._try(-self._one, stops & ~ahead)
+        # Where both directions obey the law, neither is known to be right: the first is tried again after the second.
+        also_back = self._try(-self._one, stops & ahead)
+        found = (back | (ahead & ~also_back)) & stops
+        self._each_joint(lambda j, here: self._put("sides", j * 2, f.select(back, -self._one, self._one), found & here))
+        self._enter(found)
+        module.copy(f, "sure v", "after v")
+        return found
+
+    def _try(self, direction: Value, mask: Value) -> Value:
+        """Return the lanes in which this direction obeys the law."""
+        f = self._f
+        obeys = f.variable(f.const(False, BOOL, f.width), BOOL)
+        with f.if_(f.any_of(mask)):
+            self._each_joint(lambda j, here: self._put("sides", j * 2, direction, mask & here))
+            is_known, largest = self._respond(mask)
+            own = f.variable(0.0)
+            self._each_joint(lambda j, here: own.where(here, self._acceleration(j)))
+            obeys.value = mask & is_known & (own.value * direction >= largest * -self._slides.still)
+        return obeys.value
+
+
+class _Choice(_Modes):
+    """The choice by pivots in the mechanism with locks."""
+
+    def _choose(self, stops, leaves, sign):
+        f, module, slides = self._f, self._module, self._slides
+        can_stick = module.plan.projected and module.falls_back  # otherwise locks that depend on others would not show
+        open_ = f.variable(leaves | (stops if can_stick else f.const(False, BOOL, f.width)), BOOL)
+        found, step = f.variable(f.const(False, BOOL, f.width), BOOL), f.variable(0, INT, 1)
+        self._find_locks(stops)
+
+        def begin(j: Value, here: Value):
+            rests = here | (self._entry("locks", j) > 0.5)
+            self._put("joints at rest", j, f.select(rests, self._one, self._zero), stops | leaves)
+            self._set_mode(j, f.select(stops, self._zero, sign), here & (stops | leaves))
+
+        self._each_joint(begin)
+        with f.while_(lambda: f.any_of(open_.value) & (step.value < slides.most_pivots)):
+            asked = open_.value
+            is_known, largest = self._respond(asked)
+            module.invoke(f, "multipliers_of_settled")
+            f.call("own_forces", f.given["work"])
+            violates = self._pivot(asked & is_known, largest, step.value)
+            found.value = found.value | (asked & is_known & ~violates)
+            open_.value = asked & is_known & violates
+            step.value = step.value + 1
+        module.copy(f, "sure v", "after v")
+        sticks = found.value & self._sticks_newly()
+        with f.if_(f.any_of(sticks)):
+            self._project(sticks)
+        return found.value
+
+    def _pivot(self, mask: Value, largest: Value, step: Value) -> Value:
+        """Change the modes of joints that violate the law; return the lanes in which one does."""
+        f, slides = self._f, self._slides
+        found = f.variable(f.const(False, BOOL, f.width), BOOL)
+        single = f.like(step >= slides.block_steps * slides.count, BOOL, f.width)
+
+        def change(j: Value, _: Value):
+            locked, direction = self._entry("locks", j) > 0.5, self._entry("sides", j * 2)
+            ahead, back = (self._entry("forces", j * 2 + (slides.first_force + k)) for k in range(2))
+            least = f.max(f.abs(ahead), f.abs(back)) * -slides.still
+            returns = ~locked & (self._acceleration(j) * direction < largest * -slides.still)
+            violates = mask & (self._entry("joints at rest", j) > 0.5) & ((locked & ((ahead < least) | (back < least))) | returns)
+            new = f.select(returns, self._zero, f.select(ahead < least, self._one, -self._one))
+            self._set_mode(j, new, violates & ~(single & found.value))
+            found.value = found.value | violates
+
+        self._each_joint(change)
+        return found.value
+
+    def _set_mode(self, j: Value, direction: Value, mask: Value):
+        """Let a joint slide in a direction, or stick if this is zero; a lock that is on is independent of all other rows."""
+        f = self._f
+        sticks = f.select(direction.is_(0.0), self._one, self._zero)
+        self._put("sides", j * 2, direction, mask)
+        for k in range(2):
+            self._put("locks", j + k * self._slides.count, sticks, mask)
+
+    def _find_locks(self, mask: Value):
+        """Give the locks of the joints of the masked lanes their places."""
+        f, module, place = self._f, self._module, 2 * self._slides.count
+        module.copy(f, "sure q", "state q")
+        for j, lock in enumerate(self._slides.locks):
+            f.call(f"lock{j}", f.given["work"])
+            here = mask & self._joint.is_(float(j))
+            for i in range(place, place + len(lock.program.outputs)):
+                module.put_entry(f, "locks", i, f.select(here, module.entry(f, "new locks", i), module.entry(f, "locks", i)))
+            place += len(lock.program.outputs)
+
+    def _sticks_newly(self) -> Value:
+        """Return the lanes in which the joint of the event sticks."""
+        found = self._f.variable(0.0)
+        self._each_joint(lambda j, here: found.where(here, self._entry("locks", j)))
+        return found.value > 0.5
+
+    def _project(self, mask: Value):
+        """Set `after v` to the velocities that the new locks allow."""
+        f, s, module = self._f, self._s, self._module
+        setattr(s, "state t", s.sure_t)
+        module.copy(f, "sure q", "state q")
+        module.copy(f, "sure v", "state v")
+        s.due = f.select(mask, self._one, self._zero)
+        project_output(module, f, s, "due")
+        module.copy(f, "result v", "after v", mask)
