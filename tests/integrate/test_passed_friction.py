@@ -78,7 +78,7 @@ def test_machine_code_passes_events_as_the_loop_does(case, monkeypatch):
 
 def test_the_record_of_events_is_filled_again_and_again(monkeypatch):
     """A call that has passed as many events as its record has room for ends, and the next goes on."""
-    monkeypatch.setattr(Passing, "room", 150)
+    monkeypatch.setattr(Passing, "most", 2)
     _, calls, most = counted(monkeypatch, lambda: udk.simulate(CHAIN, TS))
     few = udk.simulate(CHAIN, TS)
     assert most == 2 and calls > 10

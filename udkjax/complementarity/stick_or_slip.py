@@ -36,8 +36,8 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.complementarity.linear import eliminate
 
-# Iterations for the limits, sweeps of a projected Gauss-Seidel method in each, and the change of the forces, as shares of their
-# limits, at which both end. They decide with which modes pivots begin, and so only the number of pivots.
+# Iterations for the limits, sweeps of a projected Gauss-Seidel method in each, and the change of forces, as shares of their
+# limits, at which sweeps end. They decide with which modes pivots begin, and so only the number of pivots.
 REPETITIONS, SWEEPS, SAME_SHARE = 10, 20, 1e-6
 # Pivots per joint: at first of all joints that violate their law, then only of the first such joint, which does not cycle.
 BLOCK_STEPS, SINGLE_STEPS = 2, 8
@@ -317,15 +317,19 @@ class JointsAtRest(NamedTuple):
             new = force / xp.where(limit > 0, limit, 1.0)
             return xp.where(xp.isfinite(new), new, 0.0)
 
+        def at_limit(share: Any) -> Any:
+            return xp.where(xp.abs(share) > 1 - AT_REST.closed, xp.sign(share), 0.0)
+
         share = xp.where(self.rest, direction, 0.0)
         if xp is np:
-            for _ in range(REPETITIONS):
+            for k in range(REPETITIONS):
                 before, share = share, improve(share)
-                if np.all(np.abs(share - before) < SAME_SHARE):
+                # Pivots settle the rest once the iteration has found the joints at their limits, twice the same.
+                if k and np.array_equal(at_limit(share), at_limit(before)):
                     break
         else:
             share = jax.lax.fori_loop(0, REPETITIONS, lambda _, x: improve(x), share)
-        return xp.where(xp.abs(share) > 1 - AT_REST.closed, xp.sign(share), 0.0)
+        return at_limit(share)
 
     def _modes(self, pivot: _Pivot, xp: ModuleType) -> FrictionModes:
         """Return the modes for given joints within their limits; of these, joints with independent rows are locked."""

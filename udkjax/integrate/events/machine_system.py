@@ -89,7 +89,7 @@ class MachineSystem:
         holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
         self._watched = [np.append(np.arange(E), E + holds[: x.force_count]) for x in plan.phases]
         self._rooms = [x.number_count for x in plan.phases]
-        self._most_passed = [None if x.run.passing is None else x.run.passing.most(n) for x in plan.phases]
+        self._most_passed = [None if x.run.passing is None else x.run.passing.most for x in plan.phases]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
     def contacts(self, members: MemberIndices) -> Contacts:

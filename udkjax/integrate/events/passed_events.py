@@ -134,7 +134,7 @@ class PassedEvents(NamedTuple):
     def of(cls, record: Float[np.ndarray, "b R"], passing: Any, n: int) -> "PassedEvents":
         """Return the events in the records of runs that pass events."""
         count, first = record[:, 0].astype(int), 1 + passing.locks
-        rows = record[:, first:].reshape(len(record), passing.most(n), -1)[:, : count.max(initial=0)]
+        rows = record[:, first:].reshape(len(record), passing.most, -1)[:, : count.max(initial=0)]
         event, t, q, v, v_after, sides, locked = np.split(rows, np.cumsum([1, 1, n, n, n, passing.sides]), axis=2)
         last = np.where(count[:, None] > 0, record[:, 1:first], np.nan)
         index = np.where(np.arange(event.shape[1]) < count[:, None], event[..., 0], 0).astype(int)

@@ -1,6 +1,6 @@
 """Classification of the intervals between nodes: no crossing, a crossing, or unresolved (watching.py)."""
 
-from udkjax.native.base.ir import DOUBLE, Function, Value, Variable
+from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value, Variable
 from udkjax.native.base.layout import Lane
 from udkjax.native.watching.conditions import (
     MIDDLE,
@@ -27,10 +27,12 @@ def write_classification(module: WatchMemory):
     with f.each(module.conditions.count) as c:
         g = [module.condition(f, name, c) for name in ("g0", "g1", "g")]
         rate = [module.condition(f, name, c) for name in ("rate0", "rate1", "rate")]
+        side, on, floor = module.condition(f, "side", c), module.condition(f, "on", c) > 0.5, module.condition(f, "floor", c)
         is_finite = f.is_finite(g[1]) & f.is_finite(g[2]) & f.is_finite(g[0])
+        is_force = f.like(c >= module.conditions.own_count, BOOL, f.width)
+        is_finite = is_finite | (is_force & ~on)  # a force that nothing holds may be anything
         is_smooth = f.is_finite(rate[0]) & f.is_finite(rate[1]) & f.is_finite(rate[2])
         error = _error(f, g, rate, length, x)
-        side, on, floor = module.condition(f, "side", c), module.condition(f, "on", c) > 0.5, module.condition(f, "floor", c)
         for k in range(2):
             after = f.select(f.abs(g[k + 1]) <= floor, side, _sign(f, g[k + 1]))
             hit, is_certain = _classify_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)

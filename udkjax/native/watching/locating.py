@@ -38,8 +38,17 @@ def write_locate(module: WatchMemory):
             first.value = f.min(first.value, f.select(crosses, root, inf))
         return first.value
 
+    def hit_forces() -> Value:
+        """Return the number of forces that cross zero."""
+        count = f.variable(0.0)
+        with f.each(module.conditions.count, module.conditions.own_count) as c:
+            count.value = count.value + f.abs(module.condition(f, "hit", c))
+        return count.value
+
     inf = f.const(float("inf"), DOUBLE, f.width)
     s.where(s.seeks > 0.5, aim=inf, looks=zero)
+    watched = s.holds
+    s.holds = f.select(s.seeks > 0.5, hit_forces(), zero)  # the others are not asked for
     with f.while_(wide):
         is_between = (s.aim > s.low) & (s.aim < s.high) & (s.looks < float(MOST_AIMS))
         s.look = f.select(is_between, s.aim, (s.low + s.high) * 0.5)
@@ -52,6 +61,7 @@ def write_locate(module: WatchMemory):
         s.where(due, aim=f.select(is_beyond, root - beyond, root + beyond), looks=s.looks + 1.0)
     s.look, s.due = s.high, s.seeks
     f.call("look", work)
+    s.holds = watched
     event, seeks = crossed(), s.seeks > 0.5
     is_found = seeks & (event >= 0.0)
     # A step to the crossing lies between two breakpoints. Just after the first breakpoint, and if the second has been reached,

@@ -87,7 +87,7 @@ class Passing:
     of_scene: tuple[tuple[int, str, int], ...]  # places among the numbers of the scene, each with an array of a lane and an index
     zero: float  # bound below which a condition is zero, relative to its scale
 
-    room: ClassVar[int] = 2048  # numbers in a record: each member has one, and further events take a further call
+    most: ClassVar[int] = 64  # events in a record: each member has one, and further events take a further call
 
     @property
     def locks(self) -> int:
@@ -107,10 +107,6 @@ class Passing:
         """Return the length of the record of an event: its condition and time, q, v before and after, sides, locked joints."""
         return 2 + 3 * n + self.sides + self.joints
 
-    def most(self, n: int) -> int:
-        """Return the largest number of events that a call passes."""
-        return max(1, self.room // self.row_length(n))
-
     def record_length(self, n: int) -> int:
         """Return the length of the record of a run: the number of events, the last numbers of the locks, a row for each event."""
-        return 1 + self.locks + self.most(n) * self.row_length(n)
+        return 1 + self.locks + self.most * self.row_length(n)

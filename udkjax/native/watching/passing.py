@@ -26,6 +26,9 @@ class PassingRuns(Trajectory):
     passing: Passing | None
     conditions: Any
 
+    def ask_for_forces(self, f: Function, lane: Value):
+        raise NotImplementedError
+
     def lay_out_passing(self):
         """Reserve memory for the numbers and counts of runs that pass events."""
         if self.passing is None:
@@ -110,12 +113,12 @@ class PassingRuns(Trajectory):
         """Return the lanes that have ended at an event, and have room in their records."""
         return (s.active > 0.5) & s.code.is_(float(Status.CROSSED)) & (s.turned < s.room)
 
-    def look_at_event(self, f: Function, s: Lane, v: str = "sure v"):
-        """Evaluate the conditions at the event."""
+    def look_at_event(self, f: Function, s: Lane, v: str = "sure v", conditions: str = "conditions"):
+        """Evaluate the conditions at the event, all or those of a function."""
         setattr(s, "state t", s.sure_t)
         self.copy(f, "sure q", "state q")
         self.copy(f, v, "result v")
-        f.call("conditions", f.given["work"])
+        f.call(conditions, f.given["work"])
 
     def floor_of(self, f: Function, s: Lane, c: Value) -> Value:
         """Return below which distance from zero a condition is zero: its scale is no less than its change in a unit of time."""
@@ -170,6 +173,7 @@ class PassingRuns(Trajectory):
         f.call("begin", f.given["work"], f.given["call"], k, member)
         for name in ARRAYS:
             self._copy_in_lane(f, k, f"kept {name}", name, self.places_of(name))
+        self.ask_for_forces(f, k)
         kept["max_steps"] = self.lane_entry(f, "max_steps", k) - kept["past tried"]
         times = dict.fromkeys(("node", "sure_t", "fresh", "first_t", *(f"point{j}_t" for j in range(POINTS))), t)
         kept["next"] = f.load(ts, self.to_int(f, kept["written"]) + 1)

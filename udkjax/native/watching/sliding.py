@@ -60,13 +60,16 @@ class _Modes:
         """Pass the events of lanes in which the joint of the event `stops`, or `leaves` its lock in the direction `sign`."""
         f, s, module = self._f, self._s, self._module
         self._look("sure v")
-        module.look_at_event(f, s)
+        # The forces of joints are compared with their limits below; only those of contacts are among the other conditions.
+        forces = module.conditions.force_count - (2 * self._slides.count if self._slides.locks else 0)
+        conditions = "conditions" if forces else "own_conditions"
+        module.look_at_event(f, s, conditions=conditions)
         asked = (stops | leaves) & ~self._is_beside_others()
         for name in ("sides", "locks"):
             self._copy_numbers(name, f"kept {name}", asked)
         found = self._choose(stops & asked, leaves & asked, sign)
         self._look("after v")
-        module.look_at_event(f, s, "after v")
+        module.look_at_event(f, s, "after v", conditions)
         passes = found & ~self._others_are_beyond()
         fails = asked & ~passes
         with f.if_(f.any_of(fails)):

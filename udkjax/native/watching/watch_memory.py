@@ -27,6 +27,7 @@ LANE_NUMBERS = {
     "high": "upper bound of the time of a crossing (s)",
     "aim": "time at which the search for a crossing is to look next (s)",
     "looks": "number of times at which it has looked",
+    "holds": "number of forces of interest where conditions are evaluated",
     "seeks": "whether a crossing is being located",
     "landing": "whether a step is to end at a crossing: 0, WANTED or UNDER_WAY",
     "landings": "number of steps that have ended at a crossing",
@@ -75,6 +76,7 @@ class WatchMemory(PassingRuns):
         self.put_lane_entry(f, "event", lane, f.const(-1.0))
         self.put_lane_entry(f, "share", lane, f.const(1.0))
         self.put_lane_entry(f, "slowest", lane, f.load(given, start))
+        self.ask_for_forces(f, lane)
         if self.passing:
             self.begin_record(f, lane, f.load(given, start + 1))
             if "lock constants" in self.places.places:
@@ -95,6 +97,13 @@ class WatchMemory(PassingRuns):
                 self.copy_lane(f, to, Conditions.head + self.conditions.count + j * self.n, f"sure {x}", k)
             if self.passing:
                 self.end_record(f, k, member)
+
+    def ask_for_forces(self, f: Function, lane: Value):
+        """Let conditions be evaluated with forces if one counts in a lane."""
+        count = f.variable(0.0, width=1)
+        with f.each(self.conditions.count, self.conditions.own_count) as c:
+            count.value = count.value + self.lane_entry(f, "condition on", lane, c)
+        self.put_lane_entry(f, "holds", lane, count.value)
 
     # --- arrays of conditions and states
 

@@ -87,7 +87,8 @@ class Watching(WatchMemory):
         f, s = self.function("conditions")
         f.call("own_conditions", f.given["work"])
         if conditions.forces is not None:
-            self._write_forces(f, s)
+            with f.if_(f.any_of(s.holds > 0.5)):
+                self._write_forces(f, s)
 
     def _write_forces(self, f: Function, s: Lane):
         """Write the forces of constraints, NaN if a pivot is too small, and their rates by differences."""
