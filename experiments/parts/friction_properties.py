@@ -29,6 +29,11 @@ PROPERTIES = {
         1e-9,
         "as above",
     ),
+    "friction of redundant joints": Property(
+        "With redundant rows elimination finds the accelerations and the loads of least norm that singular values find",
+        1e-9,
+        "as above",
+    ),
     "jams": Property(
         "There are no accelerations only where neither repeated substitution nor SciPy, from many starts, finds loads",
         0.5,
@@ -48,6 +53,7 @@ PROPERTIES["friction power of a run" + WITH] = Property("Friction takes power al
 SAME, DIFFERENT = 1e-9, 1e-6  # relative changes of unique quantities, and of others; no verdict in between
 # Redundant structures whose accelerations are checked, and mechanisms of these: one of this number, as each is compiled.
 REDUNDANT_STRUCTURES, REDUNDANT_MEMBERS = 32, 8
+MOST_SHARED = 4  # redundant rows of programs that are unrolled, whose lengths grow as its square
 SAMPLES = 4  # of loads that balance each other
 
 
@@ -67,6 +73,7 @@ def check_friction(tally: Tally, seed: int, structures: Iterable[int], members: 
         q, v = (np.array([x.ravel() for x in states]) for states in zip(*(state_of(s.table) for s in scenes), strict=True))
         if redundant:  # the loads are those of least norm
             found = _by_textbook(scenes, q, v)
+            _check_shares(tally, scenes, q, v, found)
         else:
             found = Programs(build(table), (), [scene.table for scene in scenes], ["multipliers"]).run("multipliers", q, v)
         for k, scene in enumerate(scenes):
@@ -82,6 +89,26 @@ def _by_textbook(scenes: Sequence[RandomScene], q: np.ndarray, v: np.ndarray) ->
         pairs.append(udk.accelerations(build(scene.table), 0.0, *state, method=udk.pinv.SVD(), multipliers=True))
     found = {"a": [np.ravel(a) for a, _ in pairs], "multipliers": [x for _, x in pairs], "safe": np.ones((len(pairs), 1))}
     return {name: np.array(x) for name, x in found.items()}
+
+
+def _check_shares(
+    tally: Tally, scenes: Sequence[RandomScene], q: np.ndarray, v: np.ndarray, expected: dict[str, np.ndarray]
+) -> None:
+    """Hold accelerations and multipliers by elimination against those by singular values."""
+    analyses = [udk.analyse(build(scene.table)) for scene in scenes]
+    rows = analyses[0].redundant_rows
+    if not rows or len(rows) > MOST_SHARED or any(x.redundant_rows != rows for x in analyses):
+        tally.leave_out("friction shared by many redundant rows, or not by the same ones")
+        return
+    weights, tables = np.array([x.scales.weights for x in analyses]), [scene.table for scene in scenes]
+    found = Programs(build(tables[0]), rows, tables, ["multipliers"], weights).run("multipliers", q, v)
+    for k, scene in enumerate(scenes):
+        solved = solve(scene)
+        if not (found["safe"][k, 0] > 0 and solved.is_clear and all(np.isfinite(x["a"][k]).all() for x in (found, expected))):
+            tally.leave_out("friction in rows that are nearly redundant")
+            continue
+        errors = [np.max(abs(found[x][k] - expected[x][k])) / np.max(abs(expected[x][k])) for x in ("a", "multipliers")]
+        tally.add("friction of redundant joints", max(errors) / growth(solved), scene.label)
 
 
 def _check_state(tally: Tally, scene: RandomScene, a: np.ndarray, multipliers: np.ndarray, safe: np.ndarray) -> int:

@@ -18,6 +18,7 @@ from experiments.parts.random_scenes import RandomScene, Table, build, random_sc
 from experiments.parts.reference_equations import Terms, evaluate
 from experiments.parts.tally import Property, Tally, relative
 from udkjax.equations.scene_arrays import SceneArrays
+from udkjax.equations.scene_layout import LoadShares
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.structure import numbers_as_vector
 from udkjax.equations.unrolled import Unrolled
@@ -131,14 +132,19 @@ class Programs:
         redundant: Sequence[int],
         tables: Sequence[Table] = (),
         names: Sequence[str] = ("accelerations", "tangent_part", "rows_and_loads"),
+        weights: np.ndarray | None = None,
     ):
-        """Evaluators by programs of one mechanism, or of `tables` of its structure, whose numbers replace its own."""
-        programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE)
+        """Evaluators by programs of one mechanism, or of `tables` of its structure, whose numbers replace its own.
+
+        With `weights` (members, rows) redundant rows share the loads of joints with friction.
+        """
+        sharing = LoadShares.NONE if weights is None else LoadShares.KNOWN
+        programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE, sharing=sharing)
         self._unrolled = Unrolled(programs, names)
         self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
         own = np.concatenate([np.ravel(x) for x in mechanism.numbers])
         rows = _at_start(mechanism.without_origin, numbers_of(mechanism, tables) if tables else own[None])
-        numbers = np.hstack([rows, np.tile([0.0, SAFE], (len(rows), 1))])
+        numbers = np.hstack([rows, *([] if weights is None else [weights]), np.tile([0.0, SAFE], (len(rows), 1))])
         self._constants = _run(self._unrolled.prologue, numbers)
 
     def run(self, name: str, q: np.ndarray, v: np.ndarray, dv: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:

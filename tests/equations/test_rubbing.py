@@ -1,5 +1,7 @@
 """Friction that depends on the loads of joints: the programs by elimination agree with the textbook, and never add energy."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,17 @@ from udkjax.equations.unrolled import Unrolled
 from udkjax.pinv.rank_policy import RankPolicy
 
 MOVING = {"a": udk.Body(1.0, 0.1, [0.4, 0.1], 0.3), "b": udk.Body(2.0, 0.3, [0.9, 0.3], 0.3)}
+GUIDED = {"a": udk.Body(1.0, 0.1, [0.0, 0.3], velocity=[1.0, 0.0]), "b": udk.Body(2.0, 0.2, [1.0, 0.3], velocity=[1.0, 0.0])}
+GUIDES = {
+    "S1": udk.Prismatic(["ground", "a"], [[0.0, 0.3], [0.1, 0.0]], 0.0),
+    "S2": udk.Prismatic(["ground", "b"], [[0.0, 0.3], [0.2, 0.0]], 0.0),
+    "P": udk.Revolute(["a", "b"], [[0.5, 0.1], [-0.5, 0.1]]),
+}
+REDUNDANT = {  # their redundant rows share loads: of pins, of slides in metres and radians, of both
+    "parallelogram": lambda: rubbing(udk.library.parallelogram()),
+    "two guides": lambda: rubbing(udk.Mechanism(GUIDED, GUIDES, gravity=[0.3, -9.81])),
+    "lift": lambda: rubbing(udk.library.scissor_lift()),
+}
 MECHANISMS = {
     "pendulum": lambda: pendulum(coefficient=0.3, radius=0.1),
     "cart": lambda: cart(0.3, 0.2, static_coefficient=0.4, viscous=0.1),
@@ -47,6 +60,33 @@ def test_elimination_agrees_with_the_textbook(name):
         np.testing.assert_allclose(found["a"], expected, atol=1e-10 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("name", ["two guides", *(pytest.param(x, marks=pytest.mark.slow) for x in ("parallelogram", "lift"))])
+def test_redundant_rows_share_loads_by_least_norm(name):
+    mechanism = REDUNDANT[name]()
+    for factor in (1.0, 8.0):
+        changed = scaled(mechanism, factor)
+        for q, v in states(changed, 2):
+            found = evaluated(changed, prepare(changed).programs, "multipliers", q, v)
+            state = 0.0, q.reshape(-1, 3), v.reshape(-1, 3)
+            a, multipliers = udk.accelerations(changed, *state, method=udk.pinv.SVD(), multipliers=True)
+            np.testing.assert_allclose(found["a"], np.ravel(a), atol=1e-12 * np.abs(a).max())
+            np.testing.assert_allclose(found["multipliers"], multipliers, atol=1e-12 * np.abs(multipliers).max())
+
+
+def test_only_redundant_rows_take_operations():
+    """A scene without redundant rows has the programs of one in which no row may be redundant, also if marks tell so."""
+    mechanism, own = rubbing(udk.library.four_bar()), {"null", "loads0", "border"}
+    equations = prepare(mechanism)
+    marked = replace(equations, redundant=None).programs
+    assert marked.shares_by_marks and not equations.programs.marks_rows
+    switched = replace(equations, redundant=None, only_switched=True).programs
+    for programs in (equations.programs, marked.with_shared_rows(())):
+        assert not own & {*programs.scratch, *programs.accelerations.arrays}
+    assert marked.with_shared_rows(()) is switched
+    shared = prepare(REDUNDANT["parallelogram"]()).programs
+    assert shared.weighs_rows and own <= {*shared.accelerations.arrays}
+
+
 def scaled(mechanism: udk.Mechanism, factor: float) -> udk.Mechanism:
     """Return a mechanism with coefficients of friction multiplied by a factor."""
     names = [x for x in mechanism.parameters() if x.endswith(("coefficient", ".viscous"))]
@@ -56,7 +96,8 @@ def scaled(mechanism: udk.Mechanism, factor: float) -> udk.Mechanism:
 def evaluated(mechanism: udk.Mechanism, programs: ScenePrograms, name: str, q: jnp.ndarray, v: jnp.ndarray) -> dict:
     """Return the results of a program of a mechanism."""
     numbers = map(float, np.concatenate([np.ravel(x) for x in mechanism.without_origin.numbers]))
-    return evaluate_programs(programs, [name], [*numbers, 0.0, 0.0], 0.0, np.asarray(q), np.asarray(v))
+    weights = map(float, udk.analyse(mechanism).scales.weights if programs.weighs_rows else ())
+    return evaluate_programs(programs, [name], [*numbers, *weights, 0.0, 0.0], 0.0, np.asarray(q), np.asarray(v))
 
 
 @pytest.mark.slow

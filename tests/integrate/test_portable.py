@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.friction import rubbing
 from udkjax.integrate.portable import portable_engine, scalar_parameters
 from udkjax.scene.checks import SceneError
 
@@ -22,6 +23,12 @@ def test_parameters_are_named_one_number_at_a_time():
     # A body's numbers follow from the drawing; one that was changed has its own, and goes on having it.
     own = scalar_parameters(mechanism.with_parameters({"body.crank.mass": 3.0}))
     assert own == {**every, "body.crank.mass": 3.0} and "body.crank.mass" not in every
+
+
+def test_a_page_refuses_friction_whose_loads_redundant_rows_share():
+    mechanism = rubbing(udk.library.parallelogram())
+    assert "rows that may be redundant share these" in portable_engine(mechanism).data["why"]
+    assert portable_engine(rubbing(udk.library.four_bar()), runs=False).data["why"] == ""
 
 
 @pytest.mark.parametrize("name", ["pin.Q", "pin.P[2]", "pin.P[0][0]", "body.crank.mas"])

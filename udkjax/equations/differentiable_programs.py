@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from udkjax.equations.friction_elimination import FrictionElimination
+from udkjax.equations.load_sharing import LoadSharing
 from udkjax.equations.scene_layout import RIGHT, ConstraintGroup
 from udkjax.equations.scene_solver import SceneSolver, program
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms, dot, read_bodies, rows, write_jt
@@ -15,6 +16,7 @@ from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, LoopP
 # Arrays that are held fixed in derivatives. Kernels that read sines and cosines differentiate them as functions of q.
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
 NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "misfit", "rubbing", "drag", "new_drag")  # of friction
+NOT_DIFFERENTIATED += LoadSharing.FIXED
 
 # Arrays of the second correction of a solution, whose first-order changes vanish after the first correction.
 SECOND_CORRECTION = ("right2", "sum2", "y2", "x2")
@@ -103,6 +105,8 @@ class DifferentiablePrograms:
         terms, implicit, friction = self._solver.terms, self._implicit_terms, self._friction(right)
         substitute = self._solver.elimination.substitute if friction is None else friction.substitute
         yield Reset("x0", 0, terms.layout.sizes["x0"])
+        if friction is not None:
+            yield from friction.sharing.move_null_space(2)
         for solve in (1, 2):
             yield from implicit.transposed(**names)
             yield from self._rubbing(right)
@@ -121,6 +125,7 @@ class DifferentiablePrograms:
         """Add the loads of friction to jt_x0."""
         friction = self._friction(right)
         if friction is not None:
+            yield from friction.sharing.share(0, "moved_null")
             yield from friction.add_loads(0)
 
     def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, target: str, sign: int) -> DifferentiableProgram:
@@ -129,10 +134,11 @@ class DifferentiablePrograms:
         z, result = terms.add("z", solution=0), terms.add(target, start=x, change="z", sign=sign)
         system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]
         friction = self._friction(right)
-        residuals = [*self._implicit_terms.residuals(right), *self._rubbing(right)]
+        moved = [] if friction is None else [*friction.sharing.move_null_space(1)]
+        residuals = [*self._implicit_terms.residuals(right), *moved, *self._rubbing(right)]
         respond = solver.solve(1) if friction is None else friction.solve(1)
         implicit = [*residuals, z, *terms.rates("z", 1, subtract=True), *respond]
-        solve = solver.solve() if friction is None else friction.settled(0)
+        solve = solver.solve() if friction is None else [*friction.settled(0), *friction.sharing.copy_null_space(0)]
         return DifferentiableProgram(
             program(system, solve, [z, result], [solver.safe] if target == "a" else []),
             [*loads, *implicit, terms.add("z", solution=1, update=ADD, fixed=("constants",)), result],

@@ -27,7 +27,8 @@ from collections.abc import Callable
 
 from udkjax.equations.block_elimination import BlockElimination
 from udkjax.equations.element_programs import RubbingPrograms
-from udkjax.equations.scene_layout import BODIES, BODY_CONSTANTS, BODY_COORDINATES, RIGHT, SLOPES, SOLVES, ConstraintGroup
+from udkjax.equations.load_sharing import LoadSharing
+from udkjax.equations.scene_layout import BODIES, BODY_CONSTANTS, BODY_COORDINATES, RIGHT, SHARED, SLOPES, SOLVES, ConstraintGroup
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, dot, read_bodies
 from udkjax.equations.skew_elimination import SkewElimination
 from udkjax.expressions import Scalar
@@ -47,12 +48,11 @@ class FrictionElimination:
 
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
         self.terms, self._symmetric, self._skew = terms, symmetric, SkewElimination(terms, symmetric)
-        layout = terms.layout
+        self.sharing, layout = LoadSharing(terms, symmetric, self._skew), terms.layout
         layout.sizes |= {"misfit": 1, "rubbing": 1, "drag": layout.coordinate_count, "new_drag": layout.coordinate_count}
         layout.add_solve(CORRECTION)
         layout.sizes["settled"] = layout.sizes[f"x{CORRECTION}"]
         layout.sizes["friction_share"] = 1
-        self.substitute = self._skew.substitute
 
     # --- programs
 
@@ -62,7 +62,9 @@ class FrictionElimination:
         With `reports` there is one round, and `unsettled` is one if it does not suffice to settle x, which is `settled`.
         """
         yield from self._skew.form_symmetric
-        yield from self._correct(solve, v, self._symmetric.substitute, has_slopes=False)
+        yield from self.sharing.find_null_space()
+        yield from self.sharing.share(solve)
+        yield from self._correct(solve, v, self._symmetric_substitute, has_slopes=False)
         for _ in range(1 if reports else ROUNDS):
             yield from self._round(solve, v)
         yield from self._finish(solve, v, reports)
@@ -79,15 +81,28 @@ class FrictionElimination:
         yield from self._round(solve, v)
         yield from self._finish(solve, v, reports=False)
 
+    def _symmetric_substitute(self, solve: int, x: int) -> ProgramParts:
+        yield from self._symmetric.substitute(solve, x=f"x{x}")
+
     def _begin_at_settled(self, solve: int) -> ProgramParts:
         yield from self._skew.form_symmetric
+        yield from self.sharing.find_null_space()
         yield from self._copy_solution("settled", f"x{solve}")
+        yield from self.sharing.share(solve)
 
     def _round(self, solve: int, v: str, in_part: bool = False) -> ProgramParts:
         yield from self._slopes(solve, v, in_part)
         yield from self._skew.factorize()
-        yield from self._skew.substitute(solve)
-        yield from self._correct(solve, v, self._skew.substitute, in_part=in_part)
+        yield from self.sharing.find_border()
+        yield from self.substitute(solve)
+        yield from self.sharing.share(solve)
+        yield from self._correct(solve, v, self.substitute, in_part=in_part)
+
+    def substitute(self, solve: int, x: int | None = None) -> ProgramParts:
+        """Compute the x of a system, or of the system `x`, from the right-hand side of `solve` with the last factors."""
+        x = solve if x is None else x
+        yield from self._skew.substitute(solve, x=f"x{x}")
+        yield from self.sharing.correct(x)
 
     def _finish(self, solve: int, v: str, reports: bool, in_part: bool = False) -> ProgramParts:
         yield from self._measure(solve, v, in_part)
@@ -108,7 +123,8 @@ class FrictionElimination:
 
     def solve(self, solve: int) -> ProgramParts:
         """Compute x = (J C (J + S^T)^T)^(-1) right with the last factors, and jt_x = (J + S^T)^T x."""
-        yield from self._skew.substitute(solve)
+        yield from self.substitute(solve)
+        yield from self.sharing.share(solve)
         yield from self._jt(solve, checked=False)
 
     def add_loads(self, solution: int, **names: str) -> ProgramParts:
@@ -120,7 +136,7 @@ class FrictionElimination:
                     if not s.is_zero:
                         w.write(s, "jt_x", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
 
-            named = {"x": f"x{solution}", "jt_x": f"jt_x{solution}"}
+            named = {"x": self.terms.loads_of(solution), "jt_x": f"jt_x{solution}"}
             yield self.terms.over_rubbing("loads", group, write, **named, **names)
 
     def _correct(
@@ -139,7 +155,8 @@ class FrictionElimination:
 
             names = {"right": f"right{solve}", "rest": f"right{CORRECTION}"}
             yield KernelLoop(terms.kernel(("rest of right", group), rest), group.table, names)
-        yield from substitute(CORRECTION, x=f"x{solve}")
+        yield from substitute(CORRECTION, x=solve)
+        yield from self.sharing.share(solve)
 
     def _drag(self, solve: int, v: str, to: str, has_slopes: bool = True, in_part: bool = False) -> ProgramParts:
         """Compute G(x) - S x on each body, or G(x)."""
@@ -147,14 +164,14 @@ class FrictionElimination:
         for group in self.terms.layout.rubbing:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
-                slopes = [group.slopes(w, row) for row in group.rows] if has_slopes else []
+                slopes = [group.slopes(w, row) for row in group.loaded_rows] if has_slopes else []
                 for k, whole in enumerate(_programs(group).outputs["loads"]):
                     load = _in_part(w, whole) if in_part else whole
                     if not load.is_zero:
                         known = dot(w.graph, _programs(group).x, [row[k] for row in slopes]) if slopes else w.graph.constant(0.0)
                         w.write(load - known, "drag", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
 
-            yield self.terms.over_rubbing(("drag", has_slopes, in_part), group, write, x=f"x{solve}", v=v, drag=to)
+            yield self.terms.over_rubbing(("drag", has_slopes, in_part), group, write, x=self.terms.loads_of(solve), v=v, drag=to)
 
     def _slopes(self, solve: int, v: str, in_part: bool = False) -> ProgramParts:
         for group in self.terms.layout.rubbing:
@@ -164,7 +181,7 @@ class FrictionElimination:
                     slope = Scalar(_programs(group).graph, index)
                     w.write(_in_part(w, slope) if in_part else slope, "slopes", group.column(SLOPES), offset)
 
-            yield self.terms.over_rubbing(("slopes", in_part), group, write, x=f"x{solve}", v=v)
+            yield self.terms.over_rubbing(("slopes", in_part), group, write, x=self.terms.loads_of(solve), v=v)
 
     def _measure(self, solve: int, v: str, in_part: bool) -> ProgramParts:
         """Compute `misfit` and `rubbing`, squares of the change of G(x) by another correction and of G(x), in the metric of C."""
@@ -179,7 +196,7 @@ class FrictionElimination:
                     size = size + compliance(w, k % 3, BODIES + 3 * (k // 3) + BODY_CONSTANTS) * (load * load)
                 w.write(size, "rubbing", None, 0, ADD)
 
-            yield self.terms.over_rubbing("size", group, measure_size, x=f"x{solve}", v=v)
+            yield self.terms.over_rubbing("size", group, measure_size, x=self.terms.loads_of(solve), v=v)
 
         def measure_change(w: KernelWriter):
             changes = [w.read("new_drag", BODY_COORDINATES, k) - w.read("drag", BODY_COORDINATES, k) for k in range(3)]
@@ -191,17 +208,19 @@ class FrictionElimination:
     def _jt(self, solve: int, checked: bool) -> ProgramParts:
         """Compute jt_x = (J + S^T)^T x; if `checked`, with the rest of G(x), and NaN unless it has settled."""
         yield from self.terms.jt(solve)
+        shared = len(self.terms.layout.shared)
         for group in self.terms.layout.rubbing:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
-                x = [w.read("x", RIGHT, i) for i in range(len(group.rows))]
-                slopes = [group.slopes(w, row) for row in group.rows]
+                x = [w.read("x", RIGHT, shared + i) for i in range(len(group.rows))]
+                x += [w.read("x", group.column(SHARED), i) for i in range(len(group.shared_rows))]
+                slopes = [group.slopes(w, row) for row in group.loaded_rows]
                 for k in range(group.coordinates):
                     total = dot(w.graph, [row[k] for row in slopes], x)
                     if not total.is_zero:
                         w.write(total, "jt_x", BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3, ADD)
 
-            names = {name: f"{name}{solve}" for name in ("x", "jt_x")}
+            names = {"x": self.terms.loads_of(solve), "jt_x": f"jt_x{solve}"}
             yield KernelLoop(self.terms.kernel(("jt slopes", group), write), group.table, names)
         if not checked:
             return

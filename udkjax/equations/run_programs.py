@@ -36,6 +36,10 @@ class RunPrograms:
     """True if the programs can also be written as loops, which are compiled sooner."""
     rubs: bool = False
     """True if friction depends on the loads of joints: `accelerations` then report that these are `unsettled`."""
+    weighs_rows: bool = False
+    """True if redundant rows share the loads of joints with friction: numbers are then the weights of rows, not their marks."""
+    shares_by_marks: bool = False
+    """True if redundant rows share such loads, but marks tell which these are, and `with_shared_rows` has the programs."""
     FURTHER: ClassVar[str] = "accelerations_further"
     """The program that goes on from `settled`."""
     STAGES: ClassVar[int] = 8
@@ -46,6 +50,10 @@ class RunPrograms:
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...  # the programs, by their names
+
+    def with_shared_rows(self, rows: tuple[int, ...]) -> "RunPrograms":
+        """Return programs with the same inputs in which these rows are redundant and share loads, by weights instead of marks."""
+        raise NotImplementedError(type(self).__name__)
 
     @property
     def settled_accelerations(self) -> Any:

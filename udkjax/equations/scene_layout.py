@@ -6,6 +6,7 @@ indices at which its coordinates, constants, rows of Psi and entries of Psi_q be
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from functools import cached_property
 from typing import TypeVar
 
@@ -40,8 +41,8 @@ BODY_COORDINATES, SINE, BODY_CONSTANTS = 0, 1, 2
 # of all its rows; then the three columns above for each of its bodies.
 OWN_CONSTANTS, ENTRIES, RIGHT, ROW, BODIES = 0, 1, 2, 3, 4
 # Columns at the end of the table of a group whose friction depends on its load: start indices of the constants of the friction,
-# and of its slopes.
-RUBBING_CONSTANTS, SLOPES = -2, -1
+# and of its slopes; before them, if redundant rows share the loads, the index of the first of its redundant rows among these.
+RUBBING_CONSTANTS, SLOPES, SHARED = -2, -1, -3
 # Indices of constants of the scene. The constants of each body follow: its entries of M^(-1) for x and y, and for the angle.
 DROP_TOL, SAFE_TOL, GAINS = 0, 1, 2
 PER_BODY, MASS_OR_INERTIA = 2, (0, 0, 1)  # number of entries of a body; indices for x, y and the angle
@@ -82,6 +83,12 @@ class ConstraintGroup(ElementGroup):
     entry_index: dict[int, int] = field(default_factory=dict)  # index in `psi_q` of each node of Psi_q that is not constant
     rubbing: RubbingPrograms | None = None  # friction that depends on the load
     slope_index: dict[int, int] = field(default_factory=dict)  # index in `slopes` of each node of its slopes
+    shared_rows: tuple[int, ...] = ()  # the redundant rows of each constraint that share its loads
+
+    @property
+    def loaded_rows(self) -> tuple[int, ...]:
+        """The rows whose multipliers are loads of friction: the eliminated ones, then the redundant ones."""
+        return self.rows + self.shared_rows
 
     def column(self, from_end: int) -> int:
         """Return the index of a column from its index from the end of the table."""
@@ -91,7 +98,7 @@ class ConstraintGroup(ElementGroup):
         """Read the derivative of component k of the friction's loads by x of a row; `base` is the column of a table."""
         s = w.graph.constant(0.0)
         if self.rubbing is not None:
-            s = self.rubbing.outputs["slopes"][self.rows.index(row) * self.coordinates + k]
+            s = self.rubbing.outputs["slopes"][self.loaded_rows.index(row) * self.coordinates + k]
         if s.is_zero:
             return w.graph.constant(0.0)
         value = w.read("slopes", self.column(base) if base < 0 else base, self.slope_index[s.index])
@@ -121,10 +128,36 @@ class ForceGroup(ElementGroup):
     programs: ForcePrograms
 
 
-class SceneLayout:
-    """The groups of a scene's elements, and the sizes of all arrays, for one choice of eliminated rows."""
+class LoadShares(Enum):
+    """The shares of redundant rows in the loads of joints with friction (load_sharing.py) that programs compute.
 
-    def __init__(self, mechanism: Mechanism, redundant_rows: tuple[int, ...] | None, baumgarte: bool, every_row: bool):
+    `KNOWN` programs take weights of all rows among the numbers. `SWITCHED` ones leave out rows without weight, too. Programs with
+    `MARKED` rows take marks, which are negative for the redundant rows that share loads: other programs compute the shares.
+    """
+
+    NONE, KNOWN, SWITCHED, MARKED = range(4)
+
+    @property
+    def weighs(self) -> bool:
+        """True if numbers are the weights of rows."""
+        return self in (LoadShares.KNOWN, LoadShares.SWITCHED)
+
+
+class SceneLayout:
+    """The groups of a scene's elements, and the sizes of all arrays, for one choice of eliminated rows.
+
+    If redundant rows share the loads of joints with friction (load_sharing.py), they are the `shared` rows, and numbers weigh all
+    rows.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        redundant_rows: tuple[int, ...] | None,
+        baumgarte: bool,
+        every_row: bool,
+        sharing: LoadShares = LoadShares.NONE,
+    ):
         self.gains, self.baumgarte = 2 if baumgarte else 0, baumgarte
         self.body_count = len(mechanism.body_names)
         self.coordinate_count = 3 * self.body_count
@@ -149,14 +182,18 @@ class SceneLayout:
         self._mechanism, self._loaded = mechanism, bool(mechanism.forces)
         rows = self._find_rows(redundant_rows or ())
         self._rubbing = [None if x is None else element_structure(x, x.bodies) for x in rubbing_joints(mechanism)]
-        # Marks of independent rows, in the order of elimination, if numbers mark redundant rows.
-        self.marks, self.first_mark = self.row_count if redundant_rows is None else 0, self.constant_count
+        # Weights of the shared rows, then marks of independent rows, or weights, of the others in the order of elimination.
+        self.shared = redundant_rows or () if sharing.weighs and not every_row else ()
+        self.marks = self.row_count if redundant_rows is None or sharing.weighs else 0
+        self.first_weight = self.constant_count
+        self.first_mark = self.first_weight + len(self.shared)
         self.constant_count += self.marks
-        self.leaves_out_marked = bool(self.marks) and not every_row
+        may_lack = redundant_rows is None or sharing is LoadShares.SWITCHED
+        self.leaves_out_marked = may_lack and bool(self.marks) and not every_row
         self.constraints = [
             self._constraint_group(kind, rows, every_row) for kind in self._kinds(list(zip(rows, self._rubbing, strict=True)))
         ]
-        self.rubbing = [group for group in self.constraints if group.rubbing is not None and group.rows]
+        self.rubbing = [group for group in self.constraints if group.rubbing is not None and group.loaded_rows]
         forces = element_kinds(mechanism, list(mechanism.forces.values()))
         self.forces = [self._force_group(kind) for kind in forces]
         self.one = self.reserve("psi_q", 1)
@@ -215,7 +252,10 @@ class SceneLayout:
         index: dict[int, int],
         friction: ElementStructure,
     ) -> ConstraintGroup:
-        rubbing, size = rubbing_programs(friction, programs.row_count, eliminated), len(kind.members)
+        first, size = self.row_starts[kind.members], len(kind.members)
+        shared = [k for k, row in enumerate(self.shared) if 0 <= row - first[0] < programs.row_count]
+        shared_rows = tuple(int(self.shared[k] - first[0]) for k in shared)
+        rubbing = rubbing_programs(friction, programs.row_count, eliminated + shared_rows)
         slopes: dict[int, int] = {}
         for s in rubbing.outputs["slopes"]:
             if not s.is_zero:
@@ -223,8 +263,10 @@ class SceneLayout:
         starts = self._own_constants(rubbing, size), self.reserve("slopes", len(slopes) * size)
         steps = len(rubbing.constants), len(slopes)
         columns = [start + step * np.arange(size) for start, step in zip(starts, steps, strict=True)]
+        if self.shared:
+            columns = [np.searchsorted(self.shared, first), *columns]
         table = np.concatenate([table, np.stack(columns, 1)], 1)
-        return ConstraintGroup(programs, kind.members, kind.bodies, table, eliminated, index, rubbing, slopes)
+        return ConstraintGroup(programs, kind.members, kind.bodies, table, eliminated, index, rubbing, slopes, shared_rows)
 
     def _force_group(self, kind: ElementKind) -> ForceGroup:
         programs, size = force_programs(kind.structure), len(kind.members)
@@ -247,6 +289,19 @@ class SceneLayout:
         """Reserve room for `count` more numbers in an array; return the index of the first one."""
         self.sizes[name] += count
         return self.sizes[name] - count
+
+    @property
+    def row_numbers(self) -> int:
+        """The number of rows whose multipliers are loads: the shared rows come first, then the eliminated ones."""
+        return len(self.shared) + self._eliminated
+
+    def place_of_row(self, row: int) -> tuple[ConstraintGroup, int, int]:
+        """Return the group of a row of Psi, the index of its element within the group, and of the row within the element."""
+        for group in self.constraints:
+            for i, start in enumerate(group.table[:, ROW].tolist()):
+                if 0 <= row - start < group.programs.row_count:
+                    return group, i, row - start
+        raise IndexError(row)
 
     def add_solves(self) -> None:
         """Add the arrays of linear systems, after the number of eliminated rows is final."""

@@ -16,7 +16,7 @@ from udkjax.equations.differentiable_programs import DifferentiablePrograms
 from udkjax.equations.rest_program import RestProgram, write_rest_program
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
-from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, SceneLayout, abstract_mechanism
+from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, LoadShares, SceneLayout, abstract_mechanism
 from udkjax.equations.scene_prologue import write_prologue
 from udkjax.equations.scene_solver import SceneSolver, program
 from udkjax.equations.scene_terms import SceneTerms, compliance
@@ -43,13 +43,16 @@ class ScenePrograms(RunPrograms):
         redundant_rows: tuple[int, ...] | None,
         baumgarte: bool,
         policy: RankPolicy,
+        sharing: LoadShares = LoadShares.NONE,
         every_row: bool = False,
         kernels: dict[Hashable, Kernel] | None = None,
     ):
-        self._settings = tree, shapes, redundant_rows, baumgarte
+        self._settings, self._sharing = (tree, shapes, redundant_rows, baumgarte), sharing
         self._kernels = {} if kernels is None else kernels
         self.policy, self.redundant_rows = policy, redundant_rows
-        layout = self._layout = SceneLayout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row)
+        self.weighs_rows, self.shares_by_marks = sharing.weighs, sharing is LoadShares.MARKED
+        self._with_shared_rows: dict[tuple[int, ...], ScenePrograms] = {}
+        layout = self._layout = SceneLayout(abstract_mechanism(tree, shapes), redundant_rows, baumgarte, every_row, sharing)
         self._terms = SceneTerms(layout, self._kernels)
         self._solver = SceneSolver(self._terms, policy)
         self.scratch, self.row_names, self.has_piecewise_loads = layout.sizes, layout.row_names, layout.has_piecewise_loads
@@ -81,9 +84,14 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def is_small(self) -> bool:
-        """True if the programs are unrolled because the accelerations, apart from friction, take few operations."""
+        """True if the programs are unrolled because the accelerations take few operations.
+
+        Friction does not count, but the shares of redundant rows in its loads do.
+        """
         solver = self._solver
         parts = [*solver.acceleration_system, *solver.factorize, *solver.solve(), self._terms.add("a", start="free", solution=0)]
+        if solver.friction is not None:
+            parts += [*solver.friction.sharing.find_null_space(), *solver.friction.sharing.find_border()]
         loops = [loop for loop in parts if isinstance(loop, KernelLoop)]
         return sum(len(loop.table) * loop.kernel.operation_count for loop in loops) <= UNROLLED_SCENE_OPERATIONS
 
@@ -94,12 +102,15 @@ class ScenePrograms(RunPrograms):
 
     @property
     def number_count(self) -> int:
-        """The number of inputs of `prologue`: all numbers of the scene, gains, marks of rows, `drop_tol`, `safe_tol`."""
+        """The number of inputs of `prologue`: all numbers of the scene, gains, marks or weights of rows, and two thresholds."""
         return self._number_count + self._layout.gains + self._layout.marks + 2
 
     @property
     def marks_rows(self) -> bool:
-        """True if numbers mark redundant rows: one mark for each row of Psi, which is one if the row is independent."""
+        """True if numbers mark redundant rows: one mark for each row of Psi, which is one if the row is independent.
+
+        If redundant rows share the loads of joints with friction, these numbers are the weights of all rows.
+        """
         return self._layout.marks > 0
 
     @cached_property
@@ -107,12 +118,19 @@ class ScenePrograms(RunPrograms):
         """The programs that are differentiated: these if the policy drops rows, else those with the policy `FALL_BACK`."""
         if self.policy.drops:
             return self
-        return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, kernels=self._kernels)
+        return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, self._sharing, kernels=self._kernels)
 
     @cached_property
     def with_all_rows(self) -> "ScenePrograms":
         """The same programs and constants with all rows: redundant rows may be independent in singular configurations."""
-        return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, every_row=True, kernels=self._kernels)
+        return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, self._sharing, every_row=True, kernels=self._kernels)
+
+    def with_shared_rows(self, rows: tuple[int, ...]) -> "ScenePrograms":
+        if rows not in self._with_shared_rows:
+            tree, shapes, unknown, baumgarte = self._settings
+            left_out, sharing = (rows, LoadShares.SWITCHED) if rows else (unknown, LoadShares.NONE)
+            self._with_shared_rows[rows] = _scene_programs(tree, shapes, left_out, baumgarte, self.policy, sharing)
+        return self._with_shared_rows[rows]
 
     # --- programs
 
@@ -377,14 +395,19 @@ class ScenePrograms(RunPrograms):
 
 @lru_cache(maxsize=16)
 def _scene_programs(
-    tree: TreeDef, shapes: LeafShapes, redundant_rows: tuple[int, ...] | None, baumgarte: bool, policy: RankPolicy
+    tree: TreeDef,
+    shapes: LeafShapes,
+    redundant_rows: tuple[int, ...] | None,
+    baumgarte: bool,
+    policy: RankPolicy,
+    sharing: LoadShares,
 ) -> ScenePrograms:
-    return ScenePrograms(tree, shapes, redundant_rows, baumgarte, policy)
+    return ScenePrograms(tree, shapes, redundant_rows, baumgarte, policy, sharing)
 
 
 def programs_of_structure(tree: TreeDef, shapes: LeafShapes, redundant_rows: tuple[int, ...]) -> ScenePrograms:
     """Return the programs of a structure, as `scene_programs` does."""
-    return _scene_programs(tree, shapes, redundant_rows, False, RankPolicy.DROP)
+    return _scene_programs(tree, shapes, redundant_rows, False, RankPolicy.DROP, LoadShares.NONE)
 
 
 def scene_programs(
@@ -393,6 +416,7 @@ def scene_programs(
     baumgarte: bool = False,
     policy: RankPolicy = RankPolicy.DROP,
     in_pieces: bool = True,
+    sharing: LoadShares = LoadShares.NONE,
 ) -> ScenePrograms:
     """Return the programs of a mechanism's structure, for any numbers.
 
@@ -402,9 +426,10 @@ def scene_programs(
         baumgarte: Whether Baumgarte stabilization is included.
         policy: Policy for small pivots.
         in_pieces: Whether `Mechanism.at` passes sampled numbers for each time; otherwise all samples and knots are passed.
+        sharing: Whether redundant rows share the loads of joints with friction.
 
     Returns:
         The programs; the same object for the same structure and settings.
     """
     tree_and_shapes = structure(mechanism) if in_pieces else whole_structure(mechanism)
-    return _scene_programs(*tree_and_shapes, redundant_rows, baumgarte, policy)
+    return _scene_programs(*tree_and_shapes, redundant_rows, baumgarte, policy, sharing)

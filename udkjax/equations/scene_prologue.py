@@ -51,7 +51,9 @@ def write_prologue(layout: SceneLayout, places: Mechanism, number_count: int) ->
     loops += [_constants(layout, group, group.rubbing, rubbing, group.column(RUBBING_CONSTANTS)) for group in layout.rubbing]
     loops += [_group_constants(layout, group, forces) for group in layout.forces]
     if layout.marks:
-        loops += [_marks(layout, group, number_count + layout.gains) for group in layout.constraints]
+        start = number_count + layout.gains
+        loops += [_marks(layout, group, start) for group in layout.constraints if group.rows]
+        loops += [_weights(layout, start)] if layout.shared else []
     return LoopProgram(loops)
 
 
@@ -60,6 +62,12 @@ def _marks(layout: SceneLayout, group: ConstraintGroup, start: int) -> KernelLoo
     for i, row in enumerate(group.rows):
         w.write(w.read("numbers", ROW, start + row), "constants", RIGHT, layout.first_mark + i)
     return KernelLoop(w.kernel(), group.table)
+
+
+def _weights(layout: SceneLayout, start: int) -> KernelLoop:
+    w = KernelWriter()
+    w.write(w.read("numbers", 0, start), "constants", 1, layout.first_weight)
+    return KernelLoop(w.kernel(), np.array([[row, k] for k, row in enumerate(layout.shared)]))
 
 
 def _group_constants(layout: SceneLayout, group: ElementGroup, elements: Sequence[Element]) -> KernelLoop:

@@ -16,6 +16,7 @@ from udkjax.equations.scene_layout import (
     RIGHT,
     ROW,
     RUBBING_CONSTANTS,
+    SHARED,
     SINE,
     ConstraintGroup,
     ElementGroup,
@@ -51,9 +52,9 @@ class SceneTerms:
             self.kernels[key] = writer.kernel()
         return self.kernels[key]
 
-    def single_iteration(self, key: Hashable, write: Write) -> KernelLoop:
+    def single_iteration(self, key: Hashable, write: Write, **names: str) -> KernelLoop:
         """Return a loop of one iteration."""
-        return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int))
+        return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int), names)
 
     def over_bodies(self, key: Hashable, write: Write, fixed: Collection[str] = (), **names: str) -> KernelLoop:
         """Return a loop over all bodies; `names` map arrays of the kernel to arrays of the program whose names differ."""
@@ -68,14 +69,17 @@ class SceneTerms:
     def over_rubbing(self, key: Hashable, group: ConstraintGroup, write: Write, **names: str) -> KernelLoop:
         """Return a loop over the joints of a group with friction, with the inputs of its programs bound to arrays.
 
-        x of their rows is read from the array `x`.
+        x of their rows is read from the array `x`: that of a solution, or of loads if redundant rows share them.
         """
-        rubbing = group.rubbing
+        rubbing, shared = group.rubbing, len(self.layout.shared)
         assert rubbing is not None
 
         def bind_solution(w: KernelWriter):
             for i, s in enumerate(rubbing.x):
-                w.bind(s, "x", RIGHT, i)
+                if i < len(group.rows):
+                    w.bind(s, "x", RIGHT, shared + i)
+                else:
+                    w.bind(s, "x", group.column(SHARED), i - len(group.rows))
             write(w)
 
         return self.over_elements(
@@ -233,7 +237,7 @@ class SceneTerms:
                 yield self.over_group("power", group, writer(group.programs))
         for group in self.layout.rubbing:
             assert group.rubbing is not None
-            yield self.over_rubbing("power", group, writer(group.rubbing), x=f"x{solution}")
+            yield self.over_rubbing("power", group, writer(group.rubbing), x=self.loads_of(solution))
 
     def pieces(self) -> ProgramParts:
         """Compute the index of the smooth piece of each piecewise smooth element."""
@@ -320,16 +324,28 @@ class SceneTerms:
             key, write, fixed, to=to, **{"start": start} if start else {}, **{"change": added} if added else {}
         )
 
+    def loads_of(self, solution: int) -> str:
+        """Return the array of the x of all rows that are loads of joints: the solution x, or its shares in all rows."""
+        return f"loads{solution}" if self.layout.shared else f"x{solution}"
+
     def multipliers(self, solution: int) -> ProgramParts:
         """Compute the multipliers lambda = -x of a linear system in the order of Psi, zero for rows that are left out."""
         yield Reset("multipliers", 0, self.layout.row_count)
+        shared, names = len(self.layout.shared), {"x": self.loads_of(solution)}
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 for i, row in enumerate(group.rows):
-                    w.write(-w.read("x", RIGHT, i), "multipliers", ROW, row)
+                    w.write(-w.read("x", RIGHT, shared + i), "multipliers", ROW, row)
 
-            yield KernelLoop(self.kernel(("multipliers", group.rows), write), group.table, {"x": f"x{solution}"})
+            yield KernelLoop(self.kernel(("multipliers", group.rows, shared), write), group.table, names)
+        if shared:
+
+            def write_shared(w: KernelWriter):
+                w.write(-w.read("x", 0), "multipliers", 1)
+
+            table = np.array(list(enumerate(self.layout.shared)))
+            yield KernelLoop(self.kernel("shared multipliers", write_shared), table, names)
 
 
 def read_bodies(w: KernelWriter, group: ElementGroup, array: str) -> list[Scalar]:

@@ -15,6 +15,7 @@ from udkjax.equations.abstract_system import HistoryLike, MechanismSystem, Pseud
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.loose_friction import LooseFriction, loose_friction
 from udkjax.equations.scales import Scales
+from udkjax.equations.scene_layout import LoadShares
 from udkjax.equations.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.sticking_state import StickingState, known_sticking
 from udkjax.equations.udwadia_kalaba import Baumgarte
@@ -201,7 +202,10 @@ class TextbookEquations(MechanismSystem):
     def programs(self) -> ScenePrograms:
         """The programs of the scene: if redundant rows are unknown, `Elimination` drops them, and other methods need marks."""
         redundant = () if self.redundant is None and isinstance(self.method, Elimination) else self.redundant
-        return scene_programs(self.mechanism, redundant, self.baumgarte is not None, RankPolicy.of(self.method))
+        shares = LoadShares.NONE
+        if self.rubs and redundant != () and not self.only_switched:
+            shares = LoadShares.MARKED if redundant is None else LoadShares.KNOWN
+        return scene_programs(self.mechanism, redundant, self.baumgarte is not None, RankPolicy.of(self.method), sharing=shares)
 
     @property
     def programs_of_rows(self) -> ScenePrograms:

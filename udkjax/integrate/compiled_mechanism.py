@@ -62,9 +62,21 @@ class RunPlan:
 
     @cached_property
     def marks_rows(self) -> bool:
-        """True if machine code needs marks of the independent rows of Psi as input."""
+        """True if machine code needs marks of the independent rows of Psi, or weights of all rows, as input."""
         operation = self.operation or self.evaluation
         return operation is not None and operation.code.marks_rows
+
+    @cached_property
+    def shares_by_marks(self) -> bool:
+        """True if redundant rows share the loads of joints with friction, and marks tell which these are."""
+        operation = self.operation or self.evaluation
+        return operation is not None and operation.code.shares_by_marks
+
+    @cached_property
+    def weighs_rows(self) -> bool:
+        """True if known redundant rows share the loads of joints with friction: marks are then the weights of the rows."""
+        operation = self.operation or self.evaluation
+        return operation is not None and operation.code.weighs_rows
 
 
 @jax.tree_util.register_dataclass
@@ -185,8 +197,8 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
     if isinstance(plain, TextbookEquations) and plain.rubs:
         if formulation is not None or not eliminates(plain.method):
             return "it computes friction that depends on the loads of joints by elimination only"
-        if plain.redundant or (plain.redundant is None and not plain.only_switched):
-            return "friction depends on the loads of joints, and redundant rows share these"
+        if plain.redundant is None and isinstance(plain.method, Elimination) and not plain.only_switched:
+            return "friction depends on the loads of joints, and rows that Elimination drops share these"
     return reason_for_plain(plain.method, formulation)
 
 

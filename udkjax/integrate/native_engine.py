@@ -216,15 +216,37 @@ def marking(mechanism: Mechanism) -> MarkRows:
 
 
 def mark_rows(
-    compiled: CompiledMechanism, t: Any, q: Any, v: Any, length: Any, rate: Any, xp: ModuleType = jnp, among: Any = None
+    compiled: CompiledMechanism,
+    t: Any,
+    q: Any,
+    v: Any,
+    length: Any,
+    rate: Any,
+    xp: ModuleType = jnp,
+    among: Any = None,
+    on: Any = None,
 ) -> Any:
     """Return a mark for each row of Psi, 1 if it is independent near a state; None if the compiled code contains the marks.
 
-    `among` is a mask of the rows that may be independent, by default all.
+    If redundant rows share the loads of joints with friction, the marks of those `on` are -1; or, if the compiled code contains
+    the marks, the weights of all rows are returned instead.
+
+    Args:
+        compiled: The mechanism.
+        t: Time (s).
+        q: Positions (n,).
+        v: Velocities (n,).
+        length: The unit of length; None: one.
+        rate: The characteristic rate (1/s).
+        xp: jax.numpy, or NumPy if all numbers are concrete.
+        among: Mask of the rows that may be independent, by default all.
+        on: Mask of the rows that hold, by default all.
     """
     if not compiled.plan.marks_rows:
         return None
     equations = compiled.textbook
+    if compiled.plan.weighs_rows:
+        return equations.scales.weights
     mechanism = equations.mechanism.at(t)
     operation = MarkRows(equations.programs_of_rows) if among is None else marking(mechanism)
     tol = equations.scales.rank_tol
@@ -232,7 +254,10 @@ def mark_rows(
     numbers = [*mechanism.numbers, *([] if among is None else [xp.asarray(among, float)]), tol**2, 0.0]
     inputs = operation.pack(numbers, xp.stack([t, t]), q, v, settings, equations.scales.rows, xp=xp)
     results = call_concrete(operation, inputs, 2) if xp is np else native_p.bind(*inputs, operation=operation, times=2)
-    return results[0][0] if among is None else results[0][0] * among
+    marks = results[0][0] if among is None else results[0][0] * among
+    if not compiled.plan.shares_by_marks:
+        return marks
+    return xp.where(marks > 0, 1.0, -1.0) * (1.0 if on is None else on)
 
 
 def _output(results: Sequence[Any]) -> IntegratorOutput:

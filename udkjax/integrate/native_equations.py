@@ -107,10 +107,12 @@ class ConcreteRates:
     def __init__(self, mechanism: Mechanism, method: Pseudoinverse, baumgarte: Baumgarte | None = None):
         compiled = compile_concrete(mechanism, analyse(mechanism), method, baumgarte)
         operation, n = evaluation_of(compiled.equations), mechanism.q0.size
-        if operation is None or operation.code.marks_rows or mechanism.samples:
+        unknown = operation is not None and operation.code.marks_rows and not operation.code.weighs_rows
+        if operation is None or unknown or mechanism.samples:
             raise ValueError(f"there is no machine code for {type(method).__name__} of this mechanism")
         scene = scene_inputs(compiled.equations, compiled.textbook.mechanism, operation.code.policy, np)
-        inputs = _pack(operation, scene, None, 0.0, np.zeros(n), np.zeros(n), np)
+        weights = compiled.textbook.scales.weights if operation.code.weighs_rows else None
+        inputs = _pack(operation, scene, weights, 0.0, np.zeros(n), np.zeros(n), np)
         self._call = machine_code(operation, 1, 1).prepare(inputs, operation.shapes(inputs, 2))
         self._t, self._q, self._v = (self._call.inputs[operation.input_names.index(name)][0] for name in ("ts", "q", "v"))
 

@@ -30,6 +30,7 @@ from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
 from udkjax.native.runs import RunCotangents, goes_back
+from udkjax.native.shared_loads import bind_by_rows, call_by_rows
 from udkjax.native.unsupported import unsupported
 from udkjax.programs.identity_cache import cached_by_size
 from udkjax.programs.numpy_program import evaluate_as
@@ -205,6 +206,8 @@ def machine_code(operation: Operation, width: int, tangent_lanes: int) -> Loaded
 
 def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
     """Run an operation on concrete numbers of one member, without tracing."""
+    if operation.code.shares_by_marks:
+        return call_by_rows(call_members, inputs, operation, times)
     return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
 
 
@@ -224,6 +227,8 @@ def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
 
 def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
     """Run an operation on concrete numbers of any number of members."""
+    if operation.code.shares_by_marks:
+        return call_by_rows(call_members, inputs, operation, times)
     return _select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
 
 
@@ -248,6 +253,8 @@ class MemberCalls:
 
         The operation writes all of its outputs, as one at single states does, and has no later operation.
         """
+        if self._operation.code.shares_by_marks:
+            return self(*inputs, times=times)
         shapes = tuple([x.shape for x in inputs])
         if self._prepared is not None and shapes == self._shapes:
             for own, x in zip(self._prepared.inputs, inputs, strict=True):
@@ -262,6 +269,8 @@ class MemberCalls:
 
 def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     """Lower for the CPU."""
+    if operation.code.shares_by_marks:
+        return bind_by_rows(call_members, inputs, operation, times)
     return _call_target(_select_code(inputs, operation).name, inputs, operation, times)
 
 
@@ -275,6 +284,8 @@ def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[
         return _call_target(kernel, records.with_longest(inputs, operation), operation, times)
 
     members = operation.shapes(inputs, times)[0][0]
+    if operation.code.shares_by_marks:
+        return bind_by_rows(call_members, inputs, operation, times)
     if records.are_stored(inputs, operation, members, on_card=True):
         return call(inputs, operation)
     *outputs, last = call(*records.without_records(inputs, operation))

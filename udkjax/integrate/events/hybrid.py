@@ -102,7 +102,8 @@ class Hybrid(eqx.Module):
         mechanism, analysis = self.phases.mechanism(which, phase, added), self.phases.analyses[which]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
         compiled = CompiledMechanism(equations, mechanism.breakpoints, self.plans[which])
-        may_be_independent = self.plan.switches.independent(phase, jnp) if which == SWITCHED else None
+        switches = self.plan.switches
+        may_be_independent, on = (switches.independent(phase, jnp), switches.on(phase)) if which == SWITCHED else (None, None)
         return Problem(
             compiled=compiled,
             ts=ts,
@@ -116,7 +117,7 @@ class Hybrid(eqx.Module):
             rate=self.rate,
             max_steps=self.plan.max_steps,
             drift_tol=self.drift_tol,
-            marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate, among=may_be_independent),
+            marks=native_engine.mark_rows(compiled, ts[0], q, v, self.length, self.rate, among=may_be_independent, on=on),
         )
 
     def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:

@@ -96,7 +96,7 @@ def phase_plan(
     return PhasePlan(
         run=run.watching(watched, **passed_events(plan, phases, watched, of_kinks, added, places)),
         states=run.accelerations.of_events(conditions if has_forces else without, directed),
-        marking=_marking(compiled.textbook) if run.code.marks_rows else None,
+        marking=_marking(compiled.textbook) if run.code.marks_rows and not run.code.weighs_rows else None,
         projected=compiled.plan.projected,
         project=run.accelerations.projection if added else None,
         joints=(*joints, sides),
@@ -303,7 +303,9 @@ class PhaseCode:
         inputs = np.concatenate([scene_numbers, among, tol, np.zeros((len(numbers), 1))], axis=1), np.stack([t, t], axis=1), q, v
         further = _of(self._settings, members)[:, self._of_marking], _of(self._rows, members), np.zeros((1, 0))
         (marks,) = self._mark_rows(*inputs, *further)
-        return marks * among
+        if not self.plan.run.code.shares_by_marks:
+            return marks * among
+        return np.where(marks * among > 0, 1.0, -1.0) * (self._switches.on(phase) if self.plan.active else 1.0)
 
 
 def _of(x: np.ndarray, members: Int[np.ndarray, "b"]) -> np.ndarray:

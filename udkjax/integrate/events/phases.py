@@ -48,12 +48,15 @@ class Switches(NamedTuple):
     switch_of_row: tuple[int, ...] = ()  # -1: a row of the scene that no event changes
     redundant: tuple[bool, ...] = ()  # rows of the scene that depend on others while all constraints of the scene hold
 
+    def on(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m m"]:
+        """Return a mask of the rows of Psi that hold in a phase."""
+        switch = np.array(self.switch_of_row, int)
+        return (switch < 0) | phase[..., np.maximum(switch, 0)]
+
     def independent(self, phase: Bool[Any, "*m C"], xp: ModuleType) -> Bool[Any, "*m m"]:
         """Return a mask of the rows of Psi that may be independent in a phase."""
-        switch, first = np.array(self.switch_of_row, int), np.array(self.first, bool)
-        is_on = (switch < 0) | phase[..., np.maximum(switch, 0)]
-        is_whole = xp.all(phase | ~first, axis=-1, keepdims=True)
-        return is_on & ~(np.array(self.redundant, bool) & is_whole)
+        is_whole = xp.all(phase | ~np.array(self.first, bool), axis=-1, keepdims=True)
+        return self.on(phase) & ~(np.array(self.redundant, bool) & is_whole)
 
 
 class Phases(eqx.Module):

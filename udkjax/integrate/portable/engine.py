@@ -142,6 +142,8 @@ def _engine(
     data |= _places(dressed, pull)
     problem = _problem(dressed, analysis, rtol, atol)
     data["why"] = problem.compiled.plan.why_not_native or unknown_friction(mechanism)
+    if not data["why"] and problem.compiled.plan.shares_by_marks:  # a page has no code for the rows that marks tell
+        data["why"] = "friction depends on the loads of joints, and rows that may be redundant share these"
     data["closing"] = _closing(analysis)
     modules = {"close": _close(dressed)} if held is None else {}
     if data["marks"]:

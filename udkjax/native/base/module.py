@@ -67,6 +67,8 @@ class Module(Running):
         self.is_dense = plan.pseudoinverse is not None and m > 0 and not self.partitions
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
+        # Small scenes, and those whose redundant rows share loads, fall back to singular values.
+        self.eliminates_all_rows = self.falls_back and not plan.unrolled and not code.weighs_rows
         # Rows of phi make errors of q errors of v; elimination adds these in the program `tangent_part`.
         self.adds_drift_of_rates = code.position_rows < m and (self.is_dense or self.falls_back)
         self.measures_drift = plan.steps and m > 0 and not plan.projected
@@ -142,8 +144,9 @@ class Module(Running):
             self._add_arrays("", {"further a": n} | ({"settled": code.scratch["settled"]} if self.unrolled else {}))
         if self.falls_back:
             self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
-            if self.unrolled:
-                self._add_arrays("", {"psi_q": code.scratch["psi_q"], "psi_dot": m, "root": n})
+            if not self.eliminates_all_rows:
+                entries = {"psi_q": code.scratch["psi_q"]} if self.unrolled else {}
+                self._add_arrays("", {**entries, "psi_dot": m, "root": n})
             else:
                 self._add_arrays("fallback ", code.with_all_rows.scratch | {"constants": len(code.constants)})
 
@@ -180,7 +183,7 @@ class Module(Running):
             names.append("dense_accelerations")
         if self.measures_drift:
             names.append("drift" if self.takes_dense_rows else "accelerations_and_drift")
-        if self.falls_back and self.plan.unrolled:
+        if self.falls_back and not self.eliminates_all_rows:
             names.append("rows_and_loads")
         if self.adds_drift_of_rates:
             names.append("drift_of_rates")
@@ -204,7 +207,7 @@ class Module(Running):
         }
         if not self.unrolled:
             named |= {x: x for x in self.code.scratch}
-        elif self.falls_back:
+        if self.falls_back and not self.eliminates_all_rows:
             named |= {x: x for x in ("psi_q", "psi_dot", "root")}
         if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}

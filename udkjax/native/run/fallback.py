@@ -23,7 +23,7 @@ from udkjax.native.run.manifold import iterate_newton, with_threshold
 
 def write_fallback(module: Module):
     """Write the functions of a fallback step: accelerations, the end of a step, and closing of outputs."""
-    (_write_singular_values if module.unrolled else _write_elimination)(module)
+    (_write_elimination if module.eliminates_all_rows else _write_singular_values)(module)
 
     def invoke(f: Function, s: Lane, mask: Value, name: str = "fallback"):
         s.wanted = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
