@@ -15,6 +15,7 @@ from tests.friction import cart, drawer, pendulum, rubbing
 from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, floor
 from tests.integrate.own_systems import G
 from tests.integrate.own_systems import pendulum as spatial_pendulum
+from tests.integrate.test_impacts import rocking
 from tests.integrate.test_kinks import swinging
 from tests.integrate.test_matrices_in_forces import SolvedSpring
 from tests.integrate.test_own_system_events import coupled, swung
@@ -48,6 +49,16 @@ def impacts_of_systems() -> dict[str, Any]:
     blocked = udk.simulate(spatial_pendulum(), [0.0, 1.0], start, **TIGHT, events=grows)
     runs = {"swung": swung("native"), "coupled": coupled(3.0), "blocked": blocked}
     return {name: (int(run.code), run.q) for name, run in runs.items()}
+
+
+def feet_in_turns() -> dict[str, Any]:
+    """Rods whose feet lift each other until both rest, with and without friction."""
+    runs = {
+        (inertia, friction): rocking([inertia, 0.3], 1e-5, [0.0, 0.2, 0.5], **({"coefficient": friction} if friction else {}))
+        for inertia in (0.4, 1.0)
+        for friction in (None, 0.1)
+    }
+    return {str(name): (int(run.code), run.q) for name, run in runs.items()}
 
 
 def matrices_in_forces() -> dict[str, Any]:
@@ -150,6 +161,7 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     "FITS": (held_pins, ("equations.stationary_rows.FITS",), 0.0),
     "SMALL": (held_pins, ("equations.stationary_rows.SMALL",), 0.0),
     "BLOCKED_IN_SYSTEM": (impacts_of_systems, ("integrate.events.impacts.BLOCKED_IN_SYSTEM",), 0.0),
+    "LONGEST": (feet_in_turns, ("integrate.events.hops.LONGEST",), 1e-9),
     "MOST_ROWS": (matrices_in_forces, ("expressions.matrix_rules.MOST_ROWS",), 1e-8),
     "REPETITIONS": (sticking_joints, ("complementarity.stick_or_slip.REPETITIONS",), 1e-9),
     "SWEEPS": (sticking_joints, ("complementarity.stick_or_slip.SWEEPS",), 1e-9),

@@ -3,11 +3,13 @@
 # pyright: reportOptionalMemberAccess=false
 # All of these runs have events.
 from itertools import product
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 import udkjax as udk
 from udkjax.complementarity.linear import solve_complementarity
@@ -117,6 +119,64 @@ def test_gradients_of_an_impact_with_a_contact_at_rest_beside_it():
     differences = [(value(x + h * d, INERTIAS) - value(x - h * d, INERTIAS)) / (2 * h) for d in np.eye(2)]
     jacobian = jax.jit(jax.vmap(jax.jacfwd(smooth), (None, 0)))(x, INERTIAS)
     assert np.abs(jacobian - np.stack(differences, axis=-1)).max() < 1e-6 * np.abs(differences).max()
+
+
+def rocking(x, gap, ts, engine: Any = "native", **friction):
+    """A rod slides on its left foot, while its right one falls from a small height; x: its moment of inertia and its speed."""
+    rod = udk.Mechanism({"rod": udk.Body(1.0, 1.0)}).with_parameters(
+        {
+            "body.rod.position": 0.5 * jnp.stack([jnp.cos(gap), jnp.sin(gap)]),
+            "body.rod.angle": gap,
+            "body.rod.inertia": x[0],
+            "body.rod.velocity": jnp.stack([x[1], 0.0]),
+        }
+    )
+    feet = [udk.Contact("rod", point=[side, 0], name=n, **friction) for side, n in ((-0.5, "L"), (0.5, "R"))]
+    return udk.simulate(rod, ts, events=feet, throw=False, rtol=1e-10, atol=1e-10, engine=engine)
+
+
+def check_rocking(inertia, sol):
+    """Feet land in turn and lift each other, ever more slowly. Then both rest, and no foot has ever pulled at an impact."""
+    assert sol.result == udk.Result.successful and np.abs(sol.v[-1, 0, 1:]).max() < 1e-12 and abs(sol.q[-1, 0, 2]) < 1e-12
+    counts = {name: int(n) for name, n in sol.events.counts.items()}
+    assert counts["L lets go"] > 1 and counts["L rests"] + counts["R rests"] == 2 + counts["L lets go"] + counts["R lets go"]
+    mass, floor, lifted = np.array([1, 1, inertia]), 1e-12 * np.sqrt(G), 0
+    q, before, after = (np.asarray(x)[:, 0] for x in (sol.events.q_before, sol.events.v_before, sol.events.v_after))
+    for angle, v0, v1 in zip(q[:, 2], before, after, strict=True):
+        normals = np.array([[0, 1, side * np.cos(angle)] for side in (-0.5, 0.5)])
+        along = np.array([[1, 0, -side * np.sin(angle)] for side in (-0.5, 0.5)])
+        impulse, rates = mass * (v1 - v0), normals @ v1
+        pushes, missing = nnls(np.concatenate([normals, along, -along]).T, impulse)
+        assert missing < 1e-9 * np.abs(impulse).max() + 1e-13 and rates.min() > -floor
+        assert np.abs(pushes[:2] * rates).max() < 1e-9 * max(np.abs(impulse).max(), floor) * np.abs(v0).max()
+        assert mass @ (v1**2 - v0**2) <= 1e-13 * (mass @ v0**2)
+        lifted += rates.max() > 1e-6
+    assert lifted > 2
+
+
+@pytest.mark.parametrize("inertia", [0.4, 1.0])  # kg m^2: more than m a^2, so that each foot lifts the other
+def test_feet_that_take_turns_come_to_rest_without_a_pull(inertia):
+    check_rocking(inertia, rocking([inertia, 0.3], 1e-5, [0.0, 0.2, 0.5]))
+
+
+@pytest.mark.slow
+def test_feet_that_take_turns_do_so_by_jax():
+    native, plain = (rocking([0.4, 0.3], 1e-5, [0.0, 0.2, 0.5], engine) for engine in ("native", "jax"))
+    check_rocking(0.4, plain)
+    assert native.events.counts == plain.events.counts and np.abs(native.events.time - plain.events.time).max() < 1e-12
+    np.testing.assert_allclose(native.v, plain.v, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_feet_that_take_turns_have_friction_and_derivatives():
+    """They press by m g on average, so the rod slides like a block, with the same derivatives."""
+    ts, x, step, friction = jnp.array([0.0, 0.2, 0.3]), jnp.array([0.4, 0.4]), 1e-4, 0.1
+    sol = rocking(x, 1e-5, ts, coefficient=friction)
+    check_rocking(0.4, sol)
+    np.testing.assert_allclose(sol.v[1:, 0, 0], 0.4 - friction * G * ts[1:], atol=1e-9)
+    end = jax.jit(lambda x: rocking(x, 1e-5, ts, coefficient=friction).v[1:, 0].ravel())
+    differences = [(end(x + step * d) - end(x - step * d)) / (2 * step) for d in np.eye(2)]
+    assert np.abs(jax.jacfwd(end)(x) - np.stack(differences, axis=-1)).max() < 1e-7  # errors of 1e-11 over a step of 1e-4
 
 
 def feet(places, restitution):

@@ -4,7 +4,6 @@ from udkjax.complementarity.linear import diagonal as diagonal
 from udkjax.complementarity.linear import eliminate as eliminate
 from udkjax.complementarity.linear import solve_complementarity as solve_complementarity
 from udkjax.complementarity.linear import solve_general_complementarity as solve_general_complementarity
-from udkjax.complementarity.linear import solve_rows as solve_rows
 from udkjax.complementarity.linear import times as times
 from udkjax.complementarity.stick_or_slip import AT_REST as AT_REST
 from udkjax.complementarity.stick_or_slip import BLOCK_STEPS as BLOCK_STEPS

@@ -155,12 +155,6 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
     return passive, state.done
 
 
-def solve_rows(W: Float[Any, "*m E E"], b: Float[Any, "*m E"], rows: Bool[Any, "*m E"], xp: ModuleType) -> Float[Any, "*m E"]:
-    """Return x with W x + b = 0 in the given independent rows, and x = 0 elsewhere."""
-    size, scaled, rhs = _unit_rows(W, b, rows, xp)
-    return _solve_passive(scaled, rhs, rows, xp) / size
-
-
 def eliminate(
     W: Float[Any, "*m E E"], rows: Bool[Any, "*m E"], least: Float[Any, "*m E"], xp: ModuleType = jnp
 ) -> tuple[Float[Any, "*m E E"], Bool[Any, "*m E"]]:

@@ -36,7 +36,8 @@ s is one unless contacts with different e act on each other strongly; without s 
 direction in each phase, the result is Routh's.
 
 Contacts whose g_dot stays zero are in complementarity in accelerations: 0 <= lambda, g_ddot = g_ddot(lambda = 0) + W lambda >= 0,
-one of them zero. Those with lambda > 0 are held, as constraints.
+one of them zero. Those with lambda > 0 are held, as constraints. If one of them is too slow to rebound, the impact is repeated
+with e = 0 for all of them. Contacts that this impact lifts hop, however slowly: no contact is held by a pull (`hops`).
 
 Arrays are JAX's, for one state, or NumPy's, for several states (*m).
 """
@@ -55,7 +56,6 @@ from udkjax.complementarity.linear import (
     eliminate,
     solve_complementarity,
     solve_general_complementarity,
-    solve_rows,
     times,
 )
 from udkjax.complementarity.stick_or_slip import AT_REST
@@ -292,39 +292,44 @@ def hit_contacts(
     closed = closed if closed is not None else contact_states(contacts, k, held, before, rows.W, xp)
     assert closed is not None
     restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
-    impact = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
     rubs = (closed > OPEN) & (contacts.tangents >= 0)
-    if np.any(contacts.tangents >= 0) and (xp is not np or rubs.any()):
-        rubbing = impulses_with_friction(contacts, rows, rate, restitution, closed > OPEN, floor, xp)
-        impact = Impulses(*(_where_any(rubs, x, y, xp) for x, y in zip(rubbing, impact, strict=True)))
-    before_impact, v = v, v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
+
+    def impulses(restitution: Any) -> Impulses:
+        found = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
+        if np.any(contacts.tangents >= 0) and (xp is not np or rubs.any()):
+            rubbing = impulses_with_friction(contacts, rows, rate, restitution, closed > OPEN, floor, xp)
+            found = Impulses(*(_where_any(rubs, x, y, xp) for x, y in zip(rubbing, found, strict=True)))
+        return found
+
+    def velocities(impact: Impulses) -> Any:
+        return v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
 
     # The set of held contacts is discrete, and has no derivatives.
-    W, of_rest, fixed_rate = stop(rows.W), impact.rate, stop(rate)
-    fastest = _largest(fixed_rate, closed > OPEN, xp)
-    still = xp.maximum(floor, STILL * fastest)
+    W, fixed_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2 * scale * system**2
+    may_stay = (closed > OPEN) & rows.free & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
+    still = xp.maximum(floor, STILL * _largest(fixed_rate, closed > OPEN, xp))
     slow = xp.maximum(still, REST * scale * system)
-    stays = (closed > OPEN) & rows.free & (stop(of_rest) <= slow)
-    stays = stays & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
-    is_held, ends, carried = xp.where(closed > OPEN, False, held), xp.zeros_like(stays), xp.zeros_like(stays)
+    impact = impulses(restitution)
+    stays, is_held = may_stay & (stop(impact.rate) <= slow), xp.where(closed > OPEN, False, held)
+    ends, carried = xp.zeros_like(stays), xp.zeros_like(stays)
     if xp is not np or stays.any():
-        pull, pressed = second_rates(stop(v)), ZERO_RATE_2 * scale * system**2
+        pull = second_rates(stop(velocities(impact)))
+        solution = solve_complementarity(W, pull, stays, pressed, xp)
+        # A pressed contact that rises so slowly is at rest, too: the impact is one without its rebound. It may still rise, lifted
+        # by other contacts, and is then let go.
+        presses = solution.passive & (solution.x > 0)
+        rises = xp.any(presses & (stop(impact.rate) > still), axis=-1, keepdims=True)
+        if xp is not np or rises.any():
+            again = impulses(xp.where(presses & rises, 0.0, restitution))
+            impact = Impulses(*(_where_any(rises, x, y, xp) for x, y in zip(again, impact, strict=True)))
+        stays = may_stay & (stop(impact.rate) <= still)
         solution = solve_complementarity(W, pull, stays, pressed, xp)
         presses = solution.passive & (solution.x > 0)
-        # Pressed contacts that rise as slowly are at rest, too: feet that take turns would do so without end.
-        rises = xp.any(presses & (stop(of_rest) > still), axis=-1, keepdims=True)
-        if xp is not np or rises.any():
-            if np.any(contacts.tangents >= 0) and (xp is not np or rubs.any()):
-                # Friction goes with the normal impulse: without a rebound, it has none of an expansion either.
-                without = xp.where(presses & rises, 0.0, restitution)
-                again = impulses_with_friction(contacts, rows, rate, without, closed > OPEN, floor, xp)
-                v_again = before_impact + (again.impulse[..., None, :] @ rows.directions)[..., 0, :]
-                of_rest, v = (_where_any(rubs & rises, x, y, xp) for x, y in ((again.rate, of_rest), (v_again, v)))
-            caught = solve_rows(rows.W, of_rest, presses & rises, xp)
-            v = v + (caught[..., None, :] @ rows.directions)[..., 0, :]
         is_held = xp.where(closed > OPEN, presses & contacts.hold, held)
-        resting = stays & ~is_held & (xp.abs(solution.y) <= xp.maximum(pressed, STILL * _largest(pull, stays, xp)))
-        ends, carried = presses & contacts.stop, resting & _depends(W, is_held, contacts.impacts, xp)
+        is_slow, weak = may_stay & (stop(impact.rate) <= slow), xp.maximum(pressed, STILL * _largest(pull, stays, xp))
+        carried = is_slow & ~is_held & (xp.abs(solution.y) <= weak) & _depends(W, is_held, contacts.impacts, xp)
+        ends, stays = presses & contacts.stop, stays | carried
+    v = velocities(impact)
     hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
     return ContactChanges(v, closed, hits, is_held, stays, ends, carried, impact.remaining)
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, first_crossing, side_of_zero
+from udkjax.integrate.events.hops import ends_hop, return_to_top
 from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
 from udkjax.integrate.events.kinks import FREE, MOST_KINKS
@@ -30,6 +31,8 @@ def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
 
     def change(runs: MemberRuns) -> MemberRuns:
         runs = system.when(runs.running & (runs.event == NO_EVENT), system.advance, runs)
+        if system.plan.held_at_rest.sum() > 1:
+            runs = system.when(ends_hop(system, runs), partial(return_to_top, system), runs)
         return system.when(runs.running, partial(_settle, system), runs)
 
     return system.repeat(change, runs)

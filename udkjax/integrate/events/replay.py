@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.annotations import TreeDef
-from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ZERO_RATE
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ZERO_RATE, ZERO_RATE_2
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.host_run import run_by_machine_code
 from udkjax.integrate.events.hybrid import Hybrid, rate_along
@@ -294,6 +294,10 @@ def _apply_at_fixed_time(
         h, rate = (jnp.where(k >= E, *x) for x in zip(of_force, (h, rate), strict=True))
     unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E])
     is_transversal = jnp.abs(stop_gradients(rate)) > ZERO_RATE * unit * hybrid.rate
+    if system.plan.held_at_rest.any():  # a contact comes to rest at the top of a hop, where its rate falls through zero (`hops`)
+        of_top, rate_2 = hybrid.conditions_and_rates(state.joints)(*state[:3])[1][k % E], values.rate_2[0, k % E]
+        is_top = ~again & ~is_transversal & (index >= 2 * E) & (rate_2 < -ZERO_RATE_2 * unit * hybrid.rate**2)
+        h, rate, is_transversal = jnp.where(is_top, of_top, h), jnp.where(is_top, rate_2, rate), is_transversal | is_top
     # An event at the same instant as the event before moves with that event if its condition is stationary, or if the jump of
     # the event before has carried its condition beyond zero, further than the flow does within the shortest step.
     by_flow = ZERO * unit + 2 * hybrid.smallest * jnp.abs(rate)
