@@ -115,3 +115,20 @@ def test_most_steps_and_most_events_hold_for_all_stretches_together():
     steps = int(whole.stats["steps"]) // 2
     short = udk.simulate(CHAIN, TS, max_steps=steps, throw=False)
     assert short.result.name == "step_limit" and int(short.stats["steps"]) <= steps
+
+
+def test_lanes_equal_single_runs_where_the_loads_of_some_need_further_rounds():
+    """A round that one lane needs leaves the loads of the others as they are, and their forces by which joints slip."""
+    mechanism = rubbing(udk.library.double_pendulum(), 0.9, 0.1, law="set-valued")
+    scale, ts = np.linspace(0.3, 1.7, 17), np.linspace(0.0, 4.0, 5)
+
+    def run(scale):
+        forces = [eqx.tree_at(lambda x: x.coefficient, x, scale * x.coefficient) for x in mechanism._forces]
+        found = udk.simulate(eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces)), ts, throw=False)
+        return found.q, found.v, found.events.count
+
+    found = jax.vmap(run)(jnp.asarray(scale))
+    assert len(set(found[2].tolist())) > 4
+    for k in range(1, len(scale), 3):
+        for lanes, one in zip(found, run(scale[k]), strict=True):
+            np.testing.assert_array_equal(lanes[k], one)

@@ -40,8 +40,14 @@ def _write_rounds(module: Memory, f: Function, s: Lane):
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.unsettled > 0.5) & (k.value < SETTLING_ROUNDS)):
         open_ = s.unsettled > 0.5
+        count = module.plan.code.scratch["settled"] if f.width > 1 else 0  # a single lane is open here
+        with f.each(count) as i:
+            module.put_entry(f, "settled before", i, module.entry(f, "settled", i))
         module.invoke(f, RunPrograms.FURTHER, "further a")
         module.copy(f, "further a", "out", open_)
+        with f.each(count) as i:  # other lanes keep theirs: what follows from it must not depend on the lanes beside
+            old, new = (module.entry(f, name, i) for name in ("settled before", "settled"))
+            module.put_entry(f, "settled", i, f.select(open_, new, old))
         s.where(~open_, unsettled=0.0)
         k.value = k.value + 1
 
