@@ -104,8 +104,10 @@ class ConstrainedSystem(PrintsLine):
     @property
     def is_concrete(self) -> bool:
         """True if no number is traced, neither a field nor one that a function closes over."""
-        size = np.size(self.q0) if self.q0 is not None else None
-        return not is_traced(self) and (size is None or bool(getattr(self.traced(size), "is_concrete", True)))
+        if is_traced(self):
+            return False
+        traced = self if self.q0 is None else self.traced(np.size(self.q0))
+        return traced is self or bool(getattr(traced, "is_concrete", True))
 
     def traced(self, n: int) -> Any:
         """Return the system with functions that are traced for n coordinates; unchanged without float64, for JAX alone.
