@@ -51,6 +51,11 @@ class RunPrograms:
 
         def __getattr__(self, name: str) -> Any: ...  # the programs, by their names
 
+    @property
+    def marks(self) -> slice:
+        """The places of the marks of rows, if there are any, among the numbers: before the two thresholds of pivots."""
+        return slice(self.number_count - 2 - self.row_count, self.number_count - 2)
+
     def with_shared_rows(self, rows: tuple[int, ...]) -> "RunPrograms":
         """Return programs with the same inputs in which these rows are redundant and share loads, by weights instead of marks."""
         raise NotImplementedError(type(self).__name__)

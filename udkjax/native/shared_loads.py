@@ -17,7 +17,6 @@ from udkjax.native.base.layout import INPUTS
 from udkjax.native.operations import Operation
 
 NUMBERS, SETTINGS, ROWS = (INPUTS.index(name) for name in ("numbers", "settings", "rows"))
-THRESHOLDS = 2  # numbers after the marks
 
 Call = Callable[..., list[np.ndarray]]
 
@@ -31,7 +30,7 @@ def call_by_rows(call: Call, inputs: Sequence[np.ndarray], operation: Operation,
         operation: The operation; its code `shares_by_marks`.
         times: The number of times.
     """
-    is_shared = inputs[NUMBERS][:, _marks(operation)] < 0
+    is_shared = inputs[NUMBERS][:, operation.code.marks] < 0
     if (is_shared == is_shared[0]).all():
         return _call_of_rows(call, inputs, operation, times, is_shared[0])
     outputs = [np.full(shape, np.nan) for shape in operation.shapes(inputs, times)]
@@ -76,13 +75,9 @@ def bind_by_rows(call: Call, inputs: Sequence[Any], operation: Operation, times:
     return call_host(CallByRows(call, operation, times, shapes), inputs)
 
 
-def _marks(operation: Operation) -> slice:
-    return slice(operation.code.number_count - THRESHOLDS - operation.code.row_count, -THRESHOLDS)
-
-
 def _with_weights(inputs: Sequence[np.ndarray], operation: Operation, shared: int) -> list[np.ndarray]:
     """Return inputs with weights of rows instead of their marks, and with the rank without the redundant rows."""
-    settings, names, marks = inputs[SETTINGS].copy(), operation.all_settings, _marks(operation)
+    settings, names, marks = inputs[SETTINGS].copy(), operation.all_settings, operation.code.marks
     weights = settings[:, names.index("length"), None] / inputs[ROWS]
     numbers = np.broadcast_to(inputs[NUMBERS], (max(len(inputs[NUMBERS]), len(weights)), inputs[NUMBERS].shape[1])).copy()
     numbers[:, marks] = np.where(numbers[:, marks] == 0, 0.0, weights)

@@ -91,7 +91,7 @@ def phase_plan(
         active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, names)
     sides = places_of_sides(mechanism, phases.sided) if phases.sided else ()
     watched = conditions if which == SWITCHED else without  # nothing is held that could let go
-    first_mark = run.code.number_count - 2 - run.code.row_count if run.code.marks_rows else -1
+    first_mark = run.code.marks.start if run.code.marks_rows else -1
     places = NumberPlaces(sides, joints, active, first_mark)
     return PhasePlan(
         run=run.watching(watched, **passed_events(plan, phases, watched, of_kinks, added, places)),
@@ -276,7 +276,7 @@ class PhaseCode:
 
     def _with_marks(self, members: Int[np.ndarray, "b"], state: RunState) -> np.ndarray:
         """Return the numbers of members, with marks of independent rows, determined where each member enters its phase first."""
-        numbers, m = self._numbers_of(members, state.phase), self.plan.run.code.row_count
+        numbers = self._numbers_of(members, state.phase)
         if self.plan.marking is None:
             return numbers
         is_one = len(members) == 1
@@ -288,7 +288,7 @@ class PhaseCode:
             if unknown.any():
                 found = self._mark(members[unknown], numbers[unknown], state.where(unknown))
                 marks[members[unknown]] = found
-            numbers[here, -2 - m : -2] = marks[members[here]]
+            numbers[here, self.plan.run.code.marks] = marks[members[here]]
         return numbers
 
     def _mark(self, members: Int[np.ndarray, "b"], numbers: np.ndarray, state: RunState) -> np.ndarray:
@@ -296,7 +296,7 @@ class PhaseCode:
         marking, (t, q, v, phase, _), m = self.plan.marking, state, self.plan.run.code.row_count
         assert marking is not None and self._mark_rows is not None  # checked by the caller
         numbers = self._with_samples(members, t, numbers)
-        scene_numbers, tol = numbers[:, : marking.code.number_count - 2 - m], _spread(_of(self._tol, members), len(numbers))
+        scene_numbers, tol = numbers[:, : marking.code.marks.start], _spread(_of(self._tol, members), len(numbers))
         among = np.ones((len(numbers), m))
         if self.plan.active:
             among = self._switches.independent(phase, np).astype(float)
