@@ -84,7 +84,6 @@ def _slides(plan: EventPlan, conditions: Conditions, added: Sequence[AddedJoint]
         "first": int(plan.forwards[0]),
         "first_force": first_force,
         "locks": tuple(locks),
-        "zero": ZERO,
         "closed": AT_REST.closed,
         "still": AT_REST.still,
         "block_steps": BLOCK_STEPS,

@@ -54,8 +54,7 @@ class Sliding:
     first: int
     first_force: int  # -1: the mechanism lacks the locks, and a run in which a joint sticks ends
     locks: tuple[SlideLock, ...]
-    zero: float  # least bound below which a speed is zero, relative to the scale of its condition
-    closed: float  # speed of a joint at rest, relative to the same scale
+    closed: float  # speed of a joint at rest, relative to the scale of its condition
     still: float  # smallest part of the largest acceleration or force that is not zero
     block_steps: int  # pivots per joint of all joints that violate the law, then of the first such joint
     single_steps: int

@@ -27,7 +27,11 @@ class PassingRuns(Trajectory):
     conditions: Any
 
     def ask_for_forces(self, f: Function, lane: Value):
-        raise NotImplementedError
+        """Let conditions be evaluated with forces if one counts in a lane."""
+        count = f.variable(0.0, width=1)
+        with f.each(self.conditions.count, self.conditions.own_count) as c:
+            count.value = count.value + self.lane_entry(f, "condition on", lane, c)
+        self.put_lane_entry(f, "holds", lane, count.value)
 
     def lay_out_passing(self):
         """Reserve memory for the numbers and counts of runs that pass events."""

@@ -18,7 +18,7 @@ from udkjax.native.watching.passed_events import Sliding
 from udkjax.native.watching.passing import PassingRuns
 
 
-def write_slide(module: PassingRuns, slides: Sliding):
+def write_slide(module: PassingRuns, slides: Sliding, zero: float):
     """Write `pass_slides(work, call)`: begin anew the runs that have ended where a joint stops or slips."""
     _write_locks(module, slides)
     f, s = module.function("pass_slides", [(POINTER, "work"), (POINTER, "call")])
@@ -29,7 +29,7 @@ def write_slide(module: PassingRuns, slides: Sliding):
         event = s.event - f.select(leaves, f.const(float(first_force), DOUBLE, f.width), float(slides.first))
         joint = f.intrinsic("floor", event * 0.5)
         sign = 1.0 - (event - joint * 2.0) * 2.0
-        (_Choice if slides.locks else _ChoiceWithoutLocks)(module, slides, f, s, joint).pass_events(stops, leaves, sign)
+        (_Choice if slides.locks else _ChoiceWithoutLocks)(module, slides, zero, f, s, joint).pass_events(stops, leaves, sign)
 
 
 def _is_among(event: Value, first: int, count: int) -> Value:
@@ -52,8 +52,8 @@ def _write_locks(module: PassingRuns, slides: Sliding):
 class _Modes:
     """The code that chooses the modes of the joints at an event, and begins runs anew in these."""
 
-    def __init__(self, module: PassingRuns, slides: Sliding, f: Function, s: Lane, joint: Value):
-        self._module, self._slides, self._f, self._s, self._joint = module, slides, f, s, joint
+    def __init__(self, module: PassingRuns, slides: Sliding, least: float, f: Function, s: Lane, joint: Value):
+        self._module, self._slides, self._least, self._f, self._s, self._joint = module, slides, least, f, s, joint
         self._zero, self._one = (f.const(x, DOUBLE, f.width) for x in (0.0, 1.0))
 
     def pass_events(self, stops: Value, leaves: Value, sign: Value):
@@ -119,7 +119,7 @@ class _Modes:
         f, s, module, slides = self._f, self._s, self._module, self._slides
         is_near = module.any_condition(f, lambda c, g, _, floor: ~(f.abs(g) > floor) & ~self._is_of_joint(c))
         found = f.variable(is_near, BOOL)
-        wider = f.max(slides.closed / f.max(s.atol, slides.zero), self._one)
+        wider = f.max(slides.closed / f.max(s.atol, self._least), self._one)
 
         def look(j: Value, here: Value):
             c = j * 2 + slides.first

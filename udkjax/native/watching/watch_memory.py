@@ -98,13 +98,6 @@ class WatchMemory(PassingRuns):
             if self.passing:
                 self.end_record(f, k, member)
 
-    def ask_for_forces(self, f: Function, lane: Value):
-        """Let conditions be evaluated with forces if one counts in a lane."""
-        count = f.variable(0.0, width=1)
-        with f.each(self.conditions.count, self.conditions.own_count) as c:
-            count.value = count.value + self.lane_entry(f, "condition on", lane, c)
-        self.put_lane_entry(f, "holds", lane, count.value)
-
     # --- arrays of conditions and states
 
     def condition(self, f: Function, name: str, c: Value) -> Value:

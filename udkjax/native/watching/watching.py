@@ -38,7 +38,7 @@ class Watching(WatchMemory):
         if self.passing and self.passing.kinks:
             write_turn(self, self.passing.kinks)
         if self.passing and self.passing.slides:
-            write_slide(self, self.passing.slides)
+            write_slide(self, self.passing.slides, self.passing.zero)
 
     def before_step(self, f: Function, s: Lane):
         with f.if_(f.any_of(s.landing > 0.5)):
