@@ -6,9 +6,9 @@ from udkjax.integrate.events.machine_system import MachineSystem
 from udkjax.integrate.events.phase_code import PhaseCode
 
 
-def by_the_loop(monkeypatch):
-    """Leave all events to the loop of events."""
-    monkeypatch.setattr(MachineSystem, "_events_to_pass", lambda self, runs, members, most: np.zeros(len(members), int))
+def by_the_loop(monkeypatch, passed: int = 0):
+    """Leave all events to the loop of events, but those that a call has `passed` before."""
+    monkeypatch.setattr(MachineSystem, "_events_to_pass", lambda self, runs, members, most: np.full(len(members), passed))
 
 
 def counted(monkeypatch, run):

@@ -34,6 +34,12 @@ def called(function: Callable[[], object]) -> set[tuple[str, str]]:
         if event == "call" and Path(code.co_filename).is_relative_to(ROOT) and not code.co_name.startswith("<"):
             seen.add((code.co_filename, code.co_qualname))
 
+    listened(function, listen)
+    return seen
+
+
+def listened(function: Callable[[], object], listen: Callable[..., None]):
+    """Call a function with a listener to its calls."""
     gc.disable()  # what is collected meanwhile calls the package, too: caches forget it
     sys.setprofile(listen)
     try:
@@ -41,7 +47,6 @@ def called(function: Callable[[], object]) -> set[tuple[str, str]]:
     finally:
         sys.setprofile(None)
         gc.enable()
-    return seen
 
 
 def pendulums(count: int) -> udk.Mechanism:
@@ -78,13 +83,7 @@ def visited(function: Callable[[], object]) -> Counter[str]:
         if event == "call" and code.co_name == "device_put" and code.co_filename.endswith("api.py"):
             seen["device_put"] += 1
 
-    gc.disable()
-    sys.setprofile(listen)
-    try:
-        function()
-    finally:
-        sys.setprofile(None)
-        gc.enable()
+    listened(function, listen)
     return seen
 
 

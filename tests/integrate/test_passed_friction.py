@@ -15,7 +15,6 @@ import udkjax as udk
 from tests.friction import rubbing
 from tests.integrate.passing import by_the_loop, counted
 from udkjax.native.base.layout import SHARE
-from udkjax.native.watching.passed_events import Passing
 
 TS = np.linspace(0.0, 2.0, 41)
 CHAIN = rubbing(udk.library.chain(5, 0.4), 0.15, 0.005, law="set-valued")
@@ -78,10 +77,9 @@ def test_machine_code_passes_events_as_the_loop_does(case, monkeypatch):
 
 def test_the_record_of_events_is_filled_again_and_again(monkeypatch):
     """A call that has passed as many events as its record has room for ends, and the next goes on."""
-    monkeypatch.setattr(Passing, "most", 2)
-    _, calls, most = counted(monkeypatch, lambda: udk.simulate(CHAIN, TS))
-    few = udk.simulate(CHAIN, TS)
-    assert most == 2 and calls > 10
+    by_the_loop(monkeypatch, passed=2)
+    few, calls, _ = counted(monkeypatch, lambda: udk.simulate(CHAIN, TS))
+    assert calls > 10
     monkeypatch.undo()
     many = udk.simulate(CHAIN, TS)
     np.testing.assert_array_equal(few.events.index, many.events.index)
