@@ -43,6 +43,7 @@ def solve_complementarity(
     allowed: Bool[Any, "*m E"],
     floor: Float[Any, "*m E"],
     xp: ModuleType = jnp,
+    equalities: Bool[Any, "*m E"] | None = None,
 ) -> Complementary:
     """Solve 0 <= x, W x + b >= 0, x (W x + b) = 0 by Lawson and Hanson's active-set method.
 
@@ -52,12 +53,14 @@ def solve_complementarity(
         allowed: mask of the x that may be positive; all others are zero, whatever y is.
         floor: tolerance on y >= 0.
         xp: jax.numpy, or NumPy.
+        equalities: mask of independent rows with y = 0, whose x have either sign; None: there are none.
 
     Returns:
         x and y, with derivatives for the final passive set.
     """
-    size, scaled, rhs = _unit_rows(W, b, allowed, xp)
-    given = scaled, rhs, allowed, floor / size
+    equalities = allowed & False if equalities is None else equalities
+    size, scaled, rhs = _unit_rows(W, b, allowed | equalities, xp)
+    given = scaled, rhs, allowed, floor / size, equalities
     passive = _passive_set(*(given if xp is np else stop_gradients(given)), xp)
     x = _solve_passive(scaled, rhs, passive, xp) / size
     return Complementary(x, times(W, x) + b, passive)
@@ -199,15 +202,16 @@ def _solve_passive(W: Any, b: Any, passive: Any, xp: ModuleType) -> Any:
     return xp.linalg.solve(matrix, xp.where(passive, -b, 0.0)[..., None])[..., 0]
 
 
-def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, xp: ModuleType) -> Any:
-    largest_b = xp.max(xp.where(allowed, xp.abs(b), 0.0), axis=-1, keepdims=True)
+def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, equalities: Any, xp: ModuleType) -> Any:
+    rows = allowed | equalities
+    largest_b = xp.max(xp.where(rows, xp.abs(b), 0.0), axis=-1, keepdims=True)
     floor = xp.maximum(floor, TIGHT * largest_b)
-    if xp is np and allowed.sum(-1).max(initial=0) <= 1:
+    if xp is np and not equalities.any() and allowed.sum(-1).max(initial=0) <= 1:
         return allowed & (b + floor < 0)
 
     def step(state: _ActiveSet) -> _ActiveSet:  # changes nothing once done
         z = _solve_passive(W, b, state.passive, xp)
-        leaves = state.passive & (z <= 0)
+        leaves = state.passive & ~equalities & (z <= 0)
         # Go towards z until the first x becomes zero; these entries leave the passive set.
         decrease = state.x - z
         fraction = xp.where(leaves, xp.where(decrease > 0, state.x / xp.where(decrease > 0, decrease, 1.0), 0.0), xp.inf)
@@ -223,7 +227,7 @@ def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, xp: ModuleType) -> An
     def goes_on(state: _ActiveSet) -> Any:
         return ~state.done & (state.steps < STEPS_PER_ROW * b.shape[-1] + 2)
 
-    state = _ActiveSet(xp.zeros_like(b), xp.zeros_like(allowed), xp.asarray(0), xp.asarray(False))
+    state = _ActiveSet(xp.zeros_like(b), equalities, xp.asarray(0), xp.asarray(False))
     if xp is not np:
         return jax.lax.while_loop(goes_on, step, state).passive
     while goes_on(state):

@@ -1,7 +1,7 @@
 """Jumps: the changes of velocities, phase, added joints and held contacts at the instant of an event.
 
 The action of the event is applied first. The complementarity of all closed contacts is then solved (`impacts`), since every event
-except `Log` and `Stop` can push or lift them.
+except `Log` and `Stop` can push or lift them. Their positions follow (`closing`).
 """
 
 from types import ModuleType
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from udkjax.complementarity.stick_or_slip import FrictionModes
+from udkjax.integrate.events.closing import Gaps, close_contacts
 from udkjax.integrate.events.crossings import NO_EVENT, ConditionValues
 from udkjax.integrate.events.impacts import ATTACHABLE, OPEN, ContactChanges, hit_contacts, rows_of_directions, rows_of_system
 from udkjax.integrate.events.runs import MemberIndices, RunState, take
@@ -50,9 +51,16 @@ def apply_event(
         closed: the states of the contacts that take part, OPEN, TOUCHES or SLOW; None: not known yet.
         modes: the modes of joints with set-valued friction after the event; None: not known yet.
     """
-    found = _apply_event(system, members, k, before, values, state_values, closed)
-    if not system.plan.sticking:
-        return found
+    found, gaps = _apply_event(system, members, k, before, values, state_values, closed)
+    if system.plan.sticking:
+        found = _settle_friction(system, members, k, found, modes)
+    return found if gaps is None else found._replace(state=found.state._replace(q=close_contacts(system, gaps, found.state)))
+
+
+def _settle_friction(
+    system: System, members: MemberIndices, k: Int[Any, "b"], found: JumpResult, modes: FrictionModes | None
+) -> JumpResult:
+    """Return the states after events with the modes of all joints that may stick."""
     plan, xp, contacts = system.plan, system.xp, found.contacts
     stopped = xp.where(xp.asarray(plan.slides)[k % plan.count], k, NO_EVENT)
     resting = None if contacts is None else contacts.rests
@@ -70,8 +78,8 @@ def _apply_event(
     values: ConditionValues,
     state_values: StateValues,
     closed: Int[Any, "b E"] | None,
-) -> JumpResult:
-    """Apply events, without what follows for joints with set-valued friction."""
+) -> tuple[JumpResult, Gaps | None]:
+    """Apply events, except the decisions of joints with set-valued friction; return the contacts, too, if any are closed."""
     plan, xp = system.plan, system.xp
     releases, e = k >= plan.count, k % plan.count
     t, q, v, phase, joints = before
@@ -91,7 +99,7 @@ def _apply_event(
     acts = ((releases | xp.asarray(plan.changes)[e]) & ~xp.asarray(plan.slides)[e])[:, None]
     state = RunState(t, q, v, after, joints)
     if not plan.impacts.any() or (xp is np and not acts.any()):
-        return JumpResult(state, None, _code(blocked, xp))
+        return JumpResult(state, None, _code(blocked, xp)), None
 
     free, held = state._replace(phase=plan.free(after)), plan.held(phase, xp)
     is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
@@ -117,7 +125,9 @@ def _apply_event(
     )
     phase = plan.with_contacts(free.phase, contacts.held, xp)
     code = _code(blocked | (acts[:, 0] & hit.blocked), xp)
-    return JumpResult(state._replace(v=xp.where(acts, hit.v, v), phase=phase), contacts, code)
+    result = JumpResult(state._replace(v=xp.where(acts, hit.v, v), phase=phase), contacts, code)
+    may_push = plan.adds.any() or (plan.held_at_rest.any() and plan.impacts.sum() > 1)
+    return result, Gaps(rows, state_values.g, values.scale, plan.impacts & rows.free & acts) if may_push else None
 
 
 def _code(blocked: Bool[Any, "b"], xp: ModuleType) -> Int[Any, "b"]:
