@@ -161,6 +161,13 @@ def test_choices_of_a_wrong_type_are_refused(name, wrong, text):
 
 
 RECORD: dict[str, Any] = {"times": TS, "values": {"body.coupler.angle": 0 * TS}}
+WRONG_KINDS: list[Any] = [object(), 1j, np.zeros((2, 3), complex), [object()], np.array(2.5 + 1j)]
+SOLVERS = udk.Adams, udk.BDF
+QUANTITY: dict[str, Any] = {"name": "height", "function": lambda mechanism, solution: solution.q[:, 0, 1]}
+PATH: dict[str, Any] = {"point": "coupler", "targets": [[0.0, 0.0], [1.0, 1.0]], "values": [0.0, 1.0]}
+POSE: dict[str, Any] = {"body": "coupler", "targets": np.zeros((2, 3)), "values": [0.0, 1.0]}
+FUNCTION: dict[str, Any] = {"output": "body.coupler.angle", "values": [0.0, 1.0], "targets": [0.0, 1.0]}
+TOLERANCE: dict[str, Any] = {"point": "coupler", "tolerances": {"body.coupler.mass": 0.1}, "most": 1.0}
 CONSTRUCTORS: list[tuple[Any, dict[str, Any], str, str]] = [
     (udk.Record, RECORD, "values", "values: must map channels to numbers"),
     (udk.Record, RECORD, "noise", "noise of .*: must be real numbers|noise of .*: must be an array of numbers"),
@@ -175,13 +182,38 @@ CONSTRUCTORS: list[tuple[Any, dict[str, Any], str, str]] = [
     (udk.Adams, {}, "min_order", "min_order must be"),
     (udk.BDF, {}, "max_order", "max_order must be"),
     (udk.Coordinate, {}, "bodies", "bodies must be a name, or a list of names"),
+    (udk.Coordinate, {"bodies": ["ground", "coupler"]}, "coordinate", "coordinate must be one of"),
+    *((solver, {}, "root_find_max_steps", "root_find_max_steps must be") for solver in SOLVERS),
+    (udk.Parameter, {}, "of", "of must be a name, a list of names, a length or a function"),
+    *((udk.Parameter, {"of": "gravity"}, name, f"{name} must be") for name in ("guess", "bounds", "prior", "scale")),
+    *((udk.Parameter, {"of": "gravity"}, name, f"{name} must be") for name in ("name", "transform", "share")),
+    *((udk.Quantity, QUANTITY, name, f"{name} must be") for name in ("name", "function", "units")),
+    *((udk.PathGoal, PATH, name, f"{name} must be") for name in ("point", "targets", "values", "start", "line", "at")),
+    *((udk.PoseGoal, POSE, name, f"{name} must be") for name in ("body", "targets", "arm", "pin", "values", "start", "line")),
+    *((udk.FunctionGoal, FUNCTION, name, f"{name} must be") for name in ("output", "values", "targets", "output_start")),
+    *((udk.ToleranceGoal, TOLERANCE, name, f"{name} must ") for name in ("point", "tolerances", "most", "weight", "samples")),
+    (udk.LoadGoal, {"most": 1.0}, "joint", "joint must be"),
+    (udk.MotionGoal, {"most": 1.0}, "function", "function must be"),
 ]
 
 
 @pytest.mark.parametrize(("make", "given", "name", "text"), CONSTRUCTORS, ids=[f"{x[0].__name__}-{x[2]}" for x in CONSTRUCTORS])
 def test_values_of_the_wrong_kind_are_refused_by_constructors(make, given, name, text):
-    for wrong in (object(), 1j, np.zeros((2, 3), complex), [object()], np.array(2.5 + 1j)):
-        assert re.search(text, message(make, **(given | {name: wrong})))
+    for wrong in WRONG_KINDS:
+        assert re.search(text, message(lambda wrong=wrong: make(**(given | {name: wrong}))))
+
+
+@pytest.mark.parametrize("name", ["condition", "action", "direction", "name"])
+def test_values_of_the_wrong_kind_are_refused_in_events(name):
+    given: dict[str, Any] = {"condition": lambda t, at: at["coupler"].y - 9.0}
+    for wrong in WRONG_KINDS:
+        text = message(udk.simulate, MECH, TS, events=[udk.Event(**(given | {name: wrong}))])
+        assert re.match(rf"events\[0\]: .*{name} must be", text)
+
+
+def test_axes_of_the_wrong_kind_are_refused_in_a_sweep():
+    for wrong in (*WRONG_KINDS, {}, {3: [1.0]}, "body.coupler.mass", None):
+        assert "Zipped" in message(udk.sweep, MECH, {"loads": udk.Zipped(wrong)}, ts=TS)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_solver_without_an_error_estimate_is_refused_with_the_cure():

@@ -1,6 +1,6 @@
 """Requirements on arguments (real, finite, shape, sign), with errors that state the argument and its value."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from inspect import isclass, signature
 from types import MappingProxyType
@@ -77,6 +77,51 @@ def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = F
     if is_invalid or (sign == "positive" and not x > 0) or (sign == "not negative" and not x >= 0):
         condition = {"any": "a finite number", "positive": "positive", "not negative": "zero or positive"}[sign]
         raise ArgumentError(f"{name} must be {condition}{' and finite' if sign != 'any' and not infinite else ''}, not {x:g}")
+
+
+def require_numbers(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> None:
+    """Require real numbers of a shape, which may be infinite or NaN; `meaning` describes them in messages."""
+    if array(name, value).shape != shape:
+        raise ArgumentTypeError(f"{name} must be {meaning}, {describe(value)}")
+
+
+def require_text(name: str, value: Any, may_be_empty: bool = False) -> None:
+    """Require a string, which is not empty unless `may_be_empty`."""
+    if not isinstance(value, str):
+        raise ArgumentTypeError(f"{name} must be a string, {describe(value)}")
+    if not value and not may_be_empty:
+        raise ArgumentError(f"{name} must not be empty")
+
+
+def are_names(value: Any) -> bool:
+    """Return True for a list of strings."""
+    return isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(name, str) for name in value)
+
+
+def require_names(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+    """Require a list of names."""
+    if not are_names(value):
+        raise ArgumentTypeError(f"{name} must be a list of names, {describe(value)}")
+
+
+def require_numbers_by_name(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+    """Require a mapping of names to finite numbers."""
+    if not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
+        raise ArgumentTypeError(f"{name} must map names to numbers, such as {{name: number}}, {describe(value)}")
+    for key, number in value.items():
+        require_number(f"{name}[{key!r}]", number)
+
+
+def require_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Require one of several strings."""
+    if not isinstance(value, str) or value not in choices:
+        raise ArgumentError(f"{name} must be one of {', '.join(choices)}, {describe(value)}")
+
+
+def require_function(name: str, value: Any, arguments: str) -> None:
+    """Require a function, or a callable object; a class is neither."""
+    if not callable(value) or isclass(value):
+        raise ArgumentTypeError(f"{name} must be a function {arguments}, {describe(value)}")
 
 
 def require_count(name: str, value: Any, least: float = 1, given: GivenArguments = NOTHING) -> None:

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Numbers
 from udkjax.arrays import number
 from udkjax.equations.general import ConstrainedSystem
+from udkjax.requirements import require_function, require_text
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Joint
 from udkjax.scene.mechanism import Mechanism
@@ -79,6 +80,11 @@ class Quantity:
     name: str
     function: Callable[[Any, StateHistory], Float[Array, "T"]]
     units: str = ""
+
+    def __post_init__(self):
+        require_text("name", self.name)
+        require_function("function", self.function, "(mechanism, solution)")
+        require_text("units", self.units, may_be_empty=True)
 
     def __repr__(self) -> str:
         function = getattr(self.function, "__name__", type(self.function).__name__)

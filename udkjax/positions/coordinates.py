@@ -14,7 +14,7 @@ from udkjax.annotations import Numbers
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.positions.channels import channel_of, point_of_pin
 from udkjax.printing import PrintsLine
-from udkjax.requirements import ArgumentTypeError, describe
+from udkjax.requirements import ArgumentTypeError, describe, require_choice
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Driver, Motion, Polynomial, effort_unit
@@ -49,6 +49,9 @@ class Coordinate(PrintsLine):
     coordinate: CoordinateName = eqx.field(static=True, default="angle")
     points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
     axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
+
+    def __check_init__(self):
+        require_choice("coordinate", self.coordinate, DRIVEN)
 
     @classmethod
     def of(cls, driver: Driver) -> "Coordinate":

@@ -19,11 +19,14 @@ from udkjax.requirements import (
     ArgumentError,
     ArgumentTypeError,
     GivenArguments,
+    are_names,
     array,
     describe,
     require_count,
     require_finite,
+    require_names,
     require_number,
+    require_numbers_by_name,
     require_times,
 )
 from udkjax.scene.bodies import COORDINATES
@@ -146,22 +149,11 @@ def _has(method: str) -> Callable[[Any], bool]:
     return lambda x: hasattr(x, method) and not isclass(x)
 
 
-def _are_names(x: Any) -> bool:
-    return isinstance(x, Sequence) and not isinstance(x, str) and all(isinstance(name, str) for name in x)
-
-
-require_names = _of_kind("be a list of names", _are_names)
-require_name_or_names = _of_kind("be a name, or a list of names", lambda x: isinstance(x, str) or _are_names(x))
+require_name_or_names = _of_kind("be a name, or a list of names", lambda x: isinstance(x, str) or are_names(x))
 _require_mapping = _of_kind(
     "map names to numbers, such as {name: number}",
     lambda x: isinstance(x, Mapping) and all(isinstance(name, str) for name in x),
 )
-
-
-def _require_numbers_by_name(name: str, value: Any, given: GivenArguments) -> None:
-    _require_mapping(name, value, given)
-    for key, number in value.items():
-        require_number(f"{name}[{key!r}]", number)
 
 
 def _require_arrays_by_name(name: str, value: Any, given: GivenArguments) -> None:
@@ -290,12 +282,12 @@ CHECKS: dict[str, ArgumentCheck] = {
     "length": partial(require_number, sign="positive"),
     "angle": require_number,
     "angular_velocity": require_number,
-    "held": _require_numbers_by_name,
+    "held": require_numbers_by_name,
     "inputs": _require_mapping,
-    "weights": _require_numbers_by_name,
+    "weights": require_numbers_by_name,
     "compliances": _require_arrays_by_name,
     "point": _require_point,
-    "bodies": _of_kind("be the name of a body, or a list of names", lambda x: isinstance(x, str) or _are_names(x)),
+    "bodies": _of_kind("be the name of a body, or a list of names", lambda x: isinstance(x, str) or are_names(x)),
     "solver": _check_solver,
     "stepsize_controller": _check_controller,
     "adjoint": _of_diffrax("AbstractAdjoint", "diffrax.ForwardMode()"),

@@ -7,7 +7,7 @@ design is the sum of the squares of all residuals.
 from abc import abstractmethod
 from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from udkjax.annotations import Numbers, NumericArray
 from udkjax.positions.channels import locate
 from udkjax.positions.coordinates import Coordinate, value_of
 from udkjax.printing import PrintedTable, PrintsTable
-from udkjax.requirements import require_finite
+from udkjax.requirements import require_choice, require_finite, require_names, require_number, require_numbers, require_text
 from udkjax.scene.bodies import GROUND, Frame
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
@@ -36,6 +36,11 @@ def _targets(name: str, columns: int) -> Callable[[Numbers], np.ndarray]:
         return array
 
     return convert
+
+
+def _names_of_pins(value: Any) -> tuple[str, ...]:
+    require_names("line", value)
+    return tuple(value)
 
 
 def _values(value: Numbers | None) -> np.ndarray | None:
@@ -72,8 +77,7 @@ class Goal(PrintsTable):
             raise ValueError(
                 f"give one value for each target: there are {len(self.values)} values and {len(self.targets)} targets"
             )
-        if self.start not in ("given", "free"):
-            raise ValueError(f'start must be "given" or "free", not {quote(str(self.start))}')
+        require_choice("start", self.start, ("given", "free"))
         if self.values is None and (self.start != "given" or self.line):
             raise ValueError("start and line define where values are measured from: give values, too")
         if self.line and len(self.line) != 2:
@@ -155,8 +159,13 @@ class PathGoal(Goal):
     targets: np.ndarray = eqx.field(converter=_targets("targets", 2))
     values: np.ndarray | None = eqx.field(converter=_values, default=None)
     start: str = eqx.field(static=True, default="given")
-    line: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    line: tuple[str, ...] = eqx.field(static=True, converter=_names_of_pins, default=())
     at: tuple[float, ...] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        require_text("point", self.point)
+        if self.at is not None:
+            require_numbers("at", self.at, (2,), "two numbers, x and y in m")
 
     @property
     def has_place(self) -> bool:
@@ -193,7 +202,14 @@ class PoseGoal(Goal):
     pin: str | None = eqx.field(static=True, default=None)
     values: np.ndarray | None = eqx.field(converter=_values, default=None)
     start: str = eqx.field(static=True, default="given")
-    line: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    line: tuple[str, ...] = eqx.field(static=True, converter=_names_of_pins, default=())
+
+    def __check_init__(self):
+        require_text("body", self.body)
+        if self.arm is not None:
+            require_number("arm", self.arm, "positive")
+        if self.pin is not None:
+            require_text("pin", self.pin)
 
     @property
     def extras(self) -> int:
@@ -237,13 +253,14 @@ class FunctionGoal(Goal):
     targets: np.ndarray = eqx.field(converter=_targets("targets", 1))
     start: str = eqx.field(static=True, default="free")
     output_start: str = eqx.field(static=True, default="free")
-    line: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    line: tuple[str, ...] = eqx.field(static=True, converter=_names_of_pins, default=())
 
     def __check_init__(self):
         if self.values is None:
             raise ValueError("give values: those of the driver at which the output has its targets")
-        if self.output_start not in ("given", "free"):
-            raise ValueError(f'output_start must be "given" or "free", not {quote(str(self.output_start))}')
+        if not isinstance(self.output, Coordinate):
+            require_text("output", self.output)
+        require_choice("output_start", self.output_start, ("given", "free"))
 
     @property
     def extras(self) -> int:

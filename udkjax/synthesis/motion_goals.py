@@ -19,7 +19,7 @@ from udkjax.equations import constraints, loads
 from udkjax.positions.drive import Driven
 from udkjax.positions.free_numbers import FreeNumbers
 from udkjax.printing import PrintedTable, PrintsTable
-from udkjax.requirements import require_count, require_number
+from udkjax.requirements import require_count, require_function, require_number, require_numbers_by_name, require_text
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.goals import check_place, place_of
@@ -61,7 +61,8 @@ class MotionPoint(NamedTuple):
 
 
 def _float(x: Any) -> Any:
-    return float(x) if np.ndim(x) == 0 and isinstance(x, jax.Array | np.ndarray | np.generic) else x
+    is_array = isinstance(x, jax.Array | np.ndarray | np.generic)
+    return float(x) if is_array and x.ndim == 0 and x.dtype.kind in "fiu" else x
 
 
 class MotionTerm(PrintsTable):
@@ -127,6 +128,9 @@ class MotionGoal(MotionTerm):
 
     function: Callable[[MotionPoint], Float[Array, ""]] = eqx.field(static=True)
 
+    def __check_init__(self):
+        require_function("function", self.function, "of a MotionPoint")
+
     def measure(self, at):
         return jnp.asarray(self.function(at)).reshape(())
 
@@ -149,6 +153,9 @@ class LoadGoal(MotionTerm):
     """
 
     joint: str = eqx.field(static=True)
+
+    def __check_init__(self):
+        require_text("joint", self.joint)
 
     def check(self, mechanism, driven, free):
         if self.joint not in mechanism.joints:
@@ -202,6 +209,10 @@ class ToleranceGoal(MotionTerm):
 
     point: str = eqx.field(static=True)
     tolerances: Mapping[str, float] = eqx.field(static=True)
+
+    def __check_init__(self):
+        require_text("point", self.point)
+        require_numbers_by_name("tolerances", self.tolerances)
 
     def check(self, mechanism, driven, free):
         problems = [

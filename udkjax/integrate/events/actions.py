@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.arrays import number, optional_number
-from udkjax.integrate.events.checks import number_if_any, require_friction, require_joint, require_name_text, require_restitution
+from udkjax.integrate.events.checks import number_if_any, require_friction, require_joint, require_restitution
 from udkjax.integrate.events.conditions import JointCoordinate, joint_coordinate, require_name
 from udkjax.printing import PrintsLine
-from udkjax.requirements import describe
+from udkjax.requirements import describe, require_text
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Angle, Joint, fill
 from udkjax.scene.mechanism import Mechanism
@@ -179,7 +179,7 @@ class Release(Action):
         return frozenset([self.name])
 
     def check(self, mechanism, where):
-        require_name_text(f"{where}: the name of Release", self.name)
+        require_text(f"{where}: the name of Release", self.name)
 
 
 class Attach(Action):
@@ -203,7 +203,7 @@ class Attach(Action):
         return self.name, self.joint
 
     def check(self, mechanism, where):
-        require_name_text(f"{where}: the name of Attach", self.name)
+        require_text(f"{where}: the name of Attach", self.name)
         require_joint(f"{where}: the joint of Attach", self.joint)
         for body in self.joint.bodies:
             require_name(body, [*mechanism.body_names, GROUND], where, "body")
@@ -229,7 +229,7 @@ class Lock(Action):
         return f"{self.joint}.lock", Displacement(at.bodies, at.points, at.axis)
 
     def check(self, mechanism, where):
-        require_name_text(f"{where}: the joint of Lock", self.joint)
+        require_text(f"{where}: the joint of Lock", self.joint)
         joint_coordinate(mechanism, self.joint, where)
 
 

@@ -20,14 +20,6 @@ def number_if_any(value: Any) -> Any:
         return value
 
 
-def require_name_text(name: str, value: object, may_be_empty: bool = False) -> None:
-    """Raise ArgumentTypeError if a name is not a string, ValueError if it is empty."""
-    if not isinstance(value, str):
-        raise ArgumentTypeError(f"{name} must be a string, {describe(value)}")
-    if not value and not may_be_empty:
-        raise ValueError(f"{name} must not be empty")
-
-
 def require_vector(name: str, value: Any) -> None:
     """Raise unless a point or a normal is two numbers, finite unless traced."""
     found = array(name, value)

@@ -27,7 +27,6 @@ from udkjax.integrate.events.actions import Action, Impact, RubbingImpact, Stop
 from udkjax.integrate.events.checks import (
     number_if_any,
     require_limits,
-    require_name_text,
     require_normal,
     require_vector,
 )
@@ -41,7 +40,7 @@ from udkjax.integrate.events.conditions import (
     sees_velocity,
 )
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
-from udkjax.requirements import describe
+from udkjax.requirements import ArgumentTypeError, describe, require_function, require_text
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.checks import Mistakes
 from udkjax.scene.mechanism import Mechanism
@@ -97,8 +96,8 @@ class JointLimit(PrintsLine):
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """Return one event for each limit."""
-        require_name_text("JointLimit: joint", self.joint)
-        require_name_text("JointLimit: name", self.name, may_be_empty=True)
+        require_text("JointLimit: joint", self.joint)
+        require_text("JointLimit: name", self.name, may_be_empty=True)
         name, found = self.name or self.joint, []
         where = f"limit {quote(name)}"
         coordinate = joint_coordinate(mechanism, self.joint, where)
@@ -148,7 +147,7 @@ class Contact(PrintsLine):
     def expand(self, mechanism: Mechanism) -> list[Event]:
         """Return the event, as a list."""
         for argument, text in (("body", self.body), ("on", self.on), ("name", self.name)):
-            require_name_text(f"Contact: {argument}", text, may_be_empty=argument == "name")
+            require_text(f"Contact: {argument}", text, may_be_empty=argument == "name")
         name = self.name or f"{self.body} on {self.on}"
         where = f"contact {quote(name)}"
         for body in (self.body, self.on):
@@ -249,8 +248,9 @@ def _expand(event: ExpandsToEvents, k: int, mechanism: Any, found: list[Event]) 
         raise ValueError(f"a {type(event).__name__} is for mechanisms; write udk.Event(lambda t, q, v: ...) for this system")
     expanded: Any = event
     for one in expanded.expand(mechanism):
-        require_name_text("name", one.name, may_be_empty=True)
+        require_text("name", one.name, may_be_empty=True)
         name = one.name or f"event{k + 1}"
+        _check_kinds(one, f"event {quote(name)}")
         if any(name == other.name for other in found):
             raise ValueError(f"event {quote(name)}: two events have this name; give one of them another (`name=`)")
         found.append(_with_name(one, name))
@@ -280,15 +280,17 @@ def _with_name(event: Event, name: str) -> Event:
     return Event(event.condition, event.action, -1 if falls else event.direction, name)
 
 
-def _check(event: Event, mechanism: Any) -> None:
-    where, action = f"event {quote(event.name)}", event.action
-    if not isinstance(action, Action):
-        raise ValueError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., not a {type(action).__name__}")
+def _check_kinds(event: Event, where: str) -> None:
+    if not isinstance(event.action, Action):
+        raise ArgumentTypeError(f"{where}: the action must be Stop(), Log(), Impact(...), ..., {describe(event.action)}")
     if not isinstance(event.direction, int) or isinstance(event.direction, bool) or event.direction not in (-1, 0, 1):
         raise ValueError(f"{where}: the direction must be -1, 0 or 1, {describe(event.direction)}")
-    if not callable(event.condition):
-        arguments = "(t, frames)" if isinstance(mechanism, Mechanism) else "(t, q, v)"
-        raise ValueError(f"{where}: the condition must be a function {arguments}, not a {type(event.condition).__name__}")
+
+
+def _check(event: Event, mechanism: Any) -> None:
+    where, action = f"event {quote(event.name)}", event.action
+    arguments = "(t, frames)" if isinstance(mechanism, Mechanism) else "(t, q, v)"
+    require_function(f"{where}: the condition", event.condition, arguments)
     if not isinstance(event.condition, BodyCondition):  # a trial would take milliseconds, for each new number
         _try_condition(event, mechanism, where)
     if action.is_impact:

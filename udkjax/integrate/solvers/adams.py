@@ -25,6 +25,7 @@ from udkjax.integrate.solvers.multistep import (
     Tolerances,
     Unravel,
     check_orders,
+    count_called,
     error_scale,
     steer_error,
     tolerances_from_controller,
@@ -163,7 +164,7 @@ class Adams(Multistep):
     min_order: int = eqx.field(default=1, static=True)
     max_order: int = eqx.field(default=HIGHEST, static=True)
     root_finder: Tolerances = eqx.field(default_factory=tolerances_from_controller)
-    root_find_max_steps: int = eqx.field(default=ITERATIONS, static=True)
+    root_find_max_steps: int = eqx.field(default=ITERATIONS, static=True, converter=count_called("root_find_max_steps"))
 
     interpolation_cls: ClassVar[Callable[..., DifferenceInterpolation]] = DifferenceInterpolation
 

@@ -69,6 +69,16 @@ def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Float[Array, ""], y: Py
     return ravel_pytree(terms.vf_prod(t, y, args, unit))[0]
 
 
+def count_called(name: str) -> Callable[[Any], int]:
+    """Return a converter to a whole number of at least 1, for a static field: an array cannot be compared."""
+
+    def convert(value: Any) -> int:
+        require_count(name, value)
+        return int(value)
+
+    return convert
+
+
 def check_orders(least: int, most: int, highest: int) -> None:
     """Raise ValueError for orders that a family of methods lacks."""
     for name, order in (("min_order", least), ("max_order", most)):

@@ -3,11 +3,13 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from inspect import isclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from udkjax.requirements import ArgumentTypeError, describe, require_choice, require_numbers, require_text
 from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import must_be_positive, parameters_of, split_index
@@ -58,6 +60,20 @@ class Parameter:
     transform: Transform | None = None
     scale: float | None = None
     share: Literal["value", "scale"] = "value"
+
+    def __post_init__(self):
+        is_list = isinstance(self.of, Sequence) and all(isinstance(name, str) for name in self.of)
+        if not (is_list or isinstance(self.of, Length) or (callable(self.of) and not isclass(self.of))):
+            kinds = "a name, a list of names, a length or a function of (mechanism, value)"
+            raise ArgumentTypeError(f"of must be {kinds}, {describe(self.of)}")
+        require_text("name", self.name, may_be_empty=True)
+        pair, one = ((2,), "two numbers"), ((), "one number")
+        for name, kind in (("guess", one), ("bounds", pair), ("prior", pair), ("scale", one)):
+            if getattr(self, name) is not None:
+                require_numbers(name, getattr(self, name), *kind)
+        if self.transform is not None:
+            require_choice("transform", self.transform, get_args(Transform))
+        require_choice("share", self.share, ("value", "scale"))
 
 
 ParameterLike = TypeAliasType("ParameterLike", str | Length | Parameter | Setter)
@@ -136,8 +152,6 @@ def _unknown(mechanism: StudyModel, p: Parameter, name: str, part: _Part) -> Unk
         raise ValueError(f"the first guess must be a finite number, not {guess}")
     usual = "bounded" if p.bounds is not None else "positive" if _is_positive(mechanism, target, guess) else "free"
     kind = p.transform or usual
-    if kind not in get_args(Transform):
-        raise ValueError(f"transform must be one of {', '.join(get_args(Transform))}, not {kind!r}")
     low, high = p.bounds if p.bounds is not None else (np.nan, np.nan)
     if p.bounds is not None and not np.isfinite(p.bounds).all():
         raise ValueError(f'bounds must be two finite numbers, not ({low}, {high}); without an upper bound, use "positive"')
@@ -176,8 +190,6 @@ def _is_positive(mechanism: StudyModel, target: Target, guess: float) -> bool:
 def _parts(mechanism: StudyModel, p: Parameter) -> list[_Part]:
     """Return the numbers that a parameter refers to; an array has one for each entry."""
     of, scaled = p.of, p.share == "scale"
-    if p.share not in ("value", "scale"):
-        raise ValueError(f'share must be "value" or "scale", not {p.share!r}')
     if isinstance(of, str):
         of, scaled = _read(mechanism, of, scaled)
     if isinstance(of, Length):

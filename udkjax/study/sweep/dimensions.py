@@ -14,6 +14,7 @@ from udkjax.equations.general import ConstrainedSystem
 from udkjax.integrate.simulate import simulate
 from udkjax.pinv import Auto
 from udkjax.positions.assembly import State
+from udkjax.requirements import describe
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.checks import Mistakes, SceneError
 from udkjax.scene.mechanism import Mechanism
@@ -93,6 +94,9 @@ def lay_out(mechanism: StudyModel, axes: Mapping[str, AxisValues], design: Sweep
         if name in unit:
             continue
         inner = given.axes if isinstance(given, Zipped) else {name: given}
+        if not (isinstance(inner, Mapping) and inner and all(isinstance(key, str) for key in inner)):
+            problems.append(f"axis {quote(name)}: axes of Zipped must map names to axes, {describe(inner)}")
+            continue
         columns = [_column(mechanism, key, axis, None, problems) for key, axis in inner.items()]
         columns = tuple(column for column in columns if column is not None)
         sizes = {column.name: len(column.values) for column in columns}
