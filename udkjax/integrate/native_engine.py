@@ -42,13 +42,13 @@ def packed(problem: Problem) -> list[np.ndarray]:
 def integrate_concrete(problem: Problem) -> IntegratorOutput:
     """Integrate a problem with concrete numbers without tracing anything: `IntegratorOutput` of NumPy arrays."""
     operation = _operation(problem)
-    return _output(call_concrete(operation, run_inputs(problem, operation, np), len(problem.ts)))
+    return integrator_output(call_concrete(operation, run_inputs(problem, operation, np), len(problem.ts)))
 
 
 def integrate(problem: Problem) -> IntegratorOutput:
     """Integrate one problem; under vmap all problems together, in SIMD lanes."""
     operation = _operation(problem)
-    return _output(native_p.bind(*run_inputs(problem, operation), operation=operation, times=len(problem.ts)))
+    return integrator_output(native_p.bind(*run_inputs(problem, operation), operation=operation, times=len(problem.ts)))
 
 
 class RecordedRun(NamedTuple):
@@ -64,7 +64,7 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
     empty = (np.zeros(shape) for shape in ((1, 0), (1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     results = native_p.bind(*run_inputs(problem, operation), *empty, operation=operation, times=times)
-    raw = _output(results[: RunStates.results])
+    raw = integrator_output(results[: RunStates.results])
     return raw, RecordedRun(raw.accepted.astype(float)[None], results[-1][0], (raw.q, raw.v) if times > 2 else ())
 
 
@@ -112,7 +112,7 @@ def _integrate_along(
         operation=operation,
         times=len(problem.ts),
     )
-    return _output(results), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
+    return integrator_output(results), (dys[0, 0, :, :n], dys[0, 0, :, n:], dend[0, 0])
 
 
 def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) -> Problem:
@@ -260,7 +260,8 @@ def mark_rows(
     return xp.where(marks > 0, 1.0, -1.0) * (1.0 if on is None else on)
 
 
-def _output(results: Sequence[Any]) -> IntegratorOutput:
+def integrator_output(results: Sequence[Any]) -> IntegratorOutput:
+    """Return the output of a run of one member from the results of its operation."""
     q, v, _, info = [x[0] for x in results]
     code, t, tried, accepted, evaluations, written, lost, implicit = [info[k] for k in range(len(RunStates.info_names))]
     number = np.arange(len(q))

@@ -184,7 +184,7 @@ class EvaluateEvents(StateOperation):
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         assert self.conditions is not None
         directions = len(self.directed) * self.code.coordinate_count * (2 if self.code.has_mobility else 1)
-        values = len(self.conditions.at_state.outputs) + self.conditions.force_count
+        values = len(self.conditions.at_state.outputs) + self.conditions.force_count + (self.conditions.forces is not None)
         return [(self.code.coordinate_count + values + directions,)]
 
 

@@ -131,6 +131,11 @@ class RunWatched(RunStates):
     conditions: Conditions | None = None
     passing: Passing | None = None  # events that are recorded, and do not end the run
 
+    @property
+    def unwatched(self) -> RunStates:
+        """The operation that integrates to the last time, whatever the conditions."""
+        return RunStates(**{item.name: getattr(self, item.name) for item in fields(RunStates)})
+
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
         assert self.conditions is not None
         return Watching(self.plan(width, vector), self.conditions, self.passing)

@@ -67,10 +67,11 @@ def crosses(direction: Int[np.ndarray, "C"], before: Int[Array, "*G C"], after: 
     return (before != 0) & (after == -before) & ((direction == 0) | (after == direction))
 
 
-def carry_signs(first: Int[Array, "E"], signs: Int[Array, "G E"]) -> Int[Array, "G E"]:
+def carry_signs(first: Int[Any, "E"], signs: Int[Any, "G E"], xp: ModuleType = jnp) -> Int[Any, "G E"]:
     """Replace zeros in signs along a grid by the last nonzero sign."""
-    last = jnp.where(signs != 0, np.arange(1, len(signs) + 1)[:, None], 0)
-    return jnp.take_along_axis(jnp.concatenate([first[None], signs]), jax.lax.cummax(last, axis=0), axis=0)
+    last = xp.where(signs != 0, np.arange(1, len(signs) + 1)[:, None], 0)
+    last = np.maximum.accumulate(last, axis=0) if xp is np else jax.lax.cummax(last, axis=0)
+    return xp.take_along_axis(xp.concatenate([first[None], signs]), last, axis=0)
 
 
 def cubic_value(cubic: Cubic, x: Array) -> Array:
@@ -85,14 +86,14 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
     return da + x * (2 * (3 * (b - a) - 2 * da - db) + 3 * x * (2 * (a - b) + da + db))
 
 
-def cubic_root(cubic: Cubic, side: Array) -> Array:
+def cubic_root(cubic: Cubic, side: Any, xp: ModuleType = jnp) -> Any:
     """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1."""
-    low, width, places = jnp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
+    low, width, places = xp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
     for _ in range(DIVISIONS):
         width /= PARTS
         x = low + width * places.reshape(-1, *[1] * low.ndim)
-        low = low + width * jnp.sum(cubic_value(cubic, x) * side > 0, axis=0)
+        low = low + width * xp.sum(cubic_value(cubic, x) * side > 0, axis=0)
     middle = low + width / 2
     slope = cubic_slope(cubic, middle)
-    step = cubic_value(cubic, middle) / jnp.where(slope == 0, 1.0, slope)  # one Newton step is enough for so short a part
-    return jnp.clip(middle - step, low, low + width)
+    step = cubic_value(cubic, middle) / xp.where(slope == 0, 1.0, slope)  # one Newton step is enough for so short a part
+    return xp.clip(middle - step, low, low + width)

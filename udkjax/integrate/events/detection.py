@@ -7,11 +7,13 @@ Bernstein coefficients of the cubic plus and minus this error change sign once (
 change sign. Other intervals are refined.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.events.crossings import (
     ZERO,
@@ -34,47 +36,49 @@ INTERVALS_OF_JUMP = 6  # a jump or a kink makes at most this many intervals coar
 REDONE = 4  # intervals before a coarse one that are repeated
 
 
-class _Arithmetic:
+class _Arithmetic(NamedTuple):
     """The arithmetic of arrays for `classify_interval`."""
 
-    min, max = staticmethod(jnp.minimum), staticmethod(jnp.maximum)
+    min: Callable[..., Any]
+    max: Callable[..., Any]
 
 
 class Nodes(NamedTuple):
     """The conditions and contact forces at the nodes of a window."""
 
-    t: Float[Array, "G"]
-    g: Float[Array, "G C"]
-    g_dot: Float[Array, "G C"]
-    good: Bool[Array, "G"]  # whether the run reached the node
+    t: Float[Any, "G"]
+    g: Float[Any, "G C"]
+    g_dot: Float[Any, "G C"]
+    good: Bool[Any, "G"]  # whether the run reached the node
 
 
 class Detection(NamedTuple):
     """The first crossing of conditions in a window."""
 
-    sides: Int[Array, "G C"]  # sides of zero at the nodes
-    place: Int[Array, ""]  # the last node before the first crossing where the crossing condition is not zero
-    behind: Int[Array, ""]  # the first node after the crossing
-    is_found: Bool[Array, ""]
-    event: Int[Array, ""]
-    root: Float[Array, ""]  # place of the crossing between these nodes, from 0 to 1
-    is_exact: Bool[Array, ""]  # whether the root is exact up to rounding
-    is_coarse: Bool[Array, ""]  # whether this or an earlier interval is too coarse
-    last_sure: Int[Array, ""]  # the last node before a coarse interval that is certain
-    coarse: Bool[Array, "C"]  # conditions for which that interval is too coarse
-    undefined: Bool[Array, "C"]  # conditions that are NaN at the end of that interval
+    sides: Int[Any, "G C"]  # sides of zero at the nodes
+    place: Int[Any, ""]  # the last node before the first crossing where the crossing condition is not zero
+    behind: Int[Any, ""]  # the first node after the crossing
+    is_found: Bool[Any, ""]
+    event: Int[Any, ""]
+    root: Float[Any, ""]  # place of the crossing between these nodes, from 0 to 1
+    is_exact: Bool[Any, ""]  # whether the root is exact up to rounding
+    is_coarse: Bool[Any, ""]  # whether this or an earlier interval is too coarse
+    last_sure: Int[Any, ""]  # the last node before a coarse interval that is certain
+    coarse: Bool[Any, "C"]  # conditions for which that interval is too coarse
+    undefined: Bool[Any, "C"]  # conditions that are NaN at the end of that interval
 
 
 def detect(
     nodes: Nodes,
     has_rates: Bool[np.ndarray, "C"],
     direction: Int[np.ndarray, "C"],
-    sides: Int[Array, "C"],
-    scale: Float[Array, "C"],
-    located: Int[Array, ""],
-    watched: Bool[Array, "C"],
-    is_short: Bool[Array, ""],
-    unresolved: Bool[Array, "C"],
+    sides: Int[Any, "C"],
+    scale: Float[Any, "C"],
+    located: Int[Any, ""],
+    watched: Bool[Any, "C"],
+    is_short: Bool[Any, ""],
+    unresolved: Bool[Any, "C"],
+    xp: ModuleType = jnp,
 ) -> Detection:
     """Find the first crossing in a window, or the first coarse interval.
 
@@ -88,38 +92,39 @@ def detect(
         watched: mask of the watched conditions.
         is_short: whether the window is so short that coarse intervals must be due to a jump.
         unresolved: mask of the conditions that are not refined.
+        xp: jax.numpy, or NumPy.
     """
     t, g, g_dot, good = nodes
-    finite = jnp.isfinite(g)
-    g = jnp.where(finite, g, 0.0)
-    zero_tol = jnp.where(np.arange(len(scale)) == located, 0.0, ZERO * scale)
-    signs = jnp.where((jnp.abs(g) <= zero_tol) | ~good[:, None] | ~finite, 0, jnp.sign(g)).astype(int)
-    sides = carry_signs(sides, signs.at[0].set(0))
+    finite = xp.isfinite(g)
+    g = xp.where(finite, g, 0.0)
+    zero_tol = xp.where(np.arange(len(scale)) == located, 0.0, ZERO * scale)
+    signs = xp.where((xp.abs(g) <= zero_tol) | ~good[:, None] | ~finite, 0, xp.sign(g)).astype(int)
+    sides = carry_signs(sides, xp.concatenate([0 * signs[:1], signs[1:]]), xp)
     before, after = sides[:-1], sides[1:]
-    step = jnp.diff(t)[:, None]
-    slope = _slopes(t, g, g_dot, has_rates)
+    step = xp.diff(t)[:, None]
+    slope = _slopes(t, g, g_dot, has_rates, xp)
     cubic: Cubic = (g[:-1], step * slope[:-1], g[1:], step * slope[1:])
-    error = _errors(t, g, slope, has_rates)
+    error = _errors(t, g, slope, has_rates, xp)
 
-    side = jnp.where(before != 0, before, after)
+    side = xp.where(before != 0, before, after)
     hits = (after == -before) & (before != 0)
     ends = g[:-1], slope[:-1], g[1:], slope[1:]
-    single, away = RESOLUTION.classify_interval(_Arithmetic, ends, step, error, side, ZERO * scale)
+    single, away = RESOLUTION.classify_interval(_Arithmetic(xp.minimum, xp.maximum), ends, step, error, side, ZERO * scale)
     usable = good[1:, None] & watched
-    coarse = (usable & ~unresolved & ~jnp.where(hits, single, away)) | (good[1:, None] & ~finite[1:])
+    coarse = (usable & ~unresolved & ~xp.where(hits, single, away)) | (good[1:, None] & ~finite[1:])
     # A few coarse intervals in a short window contain a jump or a kink: finer windows would not help.
-    jumps = is_short & (jnp.sum(coarse, 0) <= INTERVALS_OF_JUMP) & jnp.all(finite, 0)
+    jumps = is_short & (xp.sum(coarse, 0) <= INTERVALS_OF_JUMP) & xp.all(finite, 0)
     coarse = coarse & ~jumps
 
     is_crossing = hits & crosses(direction, before, after) & usable
-    place, coarse_place = (jnp.argmax(jnp.any(x, axis=1)) for x in (is_crossing, coarse))
-    last_sure = jnp.maximum(coarse_place - REDONE, 0)  # earlier intervals may only look fine enough
+    place, coarse_place = (xp.argmax(xp.any(x, axis=1)) for x in (is_crossing, coarse))
+    last_sure = xp.maximum(coarse_place - REDONE, 0)  # earlier intervals may only look fine enough
     at_place: Cubic = (cubic[0][place], cubic[1][place], cubic[2][place], cubic[3][place])
-    root = jnp.where(is_crossing[place], cubic_root(at_place, before[place]), jnp.inf)
-    event, is_found = jnp.argmin(root), jnp.any(is_crossing)
-    is_before = (signs.at[0].set(1)[:, event] != 0) & (np.arange(len(t)) <= place)
-    last_before = jnp.where(event == located, place, jnp.max(jnp.where(is_before, np.arange(len(t)), 0)))
-    is_coarse = jnp.any(coarse) & ~(is_found & (place < last_sure))
+    root = xp.where(is_crossing[place], cubic_root(at_place, before[place], xp), xp.inf)
+    event, is_found = xp.argmin(root), xp.any(is_crossing)
+    is_before = ((signs[:, event] != 0) | (np.arange(len(t)) == 0)) & (np.arange(len(t)) <= place)
+    last_before = xp.where(event == located, place, xp.max(xp.where(is_before, np.arange(len(t)), 0)))
+    is_coarse = xp.any(coarse) & ~(is_found & (place < last_sure))
     return Detection(
         sides=sides,
         place=last_before,
@@ -136,29 +141,29 @@ def detect(
 
 
 def _slopes(
-    t: Float[Array, "G"], g: Float[Array, "G C"], g_dot: Float[Array, "G C"], has_rates: Bool[np.ndarray, "C"]
-) -> Float[Array, "G C"]:
+    t: Float[Any, "G"], g: Float[Any, "G C"], g_dot: Float[Any, "G C"], has_rates: Bool[np.ndarray, "C"], xp: ModuleType
+) -> Float[Any, "G C"]:
     """Return the rates at the nodes, from differences of second order if they are not given or not finite."""
-    step = jnp.diff(t)[:, None]
-    secant = jnp.diff(g, axis=0) / jnp.where(step > 0, step, 1.0)
+    step = xp.diff(t)[:, None]
+    secant = xp.diff(g, axis=0) / xp.where(step > 0, step, 1.0)
     total = step[1:] + step[:-1]
-    inner = (step[1:] * secant[:-1] + step[:-1] * secant[1:]) / jnp.where(total > 0, total, 1.0)
+    inner = (step[1:] * secant[:-1] + step[:-1] * secant[1:]) / xp.where(total > 0, total, 1.0)
     ends = 2 * secant[0] - inner[0], 2 * secant[-1] - inner[-1]
-    by_differences = jnp.concatenate([ends[0][None], inner, ends[1][None]])
-    return jnp.where(has_rates & jnp.isfinite(g_dot), g_dot, by_differences)
+    by_differences = xp.concatenate([ends[0][None], inner, ends[1][None]])
+    return xp.where(has_rates & xp.isfinite(g_dot), g_dot, by_differences)
 
 
 def _errors(
-    t: Float[Array, "G"], g: Float[Array, "G C"], slope: Float[Array, "G C"], has_rates: Bool[np.ndarray, "C"]
-) -> Float[Array, "I C"]:
+    t: Float[Any, "G"], g: Float[Any, "G C"], slope: Float[Any, "G C"], has_rates: Bool[np.ndarray, "C"], xp: ModuleType
+) -> Float[Any, "I C"]:
     """Return the error of the cubic in each interval: the largest over its pair of intervals and the neighbouring pairs."""
     start, middle, end = t[:-2:2, None], t[1:-1:2, None], t[2::2, None]
     length = end - start
-    x = (middle - start) / jnp.where(length > 0, length, 1.0)
+    x = (middle - start) / xp.where(length > 0, length, 1.0)
     cubic: Cubic = (g[:-2:2], length * slope[:-2:2], g[2::2], length * slope[2::2])
-    miss = jnp.abs(g[1:-1:2] - cubic_value(cubic, x))
+    miss = xp.abs(g[1:-1:2] - cubic_value(cubic, x))
     # The error of the rate distinguishes a kink from a smooth condition, whose error is smaller.
-    of_rate = jnp.abs(length * slope[1:-1:2] - cubic_slope(cubic, x)) * RESOLUTION.miss
-    miss = jnp.where(has_rates, jnp.maximum(RESOLUTION.miss * miss, of_rate), miss)
-    neighbours = jnp.pad(miss, ((1, 1), (0, 0)))
-    return jnp.repeat(jnp.maximum(jnp.maximum(neighbours[:-2], neighbours[2:]), miss), 2, axis=0)
+    of_rate = xp.abs(length * slope[1:-1:2] - cubic_slope(cubic, x)) * RESOLUTION.miss
+    miss = xp.where(has_rates, xp.maximum(RESOLUTION.miss * miss, of_rate), miss)
+    neighbours = xp.pad(miss, ((1, 1), (0, 0)))
+    return xp.repeat(xp.maximum(xp.maximum(neighbours[:-2], neighbours[2:]), miss), 2, axis=0)

@@ -122,8 +122,7 @@ class HostRun:
         state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.tile(plan.events.first, (B, 1)), joints)
         joints[-1][:] = system.first_sides(state)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))
-        unresolved = np.where(plan.events.kinks, system.lost_kinks[:, None], np.inf)
-        outputs = results(plan.events, runs, ts, unresolved, np)
+        outputs = results(plan.events, runs, ts, system.unresolved_from(runs), np)
         for member in np.flatnonzero(system.unresolved):
             if self.plain is None:
                 outputs.code[member] = -1

@@ -204,7 +204,7 @@ class Hybrid(eqx.Module):
         rates = lambda t, q, v: self.conditions_and_rates(added)(t, q, v)[1]  # noqa: E731
         rate_2 = jnp.where(np.array(self.plan.by_velocity), 0.0, rate_along(rates, t, q, v, a)[1])
         forces = self.forces(at) if has_forces else jnp.ones(self.count)
-        return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions, mobilities, forces)
+        return StateValues(a, g, rate, rate_2, by_t, by_q, by_v, directions, mobilities, forces, jnp.array(True))
 
     def accelerations(self, at: RunState) -> Float[Array, "n"]:
         """Return the accelerations in a state."""

@@ -1,7 +1,7 @@
 """Runs with events by machine code: all members of a batch together, from one crossing to the next.
 
-Members whose conditions vary too quickly for machine code, or are NaN, are `unresolved` and stop: the plain form (`plain_system`)
-runs them.
+Members whose conditions vary too quickly for machine code, or are NaN, go on window by window (`machine_windows`). Those whose
+forces machine code cannot compute there are `unresolved` and stop: the plain form (`plain_system`) runs them.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,11 +15,13 @@ from udkjax.integrate.events.crossings import NO_EVENT, ZERO
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import OPEN, Contacts
 from udkjax.integrate.events.kinks import FREE, MOST_KINKS, HeldElement
+from udkjax.integrate.events.machine_windows import MachineMotion
 from udkjax.integrate.events.passed_events import PassedEvents, put_locks
 from udkjax.integrate.events.phase_code import PhaseCode, PhasePlan, StretchEnd
 from udkjax.integrate.events.phases import SCENE, SWITCHED
 from udkjax.integrate.events.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.system import StateValues
+from udkjax.integrate.events.windows import WatchedConditions, Window, WindowUnits, advance_window, first_window
 from udkjax.integrate.outcome import failure
 from udkjax.integrate.solution import Result
 from udkjax.native.base.steps import Status
@@ -81,6 +83,7 @@ class MachineSystem:
         self._phases, self.ts, self._units, self._of_impacts = phases, ts, units, of_impacts
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
         (B, _), n = ts.shape, inverse_mass.shape[1]
+        self._windows: dict[int, Window] = {}  # of the members that go on window by window
         self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
         self.coordinates = np.ones((B, n))
         if not self.plan.of_system:
@@ -183,9 +186,50 @@ class MachineSystem:
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
         """Take members to their next crossings, or to their ends, by one call of machine code for each mechanism."""
         indices = self._all if members is None else members
+        by_windows = np.array([int(member) in self._windows for member in indices], bool)
+        for member in indices[by_windows]:
+            self._advance_window(runs, int(member))
+        indices = indices[~by_windows]
         for which, here in self._mechanisms(runs.phase[indices]):
             self._run_mechanism(runs, which, indices[here])
         return runs
+
+    def go_on_by_windows(self, members: Int[np.ndarray, "b"], t: Float[np.ndarray, "b"]):
+        """Let members go on window by window, from their times."""
+        for member, start in zip(members, t, strict=True):
+            self._windows[int(member)] = first_window(self.ts[member], start, self.plan.count, np)
+
+    def unresolved_from(self, runs: MemberRuns) -> Float[np.ndarray, "B E"]:
+        """Return the times (s) from which conditions vary too quickly to be resolved, or sides are no longer held."""
+        found = np.where(self.plan.kinks, self.lost_kinks[:, None], np.inf)
+        for member, window in self._windows.items():
+            # A condition may vary quickly before it becomes NaN, but the result of the run already reports the NaN.
+            times = np.where(runs.undefined[member], np.inf, window.unresolved[: self.plan.count])
+            found[member] = np.minimum(found[member], times)
+        return found
+
+    def _advance_window(self, runs: MemberRuns, member: int):
+        """Take a member to the end of its next window, or to a crossing in it."""
+        one, units = np.array([member]), MemberUnits(*(x[member] for x in self._units))
+        (which, _), *_ = self._mechanisms(runs.phase[one])
+        watched = self.plan.watched(runs.phase[one], runs.carried[one], np)[0]
+        state, code = runs.state(one), self._phases[which]
+        force, smallest = units.mass * units.length * units.rate**2, code.setting("smallest", member)
+        of_window = WindowUnits(units.rate, units.scene_rate, force, smallest)
+        motion = MachineMotion(self.plan, code, member, self.ts[member], of_window, self.coordinates[member], watched)
+        start = RunState(state.t[0], state.q[0], state.v[0], state.phase[0], state.joints)
+        end = advance_window(
+            motion, self._windows[member], start, WatchedConditions(runs.sides[member], runs.scale[member], watched)
+        )
+        if motion.lacks_forces:
+            self.unresolved[member], runs.running[member] = True, False
+            return
+        inside = end.rows < self.ts.shape[1]
+        runs.qs[member, end.rows[inside]], runs.vs[member, end.rows[inside]] = (x[inside] for x in end.outputs)
+        runs.totals[member] += end.totals
+        names = ("t", "q", "v", "event", "sides", "code", "undefined")
+        runs.put(one, running=end.goes_on, **{name: getattr(end, name) for name in names})
+        self._windows[member] = end.window
 
     def _run_mechanism(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"]):
         ts, start, tol = self.ts[members], runs.t[members], self._units.drift_tol[members, None]
@@ -229,7 +273,8 @@ class MachineSystem:
         if known.all():
             runs.sides[members[:, None], watched] = stretch.sides
         else:
-            runs.sides[members[known, None], watched] = stretch.sides[known]
+            sure = known | ((status == Status.UNRESOLVED) & ~drifts)
+            runs.sides[members[sure, None], watched] = stretch.sides[sure]
             self._fail(runs, members, stretch, known, drifts)
         if drifts.any():  # return to the last state close enough to the manifold
             last_kept, drifting = np.where(kept, times, -np.inf).argmax(1)[drifts], members[drifts]
@@ -277,8 +322,10 @@ class MachineSystem:
             chatters = unresolved & np.isfinite(of_kinks[members]).all(1)
             freed, unresolved = members[chatters], unresolved & ~chatters
             of_kinks[freed], self.lost_kinks[freed], runs.running[freed] = FREE, runs.t[freed], True
-            known, fails = known | chatters, fails & ~chatters
-        self.unresolved[members] |= unresolved
+            fails = fails & ~chatters
+        self.go_on_by_windows(members[unresolved], stretch.t[unresolved])
+        runs.running[members[unresolved]] = True
+        fails = fails & ~unresolved
         code = np.where(drifts, Result.drift, failure(status, np))
         last = stretch.info[fails, TIME], stretch.info[fails, INFO : INFO + n], stretch.info[fails, INFO + n :]
         runs.code[members[fails]] = code[fails]

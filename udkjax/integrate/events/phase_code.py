@@ -19,8 +19,8 @@ from udkjax.integrate.events.phases import SWITCHED, Phases, Switches
 from udkjax.integrate.events.runs import RunState
 from udkjax.integrate.events.switched import places_of_switches
 from udkjax.integrate.events.system import StateValues
-from udkjax.integrate.native_engine import marking, run_inputs
-from udkjax.integrate.problem import Problem
+from udkjax.integrate.native_engine import integrator_output, marking, run_inputs
+from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.primitive import MemberCalls
 from udkjax.native.runs import RunWatched
@@ -183,6 +183,7 @@ class PhaseCode:
         self._places_of_joints = places[self._columns]
         self._of_switches = np.array(plan.active, int).reshape(-1, 2).T
         self._run, self._evaluate = MemberCalls(plan.run), MemberCalls(plan.states).at_states
+        self._flow = MemberCalls(plan.run.unwatched)
         self._mark_rows, self._project = (x and MemberCalls(x).at_states for x in (plan.marking, plan.project))
         self._seen: tuple[bytes, ...] = ()  # the states that were evaluated last, and their values
         self._values: StateValues | None = None
@@ -211,6 +212,22 @@ class PhaseCode:
         passed = None if passing is None else PassedEvents.of(record[0], passing, n)
         return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, passed)
 
+    def flow(self, member: int, ts: Float[np.ndarray, "T"], state: RunState) -> IntegratorOutput:
+        """Integrate a member over times, whatever its conditions; its state has a leading axis of length one."""
+        members = np.array([member])
+        further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
+        return integrator_output(
+            self._flow(self._with_marks(members, state), ts[None], state.q, state.v, *further, times=len(ts))
+        )
+
+    def breakpoints(self, member: int) -> Float[np.ndarray, "k"]:
+        """Return the times (s) at which the motion of a member is not smooth."""
+        return self._breaks[member if len(self._breaks) > 1 else 0]
+
+    def setting(self, name: str, member: int) -> float:
+        """Return a setting of a member."""
+        return self._settings[member if len(self._settings) > 1 else 0, self.plan.run.all_settings.index(name)]
+
     def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:
         """Evaluate the conditions of members at states."""
         t, q, v, *_ = state
@@ -230,15 +247,16 @@ class PhaseCode:
         results = results.copy()
         values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
         directions, mobilities = np.zeros((2, b, conditions.own_count, n))
-        start, end = self._places[-1][0].stop, results.shape[1] - conditions.force_count
+        start, end = self._places[-1][0].stop, results.shape[1] - (conditions.force_count + (conditions.forces is not None))
         if operation.directed:
             found = results[:, start:end].reshape(b, -1, len(operation.directed), n)
             for array, x in zip((directions, mobilities), found.swapaxes(0, 1), strict=False):
                 array[:, list(operation.directed)] = x
         forces = np.ones((b, conditions.own_count))
         if conditions.force_count:
-            forces[:, self._holds] = results[:, end:]
-        self._seen, self._values = given, StateValues._make([*values, directions, mobilities, forces])
+            forces[:, self._holds] = results[:, end:-1]
+        safe = results[:, -1] > 0.5 if conditions.force_count else np.ones(b, bool)
+        self._seen, self._values = given, StateValues._make([*values, directions, mobilities, forces, safe])
         return self._values
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray]:

@@ -27,6 +27,7 @@ class StateValues(NamedTuple):
     directions: Float[Any, "*m E n"]  # directions of impulses; arbitrary for events that are not impacts
     mobilities: Float[Any, "*m E n"]  # of a system, M^(-1) g_q: the directions without constraints
     forces: Float[Any, "*m E"]  # forces of contacts, and reserves of joints that stick; arbitrary for others
+    has_safe_forces: Bool[Any, "*m"]  # whether machine code could compute the forces, whose pivots may be too small
 
 
 class System(Protocol):

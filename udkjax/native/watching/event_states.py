@@ -8,6 +8,7 @@ For a state (t, q, v) it returns, concatenated:
     d                        directions of impulses along g_q, of some conditions, (directed, n)
     M^(-1) g_q               the same without constraints, only where M is a function of the state, (directed, n)
     f                        forces of constraints (F,)
+    safe                     one, or zero where a pivot is too small for the forces; only with forces, ()
 
 A direction d = P M^(-1) g_q^T is the change of velocity by a unit impulse along g_q, with P the projector on the tangent space,
 so that W_ij = g_q,i d_j. For conditions that depend on velocities, g_v takes the place of g_q.
@@ -44,6 +45,11 @@ class EventStates(StateTangentPart, StateAccelerations):
         if conditions.forces is not None:
             self.places.add("multipliers", self.m)
         self.places.add("forces", conditions.force_count)
+        self.places.add("safe forces", self._safe_count)
+
+    @property
+    def _safe_count(self) -> int:
+        return int(self.conditions.forces is not None)
 
     @property
     def solving(self) -> list[str]:
@@ -84,6 +90,7 @@ class EventStates(StateTangentPart, StateAccelerations):
         if self.conditions.forces is not None:
             self.invoke(f, "multipliers_of_settled")
             f.call("own_forces", f.given["work"])
+            self.put_entry(f, "safe forces", 0, s.safe)
         count = self.conditions.own_count
         for k, event in enumerate(self.directed):
             start = 4 * count + (event + (count if self.conditions.by_velocity[event] else 0)) * self.n
@@ -107,6 +114,7 @@ class EventStates(StateTangentPart, StateAccelerations):
             "directions": len(self.directed) * self.n,
             "mobilities": len(self.directed) * self.n if self.plan.code.has_mobility else 0,
             "forces": self.conditions.force_count,
+            "safe forces": self._safe_count,
         }
         with self.each_lane(f, s.active) as k:
             to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))
