@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.special import erf
 
 import udkjax as udk
 from udkjax.integrate.events import simulate_events
@@ -119,6 +120,46 @@ def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
     assert len(runs) == 18 and np.array_equal(never.q, plain.q) and never.stats["steps"] == plain.stats["steps"]
     work = [int(sol.stats["right_hand_sides"]) for sol in (plain, never, found)]
     assert work[1] == work[0] and work[2] < work[0] + 16 * 60  # a step to the event, and the first ones behind it
+
+
+class Pulse(udk.ForceElement):
+    """A force of the size a on a body near x = c, over a width w."""
+
+    c: jax.Array
+    a: float = eqx.field(static=True)
+    w: float = eqx.field(static=True)
+
+    def loads(self, t, *frames):
+        return [(0.0, self.a * jnp.exp(-(((frames[0].x - self.c) / self.w) ** 2)), 0.0)]
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_a_crossing_is_exact_where_the_next_steps_are_short(engine):
+    """A body moves with x = t towards a narrow pulse, and y = t before it crosses a line just before, within or after the pulse.
+
+    With s = (t - c) / w and y'' = a exp(-s^2): y = t + a w^2 / 2 (sqrt(pi) s (1 + erf(s)) + exp(-s^2)).
+    """
+    a, w, line = -30.0, 0.01, 0.5
+    body = udk.Body(1.0, 0.1, velocity=[1.0, 1.0])
+    event = udk.Event(lambda t, at: at["b"].y - line, udk.Log(), 1)
+
+    def run(c):
+        scene = udk.Mechanism({"b": body}, forces={"pulse": Pulse(["b"], c, a, w)}, gravity=[0, 0])
+        return udk.simulate(scene, [0.0, 0.8], events=event, rtol=1e-10, atol=1e-10, engine=engine).events
+
+    def exact(c):
+        def height(t):
+            s = (t - c) / w
+            return t + a * w**2 / 2 * (np.sqrt(np.pi) * s * (1 + erf(s)) + np.exp(-(s**2))) - line
+
+        return brentq(height, 0.0, 0.8, xtol=1e-15)
+
+    c = np.linspace(line - 2 * w, line + 15 * w, 101 if engine == "native" else 7)
+    found = jax.vmap(run)(jnp.asarray(c))
+    assert np.all(found.count == 1)
+    np.testing.assert_allclose(found.q_before[:, 0, 0, 1], line, rtol=0, atol=1e-14)
+    if engine == "native":  # a first long step of the other passes the whole pulse, and misses a part of it
+        np.testing.assert_allclose(found.time[:, 0], [exact(x) for x in c], rtol=0, atol=1e-9)
 
 
 def test_a_stiff_run_goes_on_implicitly_up_to_a_crossing():

@@ -5,6 +5,9 @@ the nodes are too coarse for a condition, the window is repeated with an eighth 
 two nodes, that interval becomes the next window. This is repeated until the zero of the cubic is exact up to rounding, where the
 last window ends, or until the interval is as short as possible, as where a condition jumps.
 
+A long step may have passed a change of the motion that the shorter steps of a last window resolve. If the condition is not zero
+at its end, the run goes on where zero is still ahead; otherwise the window is repeated with another end.
+
 Windows are advanced by JAX for runs in plain form, and by NumPy and machine code where machine code alone cannot resolve a
 condition.
 """
@@ -15,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.integrate.events.crossings import NO_EVENT
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO
 from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.runs import RunState
@@ -163,16 +166,20 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
     undefined = hit.is_coarse & is_shortest & hit.undefined[:E]
     stays = hit.is_found | hit.is_coarse
     fails = (~xp.all(good) & ~stays) | xp.any(undefined)
-    has_landed, jumps = (
+    arrives, jumps = (
         zooms & window.lands & ~stays & ~fails & (end == window.high),
         width <= 2 / SMALLEST_STEP * smallest,
     )
+    change, is_ahead = _change_to_zero(plan, given, window.event, g[-1], g_dot[-1], xp)
+    is_off = arrives & (change != 0)
+    returns = is_off & ~is_ahead & (change < 0) & (end + change > t + 100 * len(times) * smallest)
+    has_landed = arrives & ~returns & ~(is_off & is_ahead)
     is_located = has_landed | (hit.is_found & jumps)
 
-    node = xp.where(stays, xp.where(hit.is_coarse, hit.last_sure, place), len(nodes) - 1)
+    node = xp.where(stays, xp.where(hit.is_coarse, hit.last_sure, place), xp.where(returns, 0, len(nodes) - 1))
     last_good = xp.where(xp.all(good), len(times) - 1, xp.maximum(xp.sum(good) - 1, 0))
     # Where a condition jumps, the event happens at the first time after the jump.
-    k = xp.where(stays, at[xp.where(is_located, hit.behind, node)], last_good)
+    k = xp.where(stays | returns, at[xp.where(is_located, hit.behind, node)], last_good)
     t_new = times[k]
     rows = xp.where((output < T) & (requested < t_new), output, T)
     of_outputs = xp.searchsorted(times, xp.clip(requested, t, end))
@@ -195,13 +202,31 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
         outputs=(q[of_outputs], v[of_outputs]),
         window=Window(
             reach=xp.where(is_located & (since > 0), xp.minimum(reach, 2 * since), reach),
-            event=xp.where(hit.is_found & ~is_located, hit.event, xp.where(end < window.high, window.event, NO_EVENT)),
-            high=xp.where(hit.is_found, xp.where(hit.is_exact, root, nodes[hit.behind]), window.high),
+            event=xp.where(
+                hit.is_found & ~is_located, hit.event, xp.where((end < window.high) | returns, window.event, NO_EVENT)
+            ),
+            high=xp.where(
+                hit.is_found, xp.where(hit.is_exact, root, nodes[hit.behind]), window.high + xp.where(returns, change, 0.0)
+            ),
             lands=xp.where(hit.is_found, hit.is_exact, window.lands),
             last=xp.where(is_located, t_new, window.last),
             unresolved=xp.where(is_unresolved & xp.isinf(window.unresolved), t_new, window.unresolved),
         ),
     )
+
+
+def _change_to_zero(
+    plan: EventPlan, given: WatchedConditions, event: Int[Any, ""], g: Float[Any, "E"], rate: Float[Any, "E"], xp: ModuleType
+) -> tuple[Float[Any, ""], Bool[Any, ""]]:
+    """Return the time (s) from a state to the zero of an event's condition, and whether the condition has not reached zero.
+
+    The time is zero where the condition is, and for forces and conditions of velocities, whose rates are not known.
+    """
+    k = xp.clip(event, 0, len(g) - 1)
+    has_rate = (event == k) & ~xp.asarray(plan.by_velocity)[k] & (rate[k] != 0)
+    side, is_zero = given.sides[k], xp.abs(g[k]) <= ZERO * given.scale[k]
+    change = xp.where(has_rate & ~is_zero & (side != 0), -g[k] / xp.where(has_rate, rate[k], 1.0), 0.0)
+    return change, g[k] * side > 0
 
 
 def _failure(raw: IntegratorOutput, xp: ModuleType) -> Int[Any, ""]:

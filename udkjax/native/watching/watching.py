@@ -149,8 +149,12 @@ class Watching(WatchMemory):
             self.put(f, "node a", r, a)
 
     def _cut_intervals(self, f: Function, s: Lane):
-        """Cut two intervals that cross the breakpoint, the end of a piece or the sudden change at which a step has ended."""
-        abrupt = s.abrupt > 0.5
+        """Cut two intervals that cross the breakpoint, the end of a piece or the sudden change at which a step has ended.
+
+        The same where steps have become short beside the intervals: their first node must not precede the polynomial, whose first
+        point the next step drops.
+        """
+        abrupt = (s.abrupt > 0.5) | (s.first_t < s.point1_t)
         ends, end = abrupt, s.point3_t
         if self.plan.breaks:
             ends, end = abrupt | (s.lands > 0.5), f.select(abrupt, s.point3_t, s.t1)
