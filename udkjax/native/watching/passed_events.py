@@ -74,6 +74,7 @@ class Sliding:
         places.add("lock constants", sum(x.constants(n) for x in self.locks))
         places.add("new locks", self.lock_count)
         places.add("joints at rest", self.count)
+        places.add("joints that stop", self.count)
 
 
 @dataclass(frozen=True)

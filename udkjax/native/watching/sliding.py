@@ -1,11 +1,12 @@
 """Joints with set-valued friction that stop, stick or slip while a run goes on.
 
 The modes of the joints follow by the pivots of complementarity/stick_or_slip.py: the equations of motion are solved in given
-modes; a joint that sticks with a force beyond its limit slides next, one that accelerates against its direction sticks again. In
-the mechanism of the scene, which lacks the locks, a joint that stops can only go on in one of both directions.
+modes; a joint that sticks with a force beyond its limit slides next, one that accelerates against its direction sticks again.
+Where joints stop together, as in a linkage with one degree of freedom that swings back, where a lock would depend on other rows,
+and in the mechanism of the scene, which lacks the locks, joints that stop can only all turn round, or go on as they slid.
 
-All other decisions are left to the loop of events: where several joints come to rest together, where joints that stick depend on
-each other, where both directions obey the law of friction, and where pivots do not end.
+All other decisions are left to the loop of events: where joints stick that stopped together or depend on each other, where both
+directions obey the law of friction, and where pivots do not end.
 """
 
 from collections.abc import Callable
@@ -64,7 +65,7 @@ class _Modes:
         forces = module.conditions.force_count - (2 * self._slides.count if self._slides.locks else 0)
         conditions = "conditions" if forces else "own_conditions"
         module.look_at_event(f, s, conditions=conditions)
-        asked = (stops | leaves) & ~self._is_beside_others()
+        asked = (stops | leaves) & ~self._is_beside_others(leaves)
         for name in ("sides", "locks"):
             self._copy_numbers(name, f"kept {name}", asked)
         found = self._choose(stops & asked, leaves & asked, sign)
@@ -114,19 +115,24 @@ class _Modes:
             found = found | ((c >= first) & (c < first + 2 * slides.count))
         return f.like(found, BOOL, f.width)
 
-    def _is_beside_others(self) -> Value:
-        """Return the lanes in which another condition is zero, another joint stops, or one is at rest that nothing locks."""
+    def _is_beside_others(self, leaves: Value) -> Value:
+        """Mark the joints that stop; return the lanes in which another condition is zero, or others keep a joint at rest.
+
+        `leaves`: the lanes in which a joint leaves its lock, and no other may stop.
+        """
         f, s, module, slides = self._f, self._s, self._module, self._slides
         is_near = module.any_condition(f, lambda c, g, _, floor: ~(f.abs(g) > floor) & ~self._is_of_joint(c))
         found = f.variable(is_near, BOOL)
         wider = f.max(slides.closed / f.max(s.atol, self._least), self._one)
+        all_ = f.const(True, BOOL, f.width)
 
         def look(j: Value, here: Value):
             c = j * 2 + slides.first
-            is_slow = ~(f.abs(self._entry("condition g", c)) > module.floor_of(f, s, c) * wider) & ~here
+            is_slow = here | ~(f.abs(self._entry("condition g", c)) > module.floor_of(f, s, c) * wider)
             if slides.locks:
                 is_slow = is_slow & (self._entry("locks", j) < 0.5)
-            found.value = found.value | is_slow | (self._entry("sides", j * 2 + 1) > 0.5)
+            self._put("joints that stop", j, f.select(is_slow, self._one, self._zero), all_)
+            found.value = found.value | (leaves & is_slow) | (self._entry("sides", j * 2 + 1) > 0.5)
 
         self._each_joint(look)
         return found.value
@@ -166,10 +172,13 @@ class _Modes:
         module.accelerate(f, "result a")
         module.copy(f, "result a", "node a")
 
-    def _respond(self, mask: Value) -> tuple[Value, Value]:
-        """Solve the equations of motion; return the lanes that have a solution, and the largest acceleration of a joint."""
+    def _respond(self) -> tuple[Value, Value]:
+        """Solve the equations of motion in the present modes.
+
+        Returns:
+            The lanes that have a solution, and the largest acceleration of a joint.
+        """
         f, s, module, slides = self._f, self._s, self._module, self._slides
-        self._enter(mask)
         self._look("sure v")
         f.call("own_conditions", f.given["work"])
         largest, total = f.variable(0.0), f.variable(0.0)
@@ -183,42 +192,113 @@ class _Modes:
     def _acceleration(self, j: Value) -> Value:
         return self._entry("condition rate", j * 2 + self._slides.first)
 
+    def _find_forces(self):
+        """Compute how far the forces of joints are from their limits; nothing without locks."""
+        if self._slides.locks:
+            self._module.invoke(self._f, "multipliers_of_settled")
+            self._f.call("own_forces", self._f.given["work"])
+
+    def _slips(self, j: Value) -> tuple[Value, Value]:
+        """Return the lanes in which joint j is locked with a force beyond its limit, and whether this is the limit forwards."""
+        f = self._f
+        ahead, back = (self._entry("forces", j * 2 + (self._slides.first_force + k)) for k in range(2))
+        least = f.max(f.abs(ahead), f.abs(back)) * -self._slides.still
+        return (self._entry("locks", j) > 0.5) & ((ahead < least) | (back < least)), ahead < least
+
+    # --- directions of sliding
+
+    def _set_mode(self, j: Value, direction: Value, mask: Value):
+        """Let a joint slide in a direction, or stick if this is zero; a lock that is on is independent of all other rows."""
+        f = self._f
+        self._put("sides", j * 2, direction, mask)
+        if self._slides.locks:
+            sticks = f.select(direction.is_(0.0), self._one, self._zero)
+            for k in range(2):
+                self._put("locks", j + k * self._slides.count, sticks, mask)
+
+    def _turn(self, mask: Value) -> Value:
+        """Let all joints that stop turn round, or all go on; return the lanes in which just one of both obeys the law."""
+        f = self._f
+        turns = self._try(-self._one, mask)
+        goes_on = self._try(self._one, mask & ~turns)
+        # Where both obey the law, neither is known to be right: the first is tried again after the second.
+        also = self._try(self._one, mask & turns)
+        found = (goes_on | (turns & ~also)) & mask
+        self._slide(f.select(goes_on, self._one, -self._one), found)
+        return found
+
+    def _slide(self, direction: Value, mask: Value):
+        """Let all joints that stop slide on (1) or back (-1), and compute the constants."""
+
+        def put(j: Value, _: Value):
+            stops = self._entry("joints that stop", j) > 0.5
+            self._set_mode(j, self._entry("kept sides", j * 2) * direction, mask & stops)
+
+        self._each_joint(put)
+        self._enter(mask)
+
+    def _try(self, direction: Value, mask: Value) -> Value:
+        """Return the lanes in which all joints that stop clearly slide on (1) or back (-1), and locked joints stay so."""
+        f = self._f
+        obeys = f.variable(f.const(False, BOOL, f.width), BOOL)
+        with f.if_(f.any_of(mask)):
+            self._slide(direction, mask)
+            is_known, largest = self._respond()
+            self._find_forces()
+            obeys.value = mask & is_known
+
+            def judge(j: Value, _: Value):
+                stops, ahead = self._entry("joints that stop", j) > 0.5, self._acceleration(j) * self._entry("sides", j * 2)
+                wrong = stops & ~(ahead > largest * self._slides.still)
+                if self._slides.locks:
+                    wrong = wrong | self._slips(j)[0]
+                obeys.value = obeys.value & ~wrong
+
+            self._each_joint(judge)
+        return obeys.value
+
 
 class _ChoiceWithoutLocks(_Modes):
     """The choice between both directions in the mechanism of the scene."""
 
     def _choose(self, stops, leaves, sign):
-        f, module = self._f, self._module
-        ahead = self._try(self._one, stops)
-        back = self._try(-self._one, stops & ~ahead)
-        # Where both directions obey the law, neither is known to be right: the first is tried again after the second.
-        also_back = self._try(-self._one, stops & ahead)
-        found = (back | (ahead & ~also_back)) & stops
-        self._each_joint(lambda j, here: self._put("sides", j * 2, f.select(back, -self._one, self._one), found & here))
-        self._enter(found)
-        module.copy(f, "sure v", "after v")
+        found = self._turn(stops)
+        self._module.copy(self._f, "sure v", "after v")
         return found
-
-    def _try(self, direction: Value, mask: Value) -> Value:
-        """Return the lanes in which this direction obeys the law."""
-        f = self._f
-        obeys = f.variable(f.const(False, BOOL, f.width), BOOL)
-        with f.if_(f.any_of(mask)):
-            self._each_joint(lambda j, here: self._put("sides", j * 2, direction, mask & here))
-            is_known, largest = self._respond(mask)
-            own = f.variable(0.0)
-            self._each_joint(lambda j, here: own.where(here, self._acceleration(j)))
-            obeys.value = mask & is_known & (own.value * direction >= largest * -self._slides.still)
-        return obeys.value
 
 
 class _Choice(_Modes):
-    """The choice by pivots in the mechanism with locks."""
+    """The choice in the mechanism with locks."""
 
     def _choose(self, stops, leaves, sign):
-        f, module, slides = self._f, self._module, self._slides
+        f, module = self._f, self._module
         can_stick = module.plan.projected and module.falls_back  # otherwise locks that depend on others would not show
-        open_ = f.variable(leaves | (stops if can_stick else f.const(False, BOOL, f.width)), BOOL)
+        alone = stops & ~self._several_stop() if can_stick else f.const(False, BOOL, f.width)
+        found = self._pivot_modes(alone, leaves, sign)
+        turns = f.variable(stops & ~found, BOOL)
+        module.copy(f, "sure v", "after v")
+        with f.if_(f.any_of(turns.value)):
+            for name in ("sides", "locks"):
+                self._copy_numbers(f"kept {name}", name, turns.value)
+            turns.value = self._turn(turns.value)
+        sticks = found & self._sticks_newly()
+        with f.if_(f.any_of(sticks)):
+            self._project(sticks)
+        return found | turns.value
+
+    def _several_stop(self) -> Value:
+        count = self._f.variable(0.0)
+
+        def add(j: Value, _: Value):
+            count.value = count.value + self._entry("joints that stop", j)
+
+        self._each_joint(add)
+        return count.value > 1.5
+
+    def _pivot_modes(self, stops: Value, leaves: Value, sign: Value) -> Value:
+        """Choose the modes by pivots; return the lanes in which they obey the law."""
+        f, slides = self._f, self._slides
+        open_ = f.variable(stops | leaves, BOOL)
         found, step = f.variable(f.const(False, BOOL, f.width), BOOL), f.variable(0, INT, 1)
         self._find_locks(stops)
 
@@ -230,17 +310,13 @@ class _Choice(_Modes):
         self._each_joint(begin)
         with f.while_(lambda: f.any_of(open_.value) & (step.value < slides.most_pivots)):
             asked = open_.value
-            is_known, largest = self._respond(asked)
-            module.invoke(f, "multipliers_of_settled")
-            f.call("own_forces", f.given["work"])
+            self._enter(asked)
+            is_known, largest = self._respond()
+            self._find_forces()
             violates = self._pivot(asked & is_known, largest, step.value)
             found.value = found.value | (asked & is_known & ~violates)
             open_.value = asked & is_known & violates
             step.value = step.value + 1
-        module.copy(f, "sure v", "after v")
-        sticks = found.value & self._sticks_newly()
-        with f.if_(f.any_of(sticks)):
-            self._project(sticks)
         return found.value
 
     def _pivot(self, mask: Value, largest: Value, step: Value) -> Value:
@@ -250,25 +326,15 @@ class _Choice(_Modes):
         single = f.like(step >= slides.block_steps * slides.count, BOOL, f.width)
 
         def change(j: Value, _: Value):
-            locked, direction = self._entry("locks", j) > 0.5, self._entry("sides", j * 2)
-            ahead, back = (self._entry("forces", j * 2 + (slides.first_force + k)) for k in range(2))
-            least = f.max(f.abs(ahead), f.abs(back)) * -slides.still
-            returns = ~locked & (self._acceleration(j) * direction < largest * -slides.still)
-            violates = mask & (self._entry("joints at rest", j) > 0.5) & ((locked & ((ahead < least) | (back < least))) | returns)
-            new = f.select(returns, self._zero, f.select(ahead < least, self._one, -self._one))
+            (slips, forwards), direction = self._slips(j), self._entry("sides", j * 2)
+            returns = (self._entry("locks", j) < 0.5) & (self._acceleration(j) * direction < largest * -slides.still)
+            violates = mask & (self._entry("joints at rest", j) > 0.5) & (slips | returns)
+            new = f.select(returns, self._zero, f.select(forwards, self._one, -self._one))
             self._set_mode(j, new, violates & ~(single & found.value))
             found.value = found.value | violates
 
         self._each_joint(change)
         return found.value
-
-    def _set_mode(self, j: Value, direction: Value, mask: Value):
-        """Let a joint slide in a direction, or stick if this is zero; a lock that is on is independent of all other rows."""
-        f = self._f
-        sticks = f.select(direction.is_(0.0), self._one, self._zero)
-        self._put("sides", j * 2, direction, mask)
-        for k in range(2):
-            self._put("locks", j + k * self._slides.count, sticks, mask)
 
     def _find_locks(self, mask: Value):
         """Give the locks of the joints of the masked lanes their places."""
