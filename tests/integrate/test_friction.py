@@ -43,6 +43,19 @@ def test_jam_is_named():
 
 
 @pytest.mark.slow
+def test_a_jam_on_the_way_is_named_by_both_laws():
+    """Near the position where all links are in line, the forces that balance friction grow without bound."""
+    ends = []
+    for law in ("smooth", "set-valued"):
+        mechanism = rubbing(udk.library.n_four_bar(), 0.15, 0.005, law=law)
+        solution = udk.simulate(mechanism, [0.0, 4.0], throw=False, **TOL)
+        assert "friction jams joints" in solution.cause and " at 0.7151" in solution.cause
+        assert "make the coefficient or the radius of the pin smaller" in solution.cause
+        ends.append(float(solution.time))
+    assert ends[0] == pytest.approx(ends[1], abs=1e-6)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["native", "jax"])
 def test_pendulum_on_a_thick_pin(engine):
     ts = np.linspace(0.0, 3.0, 31)

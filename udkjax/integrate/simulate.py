@@ -211,16 +211,16 @@ def simulate(
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
         most = (MAX_EVENTS_STICKING if sticks else MAX_EVENTS) if max_events is None else max_events
-        solution = simulate_events(system, events, analysis, ts, state, closure, choices, most, all_concrete)
+        solution, end = simulate_events(system, events, analysis, ts, state, closure, choices, most, all_concrete)
         if not _has_failed(solution.code):
             return solution
-        if not is_concrete or int(solution.stats.get("events", 0)):
-            return _required(solution, throw)  # events may have changed what moved
+        if not is_concrete or (events is not None and int(solution.stats.get("events", 0))):
+            return _required(solution, throw)  # events may have changed what moved; joints that stick or slip have not
         if events is not None and isinstance(mechanism, ConstrainedSystem):
             return _required(solution, throw)
         if events is not None or sticks:
             assert isinstance(mechanism, Mechanism)  # no joint of a system sticks
-            return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver), throw)
+            return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
         located = solution  # locating kinks failed; perhaps a run succeeds without
 
     solution, missed, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)

@@ -1,5 +1,6 @@
 """Friction that admits no motion: the joints whose friction, as it depends on their own load, jams a mechanism."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import jax
@@ -10,6 +11,7 @@ from udkjax.equations.textbook import prepare
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.pinv import SVD
 from udkjax.scene.friction import Friction
+from udkjax.scene.joints import Prismatic, Slot
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
@@ -26,15 +28,35 @@ def explain_jamming(run: FailedRun) -> str:
     span = float(run.ts[-1] - run.ts[0])
     for share in JAMMING_TIMES:
         state = t + share * span, q + share * span * v, v
-        if not _jams(run, mechanism, state):
+        if not _jams(run, _sliding(mechanism), state):
             continue
-        alone = [name for name in joints if _jams(run, _with_friction_in(mechanism, name), state)]
+        alone = [name for name in joints if _jams(run, _sliding(mechanism, name), state)]
+        return _description(mechanism, alone or joints, state[0])
+    return ""
+    t, q, v = run.states[0]
+    span = float(run.ts[-1] - run.ts[0])
+    for share in JAMMING_TIMES:
+        state = t + share * span, q + share * span * v, v
+        if not _jams(run, _sliding(mechanism), state):
+            continue
+        alone = [name for name in joints if _jams(run, _sliding(mechanism, name), state)]
         listed = ", ".join(map(quote, alone or joints))
         return (
             f"friction jams joint {listed} at {state[0]:.6g} s: the load that would balance its friction grows with the "
             "friction; make the coefficient smaller, or the guide longer"
         )
     return ""
+
+
+def _description(mechanism: Mechanism, names: Sequence[str], t: float) -> str:
+    kinds = {isinstance(mechanism.joints[name], Prismatic | Slot) for name in names}
+    pins, guides = False in kinds, True in kinds
+    one = len(names) == 1
+    cure = f"make the coefficient{' or the radius of the pin' if pins else ''} smaller{', or the guide longer' if guides else ''}"
+    return (
+        f"friction jams joint{'' if one else 's'} {', '.join(map(quote, names))} at {t:.6g} s: the load that would balance "
+        f"{'its' if one else 'their'} friction grows with the friction; {cure}"
+    )
 
 
 def _jams(run: FailedRun, mechanism: Mechanism, state: tuple[float, np.ndarray, np.ndarray]) -> bool:
@@ -44,12 +66,19 @@ def _jams(run: FailedRun, mechanism: Mechanism, state: tuple[float, np.ndarray, 
     return not bool(np.all(np.isfinite(np.asarray(found))))
 
 
-def _with_friction_in(mechanism: Mechanism, joint: str) -> Mechanism:
-    """Return the mechanism with friction that depends on loads in one joint only."""
-    forces = {
-        name: replace(force, coefficient=0.0, static_coefficient=None, viscous=None)
-        if isinstance(force, Friction) and force.rubs and force.joint != joint
-        else force
-        for name, force in mechanism.forces.items()
-    }
+def _sliding(mechanism: Mechanism, joint: str | None = None) -> Mechanism:
+    """Return the mechanism with friction that depends on loads alone, of all joints or of one.
+
+    Joints slide, so the smooth law serves for the set-valued one, whose decisions would take long.
+    """
+    forces = {}
+    for name, force in mechanism.forces.items():
+        if not isinstance(force, Friction):
+            forces[name] = force
+        elif force.rubs:
+            rubs = joint in (None, force.joint)
+            changed = (
+                {"coefficient": force.coefficient, "viscous": force.viscous} if rubs else {"coefficient": 0.0, "viscous": None}
+            )
+            forces[name] = replace(force, law="smooth", torque=None, velocity=None, static_coefficient=None, **changed)
     return Mechanism(mechanism.bodies, mechanism.joints, mechanism.drivers, forces, mechanism.gravity, mechanism.name)

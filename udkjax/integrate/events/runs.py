@@ -57,6 +57,7 @@ class EventRun(NamedTuple):
     totals: Int[Any, "*m 5"]  # steps tried, accepted, right-hand sides, projections, implicit steps
     first_phase: Bool[Any, "*m C"]  # phase at the start
     first_sides: Float[Any, "*m S"]  # sides at the start
+    end: Float[Any, "*m 2 n"]  # q and v at the end of the run
 
 
 EVENT_STATES = ("event_time", "event_q", "event_v")
@@ -74,7 +75,7 @@ def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
     """Return the shapes of the fields of a run of T output times and n coordinates, with room for `room` events."""
     E, K, C, S = plan.count, room, len(plan.first), plan.side_count
     of_events = (K,), (K, 2, n), (K, 2, n), (K,), (K, C), (K,), (K, E), (K, S)
-    return EventRun((T, n), (T, n), (), *of_events, (), (E,), (E,), (), (5,), (C,), (S,))
+    return EventRun((T, n), (T, n), (), *of_events, (), (E,), (E,), (), (5,), (C,), (S,), (2, n))
 
 
 class MemberRuns(NamedTuple):
@@ -178,4 +179,4 @@ def results(plan: EventPlan, runs: MemberRuns, ts: Float[Any, "B T"], unresolved
     last, record = (ts == runs.t[:, None])[..., None], (x[:, : plan.room] for x in runs.record)
     q, v = xp.where(last, runs.q[:, None], runs.qs), xp.where(last, runs.v[:, None], runs.vs)
     ends = runs.count, unresolved, runs.undefined, runs.code, runs.totals, runs.first_phase, runs.first_sides
-    return EventRun._make([q, v, runs.t, *record, *ends])
+    return EventRun._make([q, v, runs.t, *record, *ends, xp.stack([runs.q, runs.v], axis=1)])

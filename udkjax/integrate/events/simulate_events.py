@@ -75,8 +75,8 @@ def simulate_events(
     choices: Choices,
     max_events: int,
     all_concrete: bool,
-) -> Solution:
-    """Run a mechanism with events.
+) -> tuple[Solution, tuple[Any, Any]]:
+    """Run a mechanism with events; return the solution, and the time and the state (q, v) at the end of the run.
 
     Args:
         mechanism: the scene, or a system of traced functions.
@@ -105,14 +105,15 @@ def simulate_events(
         given = given._replace(ts=number(ts), choices=choices.arrays())
         result = (_run if is_within_jit() else _compiled_run if choices.take_diffrax else _deferred_run)(given)
     found, reasons = result
+    end = found.time, found.end.ravel()
     if not runs_at_once:
-        return (_solution if is_within_jit() else _compiled_solution)(mechanism, given, found, reasons)
+        return (_solution if is_within_jit() else _compiled_solution)(mechanism, given, found, reasons), end
     found = EventRun(*map(np.asarray, found))  # JAX would compile a program for each operation
     names = tuple(e.name for e in listed if e.action.turn is None)
     if np.isfinite(found.unresolved[: len(names)]).any():
         fast = [f"{quote(name)} from {t:.6g} s on" for name, t in zip(names, found.unresolved) if np.isfinite(t)]
         warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
-    return put_arrays(_solution(mechanism, given, found, reasons, np))
+    return put_arrays(_solution(mechanism, given, found, reasons, np)), end
 
 
 def _run_at_once(given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
