@@ -122,6 +122,36 @@ def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
     assert work[1] == work[0] and work[2] < work[0] + 16 * 60  # a step to the event, and the first ones behind it
 
 
+class Level(eqx.Module):
+    """A condition: the level of a coordinate of a body."""
+
+    level: jax.Array
+    body: str = eqx.field(static=True)
+    coordinate: str = eqx.field(static=True)
+
+    def __call__(self, t, at):
+        return getattr(at[self.body], self.coordinate) - self.level
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_events_at_nearly_the_same_time_all_happen(engine):
+    """Six coordinates of a double pendulum pass their values at a time of the motion, together or each alone."""
+    mechanism, ts = udk.library.double_pendulum(), np.linspace(0.2, 3.9, 25 if engine == "native" else 3)
+    accurate = udk.simulate(mechanism, [0.0, *ts, 4.0], rtol=1e-9, atol=1e-9)
+    names = [(body, coordinate) for body in mechanism.body_names for coordinate in ("x", "y", "angle")]
+
+    def run(levels, chosen, engine: Any = "native"):
+        events = [udk.Event(Level(levels[k], *names[k]), udk.Log()) for k in chosen]
+        found = udk.simulate(mechanism, [0.0, 4.0], events=events, rtol=1e-7, atol=1e-7, engine=engine).events
+        return jnp.sum(found.index[:, None] == np.arange(len(chosen)), axis=0)
+
+    levels = accurate.q[1:-1].reshape(len(ts), -1)
+    together = jax.vmap(lambda x: run(x, range(6), engine))(levels)
+    for k in range(6):
+        alone = jax.vmap(lambda x, k=k: run(x, [k]))(levels)[:, 0]
+        np.testing.assert_array_equal(together[:, k], alone)
+
+
 class Pulse(udk.ForceElement):
     """A force of the size a on a body near x = c, over a width w."""
 

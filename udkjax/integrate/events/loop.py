@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, first_crossing, side_of_zero
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO, ConditionValues, crosses, first_crossing, side_of_zero
 from udkjax.integrate.events.hops import ends_hop, return_to_top
 from udkjax.integrate.events.impacts import CLOSED, OPEN
 from udkjax.integrate.events.jumps import apply_event
@@ -47,9 +47,13 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     size, is_current = xp.abs(values.h), np.arange(E) == event[:, None]
     carried = _carried(system, members, take(runs.carried, members) & (size <= CLOSED * values.scale), state.joints)
     undefined, ends = ~xp.isfinite(values.h), state.t >= take(system.end, members)
-    # A located condition keeps its side until its event happens; any other nonzero condition is on the side of its sign.
-    known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale)
-    after = xp.where(known, xp.sign(values.h).astype(int), sides[:, :E])
+    # A located condition keeps its side until its event happens, and so does one that has crossed zero just before a located one:
+    # it is located next. Any other nonzero condition is on the side of its sign.
+    watched, sign = plan.watched(state.phase, carried, xp)[:, :E], xp.sign(values.h).astype(int)
+    crossed = (sign == -sides[:, :E]) & watched & crosses(plan.both_directions[:E], sides[:, :E], sign)
+    waits = crossed & (event >= 0)[:, None] & ~plan.slides
+    known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale) & ~waits
+    after = xp.where(known, sign, sides[:, :E])
     code = xp.where(take(runs.totals, members)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
     unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
     hits = (event >= 0) & (event < E) & xp.asarray(plan.impacts & ~plan.impacts.all())[event % E]
@@ -58,7 +62,6 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
         is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
         # Contacts are approached from the allowed side: an impact whose condition is zero at the start and falls happens at once.
         before = xp.where(begins[:, None], xp.where(falling & is_zero, 1, now), sides[:, :E])
-        watched = plan.watched(state.phase, carried, xp)[:, :E]
         watched = watched & ~((event == AGAIN)[:, None] & _settled(system, runs, members))
         crossing = first_crossing(plan.both_directions[:E], watched, before, now, xp)
         # A condition that an impact turns back at zero has reached zero before: its event comes first.

@@ -4,7 +4,8 @@ On the polynomial, Newton's method finds the first zero, between bounds: each st
 the other bound, and bisection replaces steps that leave the bounds.
 """
 
-from udkjax.native.base.ir import DOUBLE, Value
+from udkjax.native.base.ir import DOUBLE, Function, Value
+from udkjax.native.base.layout import Lane
 from udkjax.native.base.steps import POINTS, UNIT, Status
 from udkjax.native.watching.conditions import FIRST, LAST_CHANGE, LEAST_STEP, MOST_AIMS, MOST_LANDINGS, UNDER_WAY, WANTED
 from udkjax.native.watching.watch_memory import WatchMemory
@@ -97,7 +98,8 @@ def write_land(module: WatchMemory):
     """Write `land(work)`: end or correct the landing of lanes whose step has ended at its target.
 
     Where the condition does not reach zero at the ends of such steps either, the crossing was an error of the polynomial, for
-    instance after a fast decay that an implicit step has passed in one step: then the run goes on from there.
+    instance after a fast decay that an implicit step has passed in one step: then the run goes on from there. Where another
+    condition has crossed zero before, which may be an error of the polynomial, too, its crossing is the event.
     """
     f, s = module.function("land")
     arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(Status.RUNNING))
@@ -106,6 +108,7 @@ def write_land(module: WatchMemory):
     for source, to in (("point3 q", "state q"), ("point3 v", "result v"), ("point3 a", "node a")):
         module.copy(f, source, to)
     f.call("conditions", f.given["work"])
+    s.where(arrived, event=_earliest(module, f, s))
     g, rate, before = f.variable(0.0), f.variable(0.0), f.variable(0.0)
     with f.each(module.conditions.count) as c:
         is_event, size = s.event.is_(f.like(c, DOUBLE, f.width)), f.abs(module.condition(f, "g", c))
@@ -132,3 +135,19 @@ def write_land(module: WatchMemory):
     module.copy_state(f, is_exact, ("state q", "result v"), "sure")
     s.where(is_complete, stops=one)
     module.stop(f, s)
+
+
+def _earliest(module: WatchMemory, f: Function, s: Lane) -> Value:
+    """Return the condition that crosses zero first: that of the event, or one that is beyond zero."""
+    event, first = f.variable(-1.0), f.variable(float("inf"))
+    with f.each(module.conditions.count) as c:
+        g, rate, side, on, floor, direction = (
+            module.condition(f, name, c) for name in ("g", "rate", "side", "on", "floor", "direction")
+        )
+        is_beyond = (on > 0.5) & (g * side < -floor) & (rate * side < 0.0) & ~(direction * side > 0.0)
+        index = f.like(c, DOUBLE, f.width)
+        change = -(g / f.select(rate.is_(0.0), f.const(1.0, DOUBLE, f.width), rate))
+        is_first = (s.event.is_(index) | is_beyond) & ((change < first.value) | (event.value < 0.0))
+        event.where(is_first, index)
+        first.where(is_first, change)
+    return event.value
