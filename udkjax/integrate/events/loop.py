@@ -19,6 +19,7 @@ from udkjax.integrate.events.runs import AGAIN, BEGIN, RECORD, MemberIndices, Me
 from udkjax.integrate.events.sticking import begin_with_friction
 from udkjax.integrate.events.system import StateValues, System, condition_values
 from udkjax.integrate.solution import Result
+from udkjax.native.watching.conditions import RESOLUTION
 
 CLOSED_FIELD, INDEX_FIELD = RECORD.index("closed"), RECORD.index("event_index")
 
@@ -48,9 +49,11 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     carried = _carried(system, members, take(runs.carried, members) & (size <= CLOSED * values.scale), state.joints)
     undefined, ends = ~xp.isfinite(values.h), state.t >= take(system.end, members)
     # A located condition keeps its side until its event happens, and so does one that has crossed zero just before a located one:
-    # it is located next. Any other nonzero condition is on the side of its sign.
+    # it is located next, unless it has just had its event, and is late by the error of the event's time. Any other nonzero
+    # condition is on the side of its sign.
     watched, sign = plan.watched(state.phase, carried, xp)[:, :E], xp.sign(values.h).astype(int)
-    crossed = (sign == -sides[:, :E]) & watched & crosses(plan.both_directions[:E], sides[:, :E], sign)
+    is_late = size * take(system.rate, members)[:, None] <= RESOLUTION.late * state_values.rate * sides[:, :E]
+    crossed = (sign == -sides[:, :E]) & watched & (is_late | crosses(plan.both_directions[:E], sides[:, :E], sign))
     waits = crossed & (event >= 0)[:, None] & ~plan.slides
     known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale) & ~waits
     after = xp.where(known, sign, sides[:, :E])

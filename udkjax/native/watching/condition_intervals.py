@@ -3,6 +3,7 @@
 from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value, Variable
 from udkjax.native.base.layout import Lane
 from udkjax.native.watching.conditions import (
+    LAST_CHANGE,
     MIDDLE,
     MOST_JUMPS,
     MOST_STUCK,
@@ -33,6 +34,10 @@ def write_classification(module: WatchMemory):
         is_finite = is_finite | (is_force & ~on)  # a force that nothing holds may be anything
         is_smooth = f.is_finite(rate[0]) & f.is_finite(rate[1]) & f.is_finite(rate[2])
         error = _error(f, g, rate, length, x)
+        # Where a run begins, a condition that has just had its event may be on the other side by the error of the event's time.
+        is_late = (s.first_t.is_(s.fresh)) & (g[0] * side < 0.0) & (rate[0] * side > 0.0)
+        is_late = is_late & (f.abs(g[0]) * s.omega <= f.abs(rate[0]) * LAST_CHANGE)
+        g[0] = f.select(is_late, f.const(0.0, DOUBLE, f.width), g[0])
         for k in range(2):
             after = f.select(f.abs(g[k + 1]) <= floor, side, _sign(f, g[k + 1]))
             hit, is_certain = _classify_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)

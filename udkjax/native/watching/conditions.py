@@ -25,6 +25,8 @@ class Resolution(NamedTuple):
         finer: factor by which an interval that is too coarse is refined.
         short: length of a window, in T, in which an unresolved condition has a jump or a kink, or varies throughout.
         finest: length of a window, in T, in which changes are no longer resolved.
+        late: largest error of the time of a located event, in T; the error of a Taylor step of this length, its square, is
+            rounding.
     """
 
     per_time: int = 16
@@ -34,6 +36,7 @@ class Resolution(NamedTuple):
     finer: int = 8
     short: float = 1e-6
     finest: float = 1e-9
+    late: float = 1e-8
 
     def classify_interval(
         self, arithmetic: Any, ends: Sequence[Any], step: Any, error: Any, side: Any, floor: Any
@@ -94,7 +97,7 @@ MOST_JUMPS = 3  # maximum number of jumps before intervals regain their length; 
 MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
 MOST_STUCK = 4  # maximum number of successive refinements; before a jump, some finer intervals are resolved
 FIRST, SECOND, THIRD = range(3)  # the next node of two intervals
-LAST_CHANGE = 1e-8  # largest final correction of the event time, in T; the error of this Taylor step, its square, is rounding
+LAST_CHANGE = RESOLUTION.late  # largest final correction of the event time, in T
 MOST_AIMS = 12  # maximum number of Newton's steps to a crossing on the polynomial, before bisection goes on
 MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; usually one
 LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long

@@ -125,14 +125,9 @@ def write_land(module: WatchMemory):
     s.where(is_false, event=-1.0, landing=0.0, landings=0.0)
     is_complete, change = arrived & ~goes_on & ~is_false, f.select(is_small, change, zero)
     change = f.max(change, s.fresh - s.point3_t)  # with a slow condition the corrected time may precede the start
-    ahead = module.broadcast(f, change)
     is_exact = is_complete & is_small
     s.where(is_exact, sure_t=s.point3_t + change)
-    with f.each(module.rowcount) as r:
-        q, v, a = (module.vector(f, f"point3 {x}", r) for x in "qva")
-        module.put(f, "state q", r, f.fma(f.fma(a, ahead * 0.5, v), ahead, q))
-        module.put(f, "result v", r, f.fma(a, ahead, v))
-    module.copy_state(f, is_exact, ("state q", "result v"), "sure")
+    module.move_point(f, is_exact, POINTS - 1, change, ("sure q", "sure v"))
     s.where(is_complete, stops=one)
     module.stop(f, s)
 

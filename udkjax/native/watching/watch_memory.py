@@ -117,6 +117,15 @@ class WatchMemory(PassingRuns):
         for source, x in zip(sources, "qv", strict=True):
             self.copy(f, source, f"{to} {x}", mask)
 
+    def move_point(self, f: Function, mask: Value, k: int, ahead: Value, to: tuple[str, str] = ("state q", "state v")):
+        """Compute the state a time `ahead` of point k, by a Taylor step; its error is rounding up to `LAST_CHANGE`."""
+        ahead = self.broadcast(f, ahead)
+        with f.each(self.rowcount) as r:
+            q, v, a = (self.vector(f, f"point{k} {x}", r) for x in "qva")
+            moved = f.fma(f.fma(a, ahead * 0.5, v), ahead, q), f.fma(a, ahead, v)
+            for name, new in zip(to, moved, strict=True):
+                self.put(f, name, r, f.select(mask, new, self.vector(f, name, r)))
+
     def stop(self, f: Function, s: Lane):
         """End the runs of lanes that stop."""
         stops = s.stops > 0.5

@@ -16,7 +16,7 @@ from udkjax.native.base.program import write
 from udkjax.native.base.steps import POINTS, Status
 from udkjax.native.run.manifold import project_output
 from udkjax.native.watching.condition_intervals import write_classification
-from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, MIDDLE, SECOND, THIRD, WANTED
+from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, LAST_CHANGE, MIDDLE, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate
 from udkjax.native.watching.sliding import write_slide
 from udkjax.native.watching.turning import write_turn
@@ -123,11 +123,13 @@ class Watching(WatchMemory):
         accelerates = any(program.uses(x) for x in program.inputs[1 + 2 * self.n : 1 + 3 * self.n])
         if accelerates:
             self._accelerate_between(f, s)
-        # At a point the polynomial has nothing but its rounding errors, and a condition may begin at zero there.
+        # At a point the polynomial has nothing but its rounding errors, which are largest at the first one, and a condition may
+        # begin at zero there.
         for k in range(POINTS):
-            is_point = getattr(s, f"point{k}_t").is_(s.look)
+            ahead = s.look - getattr(s, f"point{k}_t")
+            is_point = f.abs(ahead) * s.omega <= LAST_CHANGE
             with f.if_(f.any_of(is_point)):
-                self.copy_state(f, is_point, (f"point{k} q", f"point{k} v"), "state")
+                self.move_point(f, is_point, k, ahead)
                 if accelerates:
                     self.copy(f, f"point{k} a", "node a", is_point)
         s.next = following
