@@ -76,6 +76,7 @@ def detect(
     scale: Float[Any, "C"],
     located: Int[Any, ""],
     watched: Bool[Any, "C"],
+    late: Float[Any, ""],
     is_short: Bool[Any, ""],
     unresolved: Bool[Any, "C"],
     xp: ModuleType = jnp,
@@ -90,6 +91,7 @@ def detect(
         scale: scale of each condition.
         located: the condition that certainly crosses zero in this window; -1: none.
         watched: mask of the watched conditions.
+        late: time (s) by which an event may be early: at the first node, its condition may still be on the other side.
         is_short: whether the window is so short that coarse intervals must be due to a jump.
         unresolved: mask of the conditions that are not refined.
         xp: jax.numpy, or NumPy.
@@ -103,6 +105,8 @@ def detect(
     before, after = sides[:-1], sides[1:]
     step = xp.diff(t)[:, None]
     slope = _slopes(t, g, g_dot, has_rates, xp)
+    is_late = (g[0] * sides[0] < 0) & (slope[0] * sides[0] > 0) & (xp.abs(g[0]) <= xp.abs(slope[0]) * late)
+    g = xp.concatenate([xp.where(is_late, 0.0, g[0])[None], g[1:]])
     cubic: Cubic = (g[:-1], step * slope[:-1], g[1:], step * slope[1:])
     error = _errors(t, g, slope, has_rates, xp)
 

@@ -157,6 +157,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
         located=window.event,
         watched=given.watched & ~lands,
         is_short=length * units.rate <= RESOLUTION.short,
+        late=RESOLUTION.late / units.rate,
         unresolved=xp.isfinite(window.unresolved) | zooms,  # an interval that is being refined was fine enough
         xp=xp,
     )
@@ -173,7 +174,9 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
     change, is_ahead = _change_to_zero(plan, given, window.event, g[-1], g_dot[-1], xp)
     is_off = arrives & (change != 0)
     returns = is_off & ~is_ahead & (change < 0) & (end + change > t + 100 * len(times) * smallest)
-    has_landed = arrives & ~returns & ~(is_off & is_ahead)
+    # In a very short window the values of a condition may differ by rounding from those by which it crossed zero.
+    is_lost = zooms & ~window.lands & ~stays & ~fails & (end == window.high) & (length * units.rate <= RESOLUTION.late)
+    has_landed = (arrives & ~returns & ~(is_off & is_ahead)) | is_lost
     is_located = has_landed | (hit.is_found & jumps)
 
     node = xp.where(stays, xp.where(hit.is_coarse, hit.last_sure, place), xp.where(returns, 0, len(nodes) - 1))
