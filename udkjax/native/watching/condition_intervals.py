@@ -35,7 +35,7 @@ def write_classification(module: WatchMemory):
         is_smooth = f.is_finite(rate[0]) & f.is_finite(rate[1]) & f.is_finite(rate[2])
         error = _error(f, g, rate, length, x)
         # Where a run begins, a condition that has just had its event may be on the other side by the error of the event's time.
-        is_late = (s.first_t.is_(s.fresh)) & (g[0] * side < 0.0) & (rate[0] * side > 0.0)
+        is_late = s.first_t.is_(s.fresh) & (g[0] * side < 0.0) & (rate[0] * side > 0.0)
         is_late = is_late & (f.abs(g[0]) * s.omega <= f.abs(rate[0]) * LAST_CHANGE)
         g[0] = f.select(is_late, f.const(0.0, DOUBLE, f.width), g[0])
         for k in range(2):
