@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from experiments.parts.random_scenes import build, random_scene, state_of
 from tests.integrate.test_redundant_friction import doubled
 from tests.integrate.test_sticking import Bumper, belt, block, oscillator, sticking
 from udkjax.integrate.events import simulate_events
@@ -122,3 +123,20 @@ def test_runs_by_windows_are_those_between_crossings(name, windows, from_the_sta
     for joint, sticks in (expected.sticking or {}).items():
         np.testing.assert_array_equal(found.sticking[joint], sticks)
     np.testing.assert_allclose(found.events.time, expected.events.time, atol=1e-7)
+
+
+def test_a_crossing_within_rounding_errors_is_found_once(windows, from_the_start):
+    """The angular velocity of a body falls through the level so slowly that its rounding errors take 7e-9 s to pass."""
+    scene = random_scene(23, 72, 0, bodies=(2, 5))
+    mechanism, (q, v), end = build(scene.table), state_of(scene.table), 6 * float(scene.time)
+    body = mechanism.body_names[0]
+    event = udk.Event(lambda t, at: at[body].omega + 0.014683922117060901, udk.Log())
+
+    def run() -> udk.Solution:
+        return udk.simulate(mechanism, [0.0, end], udk.State(q, v), events=event, rtol=1e-7, atol=1e-7, max_steps=3000)
+
+    expected = run()
+    from_the_start()
+    found = run()
+    assert windows and found.events.count == expected.events.count == 2
+    np.testing.assert_allclose(found.events.time, expected.events.time, rtol=0, atol=1e-7 * end)
