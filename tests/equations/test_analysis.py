@@ -174,6 +174,7 @@ def test_a_closure_computes_psi_once_at_each_position(monkeypatch):
     mechanism, seen = row_of_cranks(4, 1.0), []
     rows, run = redundancy.kinematic_rows(mechanism), SceneArrays._run
     start = rows.close(0.0, np.asarray(mechanism.q0, float).ravel())
+    assert start is not None
     monkeypatch.setattr(
         SceneArrays, "_run", lambda *given, **more: seen.append((given[1], given[3].tobytes())) or run(*given, **more)
     )
