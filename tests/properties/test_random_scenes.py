@@ -126,16 +126,17 @@ def test_forces_are_watched_where_loads_are_followed_from_those_without_friction
 
 @pytest.mark.slow
 def test_a_run_that_ends_where_friction_jams_does_not_leave_machine_code(monkeypatch):
-    """Conditions vary too quickly for machine code alone where loads grow without bound; the run goes on by windows."""
+    """Loads grow without bound at its end, which is the same at any tolerance."""
     scene = random_scene(11, 51, 0, bodies=(2, 5))
     rub = {"type": "friction", "coefficient": 0.3, "radius": 0.3 * scene.length, "law": "set-valued"}
     pins = [joint["name"] for joint in scene.table["joint"] if joint["type"] == "revolute"]
     others = [force for force in scene.table["force"] if force["type"] != "friction"]
     table = scene.table | {"force": [*others, *({"name": f"rub {pin}", "joint": pin} | rub for pin in pins)]}
     monkeypatch.delattr(simulate_events, "_deferred_run")  # the only way to the plain form
-    run = udk.simulate(build(table), np.linspace(0.0, 3 * scene.time, 31), throw=False)
-    assert run.result == udk.Result.step_too_small and run.settings["engine"] == "native"
-    assert float(run.time) == pytest.approx(0.115768, rel=1e-4)
+    for tol in (1e-6, 1e-8, 1e-10):
+        run = udk.simulate(build(table), np.linspace(0.0, 3 * scene.time, 31), rtol=tol, atol=tol, throw=False)
+        assert run.result == udk.Result.step_too_small and run.settings["engine"] == "native"
+        assert float(run.time) == pytest.approx(0.1157806638384, rel=1e-10)
 
 
 @pytest.mark.slow
