@@ -33,19 +33,6 @@ def explain_jamming(run: FailedRun) -> str:
         alone = [name for name in joints if _jams(run, _sliding(mechanism, name), state)]
         return _description(mechanism, alone or joints, state[0])
     return ""
-    t, q, v = run.states[0]
-    span = float(run.ts[-1] - run.ts[0])
-    for share in JAMMING_TIMES:
-        state = t + share * span, q + share * span * v, v
-        if not _jams(run, _sliding(mechanism), state):
-            continue
-        alone = [name for name in joints if _jams(run, _sliding(mechanism, name), state)]
-        listed = ", ".join(map(quote, alone or joints))
-        return (
-            f"friction jams joint {listed} at {state[0]:.6g} s: the load that would balance its friction grows with the "
-            "friction; make the coefficient smaller, or the guide longer"
-        )
-    return ""
 
 
 def _description(mechanism: Mechanism, names: Sequence[str], t: float) -> str:
