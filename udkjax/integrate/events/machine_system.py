@@ -186,10 +186,11 @@ class MachineSystem:
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
         """Take members to their next crossings, or to their ends, by one call of machine code for each mechanism."""
         indices = self._all if members is None else members
-        by_windows = np.array([int(member) in self._windows for member in indices], bool)
-        for member in indices[by_windows]:
-            self._advance_window(runs, int(member))
-        indices = indices[~by_windows]
+        if self._windows:
+            by_windows = np.isin(indices, list(self._windows))
+            for member in indices[by_windows]:
+                self._advance_window(runs, int(member))
+            indices = indices[~by_windows]
         for which, here in self._mechanisms(runs.phase[indices]):
             self._run_mechanism(runs, which, indices[here])
         return runs

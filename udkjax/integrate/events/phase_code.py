@@ -183,7 +183,6 @@ class PhaseCode:
         self._places_of_joints = places[self._columns]
         self._of_switches = np.array(plan.active, int).reshape(-1, 2).T
         self._run, self._evaluate = MemberCalls(plan.run), MemberCalls(plan.states).at_states
-        self._flow = MemberCalls(plan.run.unwatched)
         self._mark_rows, self._project = (x and MemberCalls(x).at_states for x in (plan.marking, plan.project))
         self._seen: tuple[bytes, ...] = ()  # the states that were evaluated last, and their values
         self._values: StateValues | None = None
@@ -214,11 +213,9 @@ class PhaseCode:
 
     def flow(self, member: int, ts: Float[np.ndarray, "T"], state: RunState) -> IntegratorOutput:
         """Integrate a member over times, whatever its conditions; its state has a leading axis of length one."""
-        members = np.array([member])
+        members, run = np.array([member]), MemberCalls(self.plan.run.unwatched)
         further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
-        return integrator_output(
-            self._flow(self._with_marks(members, state), ts[None], state.q, state.v, *further, times=len(ts))
-        )
+        return integrator_output(run(self._with_marks(members, state), ts[None], state.q, state.v, *further, times=len(ts)))
 
     def breakpoints(self, member: int) -> Float[np.ndarray, "k"]:
         """Return the times (s) at which the motion of a member is not smooth."""

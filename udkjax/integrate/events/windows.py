@@ -167,15 +167,13 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
     undefined = hit.is_coarse & is_shortest & hit.undefined[:E]
     stays = hit.is_found | hit.is_coarse
     fails = (~xp.all(good) & ~stays) | xp.any(undefined)
-    arrives, jumps = (
-        zooms & window.lands & ~stays & ~fails & (end == window.high),
-        width <= 2 / SMALLEST_STEP * smallest,
-    )
+    jumps, reaches = width <= 2 / SMALLEST_STEP * smallest, zooms & ~stays & ~fails & (end == window.high)
+    arrives = reaches & window.lands
     change, is_ahead = _change_to_zero(plan, given, window.event, g[-1], g_dot[-1], xp)
     is_off = arrives & (change != 0)
     returns = is_off & ~is_ahead & (change < 0) & (end + change > t + 100 * len(times) * smallest)
     # In a very short window the values of a condition may differ by rounding from those by which it crossed zero.
-    is_lost = zooms & ~window.lands & ~stays & ~fails & (end == window.high) & (length * units.rate <= RESOLUTION.late)
+    is_lost = reaches & ~window.lands & (length * units.rate <= RESOLUTION.late)
     has_landed = (arrives & ~returns & ~(is_off & is_ahead)) | is_lost
     is_located = has_landed | (hit.is_found & jumps)
 
