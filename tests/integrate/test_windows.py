@@ -126,7 +126,7 @@ def test_runs_by_windows_are_those_between_crossings(name, windows, from_the_sta
 
 
 def test_a_crossing_within_rounding_errors_is_found_once(windows, from_the_start):
-    """The angular velocity of a body falls through the level so slowly that its rounding errors take 7e-9 s to pass."""
+    """The angular velocity of a body falls through the level so slowly that rounding hides the crossing."""
     scene = random_scene(23, 72, 0, bodies=(2, 5))
     mechanism, (q, v), end = build(scene.table), state_of(scene.table), 6 * float(scene.time)
     body = mechanism.body_names[0]
