@@ -1,5 +1,9 @@
-"""Scenes with events: a ball above a floor, a pendulum with stops, a ball that a pendulum catches."""
+"""Scenes with events: a ball above a floor, a pendulum with stops, a ball that a pendulum catches; and a condition."""
 
+from typing import Any
+
+import equinox as eqx
+import jax
 import numpy as np
 
 import udkjax as udk
@@ -34,3 +38,14 @@ CAUGHT = [
     ),
     udk.Event(lambda t, at: at["link"].angle + np.pi / 3, udk.Release("A"), name="cut"),
 ]
+
+
+class Level(eqx.Module):
+    """A condition: the level of a coordinate or a velocity of a body."""
+
+    level: jax.Array
+    body: str = eqx.field(static=True)
+    coordinate: str = eqx.field(static=True)
+
+    def __call__(self, t: Any, at: Any) -> Any:
+        return getattr(at[self.body], self.coordinate) - self.level

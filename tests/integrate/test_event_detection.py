@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.special import erf
 
 import udkjax as udk
+from tests.integrate.event_scenes import Level
 from udkjax.integrate.events import simulate_events
 from udkjax.integrate.events.phase_code import PhaseCode
 
@@ -120,17 +121,6 @@ def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
     assert len(runs) == 18 and np.array_equal(never.q, plain.q) and never.stats["steps"] == plain.stats["steps"]
     work = [int(sol.stats["right_hand_sides"]) for sol in (plain, never, found)]
     assert work[1] == work[0] and work[2] < work[0] + 16 * 60  # a step to the event, and the first ones behind it
-
-
-class Level(eqx.Module):
-    """A condition: the level of a coordinate of a body."""
-
-    level: jax.Array
-    body: str = eqx.field(static=True)
-    coordinate: str = eqx.field(static=True)
-
-    def __call__(self, t, at):
-        return getattr(at[self.body], self.coordinate) - self.level
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
