@@ -140,6 +140,68 @@ def test_a_step_ends_at_a_jump_or_a_kink(kind, exact):
     assert found.settings["kinks"] == "located" and found.events is None
 
 
+class TurnBrake(udk.ForceElement):
+    """A torque that brakes beyond 0.2 rad."""
+
+    k: Float[Array, ""]
+
+    def loads(self, t, *frames):
+        return [(0.0, 0.0, jnp.where(frames[0].angle > 0.2, -self.k, 0.0))]
+
+
+def on_a_pin(name):
+    return {name: udk.Revolute(["ground", name], [[0.0, 0.0], [0.0, 0.0]])}
+
+
+BESIDE = {  # joints whose constants follow from the initial guess
+    "gear": on_a_pin("c") | on_a_pin("d") | {"gear": udk.Gear(["c", "d"], [0.1, 0.2])},
+    "rack": {"rack": udk.Rack(["ground", "c"], radius=0.2, axis=0.0)},
+    "gear and cam": on_a_pin("c")
+    | on_a_pin("d")
+    | {"gear": udk.Gear(["c", "d"], [0.1, 0.2])}
+    | {"cam": udk.Cam(["c", "e"], [[0, 0], [0, 0]], udk.Profile([-1.0, 0.5, 2.0, 4.0], [1.0, 1.1, 1.2, 1.1]))},
+}
+
+
+def wheel(beside):
+    """A wheel of 1 kg m^2 that turns freely up to 0.2 rad, in a scene some of whose numbers follow from others."""
+    brake = {"f": TurnBrake(["b"], k=jnp.asarray(P[1]))}
+    if beside == "drawing":
+        link = {"pins": ["O", "A"], "mass": 1.0, "inertia": 0.75}  # 1 kg m^2 about the pin at its end
+        drawn = {"pins": {"O": (0, 0), "A": (1, 0)}, "links": {"b": link}, "ground": ["O"], "velocities": {"A": (0, P[0])}}
+        return udk.Drawing(**drawn, forces=brake, gravity=[0, 0]).mechanism()
+    bodies = {"b": udk.Body(1.0, 1.0, angular_velocity=P[0])} | {
+        name: udk.Body(1.0, 0.1, position=[1.0, 0.0] if name == "e" else [0.0, 0.0])
+        for name in sorted({x for joint in BESIDE[beside].values() for x in joint.bodies} - {"ground"})
+    }
+    return udk.Mechanism(bodies, on_a_pin("b") | BESIDE[beside], forces=brake, gravity=[0, 0])
+
+
+@pytest.mark.parametrize("events", [None, udk.Event(lambda t, frames: t - 0.1, udk.Log())], ids=["alone", "with an event"])
+@pytest.mark.parametrize("beside", [*BESIDE, "drawing"])
+def test_kinks_are_located_where_numbers_follow_from_others(beside, events):
+    mechanism = wheel(beside)
+    found = udk.simulate(mechanism, [0.0, 0.6], events=events, rtol=1e-12, atol=1e-12)
+    assert float(found.q[-1, 0, 2]) == pytest.approx(float(braked(P)), abs=1e-13)
+    assert int(found.stats["kinks"]) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("beside", [*BESIDE, "drawing"])
+def test_derivatives_and_batches_pass_kinks_where_numbers_follow_from_others(beside, engine):
+    mechanism = wheel(beside)
+
+    def end(k):
+        changed = mechanism.with_parameters({"force.f.k": k})
+        return udk.simulate(changed, [0.0, 0.6], rtol=1e-11, atol=1e-11, engine=engine).q[-1, 0, 2]
+
+    wanted = [float(braked([P[0], k])) for k in (1.0, 2.0, 3.0)]
+    np.testing.assert_allclose(jax.jit(jax.vmap(end))(jnp.array([1.0, 2.0, 3.0])), wanted, atol=1e-10)
+    slope = (wanted[2] - wanted[0]) / 2  # exact: the place is linear in k
+    np.testing.assert_allclose([jax.grad(end)(2.0), jax.jacfwd(end)(2.0)], slope, rtol=1e-8)
+
+
 @pytest.mark.slow
 def test_derivatives_pass_through_a_jump():
     """Forward derivatives with respect to the initial velocity, the size of the jump and the end."""

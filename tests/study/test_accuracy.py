@@ -48,6 +48,11 @@ def test_work_is_told_from_errors_of_the_energy():
         (held(udk.Polynomial([0.1]), udk.Torque(["ground", "a"], 1.0)), True),
         (held(udk.Polynomial([0.1]), udk.TorsionSpring(["ground", "a"], 2.0)), False),
         (held(udk.Polynomial([0.1]), udk.TorsionSpring(["ground", "a"], 2.0, 0.1)), True),
+        (held(udk.Polynomial([0.1]), udk.TorsionSpring(["ground", "a"], 2.0, angle=udk.Held([0.1, 0.1], 0.1))), False),
+        (held(udk.Polynomial([0.1]), udk.TorsionSpring(["ground", "a"], 2.0, angle=udk.Held([0.1, 0.2], 0.1))), True),
+        (held(udk.Polynomial([0.1]), udk.Friction("A", torque=0.1, velocity=0.1)), True),
+        (held(udk.Polynomial([0.1]), udk.Friction("A", coefficient=0.1, radius=0.01)), True),
+        (held(udk.Polynomial([0.1]), udk.Friction("A", coefficient=0.1, radius=0.01, law="set-valued")), True),
     ):
         assert conserves_energy(mech, ts) != works
     mech = udk.library.driven_pendulum()

@@ -10,6 +10,8 @@ from udkjax.equations.analysis import analyse
 from udkjax.equations.quantities import energy, violation
 from udkjax.integrate import Solution
 from udkjax.scene.bodies import GROUND
+from udkjax.scene.friction import Friction
+from udkjax.scene.held import Held
 from udkjax.scene.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
@@ -54,7 +56,10 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 
 
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
-    """Return True if only errors can change the total energy: drivers are at rest, and all forces have constant potentials."""
+    """Return True if only errors can change the total energy: drivers are at rest, and all forces have constant potentials.
+
+    A potential with sampled numbers is constant if these are.
+    """
     from udkjax.integrate.events.conditions import frames_of  # imports the code of events, which other studies do not need
 
     frames = frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())
@@ -62,7 +67,12 @@ def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
     times = np.linspace(np.min(ts), np.max(ts), N_SAMPLES)
     for element in mechanism.forces.values():
         attached = [frames[name] for name in mechanism.frames_of(element)]
-        if element.loads(times[0], *attached) is not None:
+        if isinstance(element, Friction) or element.loads(times[0], *attached) is not None:
+            return False
+        if element.potential(times[0], *attached) is None:
+            continue
+        held = [x.values for x in vars(element).values() if isinstance(x, Held)]
+        if any(np.ptp(np.asarray(values), axis=0).any() for values in held):
             return False
         if any(jax.grad(lambda t, e=element, s=attached: 1.0 * e.potential(t, *s))(t) for t in times):
             return False

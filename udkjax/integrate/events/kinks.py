@@ -191,6 +191,7 @@ def _turn(condition: Kink, first: int, index: int, name: str) -> Event:
 
 
 def _with_held_elements(mechanism: Mechanism, first: int) -> tuple[Mechanism, tuple[HeldElement, ...], tuple[Event, ...]]:
+    mechanism = mechanism.without_origin  # elements that follow from a drawing or a guess are no leaves
     elements, events, forces = [], [], list(mechanism._forces)
     for name, smooth, can_be_held in _smooth_forces(mechanism):
         if not smooth.count or not can_be_held:
