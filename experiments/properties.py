@@ -6,8 +6,11 @@ implementation (reference_equations.py), all methods, formulations and engines a
 orders, axes, units or copies of constraints. Power is balanced, a is nearest to a_F in the metric of M, impulses are
 reciprocal, impacts neither pull nor add energy, and derivatives are limits of differences. With friction in all joints the same
 holds of runs, friction takes power, loads are those of repeated substitution, and `diagnose` knows which of them are unique.
-Trained mechanisms are saved as they run. Derivatives hold where forces branch and where bodies have come to rest, events at
-samples happen once, joints keep within their limits, and runs without projection agree with SciPy or report that they do not.
+Where many features meet, a scene moves alike in any view, order, batch and engine, at any tolerance, and as independent
+equations say. Trained mechanisms are saved as they run. Derivatives hold where forces branch and where bodies have come to
+rest, events at samples happen once, joints keep within their limits, and runs without projection agree with SciPy or report
+that they do not.
+
 Wrong scene files, arguments and command lines neither hang nor abort a process. Each has to end in a documented error that
 names the place, without a traceback and without writing part of a file; any other result is a fault, which the page lists.
 
@@ -29,12 +32,20 @@ import xarray
 from matplotlib.figure import Figure
 
 from experiments.common import data_file, described, load, panels
-from experiments.parts import contact_properties, friction_properties, idiom_properties, run_properties, state_properties
+from experiments.parts import (
+    contact_properties,
+    friction_properties,
+    idiom_properties,
+    mixed_properties,
+    run_properties,
+    state_properties,
+)
 from experiments.parts.fuzz import KINDS, Fault, cases_of, run, verdict
+from experiments.parts.mixed_case import Failure
 from experiments.parts.tally import Found, Tally
 
 PROPERTIES = state_properties.PROPERTIES | run_properties.PROPERTIES | contact_properties.PROPERTIES
-PROPERTIES |= friction_properties.PROPERTIES | idiom_properties.PROPERTIES
+PROPERTIES |= friction_properties.PROPERTIES | idiom_properties.PROPERTIES | mixed_properties.PROPERTIES
 MARGINS = 50.0, 10_000.0  # tolerance over worst error: below the first it is nearly exceeded, above the second it tests little
 MEMBERS = 100  # mechanisms of each structure
 LISTED, SHOWN = 100, 60  # faults that the data list, and kinds of faults that the page lists
@@ -52,6 +63,8 @@ def study(
     redundant: int = 1000,
     rubbing_runs: int = 8,
     idioms: int = 24,
+    mixed: int = 40,
+    variations: int = 8,
     seed: int = 0,
     first: int = 0,
     minutes: float = 60.0,
@@ -71,6 +84,8 @@ def study(
         redundant: Number of redundant mechanisms with friction in all joints of which `diagnose` says what is unique.
         rubbing_runs: Number of structures with friction to integrate; every third also by diffrax, with derivatives.
         idioms: Number of mechanisms of each kind that are trained, have conditions in forces, limits, or run without projection.
+        mixed: Number of structures in which up to nine features meet.
+        variations: Number of scenes of each of them, which differ in their numbers.
         seed: Seed of all random numbers.
         first: The number of the first structure and of the first input.
         minutes: Time limit.
@@ -78,9 +93,9 @@ def study(
     """
     if smoke:
         mechanisms, files, arguments, rubbing, redundant, minutes = 20, 30, 10, 2, 2, 5.0
-        commands = runs = contacts = rubbing_runs = idioms = 0
+        commands = runs = contacts = rubbing_runs = idioms = mixed = 0
     members = 5 if smoke else MEMBERS
-    sets = "mechanisms", "large", "runs", "contacts", "rubbing", "redundant", "rubbing runs", "idioms"
+    sets = "mechanisms", "large", "runs", "contacts", "rubbing", "redundant", "rubbing runs", "idioms", "mixed"
     end, tally = time.time() + 60 * minutes, Tally()
     count: dict[str, int] = dict.fromkeys(sets, 0)
     for structure in _until(end, first, mechanisms // members, "structures"):
@@ -107,6 +122,9 @@ def study(
             integrated += tried > 0
     if idioms and time.time() < end:
         count["idioms"] += idiom_properties.check_idioms(tally, seed + first, idioms)
+    failures: list[Failure] = []
+    for structure in _until(end, first, mixed, "structures in which features meet"):
+        count["mixed"] += mixed_properties.check_mixed(tally, failures, seed, [structure], variations)
     faults: list[Fault] = []
     done = dict.fromkeys(KINDS, 0)
     for kind, wanted in {"commands": commands, "arguments": arguments, "files": files}.items():  # the quickest last
@@ -114,7 +132,7 @@ def study(
         for done[kind], found in run(kind, seed, first, wanted, max(1.0, end - time.time())):  # noqa: B020
             print(f"{kind}: {done[kind]} of {wanted}, {len(found)} faults", file=sys.stderr, flush=True)
         faults += found
-    data = _dataset(tally, count, done, faults)
+    data = _dataset(tally, count, done, faults, failures)
     if add and data_file("properties").exists():
         data = _merged(load("properties"), data)
     settings = {"mechanisms": mechanisms, "members": members, "runs": runs, "first": first}
@@ -130,7 +148,9 @@ def _until(end: float, first: int, count: int, what: str) -> Iterator[int]:
         yield k
 
 
-def _dataset(tally: Tally, count: dict[str, int], done: dict[str, int], faults: list[Fault]) -> xarray.Dataset:
+def _dataset(
+    tally: Tally, count: dict[str, int], done: dict[str, int], faults: list[Fault], failures: list[Failure]
+) -> xarray.Dataset:
     found = [tally.found.get(name, Found()) for name in PROPERTIES]
     return xarray.Dataset(
         {
@@ -145,6 +165,7 @@ def _dataset(tally: Tally, count: dict[str, int], done: dict[str, int], faults: 
             "worst_at": json.dumps([f.at for f in found]),
             "left_out": json.dumps(tally.left_out),
             "listed": json.dumps(sorted(faults, key=_is_severe, reverse=True)[:LISTED]),
+            "failures": json.dumps(failures),
         },
     )
 
@@ -173,6 +194,7 @@ def _merged(old: xarray.Dataset, new: xarray.Dataset) -> xarray.Dataset:
         worst_at=json.dumps([a if is_old and a else b or a for a, b, is_old in at]),
         left_out=json.dumps({reason: n for reason, n in out.items() if n}),
         listed=json.dumps([*stands, *json.loads(new.listed)][:LISTED]),
+        failures=json.dumps([*json.loads(old.attrs.get("failures", "[]")), *json.loads(new.failures)]),
     )
 
 
@@ -236,6 +258,28 @@ def _about_idioms(sets: dict[str, int]) -> str:
     return f"{sets['idioms']} mechanisms are trained, differentiated across conditions, and run with limits, without projection. "
 
 
+def _about_mixed(sets: dict[str, int]) -> str:
+    if not sets.get("mixed"):
+        return ""
+    return (
+        f"Up to nine features meet in {sets['mixed']:,} scenes of experiments/parts/mixed_scenes.py: linkages and trees with "
+        "springs, stiff dampers, drivers, samples, friction of both laws, contacts, limits and other events, and kinked forces. "
+    )
+
+
+def _failures(data: xarray.Dataset) -> list[str]:
+    """Return the table of comparisons in mixed scenes that do not hold."""
+    found = [Failure(*f) for f in json.loads(data.attrs.get("failures", "[]"))]
+    if not found:
+        return []
+    lines = ["", "Scenes in which features meet, and a comparison does not hold:", ""]
+    lines += ["| Property | Scene | Error | Circumstances |", "|---|---|---|---|"]
+    for f in found:
+        text = f.detail[:300].replace("|", "\\|").replace("\n", " ").replace("`", "'")
+        lines.append(f"| {f.name} | `{f.at}` | {f.error:.1e} | `{text}` |")
+    return lines
+
+
 def page(data: xarray.Dataset) -> str:
     """Return properties.md: the result for each property, and each remaining fault."""
     at, margins = json.loads(data.worst_at), _margins(data)
@@ -250,10 +294,11 @@ def page(data: xarray.Dataset) -> str:
         f"The equations of {sets['mechanisms']:,} mechanisms are evaluated by NumPy at single states, those of "
         f"{sets['large']} large mechanisms by loops. {sets['runs']} mechanisms are integrated by machine code, a part of them "
         f"also by diffrax and with derivatives; {sets['contacts']} bodies are thrown onto a floor and onto other bodies. "
-        f"{_about_friction(sets)}{_about_idioms(sets)}The "
+        f"{_about_friction(sets)}{_about_idioms(sets)}{_about_mixed(sets)}The "
         "call next to an error reproduces the case: "
         "`random_scene(seed, structure, numbers)` of "
-        "experiments/parts/random_scenes.py. The margin is the tolerance divided by the worst error, marked `!` below 50 and "
+        "experiments/parts/random_scenes.py, or `mixed_scene` of experiments/parts/mixed_scenes.py. "
+        "The margin is the tolerance divided by the worst error, marked `!` below 50 and "
         "`?` above 10,000. Errors are relative, in the scene's own units; if the condition number of the rows exceeds "
         f"{state_properties.ORDINARY:g}, they are also divided by its amplification of rounding.",
         "",
@@ -272,6 +317,7 @@ def page(data: xarray.Dataset) -> str:
         )
     lines += ["", "Not compared:", "", *(f"- {n:,}: {reason}" for reason, n in json.loads(data.left_out).items())]
     lines += ["", "| Input | Cases | Faults |", "|---|---|---|", *(f"| {kind} | {n:,} | {bad:,} |" for kind, n, bad in kinds)]
+    lines += _failures(data)
     faults = [Fault(*f) for f in json.loads(data.listed)]
     example = {f.signature: f for f in reversed(faults)}
     if faults:

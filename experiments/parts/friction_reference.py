@@ -54,7 +54,7 @@ def with_friction(scene: RandomScene) -> RandomScene:
 def rubs_of(table: Table, q: np.ndarray, v: np.ndarray) -> dict[str, Rub]:
     """Return the friction of each joint at q and v (bodies, 3), by hand."""
     index = {body["name"]: k for k, body in enumerate(table["body"])}
-    by_joint = {f["joint"]: f for f in table["force"] if f["type"] == "friction" and "coefficient" in f}
+    by_joint = {f["joint"]: f for f in table["force"] if f["type"] == "friction" and "speed" in f}
     counts, start, found = {"revolute": 2, "prismatic": 2, "slot": 1, "weld": 3}, 0, {}
     for joint in table["joint"]:
         rows = slice(start, start + counts.get(joint["type"], 1))
@@ -80,8 +80,15 @@ def rubs_of(table: Table, q: np.ndarray, v: np.ndarray) -> dict[str, Rub]:
         for body, wrench in zip(joint["bodies"], wrenches, strict=True):
             if body != "ground":
                 along[index[body]] += wrench
-        found[joint["name"]] = Rub(along.ravel(), rub["coefficient"] * np.tanh(4 * speed / rub["speed"]), rows, size, forms)
+        found[joint["name"]] = Rub(along.ravel(), _coefficient(rub, speed), rows, size, forms)
     return found
+
+
+def _coefficient(rub: Table, speed: float) -> float:
+    """Return mu(s) of Brown and McPhee (2016), with its sign."""
+    x, sliding = speed / rub["speed"], rub["coefficient"]
+    more = rub.get("static_coefficient", sliding) - sliding
+    return sliding * np.tanh(4 * x) + more * x / (x**2 / 4 + 3 / 4) ** 2 + rub.get("viscous", 0.0) * speed
 
 
 def _edges(length: float | None) -> Callable[[np.ndarray], float]:

@@ -223,7 +223,7 @@ def evaluate_all(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> list[T
     weight = mass * np.tile([*table["gravity"], 0.0], bodies)
     found = []
     for k in range(states):
-        block, (conservative, other, potential) = blocks[:, :, k], _loads(table, q[k], v[k], index)
+        block, (conservative, other, potential) = blocks[:, :, k], _loads(table, t, q[k], v[k], index)
         found.append(
             Terms(
                 psi=block[:, 0, -1],
@@ -239,7 +239,7 @@ def evaluate_all(table: Table, t: float, q: np.ndarray, v: np.ndarray) -> list[T
     return found
 
 
-def _loads(table: Table, q: np.ndarray, v: np.ndarray, index: dict[str, int]) -> tuple[np.ndarray, np.ndarray, float]:
+def _loads(table: Table, t: float, q: np.ndarray, v: np.ndarray, index: dict[str, int]) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the loads of the elements: those that have a potential, the others, and the potential energy."""
     kept, lost, energy = np.zeros(q.shape), np.zeros(q.shape), 0.0
     pins = {joint["name"]: joint["bodies"] for joint in table["joint"]}
@@ -281,7 +281,20 @@ def _loads(table: Table, q: np.ndarray, v: np.ndarray, index: dict[str, int]) ->
                 couple(kept, entry["bodies"], -entry["stiffness"] * twist)
                 couple(lost, entry["bodies"], -entry.get("damping", 0.0) * rate)
             case "torque":
-                couple(lost, entry["bodies"], entry["value"])
+                couple(lost, entry["bodies"], _torque(entry["value"], t))
+            case "bumper":
+                overlap = max(entry["side"] * (entry["limit"] - turning(entry["bodies"])[0]), 0.0)
+                energy += 0.5 * entry["stiffness"] * overlap**2
+                couple(kept, entry["bodies"], entry["stiffness"] * entry["side"] * overlap)
+            case "servo":
+                torque = -entry["stiffness"] * (turning(entry["bodies"])[0] - entry["target"])
+                couple(lost, entry["bodies"], float(np.clip(torque, -entry["most"], entry["most"])))
+            case "zone":
+                u, (x, y, _) = np.array(entry["direction"]), q[index[entry["body"]]]
+                add(lost, entry["body"], -entry["force"] * u * (u @ [x, y] > entry["level"]), np.zeros(2))
+            case "square_drag":
+                rate = turning(entry["bodies"])[1]
+                couple(lost, entry["bodies"], -entry["drag"] * abs(rate) * rate)
             case "friction" if "torque" in entry:  # with a coefficient: friction_properties.py
                 _, rate = turning(pins[entry["joint"]])
                 couple(lost, pins[entry["joint"]], -entry["torque"] * np.tanh(rate / entry["velocity"]))
@@ -290,3 +303,11 @@ def _loads(table: Table, q: np.ndarray, v: np.ndarray, index: dict[str, int]) ->
                 turned = at(entry["body"], entry["vector"])[0] if entry.get("frame") == "body" else np.array(entry["vector"])
                 add(lost, entry["body"], turned, arm)
     return kept.ravel(), lost.ravel(), energy
+
+
+def _torque(value: Any, t: float) -> float:
+    """Return a torque at t; samples are held, the first one before its time, too."""
+    if not isinstance(value, dict):
+        return value
+    samples, start = value["values"], value["t0"]
+    return samples[int(np.clip(np.floor((t - start) / value["dt"] + 1e-12), 0, len(samples) - 1))]

@@ -5,7 +5,7 @@ Nothing is compiled but the pseudoinverses, once for all mechanisms (`check_meth
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,6 +16,7 @@ import numpy as np
 import udkjax as udk
 from experiments.parts.random_scenes import RandomScene, Table, build, random_scene, state_of
 from experiments.parts.reference_equations import Terms, evaluate
+from experiments.parts.scene_views import can_be_turned, in_units, moved, renamed, with_copies
 from experiments.parts.tally import Property, Tally, relative
 from udkjax.equations.scene_arrays import SceneArrays
 from udkjax.equations.scene_layout import LoadShares
@@ -325,117 +326,6 @@ def check_file(tally: Tally, scene: RandomScene, mechanism: udk.Mechanism, redun
     differ = sum(np.asarray(a).tobytes() != np.asarray(b).tobytes() for a, b in zip(old, new, strict=True))
     one, two = (accelerate(scene, m, redundant)[0] for m in (mechanism, again))
     tally.add("file", float(differ + (one.tobytes() != two.tobytes())), scene.label)
-
-
-# --- the same scene, seen otherwise
-
-
-def moved(scene: RandomScene, angle: float, shift: np.ndarray) -> RandomScene:
-    """Return a scene that is turned and moved as a whole, with gravity."""
-    table = copy.deepcopy(scene.table)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    table["gravity"] = (turn @ table["gravity"]).tolist()
-    for body in table["body"]:
-        body["position"] = (turn @ body["position"] + shift).tolist()
-        body["velocity"] = (turn @ body["velocity"]).tolist()
-        body["angle"] += angle
-    for entry in (*table["joint"], *table["driver"], *table["force"]):
-        if entry.get("type") == "force":
-            if entry["frame"] == "ground":
-                entry["vector"] = (turn @ entry["vector"]).tolist()
-            continue
-        on = entry.get("bodies", [])
-        for k, name in enumerate(on):
-            if name == "ground" and "points" in entry:
-                entry["points"][k] = (turn @ entry["points"][k] + shift).tolist()
-        grounded = [k for k, name in enumerate(on) if name == "ground"]
-        sign = {(): 0.0, (0,): 1.0, (1,): -1.0}[tuple(grounded)]
-        kind = entry.get("type", "")
-        if "axis" in entry and grounded == [0]:
-            entry["axis"] += angle
-        if kind == "cam" and grounded == [0]:
-            entry["profile"]["angle"] = [x + angle for x in entry["profile"]["angle"]]
-        if kind == "torsion_spring":
-            entry["angle"] = entry.get("angle", 0.0) + sign * angle
-        if entry.get("coordinate") == "angle":
-            motion = entry["motion"]
-            for key in ("coefficients", "values"):
-                if key in motion:
-                    constant = key == "coefficients"  # of which the first alone is one
-                    motion[key] = [x if k and constant else x + sign * angle for k, x in enumerate(motion[key])]
-            if "offset" in motion:
-                motion["offset"] += sign * angle
-    return scene._replace(table=table)
-
-
-def can_be_turned(table: Table) -> bool:
-    """Return True if no element is tied to the axes or the origin of the ground."""
-    axes = [e for e in table["driver"] if e["coordinate"] in ("x", "y") and e["bodies"][0] == "ground"]
-    return not axes and not any(e["type"] == "rack" and e["bodies"][1] == "ground" for e in table["joint"])
-
-
-def in_units(scene: RandomScene, length: float, time: float, mass: float) -> RandomScene:
-    """Return a scene whose numbers are those of other units: lengths `length` times as large, ..."""
-    table, L, T, M = copy.deepcopy(scene.table), length, time, mass
-    scale: Callable[[Any, float], Any] = lambda x, by: [scale(y, by) for y in x] if isinstance(x, list) else x * by  # noqa: E731
-
-    def change(entry: Table, **units: float) -> None:
-        for key, unit in units.items():
-            if key in entry:
-                entry[key] = scale(entry[key], unit)
-
-    change(table, gravity=L / T**2)
-    for body in table["body"]:
-        change(body, mass=M, inertia=M * L**2, position=L, velocity=L / T, angular_velocity=1 / T)
-    for joint in table["joint"]:
-        change(joint, points=L, length=L, radii=L, radius=L)
-        change(joint.get("profile", {}), radius=L)
-    for driver in table["driver"]:
-        unit, motion = (1.0 if driver["coordinate"] == "angle" else L), driver["motion"]
-        change(driver, points=L)
-        change(motion, amplitude=unit, offset=unit, values=unit, frequency=1 / T, times=T)
-        if "coefficients" in motion:
-            motion["coefficients"] = [c * unit / T**k for k, c in enumerate(motion["coefficients"])]
-    F = M * L / T**2
-    for force in table["force"]:
-        match force["type"]:
-            case "spring":
-                change(force, points=L, stiffness=F / L, length=L, damping=F * T / L)
-            case "torsion_spring":
-                change(force, stiffness=F * L, damping=F * L * T)
-            case "friction":
-                change(force, torque=F * L, velocity=1 / T)
-            case "torque":
-                change(force, value=F * L)
-            case _:
-                change(force, vector=F, point=L)
-    return RandomScene(table, scene.seed, scene.length * L, scene.time * T, scene.mass * M)
-
-
-def renamed(table: Table, new: Callable[[str], str]) -> Table:
-    """Return a table with new names of everything but the ground."""
-    table = copy.deepcopy(table)
-    change = lambda name: name if name == "ground" else new(name)  # noqa: E731
-    for section in ("body", "joint", "driver", "force"):
-        for entry in table[section]:
-            entry["name"] = change(entry["name"])
-            for key in ("body", "carrier", "joint"):
-                if key in entry:
-                    entry[key] = change(entry[key])
-            if "bodies" in entry:
-                entry["bodies"] = [change(name) for name in entry["bodies"]]
-    return table
-
-
-def with_copies(table: Table, rng: np.random.Generator) -> Table:
-    """Return a table in which joints and drivers are given once more, up to four times, anywhere among the others."""
-    table = copy.deepcopy(table)
-    for section in ("joint", "driver"):
-        for entry in list(table[section]):
-            for k in range(int(rng.integers(0, 4))):
-                copied = copy.deepcopy(entry) | {"name": f"{entry['name']} copy {k}"}
-                table[section].insert(int(rng.integers(0, len(table[section]) + 1)), copied)
-    return table
 
 
 def check_structures(
