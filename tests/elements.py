@@ -22,6 +22,9 @@ JOINTS = {
     "gear": udk.Gear(["a", "b"], [0.1, 0.2]),
     "inner gear": udk.Gear(["a", "b"], [0.1, 0.2], internal=True, carrier="c"),
     "rack": udk.Rack(["ground", "b"], radius=0.2, axis=0.1),
+    "screw": udk.Screw(["ground", "b"], P, 0.3, ["a", "c"], 0.2),
+    "coupled slide": udk.Coupling(["c", "b"], ["ground", "a"], [0.3, -0.5, 0.2], axis=1.1, points=P),
+    "coupled slides": udk.Coupling(["a", "b"], ["b", "c"], [0.1, 2.0], 0.3, -0.4, P),
     "cam": udk.Cam(["a", "b"], P, udk.Profile([-1.0, 0.5, 2.0, 4.0], [1.0, 1.1, 1.2, 1.1])),
 }
 ROWS = {"revolute": 2, "prismatic": 2, "weld": 3}  # how many; all other joints have one

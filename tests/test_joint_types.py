@@ -31,25 +31,25 @@ from udkjax.study.diagnosis.fixes import Fix, changes_of
 from udkjax.study.report import row_label
 
 TABLE = """
-                  Revolute  Prismatic Slot      Weld      Distance  Angle     Gear      Rack      Cam
-row labels        served    served    -         served    -         -         -         -         -
-marks             -         served    served    served    served    -         served    served    served
-followers         -         -         -         -         -         -         served    served    -
-mjcf, tree        served    served    served    served    served    served    served    refused   refused
-mjcf, loop        served    refused   refused   served    served    served    served    refused   refused
-drawings          served    served    served    refused   served    refused   served    refused   refused
-drawn fixes       -         -         served    -         -         -         -         -         -
-with_angle        served    -         -         served    -         -         -         -         -
-event limits      served    served    served    refused   refused   refused   refused   refused   refused
-dead points       served    -         -         -         -         -         -         -         -
-joint axes        -         served    served    -         served    -         -         served    -
-one compliance    served    refused   -         refused   -         -         -         -         -
-cam forces        -         -         -         -         -         -         -         -         served
-pin directions    served    -         -         served    -         -         -         -         -
-explained pins    served    -         -         served    -         -         -         -         -
-fixes             served    served    -         served    -         -         -         -         -
-transmission      served    refused   refused   refused   refused   refused   refused   refused   refused
-motion ranges     served    served    -         -         -         -         -         -         -
+                  Revolute  Prismatic Slot      Weld      Distance  Angle     Gear      Rack      Screw     Coupling  Cam
+row labels        served    served    -         served    -         -         -         -         -         -         -
+marks             -         served    served    served    served    -         served    served    served    served    served
+followers         -         -         -         -         -         -         served    served    -         -         -
+mjcf, tree        served    served    served    served    served    served    served    refused   refused   refused   refused
+mjcf, loop        served    refused   refused   served    served    served    served    refused   refused   refused   refused
+drawings          served    served    served    refused   served    refused   served    refused   refused   refused   refused
+drawn fixes       -         -         served    -         -         -         -         -         -         -         -
+with_angle        served    -         -         served    -         -         -         -         -         -         -
+event limits      served    served    served    refused   refused   refused   refused   refused   refused   refused   refused
+dead points       served    -         -         -         -         -         -         -         -         -         -
+joint axes        -         served    served    -         served    -         -         served    served    served    -
+one compliance    served    refused   -         refused   -         -         -         -         -         -         -
+cam forces        -         -         -         -         -         -         -         -         -         -         served
+pin directions    served    -         -         served    -         -         -         -         -         -         -
+explained pins    served    -         -         served    -         -         -         -         -         -         -
+fixes             served    served    -         served    -         -         -         -         -         -         -
+transmission      served    refused   refused   refused   refused   refused   refused   refused   refused   refused   refused
+motion ranges     served    served    -         -         -         -         -         -         -         -         -
 """
 
 
@@ -86,7 +86,7 @@ class Motion(NamedTuple):
 
 
 def own(joint: udk.Joint) -> udk.Joint:
-    kind = OwnAtPoints if hasattr(joint, "points") else Own
+    kind = OwnAtPoints if getattr(joint, "points", None) is not None else Own
     return kind(joint.bodies, joint)  # pyright: ignore[reportCallIssue]
 
 
@@ -101,7 +101,7 @@ def scene(joints: dict[str, udk.Joint], bodies: dict[str, udk.Body] = BODIES) ->
 def chain(joint: udk.Joint) -> udk.Mechanism:
     """Return two links in line, pinned to the ground at their outer ends, with a joint between them."""
     bodies = {"a": udk.Body(1.0, 0.1, [0.5, 0.0]), "b": udk.Body(1.0, 0.1, [1.5, 0.0]), "c": udk.Body(1.0, 0.1, [1.0, 1.0])}
-    more = {"points": ((0.5, 0.0), (-0.4, 0.0))} if hasattr(joint, "points") else {}
+    more = {"points": ((0.5, 0.0), (-0.4, 0.0))} if getattr(joint, "points", None) is not None else {}
     outer = udk.Revolute(["ground", "a"], [[0, 0], [-0.5, 0]]), udk.Revolute(["ground", "b"], [[2, 0], [0.5, 0]])
     return udk.Mechanism(bodies, {"A": outer[0], "J": replace(joint, bodies=("a", "b"), **more), "B": outer[1]})
 

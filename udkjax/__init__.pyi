@@ -82,6 +82,7 @@ from udkjax.scene import Angle as Angle
 from udkjax.scene import Body as Body
 from udkjax.scene import Cam as Cam
 from udkjax.scene import Constraint as Constraint
+from udkjax.scene import Coupling as Coupling
 from udkjax.scene import Distance as Distance
 from udkjax.scene import Drawing as Drawing
 from udkjax.scene import Driver as Driver
@@ -103,6 +104,7 @@ from udkjax.scene import Profile as Profile
 from udkjax.scene import Rack as Rack
 from udkjax.scene import Revolute as Revolute
 from udkjax.scene import SceneError as SceneError
+from udkjax.scene import Screw as Screw
 from udkjax.scene import Sine as Sine
 from udkjax.scene import Slot as Slot
 from udkjax.scene import Spline as Spline

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,22 @@ LOOPS = """<mujoco><compiler angle="radian" eulerseq="XYZ"/><option gravity="1 2
  <tendon name="still" tendon1="twice" polycoef="0.3"/></equality></mujoco>"""
 
 
+# Slides and hinges coupled by polynomials; a slide that is held; angles of four bodies.
+COUPLED = """<mujoco><compiler angle="radian"/><option gravity="1 2 -9"><flag contact="disable"/></option>
+<default><geom size="0.1" pos="0.2 0 0.1"/></default><worldbody><frame euler="20 30 40">
+ <body name="arm"><joint name="A" axis="0 -1 0" ref="0.3"/><geom/>
+  <body name="nut" euler="0 0.4 0" pos="0.5 0 0"><joint name="s" type="slide" axis="1 0 0.2" ref="0.1"/><geom/>
+   <body name="hook"><joint name="C" axis="0 1 0"/><geom/></body></body>
+  <body name="puck"><joint name="u" type="slide" axis="1 0 0"/><joint name="v" type="slide" axis="0 0 1"/>
+   <joint name="w" axis="0 1 0" pos="0.1 0 0.2"/><geom/></body></body>
+ <body name="car" pos="0 0 1"><joint name="turn" axis="0 1 0"/><joint name="t" type="slide" axis="0.3 0 1"/><geom/></body>
+ <body name="rotor" pos="0 0 2"><joint name="R" axis="0 1 0"/><geom/></body>
+</frame></worldbody>
+<equality><joint name="screw" joint1="s" joint2="A" polycoef="0.05 -0.2 0.3 0.1 -0.2"/>
+ <joint joint1="C" joint2="R" polycoef="0.1 -1.5"/><joint joint1="t" joint2="u" polycoef="0 0.8"/>
+ <joint joint1="v" polycoef="0.07"/><joint joint1="w" joint2="turn" polycoef="0 1 0.5"/></equality></mujoco>"""
+
+
 def differences(xml, count, seed, method):
     """The largest relative differences of the velocities and accelerations of bodies from MuJoCo's, at random states."""
     mujoco = pytest.importorskip("mujoco")
@@ -155,8 +172,9 @@ def test_a_tree_has_the_accelerations_of_mujoco(seed):
 
 
 @pytest.mark.filterwarnings("error::udkjax.scene.MjcfWarning")  # what MuJoCo closes is not open here
-def test_loops_have_the_accelerations_of_mujoco_with_hard_constraints():
-    assert max(differences(LOOPS, 12, 0, udk.SVD())) < 1e-10
+@pytest.mark.parametrize("text", [LOOPS, COUPLED])
+def test_loops_have_the_accelerations_of_mujoco_with_hard_constraints(text):
+    assert max(differences(text, 12, 0, udk.SVD())) < 1e-10
 
 
 # --- there and back
@@ -287,6 +305,26 @@ def test_all_kinds_of_equalities_and_tendons_are_the_same_there_and_back():
     is_there_and_back(mech, q, rng.normal(size=q.shape))
 
 
+@pytest.mark.filterwarnings("ignore::udkjax.scene.MjcfWarning")  # it is open in places
+def test_coupled_joints_are_the_same_there_and_back():
+    drawn = udk.read_mjcf(COUPLED)
+    joints = {name: joint for name, joint in drawn.joints.items() if name not in ("joint-3", "w")}  # of the puck
+    bodies = {name: body for name, body in drawn.bodies.items() if name != "puck"}
+    joints["thread"] = udk.Screw(("arm", "nut"), drawn.joints["s"].points, drawn.joints["s"].axis, ("rotor", "ground"), 0.2)
+    mech = udk.Mechanism(bodies, {name: j for name, j in joints.items() if set(j.frame_names) <= {*bodies, "ground"}})
+    assert sum(isinstance(joint, udk.Coupling) for joint in mech.joints.values()) == 2
+    state = udk.assemble(mech)
+    places = {f"body.{name}.position": q[:2] for name, q in zip(bodies, state.q, strict=True)}
+    mech = mech.with_parameters(places | {f"body.{name}.angle": q[2] for name, q in zip(bodies, state.q, strict=True)})
+    moving = udk.assemble(mech, state=udk.State(mech.q0, np.random.default_rng(0).normal(size=mech.q0.shape)))
+    is_there_and_back(mech, np.asarray(moving.q), np.asarray(moving.v))
+    across = replace(joints["thread"], axis=joints["thread"].axis + 0.1)
+    steep = udk.Coupling(("ground", "rotor"), ("ground", "arm"), [0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    with pytest.raises(udk.SceneError) as error:
+        udk.mjcf_text(udk.Mechanism(bodies, {**mech.joints, "thread": across, "steep": steep}))
+    assert [text.split(":")[0] for text in error.value.problems][:2] == ['joint "thread"', 'joint "steep"']
+
+
 @pytest.mark.slow
 def test_a_four_bar_moves_in_mujoco_as_it_does_here():
     mujoco = pytest.importorskip("mujoco")
@@ -312,6 +350,8 @@ def model(joint="", geom="", body="", world="", rest="") -> str:
 
 FREE = '<body name="b"><freejoint/><geom size="0.1"/></body>'
 TILTED = '<body name="b"><joint name="t" axis="0 1 1"/><geom size="0.1" pos="1 0 0"/></body>'
+SLIDES = '<joint name="u" type="slide" axis="1 0 0"/><joint name="v" type="slide" axis="1 0 1"/>'
+OBLIQUE = f'<body name="b">{SLIDES}<geom size="0.1"/></body>'
 TWO = '<body name="b"><joint name="h2" axis="0 1 0" pos="1 0 0"/><joint name="h1" axis="0 1 0"/><geom size="0.1"/></body>'
 
 
@@ -338,7 +378,7 @@ TWO = '<body name="b"><joint name="h2" axis="0 1 0" pos="1 0 0"/><joint name="h1
         (model(geom="mass='0'"), '<body> "a" (line 3): must have mass and inertia'),
         (model(world=TWO, rest="<actuator><motor joint='h1'/></actuator>"), "one of two hinges of a body: not supported"),
         (model(rest="<equality><joint joint1='h' joint2='x'/></equality>"), 'joint2="x": no joint has this name'),
-        (model(rest="<equality><joint joint1='h' polycoef='0 1 2'/></equality>"), "polycoef=\"0 1 2\" is not linear"),
+        (model(world=OBLIQUE, rest="<equality><joint joint1='v' joint2='h'/></equality>"), "a body with oblique slides"),
         (model(rest="<actuator><muscle joint='h'/></actuator>"), "<muscle> (line 5): not supported"),
         (model(rest="<actuator><motor joint='h' forcerange='-1 1'/></actuator>"), "forcerange is not supported"),
         (model(rest="<option density='1.2'/>"), 'density="1.2" is not supported'),

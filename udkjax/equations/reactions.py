@@ -30,7 +30,7 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
 from udkjax.scene.drivers import Driver
-from udkjax.scene.joints import Constraint, Distance, Prismatic, Rack, Slot
+from udkjax.scene.joints import Constraint, Distance
 from udkjax.scene.mechanism import Mechanism
 
 Axes = Literal["ground", "body", "joint"]
@@ -55,9 +55,8 @@ def reactions(
         solution: anything with ts (T,), q and v (T, bodies, 3).
         method: the pseudoinverse; by default `SVD`.
         stabilization: the run's `Baumgarte`, to include its terms.
-        frame: the axes of the force. "ground"; "body": those of the loaded body; "joint": x along the `axis` of a prismatic
-            joint, slot, rack or driver of x or y, or along the line of a distance; for all others the axes of the last body of
-            the joint.
+        frame: the axes of the force. "ground"; "body": those of the loaded body; "joint": x along the `axis` of a joint, or
+            of a driver of x or y, or along the line of a distance; for all others the axes of the last body of the joint.
         about: the reference point of the torque: the "centre" of mass, or the "joint": the pin that two bodies share (in a slot
             or prismatic joint the point of body 2), each body's own point for a distance; without points the centre of mass.
         compliances: compliances by joint name, one for each row (m/N for rows in metres, rad/(N m) for rows in radians), or one
@@ -195,10 +194,10 @@ def _frame(q: Float[Array, "T n"], body: int) -> Frame:
 
 def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
     """Return the angle (rad) of a joint's own axes relative to the ground."""
-    if isinstance(element, Prismatic | Slot | Rack):
-        return frames[0].angle + element.axis
     if isinstance(element, Driver) and element.coordinate in ("x", "y"):
         return frames[0].angle if element.axis is None else frames[0].angle + element.axis
+    if not isinstance(element, Driver) and getattr(element, "axis", None) is not None:  # of a user-defined joint, too
+        return frames[0].angle + element.axis  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance"):
         line = between(element.points, *frames)
         return array_namespace(line.x).arctan2(line.y, line.x)

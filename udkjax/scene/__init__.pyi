@@ -56,12 +56,14 @@ from udkjax.scene.held import with_row as with_row
 from udkjax.scene.joints import Angle as Angle
 from udkjax.scene.joints import Cam as Cam
 from udkjax.scene.joints import Constraint as Constraint
+from udkjax.scene.joints import Coupling as Coupling
 from udkjax.scene.joints import Distance as Distance
 from udkjax.scene.joints import Gear as Gear
 from udkjax.scene.joints import Joint as Joint
 from udkjax.scene.joints import Prismatic as Prismatic
 from udkjax.scene.joints import Rack as Rack
 from udkjax.scene.joints import Revolute as Revolute
+from udkjax.scene.joints import Screw as Screw
 from udkjax.scene.joints import Slot as Slot
 from udkjax.scene.joints import Weld as Weld
 from udkjax.scene.joints import fill as fill

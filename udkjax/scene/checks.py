@@ -20,7 +20,7 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.fields import FieldMetadata, Requirement, StaticValue
 from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
-from udkjax.scene.joints import Cam, Prismatic, Revolute, Slot
+from udkjax.scene.joints import Cam, Coupling, Prismatic, Revolute, Screw, Slot
 from udkjax.scene.profiles import AbstractProfile, LawProfile, profile_class
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
@@ -187,7 +187,7 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
         joint = table.get("joint")
         joint_class = known.get("rubbing", {}).get(joint) if isinstance(joint, str) else None
         yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table, joint_class))
-    if issubclass(cls, Cam | LawProfile):
+    if issubclass(cls, Cam | Screw | Coupling | LawProfile):
         yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table))
 
 

@@ -50,7 +50,8 @@ def mechanism_of_tables(scene: Mapping[str, Any], source: str) -> Mechanism:
     entries, problems = [], list(head_mistakes(scene, ("format", "name", "gravity", *SECTIONS)))
     for section in SECTIONS:
         entries.extend(read_section(section, scene.get(section, []), problems, CLASSES_WITHOUT_TYPE.get(section)))
-    entries = [e._replace(table={k: vector_as_angle(x) if k == "axis" else x for k, x in e.table.items()}) for e in entries]
+    axes = ("axis", "to_axis")
+    entries = [e._replace(table={k: vector_as_angle(x) if k in axes else x for k, x in e.table.items()}) for e in entries]
     gravity = scene.get("gravity", [0.0, -9.81])
     problems.extend(problems_of(entries, gravity))
     if problems:

@@ -9,6 +9,7 @@ from udkjax.scene.drawing.drawn_friction import PinFriction as PinFriction
 from udkjax.scene.drawing.drawn_joints import CamPair as CamPair
 from udkjax.scene.drawing.drawn_joints import GearPair as GearPair
 from udkjax.scene.drawing.drawn_joints import PinInSlot as PinInSlot
+from udkjax.scene.drawing.drawn_joints import ScrewPair as ScrewPair
 from udkjax.scene.drawing.drawn_joints import Slide as Slide
 from udkjax.scene.drawing.link import Link as Link
 from udkjax.scene.drawing.pin_forms import CirclesPin as CirclesPin

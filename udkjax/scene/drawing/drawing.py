@@ -24,7 +24,7 @@ from udkjax.scene.drawing.drawing_reader import (
 )
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_friction import PinFriction
-from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
+from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, ScrewPair, Slide
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, around
 from udkjax.scene.drawing.mistakes import joint_names, where
@@ -71,6 +71,7 @@ class Drawing(AbstractDrawing):
         units: Units of plain numbers, such as `{"length": "mm"}`; by default SI units and radians. A number may be a string with
             its unit, such as "60 rpm".
         friction: Friction at pins, in slides and in slots, as the elements above.
+        screws: Screws that turn at a pin and move a slide, as the elements above.
 
     Raises:
         SceneError: The drawing is wrong; the error lists all mistakes. Traced numbers are not checked.
@@ -105,8 +106,9 @@ class Drawing(AbstractDrawing):
         name: str = "",
         units: Mapping[str, str] | None = None,
         friction: "Mapping[str, PinFriction | TomlTable] | Sequence[PinFriction | TomlTable] | None" = None,
+        screws: "Mapping[str, ScrewPair | TomlTable] | Sequence[ScrewPair | TomlTable] | None" = None,
     ):
-        given = {"link": links, "slide": slides, "slot": slots, "gear": gears, "cam": cams}
+        given = {"link": links, "slide": slides, "slot": slots, "gear": gears, "screw": screws, "cam": cams}
         given |= {"motor": motors, "spring": springs, "damper": dampers, "load": loads, "friction": friction}
         given |= {"body": bodies, "joint": joints, "driver": drivers, "force": forces}
         unknown = [

@@ -11,7 +11,7 @@ from udkjax.scene.bodies import GROUND, Body, Frame
 from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes, name_mistake
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_friction import PinFriction
-from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Slide
+from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, ScrewPair, Slide
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
 from udkjax.scene.drawing.link import Link, with_concrete_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, pin_mistakes, shape_mistakes, where
@@ -20,7 +20,7 @@ from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import as_leaves
 from udkjax.scene.forces import ForceElement
-from udkjax.scene.joints import Joint, Revolute
+from udkjax.scene.joints import Coupling, Joint, Revolute
 from udkjax.scene.schema import build
 from udkjax.wording import abbreviate, quote, suggestion
 
@@ -28,6 +28,7 @@ SECTIONS: Mapping[str, type[DrawnElement]] = {
     "slide": Slide,
     "slot": PinInSlot,
     "gear": GearPair,
+    "screw": ScrewPair,
     "cam": CamPair,
     "motor": Motor,
     "spring": PinSpring,
@@ -129,6 +130,8 @@ def units_of_element(cls: type, table: TomlTable) -> tuple[str, str]:
         return "Friction", ""
     if cls is Motor:
         return ("SlideMotor", "m") if "slide" in table or table.get("between") else ("Motor", "rad")
+    if cls is Coupling:
+        return cls.__name__, " per ".join("rad" if table.get(axis) is None else "m" for axis in ("axis", "to_axis"))
     return cls.__name__, "rad" if table.get("coordinate") == "angle" else "m"
 
 

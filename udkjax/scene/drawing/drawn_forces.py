@@ -51,10 +51,8 @@ class Motor(DrawnElement):
 
     def parts(self, placement):
         if self.slide is not None:
-            slide = placement.slides[self.slide]
-            pair, position = (slide.on, slide.link), placement.places[placement.links[slide.link].pins[0]]
-            axis = placement.direction(slide.on, slide.along, slide.direction)
-            return Parts(driver=Driver(pair, "x", self._law(0.0), placement.points(pair, (position, position)), axis))
+            pair, points, axis = placement.guide(placement.slides[self.slide])
+            return Parts(driver=Driver(pair, "x", self._law(0.0), points, axis))
         if self.pin is None:
             law, ends = self._law(placement.distance(*self.between)), placement.ends(self.between)
             return Parts(driver=Driver(ends, "distance", law, _points_of(placement, self.between)))

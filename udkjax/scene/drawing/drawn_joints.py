@@ -1,4 +1,4 @@
-"""Joints of a drawing other than pins: slides, slots, gears, cams."""
+"""Joints of a drawing other than pins: slides, slots, gears, screws, cams."""
 
 from dataclasses import replace
 from typing import Literal
@@ -11,9 +11,17 @@ from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.pin_forms import norm
-from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, SlidingLink, line_mistakes
-from udkjax.scene.fields import LINK, PIN, POSITIVE, given_direction, given_names, given_or_none
-from udkjax.scene.joints import Cam, Gear, Prismatic, Slot
+from udkjax.scene.drawing.placement import (
+    DrawnElement,
+    Parts,
+    PinLayout,
+    Placement,
+    SlidingLink,
+    line_mistakes,
+    pair_mistakes,
+)
+from udkjax.scene.fields import LINK, PIN, POSITIVE, SLIDE, given_direction, given_names, given_number, given_or_none
+from udkjax.scene.joints import Cam, Gear, Prismatic, Screw, Slot
 from udkjax.scene.profiles import AbstractProfile, LawProfile, SwingProfile, as_profile
 from udkjax.wording import quote
 
@@ -34,10 +42,8 @@ class Slide(DrawnElement):
             yield f"on: {quote(self.on)} is connected to itself"
 
     def parts(self, placement):
-        position = placement.places[placement.links[self.link].pins[0]]
-        axis = placement.direction(self.on, self.along, self.direction)
-        pair = (self.on, self.link)
-        return Parts(joint=Prismatic(pair, placement.points(pair, (position, position)), axis, placement.angle_between(*pair)))
+        pair, points, axis = placement.guide(self)  # pyright: ignore[reportArgumentType]  # converters
+        return Parts(joint=Prismatic(pair, points, axis, placement.angle_between(*pair)))
 
     @property
     def anchors(self):
@@ -131,6 +137,28 @@ class GearPair(DrawnElement):
     def _apart(self, sizes: Array) -> Number:
         difference = array_namespace(sizes).abs(sizes[0] - sizes[1])
         return difference if self.internal else sizes[0] + sizes[1]
+
+
+class ScrewPair(DrawnElement):
+    """A screw that turns at a `pin` moves a `slide` by its `lead` for each turn.
+
+    Its axis may lie in the plane; anticlockwise turns of the second link at the pin, relative to the first, move the slide along
+    its direction, or against it if the lead is negative.
+    """
+
+    slide: str = eqx.field(static=True, metadata=SLIDE)
+    pin: str = eqx.field(static=True, metadata=PIN)
+    lead: Float[Array, ""] = eqx.field(converter=given_number)  # m for one turn
+    of: tuple[str, ...] = eqx.field(
+        static=True, converter=given_names, default=(), metadata=LINK
+    )  # the two links, if more than two meet
+
+    def mistakes(self, layout):
+        yield from pair_mistakes(layout, self.pin, self.of)
+
+    def parts(self, placement):
+        pair, points, axis = placement.guide(placement.slides[self.slide])
+        return Parts(joint=Screw(pair, points, axis, placement.pair(self.pin, self.of), self.lead))
 
 
 class CamPair(DrawnElement):

@@ -36,7 +36,7 @@ QUANTITY_KINDS = {
     "torsional_damping": "N m s/rad",
 }
 _KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
-VECTORS = ("axis", "direction", "face")  # angles that may also be vectors
+VECTORS = ("axis", "to_axis", "direction", "face")  # angles that may also be vectors
 
 
 class Units:
@@ -205,8 +205,9 @@ def _unit(cls: type, field: str, variant: str, law: str) -> str:
 
 
 def _per_power(unit: str, power: int) -> str:
-    """Return the SI unit of a coefficient of a polynomial in time."""
-    return unit + ("" if power == 0 else "/s" if power == 1 else f"/s{power}")
+    """Return the SI unit of a coefficient of a polynomial in time with values in `unit`; "m per rad": in an angle."""
+    value, _, argument = unit.partition(" per ")
+    return value + ("" if power == 0 else f"/{argument or 's'}" + ("" if power == 1 else f"{power}"))
 
 
 def _is_number(annotation: Any) -> bool:

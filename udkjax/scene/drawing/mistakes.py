@@ -74,7 +74,7 @@ def _taken_names(layout: PinLayout, groups: DrawnGroups) -> Iterator[str]:
     motors = groups["motor"]
     spaces = (
         ("link", "body"),
-        ("slide", "slot", "gear", "cam", "motor", "joint", "driver"),
+        ("slide", "slot", "gear", "screw", "cam", "motor", "joint", "driver"),
         ("motor", "spring", "damper", "load", "friction", "force"),
     )
     for space in spaces:
@@ -97,7 +97,7 @@ def _taken_names(layout: PinLayout, groups: DrawnGroups) -> Iterator[str]:
 def _attached(layout: PinLayout, groups: DrawnGroups) -> set[str]:
     """Return the links that are connected to another element."""
     attached = {name for pin in groups["pin"] if len(m := layout.members(pin)) > 1 for name in m}
-    for section in ("slide", "slot", "cam", "gear", "motor", "spring", "damper", "load", "friction", "joint", "driver", "force"):
+    for section in [section for section in groups if section not in ("pin", "link", "body")]:
         for element in groups[section].values():
             pins = (getattr(element, "pin", None), *getattr(element, "pins", ()), *getattr(element, "between", ()))
             named = (getattr(element, name, None) for name in ("link", "on", "body"))

@@ -94,6 +94,11 @@ class Placement(PinLayout):
         assert direction is not None  # given, because `along` is not
         return direction if on == GROUND else by_numpy(direction) - self.angle(on)
 
+    def guide(self, slide: SlidingLink) -> tuple[tuple[str, str], Float[Array, "2 2"], Number]:
+        """Return the two links of a slide, its points in their frames (m), and its direction in the frame of the first (rad)."""
+        pair, position = (slide.on, slide.link), self.places[self.links[slide.link].pins[0]]
+        return pair, self.points(pair, (position, position)), self.direction(slide.on, slide.along, slide.direction)
+
 
 class Parts(NamedTuple):
     """The joint, driver or force element that an element of a drawing becomes, under the same name."""

@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from udkjax.scene.mjcf.body_tree import TreeJoint, unique_name
 from udkjax.scene.mjcf.model_settings import merge_parts
-from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneModel, gap_of
+from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, Pair, PlaneModel, gap_of
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
 EVEN = 1e-12  # relative to the largest term: smaller sums of angles are rounding errors
@@ -23,6 +25,16 @@ class CoupledLength(NamedTuple):
     angles: Mapping[int, float] = {}
     slide: TreeJoint | None = None
     ends: Ends | None = None
+
+
+class BodyCoordinate(NamedTuple):
+    """A joint coordinate, less its value in the file, as `factor` times a relative angle or displacement of two bodies."""
+
+    bodies: tuple[int, int]
+    start: float  # rad or m, the relative angle or displacement in the position of the file
+    factor: float
+    axis: float | None = None  # rad, in the frame of the first body; None: an angle
+    points: list[Pair] | None = None  # m
 
 
 class CoupledLengths:
@@ -88,6 +100,30 @@ class CoupledLengths:
             read.refuse("its sites are not at one height above the plane of the motion")
         hosts = self.model.tree.hosts
         return Ends((hosts[body1], hosts[body2]), (self.model.plane.flat(frame1.origin), self.model.plane.flat(frame2.origin)))
+
+    def between_bodies(self, length: CoupledLength) -> BodyCoordinate | None:
+        """Return a joint coordinate as one of two bodies; None if it is not a relative angle, or a displacement along an axis."""
+        if length.slide is not None:
+            return self._slide_between_bodies(length.slide)
+        if len(length.angles) != 2 or min(length.angles) < 0:
+            return None
+        (body1, _), (body2, factor) = length.angles.items()
+        return BodyCoordinate((body1, body2), self.model.relative_angle(body1, body2), factor)
+
+    def _slide_between_bodies(self, slide: TreeJoint) -> BodyCoordinate | None:
+        body, model = slide.body, self.model
+        joints, holder = model.tree.bodies[body].joints, model.holder(body)
+        kinds = "".join(joint.kind[0] for joint in joints)
+        axes = [model.plane.flat(joint.axis) for joint in joints if joint.kind == "slide"]
+        oblique = len(axes) == 2 and abs((axes[0] * np.conj(axes[1])).real) > AXES_TOL
+        if kinds.strip("h").strip("s") or oblique:  # slides on both sides of the hinge, or not measured by projections
+            return None
+        pin = model.plane.flat(next((joint for joint in joints if joint.kind == "hinge"), slide).anchor)
+        axis, bodies = model.plane.flat(slide.axis), (holder, body)
+        if kinds.startswith("h"):  # its axis turns with the body
+            axis, bodies = -axis, (body, holder)
+        points = [model.local(k, pin) for k in bodies]
+        return BodyCoordinate(bodies, 0.0, 1.0, model.direction(bodies[0], axis), points)
 
     def sum_lengths(self, terms: list[tuple[CoupledLength, float]], read: AttributeReader) -> CoupledLength | None:
         """Return a weighted sum of coordinates; if slides are among them, refuse it and return None."""

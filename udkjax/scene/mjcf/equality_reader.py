@@ -1,17 +1,17 @@
-"""Equalities of an MJCF model as joints: connect, weld, and fixed angles and distances."""
+"""Equalities of an MJCF model as joints: connect, weld, fixed angles and distances, and coupled joints."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
-from udkjax.scene.joints import Angle, Distance, Gear, Joint, Revolute, Weld
+from udkjax.scene.joints import Angle, Coupling, Distance, Gear, Joint, Revolute, Weld
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
 from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneMotion
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
-from udkjax.wording import quote
 
+DEFAULT_POLYNOMIAL = (0.0, 1.0, 0.0, 0.0, 0.0)  # of a polycoef that is not given
 MESHED = 1e-9  # rad, times the largest factor: rounding error of the angles of gears that mesh in the initial state
 
 
@@ -75,24 +75,50 @@ class EqualityReader:
         return Ends((tree.hosts[body1], tree.hosts[body2]), flat), rotation
 
     def _add_joint(self, read: AttributeReader) -> None:
-        offset, slope = self._line(read)
+        coefficients = read.numbers("polycoef", DEFAULT_POLYNOMIAL, fewest=1)
         length1 = self.lengths.named_joint(read, "joint1")
         length2 = self.lengths.named_joint(read, "joint2") if "joint2" in read else None
-        terms = [(length, factor) for length, factor in ((length1, 1.0), (length2, -slope)) if length]
-        if length1 and (length2 or "joint2" not in read):
-            self._hold(read, self.lengths.sum_lengths(terms, read), offset)
+        if not length1 or ("joint2" in read and not length2):
+            return  # refused
+        turns = bool(length1.angles) and (length2 is None or bool(length2.angles))
+        if turns and (length2 is None or not coefficients[2:].any()):
+            offset, slope = coefficients[:2] if length2 else (coefficients[0], 0.0)
+            terms = [(length1, 1.0)] if length2 is None else [(length1, 1.0), (length2, -float(slope))]
+            total = self.lengths.sum_lengths(terms, read)
+            if total is None or len(total.angles) == 2 or self._is_in_mesh(total, offset):
+                self._hold(read, total, float(offset))
+                return
+        self._couple(read, length1, length2, coefficients)
+
+    def _couple(
+        self, read: AttributeReader, length1: CoupledLength, length2: CoupledLength | None, polynomial: np.ndarray
+    ) -> None:
+        """Add the joint that makes one joint coordinate a polynomial of another, both less their values in the file."""
+        y = self.lengths.between_bodies(length1)
+        x = y if length2 is None else self.lengths.between_bodies(length2)
+        if y is None or x is None:
+            read.refuse(
+                "couples one of two hinges of a body, or a slide of a body with oblique slides, or with a hinge between them: "
+                "not supported"
+            )
+            return
+        powers = polynomial * x.factor ** np.arange(len(polynomial)) if length2 else polynomial[:1]
+        coefficients = np.polynomial.Polynomial(powers / y.factor)(np.polynomial.Polynomial([-x.start, 1.0])).coef
+        coefficients[0] += y.start
+        names = self.model.names
+        joint = Coupling(names(y.bodies), names(x.bodies), np.trim_zeros(coefficients, "b"), y.axis, x.axis, y.points, x.points)
+        self.joints[self._joint_name(read)] = joint
 
     def _add_tendon(self, read: AttributeReader) -> None:
-        offset, _ = self._line(read)
         if "tendon2" in read:
             read.refuse("couples two tendons: not supported")
-        self._hold(read, self.lengths.named_tendon(read, "tendon1"), offset)
+        offset = read.numbers("polycoef", DEFAULT_POLYNOMIAL, fewest=1)[0]
+        self._hold(read, self.lengths.named_tendon(read, "tendon1"), float(offset))
 
-    def _line(self, read: AttributeReader) -> tuple[float, float]:
-        coefficients = read.numbers("polycoef", (0.0, 1.0, 0.0, 0.0, 0.0), fewest=1)
-        if coefficients[2:].any():
-            read.refuse(f"polycoef={quote(read.text('polycoef'))} is not linear: only its first two numbers are supported")
-        return float(coefficients[0]), float(coefficients[1])
+    def _is_in_mesh(self, length: CoupledLength, offset: float) -> bool:
+        """Return True if the initial state satisfies an equality of angles, so that gears can start in mesh."""
+        mismatch = sum(factor * self._motions[body].angle for body, factor in length.angles.items())
+        return len(length.angles) == 3 and not offset and abs(mismatch) <= MESHED * max(map(abs, length.angles.values()))
 
     def _hold(self, read: AttributeReader, length: CoupledLength | None, offset: float) -> None:
         """Add the joint that fixes a length at its value in the file plus an offset."""
@@ -106,8 +132,7 @@ class EqualityReader:
             angle = self.model.relative_angle(body1, body2) + offset / factor
             self.joints[self._joint_name(read)] = Angle(self.model.names((body1, body2)), angle)
         elif len(angles) == 3:
-            mismatch = sum(factor * self._motions[body].angle for body, factor in angles.items())
-            if offset or abs(mismatch) > MESHED * max(map(abs, angles.values())):
+            if not self._is_in_mesh(length, offset):
                 read.refuse(
                     "is not satisfied in the initial state, and gears start in mesh: change the ref or the key of a joint"
                 )

@@ -16,7 +16,19 @@ from udkjax.scene.drawing import Drawing
 from udkjax.scene.forces import Spring, Torque, TorsionSpring
 from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
-from udkjax.scene.joints import Angle, Constraint, Distance, Gear, Prismatic, Revolute, Slot, Weld
+from udkjax.scene.joints import (
+    Angle,
+    Constraint,
+    Coupling,
+    Distance,
+    Gear,
+    Prismatic,
+    Revolute,
+    Screw,
+    Slot,
+    Weld,
+    coordinate_of,
+)
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name
@@ -230,9 +242,52 @@ class _Writer:
                 offset = float(joint.angle - self.frames[second_name].angle + self.frames[first_name].angle)
             if tendon := self._add_fixed(name, self._hinges(factors), "joint"):
                 section.append(f"<tendon{_attributes(name=name, tendon1=tendon, polycoef=_numbers(offset, 0.0))}/>")
+        elif isinstance(joint, Screw | Coupling):
+            self._add_coupling(name, joint)
         else:
             closes = " that closes a loop" if isinstance(joint, Slot | Prismatic) else ""
             self.problems.append(f"joint {quote(name)}: MJCF has no equality for a {type(joint).__name__.lower()}{closes}")
+
+    def _add_coupling(self, name: str, joint: Screw | Coupling) -> None:
+        """Add an equality of two joints of the tree, each relative to its position in the file."""
+        if isinstance(joint, Screw):
+            sides = (joint.bodies, joint.axis, joint.points), (joint.turning, None, None)
+            polynomial = np.polynomial.Polynomial([float(joint.constant), float(joint.lead) / (2 * np.pi)])
+        else:
+            sides = (joint.bodies, joint.axis, joint.points), (joint.to, joint.to_axis, joint.to_points)
+            polynomial = np.polynomial.Polynomial(np.asarray(joint.coefficients))
+        joint1, joint2 = (self._tree_joint(*side) for side in sides)
+        if joint1 is None or joint2 is None or polynomial.degree() > 4:
+            limit = "joints of its tree of bodies, by polynomials of degree 4 at most: one of its coordinates is no such joint"
+            self.problems.append(f"joint {quote(name)}: MJCF couples {limit}, or the degree is higher")
+            return
+        (name1, sign1), (name2, sign2) = joint1, joint2
+        y, x = (float(coordinate_of(a, points, *(self.frames[body] for body in bodies))) for bodies, a, points in sides)
+        shifted = np.asarray(polynomial(np.polynomial.Polynomial([x, sign2])).coef, float)
+        shifted[0] -= y
+        coefficients = sign1 * shifted
+        numbers = _numbers(*coefficients, *[0.0] * (5 - len(coefficients)))
+        self.sections["equality"].append(f"<joint{_attributes(name=name, joint1=name1, joint2=name2, polycoef=numbers)}/>")
+
+    def _tree_joint(
+        self, bodies: Sequence[str], axis: Number | None, points: Array | np.ndarray | None
+    ) -> tuple[str, float] | None:
+        """Return the hinge or slide of the tree that is a relative angle, or displacement, of two bodies, and its sign."""
+        if axis is None:
+            hinges = self._hinges({bodies[1]: 1.0, bodies[0]: -1.0})
+            (hinge, weight), *further = [*hinges.items(), ("", 0.0)]
+            return (hinge, weight) if len(further) == 1 and abs(weight) == 1 else None
+        for body, sign in ((bodies[1], 1.0), (bodies[0], -1.0)):
+            edge = self.tree.get(body)
+            joint = self.mechanism.joints.get(edge.joint) if edge else None
+            if edge is None or {edge.body, edge.holder} != set(bodies) or not isinstance(joint, Prismatic | Slot):
+                continue
+            directions = [self.frames[b].angle + float(a) for b, a in ((bodies[0], axis), (joint.bodies[0], joint.axis))]
+            lengthwise = float(np.cos(directions[1] - directions[0]))
+            same_point = joint.bodies == tuple(bodies) and points is not None and np.array_equal(points[1], joint.points[1])
+            if abs(abs(lengthwise) - 1) <= EVEN and (isinstance(joint, Prismatic) or same_point):
+                return (edge.joint if isinstance(joint, Prismatic) else f"{edge.joint}.slide"), sign * float(np.sign(lengthwise))
+        return None
 
     def _add_force(self, name: str, force: Any) -> None:
         if any(isinstance(value, Held) for value in vars(force).values()):

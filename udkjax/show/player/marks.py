@@ -19,12 +19,14 @@ from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
 from udkjax.scene.joints import (
     Cam,
+    Coupling,
     Distance,
     Gear,
     Joint,
     Prismatic,
     Rack,
     Revolute,
+    Screw,
     Slot,
     Weld,
 )
@@ -142,6 +144,10 @@ class _Drawing:
                 self._gear(name, joint)
             case Rack():
                 self._rack(joint)
+            case Screw():
+                self._thread(joint)
+            case Coupling():
+                pass  # the joints that guide its bodies are drawn
             case Cam():
                 rim = joint.profile.rim(PROFILE_POINTS, joint.face is not None)
                 place = self._at(joint.bodies[0], joint.points[0])
@@ -277,6 +283,14 @@ class _Drawing:
         wheel = {"radius": radius, "internal": False, "teeth": 0, "phase": 0.0}
         self.wheels.append({"kind": MarkKind.WHEEL, **self._at(second, (0.0, 0.0)), **wheel})
         self.shaped.add(second)
+
+    def _thread(self, joint: Screw) -> None:
+        first, second = joint.bodies
+        axis, margin = float(joint.axis), MARGIN * self.size
+        origin = in_frame(self._frames(first)[0], self._path(second, joint.points[1])[0])
+        start, end = self._travel(first, origin, axis, second, joint.points[1])
+        span = [start - margin, end + margin]
+        self.rails.append({"kind": MarkKind.RACK, **self._at(first, origin), "axis": axis, "span": span})
 
     def _travel(self, one: str, at: Numbers, axis: float, two: str, point: Numbers) -> tuple[float, float]:
         """Return the range (m) of a point of body `two` along an axis of body `one`, measured from the point `at` of `one`."""

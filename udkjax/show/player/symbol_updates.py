@@ -38,7 +38,11 @@ def symbol_updates(mechanism: Mechanism, record: Mapping[str, Any], symbols: Seq
         for x, y in np.asarray(more, float):
             points.setdefault(_key(mechanism.body_names.index(body), x, y), (drawn, drawn + 1))
             drawn += 2
-    angles = {_rounded(e.axis): int(indices.joints[name].axis) for name, e in mechanism.joints.items() if hasattr(e, "axis")}
+    angles = {
+        _rounded(e.axis): int(indices.joints[name].axis)
+        for name, e in mechanism.joints.items()
+        if getattr(e, "axis", None) is not None
+    }
     radii = _radii(mechanism, indices)
     found: JsonObject = {"frames": [], "points": [], "angles": [], "sizes": [], "traces": [], "pins": [], "arrows": []}
     found["measures"] = []
