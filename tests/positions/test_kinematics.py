@@ -583,3 +583,56 @@ def test_the_side_is_the_sign_of_the_determinant_of_independent_rows(name, numbe
         values + 0.01 * np.arange(5)[:, None]
     )
     assert np.all(np.asarray(lanes.side) == one.side[0]) and np.all(np.asarray(lanes.first_side) == one.first_side)
+
+
+SPACINGS = {  # values of one turn or of a travel: from half a degree to half a turn
+    "four_bar": ({}, "body.crank.angle", 2 * np.pi, (720, 24, 9, 2)),
+    "slider_crank": ({}, "motor", 2 * np.pi, (720, 24, 9, 2)),
+    "peaucellier": ({}, "body.crank.angle", -1.5, (24, 2)),
+    "elliptic_trammel": ({}, "body.rod.angle", 2 * np.pi, (24, 2)),
+}
+
+
+@pytest.mark.parametrize("name", SPACINGS)
+def test_values_far_apart_are_reached_by_machine_code_on_the_same_branch(name):
+    """The steps between them cost microseconds; those of the continuation that follows a lost position, a thousand times more."""
+    numbers, driver, far, counts = SPACINGS[name]
+    mech = getattr(udk.library, name)(**numbers)
+    driven, q = drive(mech, driver), udk.assemble(mech).q.ravel()
+    given, start = (driven.mechanism, driven.analysis, driven.unit), float(driven.value(q))
+    fine = march_at_once(*given, start, q, start + far * np.arange(1, 721) / 720)
+    assert fine.trusted == 720
+    for count in counts:
+        values, every = start + far * np.arange(1, count + 1) / count, slice(720 // count - 1, None, 720 // count)
+        one = march_at_once(*given, start, q, values)
+        lanes = jax.vmap(lambda x, values=values: march(*given, start, q, values + x))(np.zeros(3))
+        assert one.trusted == count and np.all(lanes.trusted == count)
+        for x in ("q", "dq", "ddq", "side"):
+            tol = 1e-9 * np.max(np.abs(getattr(fine, x)))
+            np.testing.assert_allclose(getattr(one, x), getattr(fine, x)[every], rtol=0, atol=tol)
+            np.testing.assert_allclose(getattr(lanes, x)[1], getattr(one, x), rtol=0, atol=tol)
+
+
+def test_values_far_apart_end_at_the_same_toggle_with_the_same_derivatives():
+    """Beyond 180 degrees of the values in one step, the toggle of a linkage that does not turn is located as by small steps."""
+    mech = udk.library.four_bar(np.pi / 3, lengths=STUCK[:3], ground=STUCK[3])
+
+    def limit(k, count):
+        pin = mech.parameters()["pin.C"]
+        found = udk.kinematics(mech.with_parameters({"pin.C": k * pin}), "body.crank.angle", np.linspace(1.1, 1.1 + np.pi, count))
+        return found.limit, found.status[-1], found.q[0, 1, 2]
+
+    coarse, fine = (jax.jit(jax.jacfwd(lambda k, n=n: limit(k, n)[::2])) for n in (2, 12))
+    for values, expected in zip((limit(1.0, 2), coarse(1.0)), (limit(1.0, 12), fine(1.0)), strict=True):
+        np.testing.assert_allclose(values, expected, rtol=1e-10)
+    assert limit(1.0, 2)[1] == Reached.beyond_limit
+
+
+def test_a_value_that_no_steps_reach_ends_the_march():
+    """Not a number, infinite, or so far that the number of steps is bounded."""
+    mech = udk.library.four_bar()
+    driven, q = drive(mech, "body.crank.angle"), udk.assemble(mech).q.ravel()
+    start = float(driven.value(q))
+    for far in (np.nan, np.inf, 1e7):
+        found = march_at_once(driven.mechanism, driven.analysis, driven.unit, start, q, np.array([start + 0.1, far, start]))
+        assert found.trusted == 1

@@ -83,7 +83,7 @@ class CloseCotangents(Close):
 
 @dataclass(frozen=True)
 class March(Operation):
-    """Follow the positions of a driven mechanism over values: q, q', q'', their sides, and the number of reliable ones."""
+    """Follow the positions of a driven mechanism over values: q, q', q'', sides, the number of sound ones, the last value."""
 
     settings: ClassVar[tuple[str, ...]] = Marching.settings
 
@@ -91,4 +91,4 @@ class March(Operation):
         return Marching(self.code, width, vector)
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
-        return [*[(times, self.code.coordinate_count)] * 3, (times,), (1,)]
+        return [*[(times, self.code.coordinate_count)] * 3, (times,), (1,), (1,)]

@@ -333,9 +333,7 @@ def _solve(
     if fast and can_march(driven.mechanism, driven.analysis):
         found = march(*stop_gradients(given)) if is_traced else march_at_once(*given)
         first = _count_on_branch(curve, s, q, values, found)
-        last = xp.maximum(first - 1, 0)
-        some = first > 0
-        s, q = xp.where(some, values[last], s), xp.where(some, found.q[last], q)
+        s, q = _place_to_go_on(s, q, values, found, first, xp)
         points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=xp.zeros_like(points.status))
     if not is_traced:
         points = follow(curve, s, q, values, points, first)
@@ -366,6 +364,24 @@ def _count_on_branch(
         if not (Reached.has_position(reached.status[0]) and np.max(distance) <= SAME_POSITION):
             return k
     return trusted
+
+
+def _place_to_go_on(
+    s: Float[Array, ""],
+    q: Float[Array, "n"],
+    values: Float[Array, "T"],
+    march_result: MarchResult,
+    first: Int[Array, ""] | int,
+    xp: Any,
+) -> tuple[Any, Any]:
+    """Return the value and the position from which continuation finds the position at values[first]."""
+    last, following = xp.maximum(first - 1, 0), xp.minimum(first, len(values) - 1)
+    some, m = first > 0, march_result
+    side = xp.where(some, m.side[last], m.first_side)
+    # Machine code may have come nearer, on the same branch.
+    is_nearer = (first == m.trusted) & (first < len(values)) & (m.side[following] == side)
+    s, q = xp.where(some, values[last], s), xp.where(some, m.q[last], q)
+    return xp.where(is_nearer, m.reached, s), xp.where(is_nearer, m.q[-1], q)
 
 
 def _with_derivatives(curve: Curve, q: Float[Array, "n"], values: Float[Array, "T"], points: Points) -> Points:

@@ -20,18 +20,16 @@ from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
-APPROACH = 16  # steps from the initial position to the first value
 MOST_KNOTS = 100  # largest number of knots of spline motions: compiling their programs takes 10 ms per knot
-FINER, FINEST = 8, 64  # factor of values that are followed where a march ends, and the largest number between two values
-FIRST_PIECE = 32  # values of the first such march; it doubles, so that little work is lost at a toggle
 DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; a march ends long before
 
 
 class MarchResult(NamedTuple):
     """Positions and their derivatives with respect to the value; the first `trusted` of them are closed and on one smooth curve.
 
-    `side` is the sign of det Psi_q, or 1 if Psi_q is not square or the independent rows are unknown; `first_side` is the side
-    of the start.
+    `side` is the sign of det Psi_q, or 1 if Psi_q is not square or the independent rows are unknown, and zero where it has
+    changed more than once since the value before; `first_side` is the side of the start. After the trusted positions, all are
+    the last one that was followed, at the value `reached`.
     """
 
     q: Float[Array, "T n"]
@@ -40,6 +38,7 @@ class MarchResult(NamedTuple):
     side: Float[Array, "T"]
     first_side: Float[Array, ""]
     trusted: Int[Array, ""]
+    reached: Float[Array, ""]
 
 
 def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
@@ -61,38 +60,16 @@ def march(
     The value of the driver replaces time; `unit` is the unit of the values.
     """
     inputs = _inputs(_numbers(mechanism, analysis), analysis, unit, s, q, values, jnp)
-    return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=APPROACH + np.size(values)), jnp)
+    return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=1 + np.size(values)), jnp)
 
 
 def march_at_once(
     mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
 ) -> MarchResult:
-    """Follow positions as `march` does, for concrete numbers, by NumPy; nothing is traced or compiled.
-
-    Where values are too far apart, values between them are followed as well.
-    """
+    """Follow positions as `march` does, for concrete numbers, by NumPy; nothing is traced or compiled."""
     prepared, analysis = _numbers_of_concrete(mechanism, analysis)
-
-    def march_on(s: NumberLike, q: NumericArray, values: NumericArray) -> MarchResult:
-        inputs = _inputs(prepared, analysis, unit, s, q, values, np)
-        return _march(prepared.calls.of_one(*inputs, times=APPROACH + len(values)), np)
-
-    found, parts, piece = march_on(s, q, values), FINER, FIRST_PIECE
-    count = int(found.trusted)
-    arrays = [np.array(x) for x in found[:4]]
-    while count < len(values) and parts <= FINEST:
-        s, q = (values[count - 1], arrays[0][count - 1]) if count else (s, q)
-        ends = values[count : count + piece]
-        shares = np.arange(1, parts + 1) / parts
-        before = np.append(s, ends[:-1])[:, None]
-        more = march_on(s, q, (before + shares * (ends[:, None] - before)).ravel())
-        reached = int(more.trusted) // parts
-        for x, new in zip(arrays, more[:4], strict=True):
-            x[count : count + reached] = new[parts - 1 :: parts][:reached]
-        count += reached
-        parts, piece = (parts, 2 * piece) if reached == len(ends) else (parts * FINER, FIRST_PIECE)
-    q, dq, ddq, side = arrays
-    return found._replace(q=q, dq=dq, ddq=ddq, side=side, trusted=np.asarray(count))
+    inputs = _inputs(prepared, analysis, unit, s, q, values, np)
+    return _march(prepared.calls.of_one(*inputs, times=1 + len(values)), np)
 
 
 def _by_numpy(x: PyTree) -> PyTree:
@@ -100,8 +77,9 @@ def _by_numpy(x: PyTree) -> PyTree:
 
 
 def _march(outputs: Sequence, xp: ModuleType) -> MarchResult:
-    q, dq, ddq, side = (x[0, APPROACH:] for x in outputs[:4])
-    return MarchResult(q, dq, ddq, side, outputs[3][0, 0], xp.maximum(outputs[4][0, 0].astype(int) - APPROACH, 0))
+    q, dq, ddq, side = (x[0, 1:] for x in outputs[:4])
+    trusted, reached = (x[0, 0] for x in outputs[4:6])
+    return MarchResult(q, dq, ddq, side, outputs[3][0, 0], xp.maximum(trusted.astype(int) - 1, 0), reached)
 
 
 class _Prepared(NamedTuple):
@@ -143,8 +121,7 @@ def _inputs(
     xp: ModuleType,
 ) -> list:
     scales = analysis.scales
-    approach = s + (values[0] - s) * xp.arange(APPROACH) / APPROACH
-    ts, settings = xp.concatenate([approach, values]), {"length": scales.length, "omega": unit}
+    ts, settings = xp.append(s, values), {"length": scales.length, "omega": unit}
     at_rest = xp.zeros(analysis.coordinates)
     return prepared.operation.pack(prepared.numbers, ts, q, at_rest, settings, scales.rows, xp=xp)
 

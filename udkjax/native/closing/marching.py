@@ -1,12 +1,14 @@
 """Machine code that follows the positions of a driven mechanism from value to value: a batch of members in W lanes.
 
 A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects twice by Newton's
-method with elimination. All lanes take the same steps, even if some fail. Reliable positions are counted: up to the first
-position that is not closed up to rounding errors, is far from its prediction, has too large a rotation of the tangent, or has a
-nearly dependent row. From there the caller continues by singular values.
+method with elimination. A position is sound if it is closed up to rounding errors, is near its prediction, has a small rotation
+of the tangent, and has no nearly dependent row. Values that are far apart are reached in several steps: each lane halves a step
+that does not lead to a sound position, and lengthens the steps after one that does. A lane stops where even the shortest step
+fails, at its last sound position; from there the caller continues by singular values.
 
 If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. The
-side changes where branches meet, and differs on another branch nearby.
+side changes where branches meet, and differs on another branch nearby. If it changes more than once on the way to a value, the
+side of that value is zero.
 """
 
 import numpy as np
@@ -27,19 +29,40 @@ CORRECTIONS = 2
 STRAIGHT = 0.95  # cosine of the largest rotation of the tangent in a step
 SLACK = 0.1  # largest distance of a position from its prediction, as a fraction of the step
 _METHOD = LUCode(relative=True)
+# Steps along the arc, in characteristic lengths or radians: the longest one, and one that is not halved any more.
+LONGEST, SHORTEST = 1.0, 1e-3
+MAX_STEPS = 2000  # in addition to four for each value: enough for some hundred turns
+LENGTHENING = 1.5  # below 2, so that a step which had to be halved is not tried again at once
 DISTANT = 1e-2  # smallest distance from dependent rows: below, elimination loses more than half of the digits of q''
+
+
+class _Going:
+    """The variables of each lane that follows positions."""
+
+    def __init__(self, f: Function, s: Lane):
+        self.good = f.variable(s.active)  # whether all positions so far are sound
+        self.value = f.variable(s.start)  # value of the last sound position
+        self.longest = f.variable(np.inf)  # longest step that is tried next
+        self.side = f.variable(0.0)  # side of the last sound position
+        self.turns = f.variable(0.0)  # changes of the side since the last value asked for
+        self.count = f.variable(0.0)  # steps tried
+        self.begins = f.variable(0.0, width=1)  # whether no step has been tried
+
+    def tries(self, target: Value) -> Value:
+        """Return the lanes that have not reached the target."""
+        return (self.good.value > 0.5) & (self.value.value.is_not(target) | (self.begins.value > 0.5))
 
 
 class Marching(Module):
     """The text of a module whose `run` follows members from their positions q at the value ts[0] over all values ts."""
 
     settings = ("length", "omega")
-    results = ("qs", "dqs", "ddqs", "sides", "trusted")
+    results = ("qs", "dqs", "ddqs", "sides", "trusted", "reached")
 
     def __init__(self, code: RunPrograms, width: int, vector: int):
         plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=code.is_small, steps=False)
         super().__init__(plan)
-        for name in ("previous dq", "previous ddq", "third derivative", "prediction"):
+        for name in ("previous q", "previous dq", "previous ddq", "third derivative", "prediction"):
             self.places.add(name, self.n)
         self._rows = None
         if self._has_sides:
@@ -71,39 +94,71 @@ class Marching(Module):
         """Write `march(work, call)`: follow the members in all lanes over all values."""
         f, s = self.function("march", [(POINTER, "work"), (POINTER, "call")])
         zero, times = f.const(0.0, DOUBLE, f.width), self.field(f, "times")
-        trusted, good, before = f.variable(0.0), f.variable(1.0), f.variable(s.start)
+        trusted, going = f.variable(0.0), _Going(f, s)
         with f.each(self.n) as i:
             self.put_entry(f, "state q", i, self.entry(f, "point3 q", i))
             for name in ("result dq", "result dv", "third derivative"):
                 self.put_entry(f, name, i, zero)
         with f.each(times) as k:
             with self.each_lane(f, s.active) as lane:
-                self.put_lane_entry(f, "state t", lane, self.input_number(f, "ts", f.lane(s.member, lane), k))
-            now = self.entry(f, "state t")
-            h, begins = now - before.value, f.compare("lt", k, 1)
-            self._step_on(f, h)
-            good.value = f.select(self._is_sound(f, s, h, begins), good.value, zero)
-            trusted.value = trusted.value + good.value
-            with f.if_(begins), f.each(self.n) as i:  # the first step has no third derivative
-                self.put_entry(f, "third derivative", i, zero)
-            before.value, side = now, self._side(f)
+                self.put_lane_entry(f, "next", lane, self.input_number(f, "ts", f.lane(s.member, lane), k))
+            going.begins.value = f.select(f.compare("lt", k, 1), f.const(1.0), 0.0)
+            going.turns.value = 0.0
+            with f.while_(lambda: f.any_of(going.tries(s.next))):
+                self._try_step(f, s, going)
+            trusted.value = trusted.value + going.good.value
+            shown = f.select(going.turns.value > 1.5, zero, going.side.value)
             with self.each_lane(f, s.active) as lane:
                 row = self.to_int(f, f.lane(s.member, lane)) * times + k
-                f.store(f.lane(side, lane), self.field(f, "sides", POINTER), row)
+                f.store(f.lane(shown, lane), self.field(f, "sides", POINTER), row)
                 for name, x in (("qs", "state q"), ("dqs", "result dq"), ("ddqs", "result dv")):
                     self.copy_lane(f, self.result_address(f, name, row, self.n), 0, x, lane)
         with self.each_lane(f, s.active) as lane:
             member = self.to_int(f, f.lane(s.member, lane))
-            f.store(f.lane(trusted.value, lane), self.field(f, "trusted", POINTER), member)
+            for name, x in (("trusted", trusted), ("reached", going.value)):
+                f.store(f.lane(x.value, lane), self.field(f, name, POINTER), member)
+
+    def _try_step(self, f: Function, s: Lane, going: _Going):
+        """Try one step towards `next` in the lanes that have not got there."""
+        one, zero, tries = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width), going.tries(s.next)
+        begins = going.begins.value > 0.5
+        begins = f.repeat(begins, f.width) if f.width > 1 else begins
+        rest = f.select(tries, s.next - going.value.value, zero)
+        parts = f.max(f.intrinsic("ceil", f.abs(rest) / going.longest.value), one)
+        h = rest / parts
+        now = f.select(tries & (parts < 1.5), s.next, going.value.value + h)
+        setattr(s, "state t", now)
+        self._step_on(f, h)
+        is_sound, old_rate, new_rate = self._is_sound(f, s, h, begins)
+        accepted, refused = tries & is_sound, tries & ~is_sound
+        per_h = f.select(begins, zero, one / f.select(begins, one, h))  # the first step has no third derivative
+        with f.each(self.n) as i:
+            third = (self.entry(f, "result dv", i) - self.entry(f, "previous ddq", i)) * per_h
+            self.put_entry(f, "third derivative", i, f.select(accepted, third, self.entry(f, "third derivative", i)))
+            for name, before in (("state q", "previous q"), ("result dq", "previous dq"), ("result dv", "previous ddq")):
+                self.put_entry(f, name, i, f.select(accepted, self.entry(f, name, i), self.entry(f, before, i)))
+        side = self._side(f)
+        going.turns.where(accepted & side.is_not(going.side.value), going.turns.value + 1.0)
+        going.side.where(accepted, side)
+        going.value.where(accepted, now)
+        going.count.where(tries, going.count.value + 1.0)
+        ends = refused & ~(f.abs(h) * old_rate > SHORTEST) | (going.count.value > self.field(f, "times") * 4 + MAX_STEPS)
+        going.good.where(tries & ends, 0.0)
+        longer = f.min(f.max(going.longest.value, f.abs(h) * LENGTHENING), f.const(LONGEST) / new_rate)
+        going.longest.value = f.select(accepted, longer, f.select(refused, f.abs(h) * 0.5, going.longest.value))
+        going.begins.value = 0.0
 
     def _step_on(self, f: Function, h: Value):
         """Predict the next positions, correct them, and compute their q' and q''."""
         with f.each(self.n) as i:
             first, second = self.entry(f, "result dq", i), self.entry(f, "result dv", i)
             curvature = f.fma(h * (1 / 6), self.entry(f, "third derivative", i), second * 0.5)
-            predicted = f.fma(f.fma(curvature, h, first), h, self.entry(f, "state q", i))
-            for name, x in (("previous dq", first), ("previous ddq", second), ("state q", predicted), ("prediction", predicted)):
+            q = self.entry(f, "state q", i)
+            predicted = f.fma(f.fma(curvature, h, first), h, q)
+            for name, x in (("previous q", q), ("previous dq", first), ("previous ddq", second)):
                 self.put_entry(f, name, i, x)
+            for name in ("state q", "prediction"):
+                self.put_entry(f, name, i, predicted)
         for _ in range(CORRECTIONS):
             self.invoke(f, "newton_q")
             with f.each(self.n) as i:
@@ -118,13 +173,11 @@ class Marching(Module):
         self._rows.factor(f)
         return _METHOD.sign(self._rows.matrices(f))
 
-    def _is_sound(self, f: Function, s: Lane, h: Value, begins: Value) -> Value:
-        """Return whether positions are closed, near their prediction, and with little rotation; estimate the third derivative."""
-        one, zero, eps = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width), float(np.finfo(float).eps)
+    def _is_sound(self, f: Function, s: Lane, h: Value, begins: Value) -> tuple[Value, Value, Value]:
+        """Return whether positions are sound, and the lengths of arc per value before and after the step."""
+        one, eps = f.const(1.0, DOUBLE, f.width), float(np.finfo(float).eps)
         deviation, largest = f.variable(0.0), f.variable(1.0)
         product, old_square, new_square = f.variable(0.0), f.variable(0.0), f.variable(0.0)
-        has_step = h.is_not(0.0)
-        per_h = f.select(has_step, one / f.select(has_step, h, one), zero)
         with f.each(self.n) as i:
             unit, q = self.entry(f, "inverse unit", i), self.entry(f, "state q", i)
             largest.value = f.max(f.abs(q) * unit, largest.value)
@@ -133,15 +186,13 @@ class Marching(Module):
             product.value = f.fma(old, new, product.value)
             old_square.value = f.fma(old, old, old_square.value)
             new_square.value = f.fma(new, new, new_square.value)
-            change = self.entry(f, "result dv", i) - self.entry(f, "previous ddq", i)
-            self.put_entry(f, "third derivative", i, change * per_h)
         violated, per_unit = largest_violation(self, f), one / (s.omega * s.omega)
-        old_length2, new_length2 = old_square.value + per_unit, new_square.value + per_unit
-        is_straight = product.value + per_unit > f.intrinsic("sqrt", old_length2 * new_length2) * STRAIGHT
-        is_near = deviation.value < f.abs(h) * f.intrinsic("sqrt", old_length2) * SLACK + largest.value * (64 * eps)
+        old_rate, new_rate = (f.intrinsic("sqrt", x.value + per_unit) for x in (old_square, new_square))
+        is_straight = product.value + per_unit > old_rate * new_rate * STRAIGHT
+        is_near = deviation.value < f.abs(h) * old_rate * SLACK + largest.value * (64 * eps)
         is_closed = ~(violated > largest.value * (CLOSURE.rounding * eps)) & f.is_finite(violated)
-        is_smooth = (is_straight & is_near) | (f.repeat(begins, f.width) if f.width > 1 else begins)
-        return is_closed & (s.distance > DISTANT) & is_smooth
+        is_smooth = (is_straight & is_near) | begins
+        return is_closed & (s.distance > DISTANT) & is_smooth, old_rate, new_rate
 
     def step_all(self, f: Function, s: Lane, fill):
         f.call("march", f.given["work"], f.given["call"])
