@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from udkjax.native import primitive, records
-from udkjax.native.base import machine
+from udkjax.native.base import machine, processor
 from udkjax.native.base.layout import INPUTS
 from udkjax.native.derivatives.record import FIRST_POINTS, Recorded
 from udkjax.native.gpu.kernel import VECTOR, KernelCode, kernel_code
@@ -43,17 +43,17 @@ def calls_of(function: Callable, *given: Any) -> list[Called]:
         calls.append(Called(operation, arrays, times, [np.array(x) for x in outputs]))
         return outputs
 
-    caches, lanes, largest = (primitive.generate, primitive.machine_code), machine.lanes, records.LARGEST
+    caches, lanes, largest = (primitive.generate, primitive.machine_code), processor.lanes, records.LARGEST
     for cache in caches:
         cache.cache_clear()
     # Sums over vectors depend on the size of a register.
-    primitive.call_members, machine.lanes = record, lambda: VECTOR
+    primitive.call_members, processor.lanes = record, lambda: VECTOR
     records.LARGEST = 0  # as for the large batches of kernels
     try:
         with jax.disable_jit():
             function(*given)
     finally:
-        primitive.call_members, machine.lanes, records.LARGEST = call_members, lanes, largest
+        primitive.call_members, processor.lanes, records.LARGEST = call_members, lanes, largest
         for cache in caches:
             cache.cache_clear()
     return [call for call in calls if call.outputs[0].shape[0] > 1]

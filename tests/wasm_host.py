@@ -88,9 +88,9 @@ def record_of(
 
 def run_without_contraction(module: Any, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
     """Run the same code on this processor, compiled without fused multiply-add."""
-    from udkjax.native.base import machine
+    from udkjax.native.base import machine, processor
 
-    llvm = machine._llvm()
+    llvm = processor.llvm()
     target = llvm.Target.from_default_triple().create_target_machine(
         cpu="generic", features="-fma,-fma4", opt=machine.LEVEL, reloc="pic", codemodel="small", jit=True
     )

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import udkjax as udk
 from tests.native.test_program import ONE, TWO
 from udkjax.expressions import Graph, ScalarProgram, trace
-from udkjax.native.base import elementary, machine
+from udkjax.native.base import elementary, machine, processor
 from udkjax.native.base.ir import POINTER, Function
 from udkjax.native.base.program import write
 from udkjax.native.base.text import external_functions, text_of_module
@@ -156,7 +156,7 @@ def test_lanes_compute_the_bits_of_single_numbers(evaluate, name):
     pairs = zip(CASES[name].arguments, special_arguments(name), strict=True)
     arguments = [np.concatenate([special, x[:: len(x) // 200]]) for x, special in pairs]
     single = evaluate(name, 1, *arguments)
-    for width in {2, machine.lanes()}:
+    for width in {2, processor.lanes()}:
         found = evaluate(name, width, *arguments)
         is_number = ~np.isnan(single)
         assert_array_equal(np.isnan(found), ~is_number)
@@ -192,7 +192,7 @@ def test_tangents_of_huge_angles(evaluate, width):
 
 
 def test_errors_are_small_without_fused_multiply_add(monkeypatch, evaluate):
-    llvm = machine._llvm()
+    llvm = processor.llvm()
     if not llvm.get_default_triple().startswith("x86_64"):
         pytest.skip("other processors have fused multiply-add only")
     target = llvm.Target.from_default_triple().create_target_machine(

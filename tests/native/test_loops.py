@@ -22,7 +22,7 @@ from udkjax.equations.scene_programs import scene_programs
 from udkjax.equations.unrolled import Unrolled
 from udkjax.expressions.loop_derivative import PREFIXES, TWICE, LoopDerivative
 from udkjax.expressions.loop_program import KernelLoop, Reset
-from udkjax.native.base import machine
+from udkjax.native.base import processor
 from udkjax.native.base.loops import LoopWriter
 from udkjax.pinv.elimination_order import order_blocks
 from udkjax.pinv.rank_policy import RankPolicy
@@ -297,7 +297,7 @@ def test_constants_by_jax_are_those_of_the_loops(at):
 
 @pytest.mark.parametrize(
     ("at", "width"),
-    [("loaded", 1), ("loaded", machine.lanes()), ("linkage", machine.lanes()), ("gears", machine.lanes())],
+    [("loaded", 1), ("loaded", processor.lanes()), ("linkage", processor.lanes()), ("gears", processor.lanes())],
     indirect=True,
 )
 @pytest.mark.parametrize("name", ["end_of_step", "equation_terms"])

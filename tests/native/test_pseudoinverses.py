@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.choices import fast
 from tests.pinv.matrices import read_exact
 from udkjax import pinv
-from udkjax.native.base import machine
+from udkjax.native.base import machine, processor
 from udkjax.native.base.ir import POINTER, Function
 from udkjax.native.base.layout import Layout
 from udkjax.native.base.memory import Memory
@@ -36,11 +36,11 @@ class Solver(Memory):
     """One method for (m, n) matrices with a number of lanes."""
 
     def __init__(self, method: pinv.Pseudoinverse, m: int, n: int, width: int):
-        plan: Any = SimpleNamespace(width=width, vector=machine.lanes())
+        plan: Any = SimpleNamespace(width=width, vector=processor.lanes())
         code = dense_method(method)
         assert code is not None
         self.plan = plan
-        self.places, self.m, self.n = Layout(width, machine.lanes()), m, n
+        self.places, self.m, self.n = Layout(width, processor.lanes()), m, n
         self.places.add("fallback_tol")
         self.begins = []
         self.places.add("method")
@@ -108,7 +108,7 @@ def random_matrices(m, n, ranks, seed=0):
 
 
 @pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("m, n, width", [(12, 12, machine.lanes()), (5, 20, 1), (9, 5, machine.lanes()), (3, 1, 1)])
+@pytest.mark.parametrize("m, n, width", [(12, 12, processor.lanes()), (5, 20, 1), (9, 5, processor.lanes()), (3, 1, 1)])
 def test_every_lane_has_a_rank_of_its_own(name, m, n, width):
     """Right-hand sides are inconsistent: where the rank falls, results are least-squares solutions of least norm."""
     ranks = [k % (min(m, n) + 1) for k in range(min(m, n), 2 * min(m, n) + 9)]
@@ -167,7 +167,7 @@ def test_exact_matrices(name):
         m = len(matrix.a)
         tol = eps ** (1 / 3) if name == "Greville" else 1e-12 if matrix.cond < 1e11 else 0.0
         matrices, right = np.broadcast_to(matrix.a, (m, *matrix.a.shape)), np.eye(m)
-        x, rank = solved(make, matrices, right, tol, machine.lanes())
+        x, rank = solved(make, matrices, right, tol, processor.lanes())
         bound = 100 * eps * matrix.cond**power * np.linalg.norm(matrix.plus)
         assert_array_equal(rank, matrix.rank, err_msg=matrix.name)
         assert np.linalg.norm(x.T - matrix.plus) <= bound, matrix.name
@@ -180,14 +180,14 @@ def test_thresholds_meet_the_same_scale(name, relative):
     lengths = 10.0 ** -np.arange(5)
     matrices = np.array([np.diag(lengths) * 3.0] * 7)
     right, tols = np.ones((7, 5)), np.array([3e-1, 0.05, 3e-2, 5e-3, 3e-4, 1e-5, 4.0]) * (1.0 if relative else 1.7)
-    x, rank = solved(METHODS[name], matrices, right, tols, machine.lanes(), relative)
+    x, rank = solved(METHODS[name], matrices, right, tols, processor.lanes(), relative)
     reference, expected = plain(METHODS[name], matrices, right, tols, relative)
     assert len(set(expected)) > 4
     assert_array_equal(rank, expected)
     assert_allclose(x, reference, rtol=1e-12)
 
 
-@pytest.mark.parametrize("width", [1, machine.lanes()])
+@pytest.mark.parametrize("width", [1, processor.lanes()])
 def test_each_lane_has_chosen_a_method_of_its_own(width):
     """Each lane's result is bitwise that of the code of its method alone, in any order of methods."""
     numbers = np.array([3, 0, 4, 1, 1, 2, 0, 4, 2, 3, 0, 2, 4])

@@ -5,7 +5,7 @@ from udkjax.native.base.code_cache import cached_files as cached_files
 from udkjax.native.base.host_function import call_host as call_host
 from udkjax.native.base.host_function import call_seldom as call_seldom
 from udkjax.native.base.ir import Function as Function
-from udkjax.native.base.machine import lanes as lanes
+from udkjax.native.base.processor import lanes as lanes
 from udkjax.native.base.program import UnsupportedError as UnsupportedError
 from udkjax.native.base.program import vector_function as vector_function
 from udkjax.native.base.steps import FACTORS as FACTORS

@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from udkjax.equations.scales import scales_p
 from udkjax.native import records
-from udkjax.native.base import host_program, machine
+from udkjax.native.base import host_program, machine, processor
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.base.loading import Code, load
@@ -51,7 +51,7 @@ def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
 
     `tangent_lanes` is the number of directions of a single member in the lanes of a tangent.
     """
-    module = operation.module(width, tangent_lanes, machine.lanes())
+    module = operation.module(width, tangent_lanes, processor.lanes())
     handlers = handler(module, "call_frame")
     module.written_text = f"{module.text()}\n{text_of_module(handlers)}"
     return module
@@ -217,8 +217,8 @@ def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int
 def _select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
     one_by_one = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
     directions = inputs[-1].shape[1] if operation.tangents and one_by_one and operation.code.is_small else 1
-    tangent_lanes = min(2 ** math.ceil(math.log2(directions)), machine.lanes())  # shorter registers are faster
-    return machine_code(operation, 1 if one_by_one else machine.lanes(), tangent_lanes)
+    tangent_lanes = min(2 ** math.ceil(math.log2(directions)), processor.lanes())  # shorter registers are faster
+    return machine_code(operation, 1 if one_by_one else processor.lanes(), tangent_lanes)
 
 
 def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:

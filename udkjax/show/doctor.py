@@ -16,7 +16,7 @@ from udkjax.folders import is_writable
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
 from udkjax.native.base.code_cache import cache_folder, cached_files
-from udkjax.native.base.machine import lanes
+from udkjax.native.base.processor import lanes
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import processor
 from udkjax.threads import cores, thread_count
@@ -76,7 +76,7 @@ def summary(facts_by_name: dict[str, Any]) -> str:
         "devices": ", ".join(facts_by_name["devices"]),
         "precision": facts_by_name["precision"],
         "engine": f"{facts_by_name['engine']}: {facts_by_name['engine_reason']}",
-        "machine code": f"{facts_by_name['lanes']} lanes; cached: {cached}",
+        "machine code": f"{facts_by_name['lanes']} lanes (UDKJAX_LANES sets 1, 2, 4 or 8); cached: {cached}",
         "environment": ", ".join(f"{key}={value}" for key, value in facts_by_name["environment"].items()) or "-",
     }
     width = max(map(len, lines))

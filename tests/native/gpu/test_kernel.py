@@ -18,7 +18,7 @@ import udkjax as udk
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import primitive, records
-from udkjax.native.base import ffi, machine
+from udkjax.native.base import ffi, machine, processor
 from udkjax.native.gpu import launch, launch_handler, target
 from udkjax.native.gpu.driver import CudaError
 from udkjax.native.gpu.kernel import VECTOR
@@ -203,13 +203,13 @@ NUMBERS = itertools.count()
 
 def both(request, function, *given):
     """Results of a compiled function with the CPU's code and with kernels; and the card."""
-    machine_lanes = machine.lanes
-    machine.lanes = lambda: VECTOR
+    machine_lanes = processor.lanes
+    processor.lanes = lambda: VECTOR
     try:
         _forget()
         known = jax.tree.map(np.asarray, jax.jit(function)(*given))
     finally:
-        machine.lanes = machine_lanes
+        processor.lanes = machine_lanes
     card = request.getfixturevalue("card")
     return known, jax.tree.map(np.asarray, jax.jit(function)(*given)), card
 

@@ -15,6 +15,7 @@ from functools import cache
 from typing import Any
 
 from udkjax.native.base import code_cache
+from udkjax.native.base.processor import llvm, target
 from udkjax.native.base.text import named_apart
 from udkjax.threads import thread_count
 
@@ -30,35 +31,11 @@ GROUP_LINES = 2_000  # maximum lines of a group of smaller functions, compiled i
 STACK_PROBE = "__chkstk"  # its name on Windows; a C compiler would link it
 
 
-@cache
-def _llvm() -> Any:
-    import llvmlite.binding as llvm
-
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm
-
-
 def _target_machine(level: int) -> Any:
-    """Return a compiler for this processor."""
-    llvm = _llvm()
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=_features(), opt=level, reloc="pic", codemodel="small", jit=True
-    )
-
-
-@cache
-def _features() -> str:
-    return _llvm().get_host_cpu_features().flatten()
-
-
-@cache
-def lanes() -> int:
-    """Return the number of float64 numbers in a vector register."""
-    features = _llvm().get_host_cpu_features()
-    if features.get("avx512f") and features.get("avx512dq") and features.get("avx512vl"):
-        return 8
-    return 4 if features.get("avx2") and features.get("fma") else 2
+    """Return a compiler for the processor that `processor.target` names."""
+    cpu, features = target()
+    machine = llvm().Target.from_default_triple()
+    return machine.create_target_machine(cpu=cpu, features=features, opt=level, reloc="pic", codemodel="small", jit=True)
 
 
 def digest(text: str, level: int = LEVEL) -> str:
@@ -71,16 +48,14 @@ def _compiler() -> str:
     """Return a description of the processor and the compiler."""
     import llvmlite
 
-    llvm = _llvm()
-    return "\0".join((llvm.get_host_cpu_name(), _features(), llvm.get_default_triple(), llvmlite.__version__))
+    return "\0".join((*target(), llvm().get_default_triple(), llvmlite.__version__))
 
 
 @cache
 def _linker() -> Any:
     """Return the loader of object code; JITLink places code and constants within reach of relative addresses."""
-    llvm = _llvm()
-    machine = llvm.Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
-    return llvm.create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
+    machine = llvm().Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
+    return llvm().create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
 
 
 def _address_of_stack_probe() -> int:
@@ -98,7 +73,7 @@ class Library:
 
     def __init__(self, parts: Sequence[bytes], names: Sequence[str], is_optimized: bool = True):
         self.is_optimized = is_optimized
-        builder = _llvm().JITLibraryBuilder().add_current_process()
+        builder = llvm().JITLibraryBuilder().add_current_process()
         if sys.platform == "win32":
             builder.import_symbol(STACK_PROBE, _address_of_stack_probe())
         for code in parts:
@@ -161,16 +136,16 @@ def split_module(text: str) -> list[str]:
 
 def compile_module(text: str, level: int = LEVEL) -> bytes:
     """Compile a module to object code for this processor."""
-    return object_code(text, _target_machine(level), _llvm().get_default_triple(), () if level == QUICK else PASSES)
+    return object_code(text, _target_machine(level), llvm().get_default_triple(), () if level == QUICK else PASSES)
 
 
 @cache
 def llvm_for_all_targets() -> Any:
     """Return LLVM with the compilers of all its targets, not only of this processor."""
-    llvm = _llvm()
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    return llvm
+    binding = llvm()
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    return binding
 
 
 def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[str] = PASSES) -> bytes:
@@ -182,14 +157,14 @@ def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[st
 @contextmanager
 def optimized(text: str, machine: Any, triple: str, optimizations: Sequence[str]) -> Iterator[Any]:
     """Parse a module for a target, and run passes of optimization on it."""
-    llvm = _llvm()
-    with llvm.create_context() as context, llvm.parse_assembly(text, context) as module:
+    binding = llvm()
+    with binding.create_context() as context, binding.parse_assembly(text, context) as module:
         module.triple = triple
         module.data_layout = str(machine.target_data)
-        passes = llvm.create_new_module_pass_manager()
+        passes = binding.create_new_module_pass_manager()
         for name in optimizations:
             getattr(passes, f"add_{name}_pass")()
-        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
+        passes.run(module, binding.create_pass_builder(machine, binding.create_pipeline_tuning_options()))
         yield module
 
 

@@ -5,7 +5,7 @@ import ctypes
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.base import machine
+from udkjax.native.base import machine, processor
 from udkjax.native.base.ir import INT, POINTER, Function
 from udkjax.native.base.program import Writer, from_memory
 from udkjax.native.base.text import text_of_module
@@ -20,7 +20,7 @@ class BatchProgram:
     """
 
     def __init__(self, program: ScalarProgram, shared: int = 0):
-        self.program, self.width = program, machine.lanes()
+        self.program, self.width = program, processor.lanes()
         self._input_count = len(program.inputs) - shared
         f = self._write()
         self._library = machine.library(text_of_module([f]), (f.name,))

@@ -14,7 +14,7 @@ import numpy as np
 
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_programs import PositionPrograms
-from udkjax.native.base import machine
+from udkjax.native.base import machine, processor
 from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value, Variable
 from udkjax.native.base.program import consecutive, write
 from udkjax.native.base.text import ALLOCATION, text_of_module
@@ -50,7 +50,7 @@ class PositionCode:
     """The machine code of position programs."""
 
     def __init__(self, programs: PositionPrograms):
-        self.programs, self.width = programs, machine.lanes()
+        self.programs, self.width = programs, processor.lanes()
         self._library = machine.library(_Text(programs, self.width).text(), ("run",))
         self._run = machine.function(self._library["run"], ctypes.c_void_p)
 
