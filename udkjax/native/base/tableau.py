@@ -1,5 +1,6 @@
 """Tableaus of Runge-Kutta methods for q'' = a(t, q, v), explicit or singly diagonally implicit, including the default method."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -51,7 +52,7 @@ class Method:
             for i, coefficients in enumerate(given):
                 rows[i + 1, : i + 1] = coefficients
         A += np.diag(np.append(0.0, np.full(len(c) - 1, diagonal)))
-        numbers = np.append(c, 1.0), np.vstack([A, b]), np.vstack([A @ A, b @ A]), error, error @ A
+        numbers = np.append(c, 1.0), np.vstack([A, b]), _product(np.vstack([A, b]), A), error, _product([error], A)[0]
         numbers = *numbers, float(order), ends, float(diagonal), P
         return cls._methods.setdefault(tuple(np.asarray(x).tobytes() for x in numbers), cls(*numbers))
 
@@ -71,6 +72,11 @@ class Method:
         middles, gaps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
         widest = np.argmax(gaps)
         return middles[np.argmax(gaps[: max(widest, 1)])], middles[widest]
+
+
+def _product(a: Any, b: np.ndarray) -> np.ndarray:
+    """Return a @ b with the same bits on all machines: the order of NumPy's sums depends on the processor."""
+    return np.array([[math.fsum(x * y for x, y in zip(row, column, strict=True)) for column in b.T.tolist()] for row in a])
 
 
 def row(text: str) -> np.ndarray:
