@@ -23,6 +23,10 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
             if not (isinstance(value, ModuleType) and value.__name__ == homes.get(name)):
                 super().__setattr__(name, value)
 
+        def __reduce__(self) -> tuple[Callable[[str], ModuleType], tuple[str]]:
+            # Pickled by name: cloudpickle would store the module by its contents, as it does with any class but `ModuleType`.
+            return import_module, (package,)
+
     def find(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")

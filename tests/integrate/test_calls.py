@@ -65,6 +65,46 @@ def test_few_functions_stand_between_a_call_and_machine_code(monkeypatch):
     assert len({file for file, _ in seen}) <= 12
 
 
+DRAWN, DRIVEN = udk.library.four_bar(), udk.library.slider_crank()
+WITH_MOTOR = udk.Mechanism(DRAWN.bodies, DRAWN.joints, forces={"motor": udk.Torque(["ground", "crank"], 1.0)})
+
+# The calls of Python of a repeated call with concrete numbers, a few more than at the last count: a microsecond for three.
+MOST_CALLS: dict[str, tuple[int, Callable[[Any, Any], object]]] = {
+    "simulate": (95, lambda state, run: udk.simulate(DRAWN, TS, state)),
+    "step": (52, lambda state, run: udk.step(DRAWN, state, None, 1e-3)),
+    "step with an input": (51, lambda state, run: udk.step(WITH_MOTOR, state, {"force.motor.value": 1.0}, 1e-3)),
+    "step of another drawing": (54, lambda state, run: udk.step(DRAWN, state, {"link.crank.width": 0.02}, 1e-3)),
+    "assemble": (23, lambda state, run: udk.assemble(DRAWN)),
+    "accelerations": (126, lambda state, run: udk.accelerations(DRAWN, 0.0, state.q, state.v)),
+    "energy": (68, lambda state, run: udk.energy(DRAWN, run)),
+    "violation": (69, lambda state, run: udk.violation(DRAWN, run)),
+    "reactions": (290, lambda state, run: udk.reactions(DRAWN, run)),
+    "kinematics": (180, lambda state, run: udk.kinematics(DRAWN, "body.crank.angle", [1.0, 1.01, 1.02])),
+    "inverse dynamics": (206, lambda state, run: udk.inverse_dynamics(DRIVEN, TS)),
+    "another number": (131, lambda state, run: WITH_MOTOR.with_parameters({"force.motor.value": 1.0})),
+    "another drawing": (1850, lambda state, run: DRAWN.with_parameters({"link.crank.width": 0.02})),
+}
+
+
+@pytest.mark.skipif(deferred_p is None, reason="this JAX evaluates a program in other calls")
+def test_a_repeated_call_of_a_public_function_makes_few_calls():
+    state = udk.assemble(DRAWN)
+    run, counts = udk.simulate(DRAWN, TS, state), {}
+    for name, (_, function) in MOST_CALLS.items():
+        for _ in range(3):
+            function(state, run)
+        made = Counter()
+
+        def listen(frame, event, _, made=made):
+            code = frame.f_code
+            if event == "call" and Path(code.co_filename).is_relative_to(ROOT) and not code.co_name.startswith("<"):
+                made[code.co_qualname] += 1
+
+        listened(lambda function=function: function(state, run), listen)
+        counts[name] = made.total()
+    assert {name: n for name, n in counts.items() if n > MOST_CALLS[name][0]} == {}
+
+
 def test_what_is_decided_of_a_mechanism_is_decided_once():
     mechanism = udk.library.parallelogram()
     udk.simulate(mechanism, TS)
@@ -157,6 +197,15 @@ def test_the_trace_of_a_condition_has_its_own_operations_and_those_of_frames(mon
     monkeypatch.setattr(condition_program, "read_jaxpr", read)
     assert operations(1) <= 5
     assert operations(4) == operations(1) + 3 * 2
+
+
+def test_a_repeated_step_visits_no_number_of_the_scene():
+    """Nor does it put arrays on a device: the numbers of the mechanism are one array, those of the call another."""
+    mechanism = pendulums(2)
+    state = udk.assemble(mechanism)
+    step = lambda: udk.step(mechanism, state, {"body.b0.mass": 1.5}, 1e-3)  # noqa: E731
+    assert visited(step)["Body"]
+    assert visited(step) == {}
 
 
 LEVEL = [0.0]

@@ -222,3 +222,71 @@ def test_a_step_that_fails_says_why_or_is_not_a_number():
             udk.step(mechanism, state, inputs, 0.1)
     with pytest.raises(ValueError, match="dt must be positive"):
         udk.step(mechanism, state, None, 0.0)
+
+
+def drawn_scene() -> udk.Mechanism:
+    """A four-bar with everything that a drawing has numbers of: lengths, a motor, a spring, a damper, a load and friction."""
+    return udk.Drawing(
+        pins={"O": (0, 0), "C": (100, 0), "A": udk.polar("O", 40, 60), "B": udk.circles(("A", "C"), (120, 80), "left")},
+        links={
+            "crank": {"pins": ["O", "A"], "density": 7850, "width": 15, "thickness": 5},
+            "coupler": {"pins": ["A", "B"], "mass": "0.2 kg", "inertia": "0.001 kg m2"},
+            "rocker": {"pins": ["C", "B"], "density": 7850, "width": 15, "thickness": 5},
+        },
+        ground=["O", "C"],
+        motors={"motor": {"pin": "O", "speed": "60 rpm"}},
+        springs=[{"between": ["O", "B"], "stiffness": "1 N/mm", "length": 60}],
+        dampers=[{"between": ["C", "A"], "damping": "1 N s/m"}],
+        loads=[{"pin": "B", "force": ["0 N", "-5 N"]}],
+        friction=[{"pin": "B", "coefficient": 0.1, "radius": 5}],
+        units={"length": "mm", "angle": "deg"},
+    ).mechanism()
+
+
+def geared() -> udk.Mechanism:
+    """Two wheels, the constant of whose gear follows from their angles."""
+    bodies = {name: udk.Body(1.0, 0.1, [x, 0.0], 0.3 * x, angular_velocity=w) for name, x, w in (("a", 0, 1.0), ("b", 1.0, -2.0))}
+    joints: dict[str, Any] = {
+        f"pin {n}": udk.Revolute(["ground", n], [[x, 0.0], [0.0, 0.0]]) for n, x in (("a", 0.0), ("b", 1.0))
+    }
+    joints["gear"] = udk.Gear(["a", "b"], [0.5, 0.25])
+    return udk.Mechanism(bodies, joints, forces={"motor": udk.Torque(["ground", "a"], 1.0)})
+
+
+@pytest.mark.parametrize("scene", [drawn_scene, geared, udk.library.planetary_gear], ids=["drawing", "gears", "library"])
+def test_every_number_of_a_scene_can_be_an_input(scene):
+    """Those of a drawing, which change everything that follows from them, and those that follow, given directly; traced, too."""
+    mechanism, dt = scene(), 0.01
+    for numbers, traced in ((mechanism.independent_parameters(), True), (mechanism.parameters(), False)):
+        factors = 1 + 1e-3 * np.sin(np.arange(len(numbers)))
+        inputs = {name: factor * np.asarray(x) for factor, (name, x) in zip(factors, numbers.items(), strict=True)}
+        changed = mechanism.with_parameters(inputs)
+        state = udk.assemble(changed)
+        expected = udk.simulate(changed, [0.0, dt], state, **EXACT)
+        step = lambda inputs, state=state: udk.step(mechanism, state, inputs, dt, **EXACT)  # noqa: E731
+        for found in (step(inputs), jax.jit(step)(inputs)) if traced else (step(inputs),):
+            assert_allclose(found.q, expected.q[-1], rtol=0, atol=1e-12)
+            assert_allclose(found.v, expected.v[-1], rtol=0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_step_by_numbers_of_a_drawing():
+    mechanism = drawn_scene()
+    state, names = udk.assemble(mechanism), ("link.coupler.mass", "motor.motor.speed", "spring.spring1.stiffness")
+    names = [name for name in names if name in mechanism.parameters()]
+    x0 = np.array([float(mechanism.parameters()[name]) for name in names])
+
+    def torque_of(x):
+        after = udk.step(mechanism, state, dict(zip(names, x, strict=True)), 0.02, **EXACT)
+        return jnp.sum(after.q**2) + jnp.sum(after.v)
+
+    steps = 1e-5 * np.diag(x0)
+    wanted = [(torque_of(x0 + h) - torque_of(x0 - h)) / (2 * h.max()) for h in steps]
+    assert_allclose(jax.grad(torque_of)(jnp.asarray(x0)), wanted, rtol=1e-6, atol=1e-8)
+    assert_allclose(jax.jit(jax.jacfwd(torque_of))(jnp.asarray(x0)), wanted, rtol=1e-6, atol=1e-8)
+
+
+def test_an_input_that_is_no_constant_is_refused():
+    mechanism = geared()
+    with pytest.raises(TypeError, match=r"inputs\['force.motor.value'\] is a Held"):
+        udk.step(mechanism, udk.assemble(mechanism), {"force.motor.value": udk.Held([1.0, 2.0], 0.1)}, 0.1)

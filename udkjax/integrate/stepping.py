@@ -1,9 +1,10 @@
 """One control interval with held inputs, from one state to the next, for control loops."""
 
-from collections.abc import Callable, Hashable, Mapping
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import is_traced, is_within_jit, make_module, number
+from udkjax.arrays import float_type, is_traced, is_within_jit, make_module, number, stored
 from udkjax.devices import on_host
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.general import ConstrainedSystem
@@ -23,8 +24,10 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembly import State
 from udkjax.programs.deferred import deferred
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
+from udkjax.requirements import ArgumentError, ArgumentTypeError, describe
 from udkjax.scene.arguments import checked
+from udkjax.scene.held import Held
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
@@ -70,21 +73,19 @@ def step(
         SimulationError: all numbers are concrete, and the end was not reached.
         SceneError: a name in `inputs` is not a parameter, or a value has another shape.
         ValueError: there are inputs for a `ConstrainedSystem`.
+        TypeError: an input is a `Held`.
     """
-    if inputs and isinstance(mechanism, ConstrainedSystem):
-        raise ValueError("inputs are for mechanisms: make a ConstrainedSystem of functions that hold the inputs of the interval")
+    values, others = _checked_inputs(mechanism, inputs), {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     moved: Any = mechanism.traced(np.size(state.q)) if isinstance(mechanism, ConstrainedSystem) else mechanism
-    values, has_fixed_times = dict(inputs or {}), not (isinstance(t, Tracer) or isinstance(dt, Tracer))
-    numbers = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves((moved, state, values, numbers, analysis))):
-        analysis = analysis or _analysis_of(moved)
+    if not is_concrete(moved, analysis) or is_traced((state.q, state.v, values, others)):
+        analysis, has_fixed_times = analysis or _analysis_of(moved), not is_traced((t, dt))
         if is_within_jit():
-            return _advance(moved, analysis, state, values, numbers, max_steps, engine, has_fixed_times)
-        values, numbers = ({name: number(x) for name, x in given.items()} for given in (values, numbers))
-        return _advance_at_once(moved.without_origin, analysis, state, values, numbers, max_steps, engine, has_fixed_times)
-    split = _parts(moved, analysis)
-    run = _program(split.form, max_steps, engine)
-    q, v = run(split.leaves, state.q, state.v, {k: np.asarray(x, float) for k, x in values.items()}, numbers)
+            return _advance(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
+        values, others = ({name: number(x) for name, x in given.items()} for given in (values, others))
+        moved = _reduced(moved, tuple(values))
+        return _advance_at_once(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
+    run = _steps_of(moved, analysis, *values).program(moved, values, np.shape(state.q), max_steps, engine)
+    q, v = run(state, values, others)
     if not np.isfinite(np.asarray(q)).all():
         ts = np.asarray(t, float) + np.array([0.0, 1.0]) * np.asarray(dt, float)
         tolerances: Any = {"rtol": rtol, "atol": atol, "dt0": dt, "max_steps": max_steps}
@@ -92,6 +93,22 @@ def step(
         run = simulate(given, ts, state, **tolerances, engine=engine)  # raises, with the cause
         return State(run.q[-1], run.v[-1])
     return make_module(State, q=q, v=v)
+
+
+def _checked_inputs(mechanism: Any, inputs: Any) -> dict[str, Any]:
+    """Return the inputs of an interval; raise an error for anything that is not held constant."""
+    if not inputs:
+        return {}
+    if isinstance(mechanism, ConstrainedSystem):
+        raise ArgumentError(
+            "inputs are for mechanisms: make a ConstrainedSystem of functions that hold the inputs of the interval"
+        )
+    if not isinstance(inputs, Mapping):
+        raise ArgumentTypeError(f"inputs must map names of parameters to numbers, {describe(inputs)}")
+    for name, value in inputs.items():
+        if isinstance(value, Held):
+            raise ArgumentTypeError(f"inputs[{name!r}] is a Held, and an input is constant: give its value, or use udk.simulate")
+    return dict(inputs)
 
 
 def _advance(
@@ -125,27 +142,74 @@ def _analysis_of(mechanism: Any) -> Analysis | None:
     return analyse(mechanism) if isinstance(mechanism, Mechanism) else None
 
 
-class MechanismParts(NamedTuple):
-    """A mechanism and its analysis, split into structure and numbers."""
+class _Steps:
+    """The intervals of a concrete mechanism: its numbers as one array, and its programs for the forms of inputs met so far.
 
-    form: Hashable  # the tree structure
-    leaves: list[Any]  # arrays
+    A program takes two arrays, since each costs microseconds in a call.
+    """
+
+    def __init__(self, mechanism: Any, analysis: Analysis | None):
+        leaves, self._form = jax.tree.flatten((mechanism, analysis))
+        leaves = [np.asarray(x) for x in leaves]
+        self._kinds = tuple((x.shape, x.dtype) for x in leaves)
+        self._numbers = stored(np.concatenate([x.ravel().astype(float_type()) for x in leaves]))
+        self._programs: dict[Hashable, Callable[..., tuple[Array, Array]]] = {}
+
+    def program(
+        self, mechanism: Any, values: Mapping[str, Any], shape: tuple[int, ...], max_steps: int, engine: str
+    ) -> Callable[..., tuple[Array, Array]]:
+        """Return the program of an interval for states and inputs of these shapes; inputs that do not fit raise an error."""
+        shapes = tuple((name, np.shape(x)) for name, x in values.items())
+        key = shapes, shape, max_steps, engine
+        if key not in self._programs:
+            if values:
+                mechanism.with_parameters(values)  # raises the error here, and not while JAX traces
+            program, numbers = _program(self._form, self._kinds, *key), self._numbers
+
+            def run(state: State, values: Mapping[str, Any], others: Mapping[str, Any]) -> tuple[Array, Array]:
+                given = (state.q, state.v, *others.values(), *values.values())
+                return program(numbers, np.concatenate([np.asarray(x, float).ravel() for x in given]))
+
+            self._programs[key] = run
+        return self._programs[key]
 
 
 @cached_by_identity
-def _parts(mechanism: Any, analysis: Analysis | None) -> MechanismParts:
-    """Return the parts of a mechanism, cached for all of its steps."""
-    leaves, form = jax.tree.flatten((mechanism.without_origin, analysis or _analysis_of(mechanism)))
-    return MechanismParts(form, leaves if is_traced(leaves) else [np.asarray(x) for x in leaves])
+def _steps_of(mechanism: Any, analysis: Analysis | None, *names: str) -> _Steps:
+    """Return the intervals of a mechanism with inputs of these names, cached for all of its steps."""
+    return _Steps(_reduced(mechanism, names), analysis or _analysis_of(mechanism))
+
+
+def _reduced(mechanism: Any, names: Sequence[str]) -> Any:
+    """Return a model without numbers that are not needed, also if those of these names change."""
+    return mechanism.without_origin_beside(names) if isinstance(mechanism, Mechanism) else mechanism.without_origin
 
 
 @lru_cache(maxsize=64)
-def _program(form: Any, max_steps: int, engine: str) -> Callable[..., tuple[Array, Array]]:
-    """Return the step as a program for all mechanisms with one structure."""
+def _program(
+    form: Any,
+    kinds: tuple[tuple[tuple[int, ...], np.dtype], ...],
+    inputs: tuple[tuple[str, tuple[int, ...]], ...],
+    shape: tuple[int, ...],
+    max_steps: int,
+    engine: str,
+) -> Callable[..., tuple[Array, Array]]:
+    """Return the interval as a program for all mechanisms with one structure."""
 
-    def run(leaves: list[Array], q: Array, v: Array, values: dict[str, Array], numbers: dict[str, Array]) -> tuple[Array, Array]:
+    def run(numbers: Array, given: Array) -> tuple[Array, Array]:
+        shapes = [shape, shape, *4 * [()], *(x for _, x in inputs)]
+        q, v, dt, t, rtol, atol, *values = split_array(given, shapes)
+        leaves = [x.astype(kind) for x, (_, kind) in zip(split_array(numbers, [x for x, _ in kinds]), kinds, strict=True)]
         mechanism, analysis = jax.tree.unflatten(form, leaves)
-        end = _advance(mechanism, analysis, State(q, v), values, numbers, max_steps, engine, has_fixed_times=False)
+        others = {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
+        named = {name: value for (name, _), value in zip(inputs, values, strict=True)}
+        end = _advance(mechanism, analysis, State(q, v), named, others, max_steps, engine, has_fixed_times=False)
         return end.q, end.v  # pyright: ignore[reportReturnType]
 
     return on_host(jax.jit(run))
+
+
+def split_array(array: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """Return parts of a vector, one after another, in these shapes."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    return [x.reshape(shape) for x, shape in zip(jnp.split(array, ends[:-1]), shapes, strict=True)]

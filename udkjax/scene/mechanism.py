@@ -259,6 +259,14 @@ class Mechanism(PrintsTable, ConvertsItself):
         """
         return self if type(self._source) is Elements and self.origin is None else _without_origin(self)
 
+    def without_origin_beside(self, names: Sequence[str]) -> "Mechanism":
+        """Return `without_origin`, or, where numbers of these names determine others, the mechanism with its drawing or guess."""
+        if all(name.startswith("force.") for name in names):  # loads determine nothing else
+            drawn = () if self.drawing is None else parameters_of_drawing(self.drawing)
+            if not any(split_index(name, parameters_of(self))[0] in drawn for name in names):
+                return self.without_origin
+        return self if self.origin is None else _copy(self, {"origin": None})
+
     def know_elements(self, known: "Mechanism") -> None:
         """Take for `without_origin` what it returned for the same numbers, so that a program does not compute it again."""
         elements_of.know(self._source, known._source.elements)

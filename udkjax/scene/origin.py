@@ -12,7 +12,7 @@ class Origin:
     def __init__(self, mechanism: Any):
         self.mechanism = mechanism
         leaves, structure = jax.tree.flatten(mechanism)
-        self._key = structure, tuple(np.asarray(leaf).tobytes() for leaf in leaves)
+        self._key = structure, tuple((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
         self._hash = hash(self._key)
 
     def __hash__(self) -> int:

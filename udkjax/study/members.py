@@ -15,6 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +35,13 @@ class MemberFunction(Protocol):
     """A function of a member: arrays by name, from shared inputs, the member's inputs, and a shift (K,) of varied numbers."""
 
     def __call__(self, shared: Any, own: Any, shift: Array, /) -> Outputs: ...
+
+
+def structure_of(tree: PyTree) -> Hashable:
+    """Return a tree without the values of its arrays; trees with the same structure share a program."""
+    arrays, static = eqx.partition(tree, eqx.is_array)
+    leaves, form = jax.tree.flatten(static)
+    return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), form, tuple(leaves)
 
 
 class Program:

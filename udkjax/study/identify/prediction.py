@@ -24,7 +24,7 @@ from udkjax.positions.channels import Channel, Quantity
 from udkjax.scene.held import Held
 from udkjax.study.channel_values import measure
 from udkjax.study.identify.unknowns import Target, apply_values
-from udkjax.study.members import MOST_PROGRAMS, PIECE_MEMBERS, Program
+from udkjax.study.members import MOST_PROGRAMS, PIECE_MEMBERS, Program, structure_of
 from udkjax.study.quantities import StudyModel, with_guess
 
 # Relative and absolute tolerances of the integration: for final estimates (the accuracy of parameters without noise); for
@@ -89,8 +89,8 @@ class Predictor:
             return self._cache[key]
         self.evaluations += size
         piece = PIECE_MEMBERS if size >= FEWEST_IN_LANES else 1
-        shapes = tuple((x.shape[1:], str(x.dtype)) for x in jax.tree.leaves(members))
-        program = _program(self._run, members.x.shape[1] + members.shift.shape[1], piece, shapes)
+        member = jax.tree.map(lambda x: x[0], members)
+        program = _program(self._run, members.x.shape[1] + members.shift.shape[1], piece, structure_of((self._arrays, member)))
         with computing_on_host():
             values, slopes = program((self._arrays, np.array(tol)), members, on_threads=True)
         predicted = Prediction(values["y"], slopes["y"], values["code"], values.get("ends"), slopes.get("ends"))
@@ -157,8 +157,8 @@ class _MemberRun:
 
 
 @lru_cache(maxsize=MOST_PROGRAMS)
-def _program(run: _MemberRun, slopes: int, piece: int, shapes: Hashable) -> Program:
-    del shapes
+def _program(run: _MemberRun, slopes: int, piece: int, inputs: Hashable) -> Program:
+    del inputs  # the static part alone does not tell an array from an absent number
     return Program(run, slopes, piece)
 
 

@@ -8,15 +8,14 @@ dense pseudoinverses, among which machine code selects by number.
 
 import abc
 import warnings
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, Protocol, TypeAlias, cast
 
 import equinox as eqx
-import jax
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import Float
 
 from udkjax.annotations import Numbers
 from udkjax.equations.general import ConstrainedSystem
@@ -26,6 +25,7 @@ from udkjax.positions.assembly import State
 from udkjax.requirements import ArgumentTypeError, describe, require_count
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.choices import Choice
+from udkjax.study.members import structure_of
 from udkjax.study.quantities import Setter, StudyModel
 
 # Settings of a run that are choices, with the label of None for each.
@@ -182,13 +182,6 @@ def _label_with_numbers(name: str, choice: AxisChoice, alike: Sequence[AxisChoic
     fields = {key: value for key, value in getattr(choice, "__dict__", {}).items() if key not in replaced}
     numbers = {key: value for key, value in fields.items() if is_shown(key, value)}
     return f"{name}({', '.join(f'{key}={float(value):g}' for key, value in numbers.items())})" if numbers else name
-
-
-def structure_of(choice: PyTree) -> Hashable:
-    """Return the structure of a choice without the values of its numbers; choices with the same structure share a program."""
-    arrays, static = eqx.partition(choice, eqx.is_array)
-    leaves, tree = jax.tree.flatten(static)
-    return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), tree, tuple(leaves)
 
 
 def one_of_several(methods: Sequence[AxisChoice]) -> tuple[AxisChoice, ...]:

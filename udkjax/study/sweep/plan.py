@@ -20,8 +20,9 @@ from udkjax.integrate.simulate import simulate
 from udkjax.requirements import require_output_times
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.members import structure_of
 from udkjax.study.quantities import StudyModel, body_names, state_shape
-from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign, structure_of
+from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign
 from udkjax.study.sweep.dimensions import TOGETHER, Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
