@@ -289,4 +289,5 @@ def test_derivatives_of_a_step_by_numbers_of_a_drawing():
 def test_an_input_that_is_no_constant_is_refused():
     mechanism = geared()
     with pytest.raises(TypeError, match=r"inputs\['force.motor.value'\] is a Held"):
-        udk.step(mechanism, udk.assemble(mechanism), {"force.motor.value": udk.Held([1.0, 2.0], 0.1)}, 0.1)
+        held: Any = udk.Held([1.0, 2.0], 0.1)
+        udk.step(mechanism, udk.assemble(mechanism), {"force.motor.value": held}, 0.1)

@@ -26,7 +26,7 @@ RAIL = ["ground", "block"], [[0.0, 1.0], [0.1, 0.0]]
 def scene(*forces: udk.ForceElement, joints: Any = None, drivers: Any = None) -> udk.Mechanism:
     """A rod on a pin, and a block on a rail."""
     bodies = {
-        "rod": udk.Body(1.0, 1 / 12, [0.5, 0.0], angular_velocity=1.0),
+        "rod": udk.Body(1.0, 1 / 12, [0.5, 0.0], 0.0, [0.0, 0.5], 1.0),
         "block": udk.Body(2.0, 0.1, [0.3, 1.0], velocity=[0.5, 0.0]),
     }
     joints = {"pin": udk.Revolute(*PIN), "rail": udk.Prismatic(*RAIL, axis=0.0)} | (joints or {})
@@ -157,7 +157,7 @@ def test_scenes_that_differ_in_absent_numbers_are_told_apart(name):
             assert_allclose(*a, rtol=0, atol=1e-9)
 
 
-LAWS = [{"torque": 0.3, "velocity": 0.1}, {"coefficient": 0.3, "radius": 0.1}]
+LAWS: list[dict[str, Any]] = [{"torque": 0.3, "velocity": 0.1}, {"coefficient": 0.3, "radius": 0.1}]
 RUBS = [scene(udk.Friction("pin", **law)) for law in LAWS]
 
 
