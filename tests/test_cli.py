@@ -275,7 +275,7 @@ def test_what_json_cannot_hold_is_written_as_what_it_can():
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
-        (MissingExtraError("optax is not installed: pip install '.[identify]'"), 2, "pip install '.[identify]'"),
+        (MissingExtraError("optax is not installed: pip install 'udkjax[identify]'"), 2, "pip install 'udkjax[identify]'"),
         (KeyboardInterrupt(), 130, "udkjax: stopped"),
         (BrokenPipeError(), 1, ""),
         (PermissionError(13, "Permission denied", "/elsewhere/x"), 1, "Permission denied: '/elsewhere/x'"),

@@ -185,7 +185,7 @@ print(missing)
 def test_the_core_needs_no_extra_and_a_missing_one_is_named():
     shown = python(CORE, UDKJAX_CACHE=os.environ["UDKJAX_CACHE"])
     cures = [
-        f"{package} is not installed: pip install '.[{extra}]' in the folder of udkjax"
+        f"{package} is not installed: pip install 'udkjax[{extra}]'"
         for package, extra in (("xarray", "io"), ("PIL", "plot"), ("matplotlib", "plot"))
     ]
     assert shown == str([*cures, 2])

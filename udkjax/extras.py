@@ -1,5 +1,6 @@
 """Optional packages, and how to install missing ones."""
 
+from collections.abc import Sequence
 from importlib.util import find_spec
 from types import TracebackType
 
@@ -22,6 +23,20 @@ EXTRAS = {
     "uvicorn": "studio",
     "xarray": "io",
 }
+# Extras that others bring along.
+BRINGS = {
+    "identify": ("io",),
+    "cli": ("io", "plot", "identify"),
+    "dask": ("io",),
+    "notebook": ("io", "plot"),
+    "video": ("plot",),
+    "dxf": ("plot",),
+    "studio": ("cli", "io", "plot", "identify"),
+}
+# The packages that write a pose or a film, by the suffix of its file.
+WRITERS = {".png": ("PIL",), ".gif": ("PIL",), ".mp4": ("PIL", "imageio_ffmpeg"), ".dxf": ("ezdxf",)}
+NETCDF = "xarray", "h5netcdf"  # the packages that read and write runs
+STUDIO = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
 
 
 class MissingExtraError(ModuleNotFoundError):
@@ -38,20 +53,23 @@ class OptionalImport:
         return None
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if isinstance(error, ModuleNotFoundError) and not isinstance(error, MissingExtraError) and cure(error):
-            raise MissingExtraError(cure(error), name=error.name, path=error.path) from None
+        if isinstance(error, ModuleNotFoundError) and not isinstance(error, MissingExtraError):
+            missing = (error.name or "").partition(".")[0]
+            if missing in EXTRAS:
+                raise MissingExtraError(cure([missing]), name=error.name, path=error.path) from None
 
 
 def require(*packages: str) -> None:
-    """Raise `MissingExtraError` if one of these packages is missing, before work that needs them begins."""
-    for package in packages:
-        if find_spec(package) is None:
-            raise MissingExtraError(cure(ModuleNotFoundError(name=package)), name=package)
+    """Raise `MissingExtraError` if some of these packages are missing, before work that needs them begins."""
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
+        raise MissingExtraError(cure(missing), name=missing[0])
 
 
-def cure(error: ModuleNotFoundError) -> str:
-    """Return the command that installs a missing package; an empty string if no extra contains it."""
-    missing = (error.name or "").partition(".")[0]
-    if missing not in EXTRAS:
-        return ""
-    return f"{missing} is not installed: pip install '.[{EXTRAS[missing]}]' in the folder of udkjax"
+def cure(missing: Sequence[str]) -> str:
+    """Return the command that installs missing packages, by as few extras as bring them all."""
+    extras = {EXTRAS[package] for package in missing}
+    brought = {other for extra in extras for other in BRINGS.get(extra, ())}
+    names = ",".join(sorted(extras - brought))
+    packages = " and ".join(filter(None, [", ".join(missing[:-1]), missing[-1]]))
+    return f"{packages} {'is' if len(missing) == 1 else 'are'} not installed: pip install 'udkjax[{names}]'"

@@ -10,6 +10,7 @@ from importlib import import_module
 from importlib.metadata import version
 
 from udkjax.cli.exits import exit_codes
+from udkjax.extras import STUDIO, require
 
 COMMANDS = (
     "report",
@@ -39,11 +40,13 @@ PROGRAM_CACHE_BYTES = 200_000_000  # limit of stored JAX programs; the least rec
 def main(arguments: list[str] | None = None) -> None:
     """Run a command, and exit with a code of `udkjax.cli.exits`."""
     gc.set_threshold(GARBAGE_EVERY)
-    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+    words = sys.argv[1:] if arguments is None else arguments
+    if words == ["--version"]:
         print(f"udkjax {version('udkjax')}")
         return
     store_compiled_programs()
     with exit_codes():
+        require("tyro", *(STUDIO if words[:1] == ["studio"] else ()))
         from udkjax.cli.common import parse_and_run
 
         commands = {name: getattr(import_module(f"udkjax.cli.{name}"), name) for name in COMMANDS}

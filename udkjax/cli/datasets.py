@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from udkjax.cli.common import load, refuse
+from udkjax.extras import NETCDF, OptionalImport, require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +36,7 @@ def load_to_write(scene: Path, out: Path | None, plot: Path | None = None) -> tu
     """Return a scene and its text; exit if the output files cannot be written."""
     check_target(out)
     check_target(plot, PICTURE_SUFFIXES, "--plot")
+    require(*(NETCDF if out else ()), *(["matplotlib"] if plot else ()))
     return load(scene)
 
 
@@ -58,7 +60,6 @@ def write(
     """Write variables (dimensions, values, unit) with the scene, settings and versions to a file, unless `out` is None."""
     if out is None:
         return
-    from udkjax.extras import OptionalImport
     from udkjax.integrate.solution import versions
     from udkjax.scene.bodies import COORDINATES
 
@@ -93,8 +94,6 @@ def save(data: "xarray.Dataset", out: Path) -> None:
         with out.open("wb") as file:
             np.savez_compressed(file, attributes=np.asarray(json.dumps(data.attrs, default=str)), **arrays)
     else:
-        from udkjax.extras import OptionalImport
-
         with OptionalImport():
             import h5netcdf  # noqa: F401  # the engine
 

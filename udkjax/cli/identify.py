@@ -9,6 +9,7 @@ import tyro
 
 from udkjax.cli.common import Json, Quiet, Scene, fail, load, show
 from udkjax.cli.datasets import check_folder
+from udkjax.extras import NETCDF, require
 
 if TYPE_CHECKING:
     from udkjax import Estimate
@@ -79,6 +80,7 @@ def identify(
         json: write the results as JSON, as in estimate.json.
     """
     check_folder(out)
+    require(*NETCDF, "matplotlib")
     mech, text = load(scene)
 
     import udkjax as udk

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from udkjax.annotations import JsonObject, Numbers
 from udkjax.equations.general import ConstrainedSystem
+from udkjax.extras import WRITERS, require
 from udkjax.integrate.events.conditions import Gap
 from udkjax.integrate.events.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
@@ -97,6 +98,7 @@ class Animation:
         """
         path = Path(path)
         kind = path.suffix.lower()
+        require(*WRITERS.get(kind, ()))
         if kind == ".html":
             path.write_text(self.html(**options), encoding="utf-8")
         elif kind == ".svg":

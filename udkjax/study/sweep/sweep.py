@@ -99,7 +99,7 @@ def sweep(
         StoreError: `out` cannot be written to, or contains another sweep.
         ClusterError: there is no client, or its workers cannot compute the sweep.
     """
-    require("xarray")
+    require("xarray", *(("dask", "distributed") if engine == "dask" else ()))
     studied = {"design": design, "reference": reference, "derivatives": derivatives, "units": units}
     plan = make_plan(mechanism, axes, ts, measure, **studied, **settings)
     variables_of(plan)  # traces every program, and finds mistakes before anything is computed or stored
