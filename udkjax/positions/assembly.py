@@ -31,6 +31,7 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.scene_programs import scene_programs
 from udkjax.positions import native_closing
 from udkjax.positions.closure import close_by_jax, close_by_machine_code, from_moment
+from udkjax.positions.given_state import GivenState, GivenValues
 from udkjax.positions.open_rows import explain_open
 from udkjax.positions.system_closure import close_system
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
@@ -97,6 +98,7 @@ def assemble(
     state: State | None = None,
     throw: bool = True,
     analysis: Analysis | None = None,
+    given: GivenValues | None = None,
 ) -> State:
     """Return a state with Psi(t, q) = 0 and Psi_dot(t, q, v) = 0, near a given one.
 
@@ -110,19 +112,40 @@ def assemble(
         throw: whether a mechanism that cannot be closed raises; with False, or where numbers are traced, the best state found is
             returned instead.
         analysis: the mechanism's `Analysis`; by default computed here.
+        given: values that the state must have, by name; everything else follows from the constraints, near the state to start
+            from. Of a mechanism coordinates (`body.link1.angle`, `joint.A.angle`, in rad or m) and velocities
+            (`body.link1.omega`, `joint.A.omega`, `pin.A.vx`); of a `ConstrainedSystem` `q[0]` and `v[0]`. They may be traced.
 
     Returns:
         A `State`: q and v (bodies, 3): x, y in m and angle in rad, and their rates.
 
     Raises:
-        AssemblyError: joints stay open; it names them and carries the best state found.
+        AssemblyError: joints stay open, or given values contradict them or each other; it names them and carries the best state
+            found.
+        ArgumentError: a given name is unknown.
     """
+    if given is not None:
+        return _assemble_given(mechanism, t, state, throw, GivenState(mechanism, given))
     if isinstance(mechanism, ConstrainedSystem):
         return _assemble_system(mechanism, t, state, throw)
     closure = close(mechanism, t, state, analysis=analysis)
     if throw:
         require_closed(mechanism, closure, t, state)
     return closure.state
+
+
+def _assemble_given(
+    mechanism: Mechanism | ConstrainedSystem, t: NumberLike, state: State | None, throw: bool, given: GivenState
+) -> State:
+    """Close the position with the given coordinates, then the velocity with the given ones."""
+    if state is None and mechanism.q0 is not None:
+        state = State(mechanism.q0, mechanism.v0)
+    try:
+        closed = assemble(given.at_position(), t, state, throw)
+        moving = State(closed.q, closed.v if state is None else state.v)
+        return assemble(given.at_velocity(t, closed.q), t, moving, throw)
+    except AssemblyError as error:
+        raise AssemblyError(f"with {given} given: {error}", error.state) from None
 
 
 def _assemble_system(system: ConstrainedSystem, t: NumberLike, state: State | None, throw: bool) -> State:
