@@ -21,7 +21,7 @@ from tests.integrate.test_matrices_in_forces import SolvedSpring
 from tests.integrate.test_own_system_events import coupled, swung
 from tests.integrate.test_sticking import block, oscillator, sticking
 from tests.native.test_implicit_stages import damped
-from tests.statics.test_holding import clamp, wedge
+from tests.statics.test_holding import clamp, cranks, wedge
 from tests.synthesis.test_design import FOUR_BAR
 from tests.ten_times import multiplied
 from udkjax.equations.redundancy import examine_rows
@@ -108,6 +108,7 @@ def held_mechanisms() -> dict[str, Any]:
     limit = 2 * 0.1 * 0.01 / 0.2
     found["clamp"] = udk.holding_efforts(clamp(2.5 * limit), "body.lever.angle", np.arcsin(limit * np.array([2.5, 1.001, 0.5])))
     found["dead point"] = udk.holding_efforts(pendulum(coefficient=0.3, radius=0.05), "body.bob.y", [-0.3, -0.49, -0.5])
+    found["preloaded"] = udk.holding_efforts(cranks(), "body.crank0.angle", [1.0, 1.1])
     units = {"steep": 1e6, "locked": 20.0, "flat": 20.0, "clamp": 10.0}
     return {name: [x / units.get(name, 10.0) for x in (e.lower, e.upper, e.without_friction)] for name, e in found.items()}
 
@@ -173,9 +174,15 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     "ROUNDS": (rubbing_joints, ("equations.friction_elimination.ROUNDS",), 1e-8),
     "SETTLING_ROUNDS": (rubbing_joints, ("native.base.steps.SETTLING_ROUNDS",), 1e-8),
     "MOST_STEPS": (rubbing_joints, ("transforms.newton_steps.MOST_STEPS",), 1e-8),
-    "LAST_CHANGE, of efforts": (held_mechanisms, ("transforms.newton_steps.LAST_CHANGE",), 1e-9),
-    "MOST_STEPS, of efforts": (held_mechanisms, ("transforms.newton_steps.MOST_STEPS",), 1e-9),
-    "LOCKED, STILL, STOPPED": (held_mechanisms, tuple(f"statics.holding.{x}" for x in ("LOCKED", "STILL", "STOPPED")), 1e-9),
+    "BLOCKS, HELD": (held_mechanisms, tuple(f"complementarity.linear_program.{x}" for x in ("BLOCKS", "HELD")), 1e-9),
+    "STEPS_PER_ROW": (held_mechanisms, ("complementarity.linear_program.STEPS_PER_ROW",), 1e-9),
+    "STOPPED": (held_mechanisms, ("statics.holding.STOPPED",), 1e-9),
+    "UNBALANCED, LOADED": (held_mechanisms, tuple(f"statics.admissible_reactions.{x}" for x in ("UNBALANCED", "LOADED")), 1e-9),
+    "tangents": (
+        held_mechanisms,
+        tuple(f"statics.admissible_reactions.{x}" for x in ("MOST_TANGENTS", "LAST_CHANGE", "STEP_ASIDE", "PRELOAD")),
+        1e-9,
+    ),
     "STAGES": (rubbing_joints, ("equations.run_programs.RunPrograms.STAGES",), 1e-8),
     "MOST_AIMS": (located_events, ("native.watching.conditions.MOST_AIMS",), 1e-8),
     "MOST_LANDINGS": (located_events, ("native.watching.conditions.MOST_LANDINGS",), 1e-8),

@@ -636,3 +636,24 @@ def test_a_value_that_no_steps_reach_ends_the_march():
     for far in (np.nan, np.inf, 1e7):
         found = march_at_once(driven.mechanism, driven.analysis, driven.unit, start, q, np.array([start + 0.1, far, start]))
         assert found.trusted == 1
+
+
+def test_a_value_of_the_guess_is_reached_near_a_toggle():
+    """There a rounding error of the residual moves the position by many times its size."""
+    for height in (1e-1, 1e-2, 1e-3, 1e-5):
+        c, angle = 0.2 * np.sqrt(1 - height**2), np.arcsin(height)
+        scene = udk.Mechanism(
+            {
+                "lever": udk.Body(1.0, 0.01, [c / 2, 0.1 * height], angle),
+                "rod": udk.Body(1.0, 0.01, [1.5 * c, 0.1 * height], -angle),
+                "slider": udk.Body(1.0, 0.01, [2 * c, 0.0]),
+            },
+            {
+                "A": udk.Revolute(["ground", "lever"], [[0.0, 0.0], [-0.1, 0.0]]),
+                "B": udk.Revolute(["lever", "rod"], [[0.1, 0.0], [-0.1, 0.0]]),
+                "C": udk.Revolute(["rod", "slider"], [[0.1, 0.0], [0.0, 0.0]]),
+                "S": udk.Prismatic(["ground", "slider"], [[0.0, 0.0], [0.0, 0.0]], 0.0),
+            },
+        )
+        found = udk.kinematics(scene, "body.slider.x", [2 * c])
+        np.testing.assert_allclose(found.q[0, 0, 2], angle, rtol=1e-9 / height)

@@ -1,13 +1,17 @@
 """Efforts that hold mechanisms at rest against friction, beside closed forms: an incline, a wedge, a toggle clamp."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import udkjax as udk
 from tests.friction import G, pendulum
+from tests.statics.holding_closed_forms import CASES
+from tests.statics.holding_reference import FreeBodies, random_scene
 
 LAWS: dict[str, dict[str, Any]] = {"smooth": {"law": "smooth"}, "set-valued": {"law": "set-valued"}}
 
@@ -61,9 +65,118 @@ def test_a_wedge_locks_itself_up_to_the_angle_of_friction():
         assert bool(found.rests[0]) is rests
 
 
+def cranks(friction: tuple[str, ...] = ("O1",), torque: float = 0.0) -> udk.Mechanism:
+    """Return a parallelogram with three cranks of 0.3 m, a redundant row, and friction in some of its pins."""
+    up = 0.3 * np.array([np.cos(1.0), np.sin(1.0)])
+    feet = [np.array([0.5 * k, 0.0]) for k in range(3)]
+    bodies = {f"crank{k}": udk.Body(1.0, 0.01, foot + up / 2, 1.0) for k, foot in enumerate(feet)}
+    bodies["bar"] = udk.Body(4.0, 0.4, feet[1] + up)
+    joints = {f"O{k}": udk.Revolute(["ground", f"crank{k}"], [foot, [-0.15, 0.0]]) for k, foot in enumerate(feet)}
+    joints |= {f"A{k}": udk.Revolute([f"crank{k}", "bar"], [[0.15, 0.0], [0.5 * (k - 1), 0.0]]) for k in range(3)}
+    constant = {"torque": torque} if torque else {"coefficient": 0.2, "radius": 0.02}
+    forces = {f"rub {pin}": udk.Friction(pin, law="set-valued", **constant) for pin in friction}
+    return udk.Mechanism(bodies, joints, forces=forces)
+
+
+@pytest.mark.parametrize("name", ["wedge with a rubbing floor", "toggle, locked"])
+def test_bounds_do_not_depend_on_inertia(name):
+    """Closed forms, for light and heavy parts in one batch; the slow test has all of them over six decades."""
+    case = CASES[name]
+    scene = case.mechanism(np.ones(case.bodies))
+    light_and_heavy = 10.0 ** np.linspace(-3, 3, 5)
+
+    def bounds(mass):
+        body = scene.body_names[0]
+        changed = scene.with_parameters({f"body.{body}.mass": mass, f"body.{body}.inertia": mass})
+        found = udk.holding_efforts(changed, case.coordinate, [case.value])
+        return found.lower[0], found.upper[0]
+
+    lower, upper = jax.vmap(bounds)(light_and_heavy)
+    np.testing.assert_allclose(lower, np.full(5, case.bounds[0]), rtol=1e-11)
+    np.testing.assert_allclose(upper, np.full(5, case.bounds[1]), rtol=1e-11)
+
+
+def compare(seed: int) -> str:
+    """Compare a random scene with linear programs over free bodies; return its line of the table."""
+    scene, driver = random_scene(seed)
+    _, body, coordinate = driver.split(".")
+    given = scene.bodies[body].angle if coordinate == "angle" else scene.bodies[body].position[0]
+    found = udk.holding_efforts(scene, driver, [float(given)])
+    free = FreeBodies(scene, body, coordinate)
+    expected = [-free.bound(-1.0, seed), free.bound(1.0, seed)]
+    bounds = [float(found.lower[0]), float(found.upper[0])]
+    scale = max(abs(x) for x in [float(found.without_friction[0]), *expected] if np.isfinite(x))
+    np.testing.assert_allclose(bounds, expected, rtol=1e-6, atol=1e-6 * scale, err_msg=f"seed {seed}")
+    return f"{seed:6} {free.redundant:9} {len(free.limits):8} {bounds[0]:14.6f} {bounds[1]:14.6f}"
+
+
+@pytest.mark.parametrize("seed", [1004, 1006])  # redundant: unbounded by preloads, and bounded
+def test_bounds_are_those_of_linear_programs_over_free_bodies(seed):
+    compare(seed)
+
+
+def test_preloads_of_redundant_joints():
+    """Three cranks that were pressed together hold any effort; constant torques, and loads of least norm, have bounds."""
+    found = udk.holding_efforts(cranks(), "body.crank0.angle", [1.0])
+    assert found.by_preload.tolist() == [[True, True]]
+    assert float(found.upper[0]) == np.inf and float(found.lower[0]) == -np.inf
+    assert "locked by preloads" in str(found) and found.redundant[0] in str(found)
+    constant = udk.holding_efforts(cranks(("O1", "A2"), torque=0.5), "body.crank0.angle", [1.0])
+    weight = (3 * 1.0 * 0.15 + 4.0 * 0.3) * G * np.cos(1.0)
+    np.testing.assert_allclose([constant.lower[0], constant.upper[0]], [weight - 1.0, weight + 1.0], rtol=1e-12)
+    assert not constant.by_preload.any()
+    least = udk.holding_efforts(cranks(), "body.crank0.angle", [1.0], preload=False)
+    assert np.isfinite(least.upper[0]) and not least.by_preload.any()
+    for bound, sign in ((least.lower, -1.0), (least.upper, 1.0)):
+        # The friction does the rest of the work, and is the coefficient times the radius times the load of least norm.
+        excess = float(bound[0]) - float(least.without_friction[0])
+        loads = {"hand": udk.Torque(["ground", "crank0"], bound[0]), "pin": udk.Torque(["ground", "crank1"], -excess)}
+        still = udk.Mechanism(cranks().bodies, cranks().joints, forces=loads)
+        at_rest = udk.assemble(still)
+        run = SimpleNamespace(ts=np.zeros(1), q=np.asarray(at_rest.q)[None], v=0 * np.asarray(at_rest.v)[None])
+        pressed = np.hypot(*np.asarray(udk.reactions(still, run)["O1"]["crank1"])[0, :2])
+        np.testing.assert_allclose(excess, sign * 0.2 * 0.02 * pressed, rtol=1e-9)
+
+
+def holds_around(*pins: str) -> udk.Mechanism:
+    """Return a hanging double pendulum with friction in some pins."""
+    rub = {pin: udk.Friction(pin, coefficient=0.2, radius=0.01, law="set-valued") for pin in pins}
+    down = -np.pi / 2
+    return udk.Mechanism(
+        {"a": udk.Body(1.0, 0.1, [0.0, -0.5], down), "b": udk.Body(1.0, 0.1, [0.0, -1.5], down)},
+        {
+            "A": udk.Revolute(["ground", "a"], [[0.0, 0.0], [-0.5, 0.0]]),
+            "B": udk.Revolute(["a", "b"], [[0.5, 0.0], [-0.5, 0.0]]),
+        },
+        forces=rub,
+    )
+
+
+@pytest.mark.parametrize(("pins", "holds"), [("A", False), ("B", False), ("AB", True)])
+def test_friction_holds_a_mechanism_around_an_equilibrium_if_it_resists_every_motion(pins, holds):
+    rest = udk.equilibrium(holds_around(*pins))
+    assert bool(rest.balanced) and bool(rest.holds_around) is holds
+    assert ("it rests in all positions around" in str(rest)) is holds
+
+
+def test_friction_of_an_unloaded_slide_does_not_hold():
+    """A weight on a spring in a vertical guide: its normal force is zero everywhere."""
+    scene = udk.Mechanism(
+        {"weight": udk.Body(1.0, 0.1, [0.0, -0.1])},
+        {"guide": udk.Prismatic(["ground", "weight"], [[0.0, 0.0], [0.0, 0.0]], axis=np.pi / 2)},
+        forces={
+            "spring": udk.Spring(["ground", "weight"], [[0.0, 0.0], [0.0, 0.0]], 100.0, 0.05),
+            "rub": udk.Friction("guide", coefficient=0.3, law="set-valued"),
+        },
+    )
+    rest = udk.equilibrium(scene)
+    assert bool(rest.stable) and not rest.holds_around
+    assert "does not hold it in positions around" in str(rest)
+
+
 def test_an_equilibrium_names_the_friction_around_it():
     rest = udk.equilibrium(pendulum(coefficient=0.3, radius=0.1), stable=True)
-    assert bool(rest.stable) and rest.left_out == ("rub",)
+    assert bool(rest.stable) and rest.left_out == ("rub",) and rest.holds_around
     assert "friction rub, with which it rests in all positions around, see holding_efforts" in str(rest)
     assert udk.equilibrium(udk.library.simple_pendulum()).left_out == ()
 
@@ -130,3 +243,47 @@ def test_derivatives_and_batches():
     np.testing.assert_allclose(jax.jacfwd(upper)(0.3), slope, rtol=1e-10)
     coefficients = np.array([0.1, 0.3])
     np.testing.assert_allclose(jax.vmap(upper)(coefficients), weight * np.tan(0.2 + np.arctan(coefficients)), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_closed_forms_over_six_decades_of_masses():
+    lines = [f"{'case':28} {'lower':>14} {'upper':>14} {'largest error':>14}"]
+    for name, case in CASES.items():
+        errors = []
+        for mass in 10.0 ** np.arange(-3, 4):
+            masses = np.resize([1.0, 1 / mass, mass, 1.0], case.bodies)
+            found = udk.holding_efforts(case.mechanism(masses), case.coordinate, [case.value])
+            for bound, exact in zip((found.lower, found.upper), case.bounds, strict=True):
+                errors.append(0.0 if float(bound[0]) == exact else abs(float(bound[0]) / exact - 1))
+        lines.append(f"{name:28} {case.bounds[0]:14.6f} {case.bounds[1]:14.6f} {max(errors):14.1e}")
+        assert max(errors) < 1e-11, name
+    print("\n".join(lines))
+
+
+@pytest.mark.slow
+def test_random_scenes_beside_linear_programs():
+    """Slider-cranks, four-bars, wedges, six-bars, and redundant ones; `pytest -s` prints the table."""
+    print("  seed redundant friction          lower          upper")
+    for seed in range(1000, 1300):
+        print(compare(seed), flush=True)
+
+
+@pytest.mark.slow
+def test_derivatives_of_bounds_of_a_linkage():
+    """By every number of friction, and by a length, against differences; with preloads and without."""
+    base, driver = random_scene(1007)  # a slider-crank
+    names = [name for name in base.parameters() if name.startswith("force.rub") and np.ndim(base.parameters()[name]) == 0]
+    names.append("joint.C.points")
+
+    def bounds(changes):
+        found = udk.holding_efforts(base.with_parameters(changes), driver, [float(base.bodies["crank"].angle)])
+        return jnp.stack([found.lower[0], found.upper[0]])
+
+    values = {name: jnp.asarray(base.parameters()[name], float) for name in names}
+    forward, reverse = jax.jit(jax.jacfwd(bounds))(values), jax.jit(jax.jacrev(bounds))(values)
+    for name, value in values.items():
+        np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9, atol=1e-9, err_msg=name)
+        for index in np.ndindex(np.shape(value)):
+            h = 1e-6 * max(abs(float(value[index])), 0.1)
+            ends = [bounds(values | {name: value.at[index].add(way * h)}) for way in (1.0, -1.0)]
+            np.testing.assert_allclose(forward[name][(slice(None), *index)], (ends[0] - ends[1]) / (2 * h), rtol=1e-5, atol=1e-5)

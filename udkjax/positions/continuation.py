@@ -228,7 +228,10 @@ def _advance(
     with the sign `way`; a step that `lands` ends at the target's value.
     """
     xp, X, tau, h = curve.by.xp, state.X, state.tau, state.h
-    rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X)))
+    # At a fixed value a rounding error of the residual moves the point by its size over the slope of the value, at a toggle by
+    # its root.
+    slope = xp.where(lands, xp.maximum(xp.abs(tau[-1]), np.finfo(X.dtype).eps ** 0.5), 1.0)
+    rounding = 64 * np.finfo(X.dtype).eps * xp.maximum(1.0, xp.max(xp.abs(X))) / slope
     near = xp.linalg.norm(corrected - predicted) <= PREDICTION_TOL * eta + rounding
     # A residual remains in directions that E^+ truncates; it is of second order in the step, and corrected in the next step.
     closed = closed | (~lands & (clearance <= RANK_TOL) & (curve.violation(corrected) <= CLOSURE.tol))

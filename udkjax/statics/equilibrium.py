@@ -25,6 +25,7 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
+from udkjax.statics.admissible_reactions import friction_holds_around
 from udkjax.statics.linearization import Linearization, Linearizer, TracedLinearizer, linearizer, with_unit_mass
 from udkjax.statics.load_scale import LoadScale
 from udkjax.transforms.gradients import stop_gradients
@@ -48,7 +49,8 @@ class Equilibrium(PrintsTable):
         q: x, y (m) and angle (rad) of each body.
         balanced: whether loads and constraint forces cancel.
         bodies: the names of the bodies, in the order of q.
-        left_out: the names of all friction: at rest it holds the mechanism in all positions around this one.
+        left_out: the names of all friction.
+        holds_around: whether friction holds the mechanism in all positions around this one, too.
     """
 
     q: Float[Array, "bodies 3"]
@@ -57,6 +59,7 @@ class Equilibrium(PrintsTable):
     residual: Float[Array, ""]  # remaining loads along free directions, relative to the scale of forces
     balanced: Bool[Array, ""]
     neutral: Float[Array, ""]  # (rad/s)^2: a smaller |omega2| is rounding
+    holds_around: Bool[Array, ""] = eqx.field(default_factory=lambda: np.asarray(False))
     bodies: tuple[str, ...] = eqx.field(static=True, default=())
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -72,9 +75,10 @@ class Equilibrium(PrintsTable):
             ("frequency", frequencies or "no degree of freedom is left"),
             ("unbalanced loads", f"{format_number(self.residual, scale=1.0)} of the scale of forces"),
         ]
-        if self.left_out and self.balanced:
-            around = "it rests in all positions around, see holding_efforts"
-            rows.append(("left out", f"friction {', '.join(self.left_out)}, with which {around}"))
+        if self.left_out and self.balanced and np.size(self.omega2):
+            around = "with which it rests in all positions around, see holding_efforts"
+            held = around if self.holds_around else "which does not hold it in positions around"
+            rows.append(("left out", f"friction {', '.join(self.left_out)}, {held}"))
         poses = [format_pose(pose, size_of(self.q)) for pose in np.asarray(self.q)]
         rows += zip(self.bodies or map(str, range(len(poses))), poses, strict=True)
         return PrintedTable(f"position of rest, {self.kind}", rows)
@@ -117,8 +121,8 @@ def equilibrium(
 ) -> Equilibrium:
     """Return a position of rest near a given position: N^T F = 0 on Psi = 0, where N spans the free directions.
 
-    Friction is left out, and named in `left_out`: with it the mechanism rests in all positions around, a set whose bounds
-    `holding_efforts` finds.
+    Friction is left out, and named in `left_out`. Where loaded joints with friction resist every motion, as `holds_around` says,
+    the mechanism rests in all positions around as well: by statics alone, whatever its masses. `holding_efforts` has the bounds.
 
     Newton's method with K = -F_q + (lambda^T Psi)_qq; steps are limited in length, and halved until the unbalanced loads
     decrease. Pure, jittable and batched by `vmap` (`balanced` marks the members at rest); differentiable with respect to
@@ -209,6 +213,7 @@ def _equilibrium(
     unbalanced = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
     balanced = curve.is_closed(xp.append(q, t) / curve.units) & (unbalanced <= FORCE_TOL)
     neutral, friction = SMALLEST_STIFFNESS * scale.stiffness, Friction.names_in(mechanism.forces)
+    holds_around = balanced & friction_holds_around(mechanism, analysis, t, q, free) if friction else balanced & False
     return make_module(
         Equilibrium,
         q=q.reshape(-1, 3),
@@ -218,6 +223,7 @@ def _equilibrium(
         balanced=balanced,
         neutral=neutral,
         bodies=mechanism.body_names,
+        holds_around=holds_around,
         left_out=friction,
     )
 

@@ -1,14 +1,8 @@
 """Efforts that hold a mechanism at rest with friction: all efforts between two bounds.
 
 At rest the friction of a joint has any value up to its limit: the constant torque, plus the static coefficient times the load.
-The mechanism begins to move along a coordinate c, in the direction s = 1 or -1, when all joints that slide in this motion resist
-it with their limits, and the effort f along c exceeds this resistance,
-
-    s C a > 0,        M a + Psi_q^T lambda = F + C^T f + G_s(lambda),        C = c_q.
-
-Friction is a sum of norms of loads, so s C a is a concave function of s f: its first zero is the bound. Newton's method
-approaches this zero from within. If s C a stops growing below zero, no effort moves the mechanism in this direction: friction
-locks it, and the bound is infinite.
+The bounds are matters of statics (admissible_reactions.py): masses enter by their weights only. Where a bound is infinite,
+friction locks the mechanism, or redundant joints can be preloaded without limit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,11 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.equations import constraints
-from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.analysis import Analysis
-from udkjax.equations.directed_friction import DirectedFriction
-from udkjax.pinv import SVD
 from udkjax.positions.assembly import State
 from udkjax.positions.coordinates import Coordinate
 from udkjax.positions.drive import drive
@@ -33,12 +23,11 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
-from udkjax.transforms.newton_steps import repeated_newton
+from udkjax.statics.admissible_reactions import UNBALANCED, largest_effort, reactions_at
+from udkjax.wording import join_names
 
-LOCKED = 1e-9  # smaller derivatives of the acceleration by the effort, relative to that without friction, are rounding errors
-STILL = 1e-9  # smaller sliding speeds in a motion, relative to the fastest coordinate, are rounding errors
-# Missing part of the unit speed along the coordinate. Where the coordinate moves, rounding errors are below 1e-8, as the rank
-# tolerance leaves eight digits; at dead points other rows take a good share of the speed.
+# Missing part of the unit speed along the coordinate. Where the coordinate moves, rounding errors are below 1e-8; at dead points
+# other rows take a good share of the speed.
 STOPPED = 1e-5
 
 
@@ -50,9 +39,11 @@ class HoldingEfforts(PrintsTable):
     Attributes:
         values: values of the coordinate (rad, m).
         q: x, y (m) and angle (rad) of each body.
-        lower: below this effort (N m along an angle, N along a length) it moves backwards; minus infinity: friction locks it.
-        upper: above this effort it moves forwards; infinity: friction locks it.
+        lower: below this effort (N m along an angle, N along a length) it moves backwards; minus infinity: no effort moves it.
+        upper: above this effort it moves forwards; infinity: no effort moves it.
         without_friction: the only effort that would hold it without friction.
+        by_preload: whether `lower` and `upper` are infinite because of preloads alone; otherwise friction locks the mechanism.
+        redundant: the names of the redundant constraints, between which there may be preloads.
     """
 
     values: Float[Array, "T"]
@@ -60,6 +51,8 @@ class HoldingEfforts(PrintsTable):
     lower: Float[Array, "T"]
     upper: Float[Array, "T"]
     without_friction: Float[Array, "T"]
+    by_preload: Bool[Array, "T 2"]
+    redundant: tuple[str, ...] = eqx.field(static=True, default=())
     unit: str = eqx.field(static=True, default="")  # of the efforts
 
     _units = units(values="rad or m", q="m, m, rad", lower="N m or N", upper="N m or N", without_friction="N m or N")
@@ -71,7 +64,25 @@ class HoldingEfforts(PrintsTable):
         rows = [(name.replace("_", " "), format_numbers(getattr(self, name), self.unit)) for name in names]
         held = np.asarray(self.values)[rests]
         alone = f"at {rests.sum()} of {rests.size} values, from {held.min():g} to {held.max():g}" if held.size else "at no value"
-        return PrintedTable("efforts that hold a mechanism at rest", [*rows, ("rests without effort", alone)])
+        return PrintedTable("efforts that hold a mechanism at rest", [*rows, ("rests without effort", alone), *self._reasons()])
+
+    def _reasons(self) -> list[tuple[str, str]]:
+        """Return why bounds are infinite."""
+        infinite = np.isinf(np.stack([np.asarray(self.lower), np.asarray(self.upper)], 1))
+        preloaded = np.asarray(self.by_preload)
+        reasons = {
+            "locked by friction": (infinite & ~preloaded, "no effort moves it there"),
+            "locked by preloads": (
+                preloaded,
+                f"redundant constraints, {join_names(self.redundant)}, can press joints together without limit; "
+                "preload=False: loads of least norm",
+            ),
+        }
+        return [
+            (name, f"at {marks.any(1).sum()} of {len(marks)} values: {text}")
+            for name, (marks, text) in reasons.items()
+            if marks.any()
+        ]
 
     @property
     def rests(self) -> Bool[Array, "T"]:
@@ -86,12 +97,17 @@ def holding_efforts(
     values: Float[ArrayLike, "T"] | Sequence[float],
     state: State | None = None,
     held: Mapping[str, NumberLike] | None = None,
+    preload: bool = True,
 ) -> HoldingEfforts:
     """Return the bounds of the efforts along a coordinate that hold a mechanism at rest, at each value of the coordinate.
 
-    Every `Friction` counts with its constant torque and static coefficient, also one with the smooth law, which creeps in runs.
-    Between the bounds the mechanism stays where it is; where zero is between them, it stays by itself. Joints that do not slide
-    in the motion have no friction; redundant joints have loads of least norm.
+    An effort holds the mechanism if there are reactions and friction that balance all bodies, with the friction of each joint
+    within its limit: `torque` + `static_coefficient` (by default `coefficient`) times the load. This includes `Friction` with
+    the smooth law, which creeps in runs. Between the bounds friction can hold the mechanism; where zero is between them, it rests
+    by itself. Bounds depend on weights, but not on inertia.
+
+    Redundant constraints admit internal loads, such as those of a part that was pressed into place. By default these may have any
+    size, and as they press on joints, they can make a bound infinite: `by_preload` marks such bounds.
 
     The function is pure and batched by `vmap`; efforts have derivatives of first order with respect to every number of the
     mechanism.
@@ -102,6 +118,7 @@ def holding_efforts(
         values: values of the coordinate (rad, m), in the order in which they are reached.
         state: a position on the branch; by default the initial guess, assembled.
         held: values that other drivers or coordinates hold, by name; by default drivers keep their values of time 0.
+        preload: whether redundant constraints may have any internal loads; False: loads are those of least norm, as in runs.
 
     Returns:
         The `HoldingEfforts`.
@@ -111,63 +128,32 @@ def holding_efforts(
     """
     driven = drive(mechanism, driver, 0.0, held)
     q = kinematics(mechanism, driver, values, state, held=held).q
-    found = _efforts(driven.mechanism, driven.analysis, jnp.asarray(q).reshape(len(q), -1), driven.row)
-    return HoldingEfforts(jnp.asarray(values, float), q, *found, unit=driven.mechanism.drivers[driven.name].effort_unit)
+    analysis, positions = driven.analysis, jnp.asarray(q).reshape(len(q), -1)
+    bounds, exact, by_preload = _efforts(driven.mechanism, analysis, positions, driven.row, preload)
+    redundant = tuple(dict.fromkeys(name for name, _ in analysis.redundant))
+    unit = driven.mechanism.drivers[driven.name].effort_unit
+    lower, upper = bounds
+    return HoldingEfforts(jnp.asarray(values, float), q, lower, upper, exact, by_preload, redundant, unit)
 
 
 @deferred
-def _efforts(mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], row: int) -> list[Array]:
-    directed, scales = DirectedFriction.put_in(mechanism, every=True), analysis.scales
-    method, root = SVD(scales.rank_tol), uk.inverse_sqrt_mass(mechanism)
-    free = scales.weights.at[row].set(0.0)  # the coordinate moves
-    count = len(directed.joints)
-
-    def at(q: Array) -> list[Array]:
-        still, A = jnp.zeros_like(q), constraints.psi_q(mechanism, 0.0, q)
-        C, D = A[row], free[:, None] * A * root
-        plus = uk.pseudoinverse(method, D)
-        whole = uk.pseudoinverse(method, scales.weights[:, None] * A * root)
-        u = root * (whole @ (scales.weights * jnp.eye(len(A))[row]))  # the motion with C u = 1
-        fastest, speeds = scales.size(u), directed.sliding_speeds(q, u)
-        slides = jnp.abs(speeds) > STILL * fastest * directed.units(scales.length)
-        forwards = jax.lax.stop_gradient(jnp.where(slides, jnp.sign(speeds), 0.0))
-
-        def acceleration(effort: Array, sign: float) -> Array:
-            """Return C a where all joints resist a motion in the direction `sign`."""
-            sides = jnp.stack([sign * forwards, jnp.ones(count)], axis=-1)
-            scene = directed.with_sides(sides)
-
-            def b(load: Array) -> Array:
-                return -free * (A @ uk.a_F(scene, 0.0, q, still, load))
-
-            def multipliers(friction: Array) -> Array:
-                return -free * (plus.T @ (plus @ b(friction + effort * C)))
-
-            load = directed.friction(sides, multipliers, 0.0, q, still) + effort * C
-            return C @ (uk.a_F(scene, 0.0, q, still, load) + root * (plus @ b(load)))
-
-        one = jnp.ones(())
-        value, slope = jax.jvp(lambda f: acceleration(f, 0.0), (0.0 * one,), (one,))
-        exact = -value / slope
-
-        def bound(sign: float) -> Array:
-            def along(x: Array) -> tuple[Array, Array]:
-                return jax.jvp(lambda x: sign * acceleration(sign * x, sign), (x,), (one,))
-
-            def step(x: Array) -> tuple[Array, Array, Array]:
-                value, growth = along(x)
-                new = jnp.where(growth > LOCKED * slope, x - value / growth, jnp.inf)  # also for NaN: it jams
-                return new, jnp.abs(new - x), jnp.abs(new)
-
-            start = jax.lax.stop_gradient(sign * exact)
-            x, _ = repeated_newton(step, start)
-            x = jax.lax.stop_gradient(x)
-            value, growth = along(jnp.where(jnp.isfinite(x), x, start))
-            return sign * jnp.where(jnp.isfinite(x), x - value / jax.lax.stop_gradient(growth), jnp.inf)
-
-        known = jnp.abs(C @ u - 1) < STOPPED
-        return [jnp.where(known, x, jnp.nan) for x in (bound(-1.0), bound(1.0), exact)]
+def _efforts(
+    mechanism: Mechanism, analysis: Analysis, q: Float[Array, "T n"], row: int, preload: bool
+) -> tuple[list[Array], Array, Array]:
+    def at(q: Array) -> tuple[list[Array], Array, Array]:
+        reactions, balance = reactions_at(mechanism, analysis, 0.0, q, row)
+        known = (jnp.abs(balance.motion - 1) < STOPPED) & (balance.force <= UNBALANCED * reactions.scale)
+        signs = -1.0, 1.0
+        bounds = [sign * largest_effort(mechanism, reactions.without_internal, sign) for sign in signs]
+        by_preload = jnp.zeros(2, bool)
+        if preload and analysis.redundant_rows != ():
+            least, bounds = bounds, [sign * largest_effort(mechanism, reactions, sign) for sign in signs]
+            by_preload = jnp.isinf(jnp.stack(bounds)) & jnp.isfinite(jnp.stack(least))
+        exact = reactions.without_internal.effort(jnp.zeros(len(reactions.units)))
+        bounds = [jnp.where(known, x + 0.0, jnp.nan) for x in bounds]
+        return bounds, jnp.where(known, exact + 0.0, jnp.nan), known & by_preload
 
     reached = jnp.all(jnp.isfinite(q), axis=1)
-    found = jax.vmap(at)(jnp.where(reached[:, None], q, mechanism.q0.ravel()))
-    return [jnp.where(reached, x, jnp.nan) for x in found]
+    bounds, exact, by_preload = jax.vmap(at)(jnp.where(reached[:, None], q, mechanism.q0.ravel()))
+    bounds, exact = jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (bounds, exact))
+    return bounds, exact, reached[:, None] & by_preload
