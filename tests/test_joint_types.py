@@ -196,7 +196,7 @@ def has_fixes(joint: udk.Joint) -> bool:
     """Return True if a constraint can be relaxed without removing it."""
     mechanism = scene({"J": joint})
     at = RankedPositions(mechanism, 1e-9).at(0.0, np.asarray(mechanism.q0, float).ravel())
-    return len(list(changes_of(mechanism, "J", at, np.ones((len(udk.analyse(mechanism).row_names), 1))))) > 1
+    return len(list(changes_of(mechanism, "J", at, lambda: np.ones((len(udk.analyse(mechanism).row_names), 1))))) > 1
 
 
 def ranges(joint: udk.Joint) -> bool:

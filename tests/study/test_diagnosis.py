@@ -18,7 +18,7 @@ from tests.scaling import scaled
 from udkjax.pinv.sparse_gram import SmallSingularValues
 from udkjax.scene import GROUND
 from udkjax.study.accuracy import pendulum
-from udkjax.study.diagnosis import fixes
+from udkjax.study.diagnosis import fix_search
 from udkjax.study.diagnosis.configuration import RankedPositions
 
 COS, SIN = Fraction(3, 5), Fraction(4, 5)
@@ -309,12 +309,54 @@ def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
     pairs = [(f"{k}{i}", f"{k + 1}{j}") for k in (0, 1) for i in (0, 1) for j in (0, 1)] + [(f"{k}0", f"{k}1") for k in range(3)]
     joints: dict[str, Any] = {f"{a} {b}": udk.Distance([a, b], [[0.0, 0.0]] * 2) for a, b in pairs}
     joints["pin"] = udk.Revolute([GROUND, "00"], [[0.0, 0.0]] * 2)
-    built, apply = [], fixes.apply_change
-    monkeypatch.setattr(fixes, "apply_change", lambda *given: built.append(given) or apply(*given))
+    built, apply = [], fix_search.apply_change
+    monkeypatch.setattr(fix_search, "apply_change", lambda *given: built.append(given) or apply(*given))
     found = udk.diagnose(udk.Mechanism(bodies, joints), walk=False)
     assert len(found.redundancies) == 2 and len(found.cure) == 2
     assert found.cured is not None and udk.analyse(found.cured).redundant == ()
-    assert len(built) == sum(len(r.fixes) for r in found.redundancies) + 1
+    assert len(built) == len({fix.constraint for r in found.redundancies for fix in r.fixes}) + 1
+
+
+def umbrella(ribs):
+    """A runner on a pole opens pairs of ribs by stretchers; the ribs of one side lie on each other and share their pins."""
+    rib, at, stretcher, a = 500.0, 200.0, 240.0, np.deg2rad(60.0)
+    low = 400 - at * np.cos(a)
+    pins = {"N": (0, 400), "R": (0, low - np.sqrt(stretcher**2 - (at * np.sin(a)) ** 2))}
+    links: dict[str, Any] = {"runner": {"pins": ["R"], "mass": 0.05, "width": 30}}
+    for k in range(ribs):
+        for sign, side in ((1, "r"), (-1, "l")):
+            pins |= {f"J{side}": (sign * at * np.sin(a), low), f"T{side}": (sign * rib * np.sin(a), 400 - rib * np.cos(a))}
+            links[f"rib{side}{k}"] = {"pins": ["N", f"J{side}", f"T{side}"], "mass": 0.04, "width": 5}
+            links[f"stretcher{side}{k}"] = {"pins": ["R", f"J{side}"], "mass": 0.02}
+    return udk.Drawing(pins, links, ["N"], {"pole": {"link": "runner", "direction": [0, 1]}}, units={"length": "mm"}).mechanism()
+
+
+def test_many_redundant_sets_are_advised_in_a_line_each_with_few_decompositions(monkeypatch):
+    """Each change was tried by a decomposition of the Jacobian in each position, and by building the mechanism anew."""
+    decompose, large, ranked, rank = np.linalg.svd, [], [], RankedPositions.__init__
+
+    def counted(matrix, *given, **choices):
+        large.append(min(np.shape(matrix)[-2:]) > 10)
+        return decompose(matrix, *given, **choices)
+
+    mech = umbrella(2)
+    udk.diagnose(mech, walk=False, fixes=False)
+    monkeypatch.setattr(RankedPositions, "__init__", lambda self, *given: ranked.append(0) or rank(self, *given))
+    monkeypatch.setattr(np.linalg, "svd", counted)
+    found = udk.diagnose(mech, walk=False)
+    assert len(ranked) == 1 and sum(large) < 900
+    assert sum(r.count for r in found.redundancies) == sum(fix.removes for fix in found.cure) == 8
+    assert found.cured is not None
+    cured = udk.diagnose(found.cured, walk=False)
+    assert cured.redundancies == () and cured.degrees_of_freedom == found.degrees_of_freedom == 1
+    for r in found.redundancies:  # each fix is one: the decomposition of the changed mechanism says so
+        after = [udk.diagnose(fix.mechanism, fixes=False, walk=False) for fix in r.fixes[:1]]
+        assert [(x.redundant, x.degrees_of_freedom) for x in after] == [(8 - fix.removes, 1) for fix in r.fixes[:1]]
+        assert after[0].conditioning == approx(1 / r.fixes[0].conditioning, rel=0.5)
+    text = str(found)
+    assert len(text) < 400 * len(found.redundancies)
+    assert all(f"  {', '.join(r.constraints)}: " in text for r in found.redundancies)
+    assert "in each of these" in text and "remove any of them" in text
 
 
 def test_positions_of_a_large_scene_are_closed_and_ranked_without_dense_decompositions(monkeypatch):

@@ -72,11 +72,6 @@ def dependencies_at(
     return permanent, dependencies(N, owners, attached)
 
 
-def redundant_by(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> int:
-    """Return the number of redundant rows of a set of constraints, without all others."""
-    return len(null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS))
-
-
 def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
     """Return the combinations of a set's rows that vanish, (m, redundancy): the states of self-stress of the set."""
     return N @ null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS).T
@@ -86,12 +81,13 @@ def _minimal_set_around(
     seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]
 ) -> list[str]:
     """Return a minimal dependent set around a constraint: all others are removed if possible, the farthest first."""
-    far = _distances(seed, involved, attached)
-    members = list(involved)
+    far, members = _distances(seed, involved, attached), list(involved)
+    left = N @ null_space(N[~np.isin(owner, involved)], DEPENDS).T  # combinations that vanish outside of the members
     for name in sorted(involved, key=lambda name: -far[name]):
-        others = [other for other in members if other != name]
-        if redundant_by(N, owner.tolist(), others):
-            members = others
+        without = null_space(left[owner == name], DEPENDS)
+        if len(without):
+            members.remove(name)
+            left = left @ without.T
     return members
 
 

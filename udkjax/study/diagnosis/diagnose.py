@@ -20,7 +20,8 @@ from udkjax.study.diagnosis.clearance import clearance
 from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions
 from udkjax.study.diagnosis.dependence import Dependency, dependencies_at
 from udkjax.study.diagnosis.diagnosis import Diagnosis
-from udkjax.study.diagnosis.fixes import Fix, Redundancy, best_fix, fix_of_held_pin, fixes_of
+from udkjax.study.diagnosis.fix_search import FixSearch
+from udkjax.study.diagnosis.fixes import Fix, Redundancy, fix_of_held_pin
 from udkjax.study.diagnosis.joint_friction import joint_friction
 from udkjax.study.diagnosis.second_order import branches
 from udkjax.study.diagnosis.system_diagnosis import SystemDiagnosis, diagnose_system
@@ -92,7 +93,8 @@ def diagnose(
     permanent, momentary = dependencies_at(attached_bodies(mechanism), current, generic, owners)
     if not neighbours and current.freedom:  # moves to first order only: rows are dependent here
         permanent, momentary = [], [*permanent, *momentary]
-    redundancies = _with_fixes(mechanism, positions, generic if fixes and not held else [], permanent)
+    search = FixSearch(mechanism, positions, generic if fixes and not held else [], owners, positions.row_unit)
+    redundancies = _with_fixes(search, permanent)
     for k, r in enumerate(redundancies if held else []):
         pins = [pin for pin in held if pin.name in r.constraints]
         joints = [(pin.name, pin.prismatic(mechanism, current.q)) for pin in pins if fixes]
@@ -112,7 +114,7 @@ def diagnose(
         joint_rows=len(of_joints),
         can_move=bool(neighbours),
         redundancies=tuple(redundancies),
-        cure=_cure(mechanism, positions, generic, redundancies) if fixes else (),
+        cure=_cure(search, redundancies),
         branches=tuple(branches(mechanism, positions, current)),
         forces=_forces(mechanism, current, owners),
         singular_values=current.sigma,
@@ -128,36 +130,23 @@ def attached_bodies(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
     return {name: mechanism.frames_of(element) for name, element in mechanism.constraints.items()}
 
 
-def _with_fixes(
-    mechanism: Mechanism, positions: RankedPositions, generic: list[Configuration], sets: list[Dependency]
-) -> list[Redundancy]:
-    """Return permanently dependent sets with the fixes that help in all `generic` positions; without fixes if there are none."""
-    owners = [name for name, _ in positions.rows.names]
-    configurations = sorted(generic, key=lambda c: -c.smallest)  # the first position determines the stress of a set
-    fixes = [fixes_of(mechanism, positions, configurations, owners, dependency) if configurations else [] for dependency in sets]
-    return [
-        Redundancy(dependency.constraints, dependency.redundancy, True, tuple(of_set))
-        for dependency, of_set in zip(sets, fixes, strict=True)
-    ]
+def _with_fixes(search: FixSearch, sets: list[Dependency]) -> list[Redundancy]:
+    """Return permanently dependent sets with the fixes that help in all generic positions."""
+    return [Redundancy(x.constraints, x.redundancy, True, tuple(search.fixes_of(x))) for x in sets]
 
 
-def _cure(
-    mechanism: Mechanism, positions: RankedPositions, generic: list[Configuration], found: list[Redundancy]
-) -> tuple[Fix, ...]:
+def _cure(search: FixSearch, found: list[Redundancy]) -> tuple[Fix, ...]:
     """Return the best fixes in sequence, each determined after applying the previous one, until nothing is redundant."""
     done: list[Fix] = []
-    sets = [r for r in found if r.permanent]
-    best = max((r.fixes[0] for r in sets if r.fixes), key=lambda fix: (fix.removes, fix.conditioning), default=None)
-    configurations = generic
-    while best is not None:
+    of_first = [r.fixes[0] for r in found if r.permanent and r.fixes and not r.held]
+    best = max(of_first, key=lambda fix: (fix.removes, fix.conditioning), default=None)
+    after = search.after(best) if best else None
+    while best is not None and after is not None:
         done.append(best)
-        ranked = RankedPositions(best.mechanism, positions.rank_tol)
-        configurations, owners = [ranked.at(c.t, c.q) for c in configurations], [name for name, _ in ranked.rows.names]
-        left = dependencies_at(attached_bodies(best.mechanism), configurations[0], configurations, owners)[0]
+        left = dependencies_at(attached_bodies(best.mechanism), after.at[0], after.at, after.owners)[0]
         if not left or len(done) == MOST_FIXES:
             return tuple(done)
-        order = sorted(configurations, key=lambda c: -c.smallest)  # the first position determines the stress of a set
-        best = best_fix(best.mechanism, ranked, order, owners, left)
+        best, after = after.best(left) or (None, None)
     return ()
 
 

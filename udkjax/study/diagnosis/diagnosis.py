@@ -17,6 +17,7 @@ from udkjax.wording import plural
 
 LABEL_WIDTH = 14  # width of a section's title in characters
 MOST_FIXES_SHOWN = 8  # largest number of printed fixes of a set
+MOST_SETS_IN_FULL = 3  # largest number of sets that are printed with all numbers; more are a line each
 SMALLEST_POSE_NUMBER = 1e-9  # smallest number of a pose that is not rounding, in rad and relative to the length
 
 
@@ -133,7 +134,7 @@ def _sections(result: Diagnosis) -> list[tuple[str, list[str]]]:
     """Return the title and the lines of each section that is not empty."""
     parts = [
         ("mobility", _mobility(result)),
-        ("redundancy", [line for r in result.redundancies for line in _redundancy(r, bool(result.cure))]),
+        ("redundancy", _redundancies(result)),
         ("cure", _cure(result)),
         ("singular", _singular(result)),
         ("branches", _branches(result)),
@@ -162,9 +163,12 @@ def _mobility(result: Diagnosis) -> list[str]:
     return lines
 
 
+def _when(r: Redundancy) -> str:
+    return "along the whole motion" if r.held else "in every position" if r.permanent else "in this configuration only"
+
+
 def _redundancy(r: Redundancy, has_cure: bool) -> list[str]:
-    when = "along the whole motion" if r.held else "in every position" if r.permanent else "in this configuration only"
-    lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant constraint')} {when}"]
+    lines = [f"{', '.join(r.constraints)}: {plural(r.count, 'redundant constraint')} {_when(r)}"]
     if r.fixes:
         lines[0] += "; any one of these changes removes it:" if r.count == 1 else "; any one of these changes helps:"
     for fix in r.fixes[:MOST_FIXES_SHOWN]:
@@ -180,10 +184,52 @@ def _redundancy(r: Redundancy, has_cure: bool) -> list[str]:
     return lines
 
 
+def _redundancies(result: Diagnosis) -> list[str]:
+    """Describe each set in full, or, if there are many, in a line each, with a title for those of the same kind."""
+    sets, has_cure = result.redundancies, bool(result.cure)
+    if len(sets) <= MOST_SETS_IN_FULL:
+        return [line for r in sets for line in _redundancy(r, has_cure)]
+    groups: dict[tuple[int, str], list[Redundancy]] = {}
+    for r in sets:
+        groups.setdefault((r.count, _when(r)), []).append(r)
+    lines = []
+    for (count, when), group in groups.items():
+        each = f"in each of these {len(group)} sets" if len(group) > 1 else "in this set"
+        helps = ""
+        if any(r.fixes for r in group):
+            helps = "; any one of the changes after the colon removes it:" if count == 1 else "; any one of these changes helps:"
+        lines += [f"{plural(count, 'redundant constraint')} {when} {each}{helps}", *(f"  {_set_in_a_line(r)}" for r in group)]
+    return lines
+
+
+def _set_in_a_line(r: Redundancy) -> str:
+    text = ", ".join(r.constraints)
+    if r.held:
+        text += f" (they hold {', '.join(r.held)} to second order only)"
+    kinds: dict[str, list[str]] = {}  # the constraints of each kind of change; the angles of slots are left to the cure
+    for fix in r.fixes:
+        kinds.setdefault("make a slot of" if fix.change.startswith("make it a slot") else fix.change, []).append(fix.constraint)
+    if len(kinds) == 1 and set(next(iter(kinds.values()))) == set(r.constraints):
+        kinds = {change: ["any of them"] for change in kinds}
+    changes = [f"{change.replace(' it', '', 1)} {_either(names)}" for change, names in kinds.items()]
+    return f"{text}: {'; '.join(changes)}" if changes else text
+
+
+def _either(names: list[str]) -> str:
+    shown, rest = names[:MOST_FIXES_SHOWN], len(names) - MOST_FIXES_SHOWN
+    if rest > 0:
+        return f"{', '.join(shown)} or one of {rest} more"
+    return f"{', '.join(shown[:-1])} or {shown[-1]}" if len(shown) > 1 else shown[0]
+
+
 def _cure(result: Diagnosis) -> list[str]:
+    """Name the changes that remove all redundancy; those of the same kind share a line."""
     if len(result.cure) < 2:
         return []
-    return ["these changes together remove all redundancy:", *(f"  {fix.constraint}: {fix.change}" for fix in result.cure)]
+    kinds: dict[str, list[str]] = {}
+    for fix in result.cure:
+        kinds.setdefault(fix.change, []).append(fix.constraint)
+    return ["these changes together remove all redundancy:", *(f"  {', '.join(x)}: {change}" for change, x in kinds.items())]
 
 
 def _singular(result: Diagnosis) -> list[str]:
@@ -221,10 +267,11 @@ def _forces(result: Diagnosis) -> list[str]:
     for name, forces in result.forces.items():
         if all(forces.unique):
             continue
-        loose = [row_label(result.mechanism, name, k) for k, unique in enumerate(forces.unique) if not unique]
+        labels = [row_label(result.mechanism, name, k) for k, unique in enumerate(forces.unique) if not unique]
+        loose = f"{name} ({', '.join(label[len(name) + 2 : -1] for label in labels)})"
         angle = None if forces.direction is None else np.rad2deg(forces.direction)
         remark = "" if angle is None else f"; only the component along {angle:.4g} degrees is unique"
-        groups.setdefault(remark, []).extend(loose)
+        groups.setdefault(remark, []).append(loose)
     lines = [f"not unique: {', '.join(loose)}{remark}" for remark, loose in groups.items()]
     return lines or (["all unique"] if result.rows else [])
 
