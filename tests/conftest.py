@@ -21,11 +21,13 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 import udkjax as udk
 from tests.quick_code import optimize
 from udkjax import arrays
+from udkjax.folders import is_writable
 from udkjax.native import primitive
 from udkjax.native.base import code_cache
 
 optimize(False)  # but in tests/native
 if folder := code_cache.cache_folder():  # what one process has compiled, however small, serves the other
+    is_writable(folder)  # creates it for this user alone, before JAX creates it as the umask says
     jax.config.update("jax_compilation_cache_dir", f"{folder}/jax")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 

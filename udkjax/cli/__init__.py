@@ -56,14 +56,14 @@ def main(arguments: list[str] | None = None) -> None:
 def store_compiled_programs() -> None:
     """Make JAX store its compiled programs in the cache of machine code, so that a repeated command compiles nothing.
 
-    A folder named by the environment takes precedence. Nothing is changed if JAX is already imported, or if the folder cannot be
-    written.
+    A folder named by the environment takes precedence. Nothing is changed if JAX is already imported, if the folder cannot be
+    written, or if others may write it.
     """
     from udkjax.folders import is_writable
-    from udkjax.native.base.code_cache import cache_folder
+    from udkjax.native.base.code_cache import cache_folder, refusal
 
     folder = cache_folder()
-    if folder is None or "jax" in sys.modules or not is_writable(folder):
+    if folder is None or "jax" in sys.modules or not is_writable(folder) or refusal(folder):
         return
     for name, value in {"DIR": f"{folder / 'jax'}", "MAX_SIZE": f"{PROGRAM_CACHE_BYTES}"}.items():
         os.environ.setdefault(f"JAX_COMPILATION_CACHE_{name}", value)

@@ -15,7 +15,7 @@ from udkjax.extras import EXTRAS
 from udkjax.folders import is_writable
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
-from udkjax.native.base.code_cache import cache_folder, cached_files
+from udkjax.native.base.code_cache import cache_folder, cached_files, refusal
 from udkjax.native.base.processor import lanes
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import processor
@@ -42,6 +42,7 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
         "engine_reason": reason,
         "lanes": lanes(),
         "cache": None if folder is None else str(folder),
+        "cache_refused": None if folder is None else refusal(folder),
         "cached_programs": len(sizes),
         "cached_bytes": sum(sizes),
         "environment": {key: value for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)},
@@ -66,6 +67,8 @@ def summary(facts_by_name: dict[str, Any]) -> str:
         cached = "nothing, because " + (
             "UDKJAX_CACHE=0 is set" if os.environ.get("UDKJAX_CACHE") == "0" else "there is no home folder"
         )
+    elif facts_by_name["cache_refused"]:
+        cached = f"nothing in {facts_by_name['cache']}, because {facts_by_name['cache_refused']}"
     lines = {
         **facts_by_name["versions"],
         "missing extras": ", ".join(facts_by_name["missing_extras"]) or "none",
@@ -96,3 +99,8 @@ def _advice(engine: str, reason: str) -> Iterator[str]:
     if os.environ.get("UDKJAX_CACHE") != "0" and (folder is None or not is_writable(folder)):
         location = "without a home folder" if folder is None else f"in {folder}"
         yield f"machine code cannot be stored {location}, and is compiled in each process: set UDKJAX_CACHE to a folder"
+    elif folder is not None and (reason := refusal(folder)):
+        yield (
+            f"machine code in {folder} is neither executed nor stored, because {reason}: "
+            f"run chmod go-w {folder}, or set UDKJAX_CACHE to a folder of your own"
+        )

@@ -1,12 +1,14 @@
 """The cache of machine code on disk.
 
-Object code is stored under a digest of the text, the processor and the compiler. Incomplete files are ignored. The least recently
-used files are deleted when the total size exceeds a limit.
+Object code is stored under a digest of the text, the processor and the compiler, with a digest of this name and the code: a file
+that is incomplete, or belongs to another name, is ignored. So are folders and files of other users (except root), and those that
+others may write: stored code is executed. The least recently used files are deleted when the total size exceeds a limit.
 """
 
 import hashlib
 import itertools
 import os
+import stat
 import tempfile
 import time
 from pathlib import Path
@@ -16,7 +18,8 @@ import platformdirs
 MAX_BYTES = 2**28  # maximum total size of the files; each has 10 to 75 KiB
 WRITES_OF_CHECK = 500  # number of writes between two checks of the limit, as listing thousands of files takes 20 ms
 TOUCH_AFTER = 86_400.0  # accuracy (s) of a file's time of last use: most reads need not update it
-_MAGIC = b"udkjax object 1\n"
+_MAGIC = b"udkjax object 2\n"
+_READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # opening a pipe does not wait for a writer
 
 
 def cache_folder() -> Path | None:
@@ -45,25 +48,58 @@ def cached_files() -> list[tuple[float, int, Path]]:
     return files
 
 
-def read(name: str) -> bytes | None:
-    """Return the stored code of this name; None if the file is missing or incomplete."""
-    folder = cache_folder()
-    if folder is None:
-        return None
+def refusal(folder: Path) -> str | None:
+    """Return why the code in a folder is not executed; None if it is, or if there is no such folder."""
     try:
-        data = (folder / name).read_bytes()
+        return _distrust(folder.stat())
     except OSError:
         return None
-    _touch(folder / name)
-    head, code = data[: len(_MAGIC) + 32], data[len(_MAGIC) + 32 :]
-    if not head.startswith(_MAGIC) or hashlib.sha256(code).digest() != head[len(_MAGIC) :]:
+
+
+def _distrust(status: os.stat_result) -> str | None:
+    if not hasattr(os, "getuid"):  # Windows: the user's own folders are closed to others by default
         return None
-    return code
+    if status.st_uid not in (os.getuid(), 0):
+        return "it belongs to another user"
+    return "others may write to it" if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else None
 
 
-def _touch(file: Path) -> None:
+def read(name: str) -> bytes | None:
+    """Return the stored code of this name; None if the file is missing or incomplete, or cannot be trusted."""
+    folder = cache_folder()
+    if folder is None or refusal(folder):
+        return None
     try:
-        if time.time() - file.stat().st_mtime > TOUCH_AFTER:
+        data = _read_own(folder / name)
+    except OSError:
+        return None
+    head, code = data[: len(_MAGIC) + 32], data[len(_MAGIC) + 32 :]
+    return code if head == _head(name, code) else None
+
+
+def _head(name: str, code: bytes) -> bytes:
+    """Return the first bytes of the file with the code of a name."""
+    return _MAGIC + hashlib.sha256(name.encode() + b"\0" + code).digest()
+
+
+def _read_own(path: Path) -> bytes:
+    """Return the content of a regular file of this user that others may not write; nothing of any other file."""
+    handle = os.open(path, _READING)
+    try:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode) or _distrust(status):
+            return b""
+        with open(handle, "rb", closefd=False) as file:
+            data = file.read()
+    finally:
+        os.close(handle)
+    _touch(path, status.st_mtime)
+    return data
+
+
+def _touch(file: Path, last: float) -> None:
+    try:
+        if time.time() - last > TOUCH_AFTER:
             os.utime(file)
     except OSError:  # a folder of someone else, or the file has just been removed
         pass
@@ -72,14 +108,14 @@ def _touch(file: Path) -> None:
 def write(name: str, code: bytes) -> None:
     """Store code atomically, as other processes may read it meanwhile."""
     folder = cache_folder()
-    if folder is None:
+    if folder is None or refusal(folder):
         return
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(stat.S_IRWXU, parents=True, exist_ok=True)  # also where new folders are writable for a group
         handle, temporary = tempfile.mkstemp(dir=folder)
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(_MAGIC + hashlib.sha256(code).digest() + code)
+                file.write(_head(name, code) + code)
             os.replace(temporary, folder / name)
         except OSError:  # a full disk: remove the partial file
             Path(temporary).unlink(missing_ok=True)

@@ -8,6 +8,7 @@ rows. Only the constraint that changes is built anew: all other rows of J stay.
 from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -151,7 +152,8 @@ class _ElementRows:
         if element is not None:
             names = [name for name in dict.fromkeys(mechanism.frames_of(element)) if name != GROUND]
             self._columns = [3 * mechanism.body_names.index(name) + k for name in names for k in range(3)]
-            self._alone = KinematicRows(Mechanism({name: mechanism.bodies[name] for name in names}, {"alone": element}))
+            joints: dict[str, Any] = {"alone": element}  # a driver is only removed, and never changed
+            self._alone = KinematicRows(Mechanism({name: mechanism.bodies[name] for name in names}, joints))
 
     def __call__(self, at: Configuration) -> tuple[np.ndarray, np.ndarray]:
         if self._alone is None:
