@@ -18,7 +18,7 @@ import udkjax as udk
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import primitive, records
-from udkjax.native.base import ffi, machine, processor
+from udkjax.native.base import ffi, processor
 from udkjax.native.gpu import launch, launch_handler, target
 from udkjax.native.gpu.driver import CudaError
 from udkjax.native.gpu.kernel import VECTOR
@@ -183,7 +183,7 @@ def card(monkeypatch):
     }.items():
         monkeypatch.setattr(launch, name, value)
     monkeypatch.setattr(launch_handler, "BLOCK", 4)
-    monkeypatch.setattr(machine, "lanes", lambda: VECTOR)
+    monkeypatch.setattr(processor, "lanes", lambda: VECTOR)
     monkeypatch.setattr(primitive.LoadedCode, "name_on_card", primitive.LoadedCode.name)
     mlir.register_lowering(primitive.native_p, mlir.lower_fun(primitive._lower_for_card), platform="cpu")
     _forget()
