@@ -322,11 +322,12 @@ def test_machine_code_passes_kinks_as_the_loop_of_events_does(case, monkeypatch)
     expected, more_calls, _ = counted(monkeypatch, run)
     kinks, events = int(expected.stats["kinks"]), 0 if expected.events is None else int(expected.events.count)
     assert more_calls > kinks / 2 > 10 and most > 10 and calls <= kinks / most + events + 7  # some kinks are simultaneous
-    np.testing.assert_array_equal(found.q, expected.q)
-    np.testing.assert_array_equal(found.v, expected.v)
-    assert found.stats == expected.stats
+    # To the bit where multiplications are fused with additions; elsewhere the two round in other places.
+    for one, other in ((found.q, expected.q), (found.v, expected.v)):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=0.1 * options["rtol"] * np.abs(other).max())
+    assert found.stats["kinks"] == kinks and abs(found.stats["steps"] - expected.stats["steps"]) <= 2
     if expected.events is not None:
-        np.testing.assert_array_equal(found.events.time, expected.events.time)
+        np.testing.assert_allclose(found.events.time, expected.events.time, rtol=0.0, atol=0.1 * options["rtol"])
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.fused import is_fused
 from tests.native.test_program import ONE, TWO
 from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.native.base import elementary, machine, processor
@@ -26,6 +27,7 @@ RNG = np.random.default_rng(7)
 # More digits than float64, except on Windows and on Apple's processors
 LONG = np.longdouble
 IS_LONG = np.finfo(LONG).eps < 2.0**-60
+TWICE_ROUNDED = 0.75  # units in the last place by which errors are larger without fused multiply-add
 
 
 def signed(x):
@@ -142,7 +144,8 @@ def test_every_function_has_a_case():
 def test_errors_are_small_for_numbers_of_all_sizes(evaluate, name):
     case = CASES[name]
     found = evaluate(name, 1, *case.arguments)
-    assert np.max(errors(found, exact_results(name)), initial=0.0) <= case.ulps + (0.0 if IS_LONG else 1.0)
+    most = case.ulps + (0.0 if is_fused() or not case.ulps else TWICE_ROUNDED) + (0.0 if IS_LONG else 1.0)
+    assert np.max(errors(found, exact_results(name)), initial=0.0) <= most
 
 
 def special_arguments(name):
@@ -201,7 +204,7 @@ def test_errors_are_small_without_fused_multiply_add(monkeypatch, evaluate):
     monkeypatch.setattr(machine, "_target_machine", lambda level: target)
     for name, case in CASES.items():
         found, exact = evaluate(name, 1, *case.arguments), exact_results(name)
-        assert np.max(errors(found, exact), initial=0.0) <= case.ulps + 0.75 * (case.ulps > 0), name
+        assert np.max(errors(found, exact), initial=0.0) <= case.ulps + TWICE_ROUNDED * (case.ulps > 0), name
 
 
 @pytest.mark.parametrize("name", [*ONE, *TWO])

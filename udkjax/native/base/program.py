@@ -16,7 +16,10 @@ from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, l
 
 SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
 COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
-HALF_PI = (math.pi / 2, 6.123233995736766e-17)  # in two parts: their sum is exact to 107 binary digits
+# pi / 2: the first three parts have 23 digits; their multiples up to 2^30 are exact, whether or not multiplications are fused.
+HALF_PI = tuple(
+    map(float.fromhex, ("0x1.921fb40000000p+0", "0x1.4442d00000000p-24", "0x1.8469880000000p-48", "0x1.8cc51701b839ap-72"))
+)
 ROUND = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
 _ARITHMETIC = ("add", "sub", "mul", "div")
 _COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
@@ -262,8 +265,9 @@ def sincos(f: Function, a: Value) -> tuple[Value, Value]:
     width, T, integers = a.width, a.type, llvm_type(INT, a.width)
     shifted = f.fma(a, 2 / math.pi, ROUND)
     turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUND, DOUBLE, width).name}", DOUBLE, width)
-    x = f.fma(turns, -HALF_PI[0], a)
-    x = f.fma(turns, -HALF_PI[1], x)
+    x = a
+    for part in HALF_PI:
+        x = f.fma(turns, -part, x)
     y = x * x
     s, c = f.const(SIN[8], DOUBLE, width), f.const(COS[9], DOUBLE, width)
     for k in range(7, 0, -1):
