@@ -98,6 +98,22 @@ PAIRS = {
         scene(drivers={"turn": udk.Driver(**TURN, points=PIN[1][::-1])}, joints={"pin": udk.Slot(*PIN, axis=1.5)}),
         scene(drivers={"turn": udk.Driver(**TURN, axis=0.2)}, joints={"pin": udk.Slot(*PIN, axis=1.5)}),
     ),
+    "slides or angles that are coupled": Pair(
+        udk.Coupling,
+        ("axis", "points"),
+        scene(joints={"coupled": udk.Coupling(["ground", "block"], ["ground", "rod"], [0.3, 0.5], 0.0, points=np.zeros((2, 2)))}),
+        scene(joints={"coupled": udk.Coupling(["ground", "block"], ["ground", "rod"], [0.0, 0.5]), "rail": udk.Slot(*RAIL, 0.0)}),
+    ),
+    "slides and angles that are coupled": Pair(
+        udk.Coupling,
+        ("to_axis", "to_points"),
+        scene(
+            joints={
+                "coupled": udk.Coupling(["ground", "rod"], ["ground", "block"], [-0.6, 2.0], None, 0.0, None, np.zeros((2, 2)))
+            }
+        ),
+        scene(joints={"coupled": udk.Coupling(["ground", "rod"], ["ground", "block"], [-0.6, 2.0], None, 0.0)}),
+    ),
     "lower or upper limit": Pair(
         udk.JointLimit,
         ("lower", "upper"),
@@ -146,7 +162,7 @@ def test_scenes_that_differ_in_absent_numbers_are_told_apart(name):
     first, second, again = found["eager"]
     assert_allclose(again, first, rtol=0, atol=0)
     assert np.isfinite(first).all() and np.isfinite(second).all()
-    if name != "static contact":  # which differs at rest only
+    if name not in ("static contact", "slides and angles that are coupled"):  # differs at rest only; the points are the default
         assert np.abs(first - second).max() > 1e-6
     assert_allclose(found["jit"], found["eager"], rtol=0, atol=1e-9)
     if pair.first_events is None:
@@ -212,3 +228,19 @@ def test_systems_that_differ_in_absent_functions():
     assert_allclose(potential[0], 19.62 * np.asarray(ends[0].q)[:, 1], atol=1e-12)
     assert_allclose(potential[5], potential[0], rtol=0, atol=0)
     assert not np.any(potential[1])
+
+
+ACTIONS = (udk.Log(), udk.Impact(0.5), udk.Stop(), udk.Release("pin"), udk.Lock("pin"), udk.Impact(0.3, at_rest="stop"))
+RETURNED = (-1.0, 0.5, -1.0, -1.0, 0.0, 0.3)  # rate after over rate before, with the sign of a rebound
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_actions_at_the_same_condition_one_after_another(engine):
+    """The code of a run has room for all numbers of its events, also for those that no condition uses."""
+    ts = np.linspace(0.0, 0.2, 3)
+    for action, ratio in (*zip(ACTIONS, RETURNED, strict=True), *zip(ACTIONS[::-1], RETURNED[::-1], strict=True)):
+        event = udk.Event(lambda t, frames: frames["rod"].angle + 0.05, action, name="met")
+        run = udk.simulate(scene(), ts, events=event, engine=engine, throw=False, **EXACT)
+        assert run.events is not None and run.events.of("met")[0] == pytest.approx(0.18, abs=0.05), action
+        before, after = (float(x[0, 0, 2]) for x in (run.events.v_before, run.events.v_after))
+        assert after == pytest.approx(-ratio * before, abs=1e-7), action

@@ -110,7 +110,7 @@ FORCE_STEP = 1e-7  # time difference, in T, for the rate of a force
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions g(t, q, v), and forces of constraints, that a run watches; compared by `key` and `force_key`.
+    """Conditions g(t, q, v), and forces of constraints, that a run watches; compared by texts instead of programs.
 
     Attributes:
         key: texts of the programs.
@@ -126,8 +126,8 @@ class Conditions:
     key: Hashable
     program: ScalarProgram = field(compare=False)
     at_state: ScalarProgram = field(compare=False)
-    number_count: int = field(compare=False)
-    by_velocity: tuple[bool, ...] = field(compare=False)
+    number_count: int  # compared: a program may use none of the numbers, and the room for them is part of the code
+    by_velocity: tuple[bool, ...]
     forces: ScalarProgram | None = field(compare=False, default=None)
     force_key: Hashable = ""
 
