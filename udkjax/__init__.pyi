@@ -124,6 +124,7 @@ from udkjax.scene import on_rail as on_rail
 from udkjax.scene import polar as polar
 from udkjax.scene import read_mjcf as read_mjcf
 from udkjax.scene import save as save
+from udkjax.scene import stacked as stacked
 from udkjax.scene import with_angle as with_angle
 from udkjax.scene import with_length as with_length
 from udkjax.show.player import Animation as Animation

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.optimize import minimize_scalar
 
 import udkjax as udk
 from udkjax.positions.characteristics import acute_range
@@ -112,6 +113,56 @@ def test_dead_points_time_ratio_and_transmission_of_a_crank_rocker():
     assert found.mobility.counted == found.mobility.true == 1 and found.turns
     lines = found.lines()
     assert lines["type"].startswith("crank-rocker") and "the angle of O-A" in lines["driver"]
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e3])
+def test_speeds_of_a_whitworth_quick_return_are_extreme_above_and_below_its_pin(unit):
+    r, e = 0.1 * unit, 0.05 * unit  # the pin of the lever lies within the circle of the crank
+    pins = {"O": (0, 0), "C": (0, -e), "A": udk.polar("O", r, 1.0)}
+    links = {"crank": {"pins": ["O", "A"], "mass": 1}, "lever": {"pins": ["C"], "mass": 1, "width": r}}
+    slots = [{"pin": "A", "along": ["C", "A"], "on": "lever"}]
+    mech = udk.Drawing(pins, links, ["O", "C"], slots=slots, motors=[{"pin": "O", "speed": 1.0}]).mechanism()
+    found = udk.characteristics(mech)
+    slow, fast = found.outputs["lever"].speed_ratios
+    assert_allclose([slow.ratio, fast.ratio], [r / (r + e), r / (r - e)], rtol=1e-12)
+    assert_allclose(np.sin([slow.at[0], fast.at[0]]), [1.0, -1.0], rtol=1e-12)
+    assert found.lines()["speed ratio of lever"] == "0.666667 at 90 deg to 2 at 270 deg"
+
+
+def test_speed_of_a_slide_in_the_units_of_the_drawing():
+    """A scotch yoke: the slide follows the cosine of the crank."""
+    pins = {"O": (0, 0), "A": udk.polar("O", 50, 20), "P": (90, 0)}
+    links = {"crank": {"pins": ["O", "A"], "mass": 1}, "yoke": {"pins": ["P"], "mass": 1, "width": 20}}
+    slots = [{"pin": "A", "direction": 90, "on": "yoke"}]
+    given = {"slides": [{"link": "yoke", "direction": 0}], "slots": slots, "motors": [{"pin": "O", "speed": "60 rpm"}]}
+    found = udk.characteristics(udk.Drawing(pins, links, ["O"], **given, units=MM).mechanism())
+    least, most = found.outputs["yoke"].speed_ratios
+    assert_allclose([least.ratio, most.ratio], [-0.05, 0.05], rtol=1e-12)
+    assert_allclose(np.cos([*least.at, *most.at]), np.zeros(2), atol=1e-12)
+    assert found.lines()["speed ratio of yoke"] == "-50 mm/rad at 90 deg to 50 mm/rad at 270 deg"
+
+
+def test_speeds_of_a_crank_rocker_are_those_of_its_loop():
+    found = udk.characteristics(four_bar()).outputs["rocker"].speed_ratios
+
+    def ratio(angle):
+        return by_vectors(angle, 1.0, 0.0, 0.04, 0.12, 0.08, 0.1)[1][1]
+
+    for sign, extreme in zip((1, -1), found, strict=True):
+        k = np.argmin([sign * ratio(x) for x in np.linspace(0, 2 * np.pi, 200)])
+        around = np.linspace(0, 2 * np.pi, 200)[k] + np.array([-0.05, 0.05])
+        best = minimize_scalar(lambda x, sign=sign: sign * ratio(x), bounds=around, method="bounded", options={"xatol": 1e-9})
+        assert_allclose(extreme.ratio, sign * best.fun, rtol=1e-12)
+        assert_allclose(np.cos(extreme.at[0] - best.x), 1.0, rtol=1e-12)
+        near = extreme.at[0] + np.array([-1e-4, 1e-4])
+        assert_allclose(*map(ratio, near), rtol=1e-10)  # the place itself, to more digits than a minimum tells
+
+
+def test_a_constant_speed_has_no_place():
+    found = udk.characteristics(udk.library.parallelogram(), "body.link1.angle")
+    text = {title: words for title, words in found.lines().items() if title.startswith("speed")}
+    assert text and set(text.values()) == {"constantly 1"}
+    assert udk.characteristics(four_bar(90, 60, 80, 120)).outputs["rocker"].speed_ratios is None  # toggles: without limit
 
 
 def test_acute_angles_fold():

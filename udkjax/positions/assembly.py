@@ -138,7 +138,7 @@ def _assemble_given(
     mechanism: Mechanism | ConstrainedSystem, t: NumberLike, state: State | None, throw: bool, given: GivenState
 ) -> State:
     """Close the position with the given coordinates, then the velocity with the given ones."""
-    if state is None and mechanism.q0 is not None:
+    if state is None and mechanism.q0 is not None and mechanism.v0 is not None:
         state = State(mechanism.q0, mechanism.v0)
     try:
         closed = assemble(given.at_position(), t, state, throw)

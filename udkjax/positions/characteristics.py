@@ -21,7 +21,20 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.joints import Cam, Gear, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
+ALIKE = 1e-9  # relative to the fastest: speeds of mirrored positions, which rounding separates
 REFINEMENTS, REFINED = 6, 21  # of the extremes of pressure angles: rounds, and values of each; a round divides the step by ten
+
+
+class SpeedRatio(NamedTuple):
+    """An extreme speed of a link for one of the driver.
+
+    Attributes:
+        ratio: the speed (rad or m) per rad of the driver, with its sign.
+        at: the values of the driver (rad) at which it is reached; empty if the ratio is constant.
+    """
+
+    ratio: float
+    at: tuple[float, ...]
 
 
 class Output(NamedTuple):
@@ -32,12 +45,15 @@ class Output(NamedTuple):
         extent: its swing angle (rad) or its stroke (m); for a link that turns all the way round, a whole turn.
         dead_points: the values of the driver (rad, m) at which it turns back.
         time_ratio: of a link that turns back twice a turn: the driver's longer way between them over the shorter one, else None.
+        speed_ratios: the least and the largest speed for one of the driver, with their signs; None unless the driver makes whole
+            turns, because in its toggle positions the ratio has no limit.
     """
 
     kind: str
     extent: float
     dead_points: tuple[float, ...]
     time_ratio: float | None
+    speed_ratios: tuple[SpeedRatio, SpeedRatio] | None = None
 
 
 class Characteristics(PrintsTable):
@@ -83,12 +99,28 @@ class Characteristics(PrintsTable):
                 )
             if output.time_ratio is not None:
                 lines[f"time ratio of {name}"] = f"{output.time_ratio:.6g}"
+            if output.speed_ratios is not None:
+                lines[f"speed ratio of {name}"] = self._speed_words(output)
         angles = {f"transmission angle at {pin}": ends for pin, ends in self.transmission_angles.items()}
         for title, ends in (angles | {f"pressure angle of {cam}": ends for cam, ends in self.pressure_angles.items()}).items():
             least, most = (format_number(np.degrees(x), scale=90.0) for x in ends)
             lines[title] = f"{least} to {most} deg"
         lines |= {f"ratio of {name}": f"{ratio:.9g}" for name, ratio in self.ratios.items()}
         return lines
+
+    def _speed_words(self, output: Output) -> str:
+        """Return the least and the largest speed ratio as text, with the places of the driver."""
+        assert output.speed_ratios is not None
+        units, scale = self.count.units, max(abs(extreme.ratio) for extreme in output.speed_ratios)
+        slides = output.kind == "slides"
+        size, unit = (units.size("m"), f" {units.shown('m')}/rad") if slides else (1.0, "")
+        words = [
+            format_number(ratio / size, scale=scale / size)
+            + unit
+            + (f" at {', '.join(map(self.count.within_turn, at))}" if at else "")
+            for ratio, at in output.speed_ratios
+        ]
+        return " to ".join(words) if output.speed_ratios[0].at else f"constantly {words[0]}"
 
     def _table(self) -> PrintedTable:
         return PrintedTable("characteristics", list(self.lines().items()))
@@ -121,6 +153,12 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
     measured = _outputs(mechanism, element) if cycle.is_known else {}
     turning = dict(zip(measured, cycle.turning_points([weights for _, weights in measured.values()]), strict=True))
     outputs = {name: _output(cycle, kind, weights, turning[name]) for name, (kind, weights) in measured.items()}
+    if cycle.turns:
+        fastest = cycle.speed_extremes([weights for _, weights in measured.values()])
+        outputs = {
+            name: outputs[name]._replace(speed_ratios=_speed_ratios(cycle, weights, extremes))
+            for (name, (_, weights)), extremes in zip(measured.items(), fastest, strict=True)
+        }
     angles = _transmission_angles(mechanism, element, cycle) if cycle.is_known else {}
     has_gears = any(isinstance(joint, Gear) for joint in mechanism.joints.values())
     pressures = _pressure_angles(mechanism, driver, cycle) if cycle.is_known else {}
@@ -165,6 +203,20 @@ def _output(cycle: Cycle, kind: str, weights: Combination, turning: list[Turning
         way = (values[1] - values[0]) % (2 * np.pi)
         ratio = max(way, 2 * np.pi - way) / min(way, 2 * np.pi - way)
     return Output(kind, extent, values, ratio)
+
+
+def _speed_ratios(cycle: Cycle, weights: Combination, extremes: list[tuple[float, float]]) -> tuple[SpeedRatio, SpeedRatio]:
+    """Return the least and the largest of the extremes; if there are none, the constant ratio twice."""
+    if not extremes:
+        constant = SpeedRatio(float(weights.of(cycle.dq[:1])[0]), ())
+        return constant, constant
+    rates = [rate for _, rate in extremes]
+    same = ALIKE * max(map(abs, rates))
+
+    def reached(best: float) -> SpeedRatio:
+        return SpeedRatio(best, tuple(value for value, rate in extremes if abs(rate - best) <= same))
+
+    return reached(min(rates)), reached(max(rates))
 
 
 def _transmission_angles(mechanism: Mechanism, driven: Coordinate, cycle: Cycle) -> dict[str, tuple[float, float]]:

@@ -26,7 +26,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
 GivenValues: TypeAlias = Mapping[str, NumberLike]
-_COORDINATE_OF = dict(zip(RATES, COORDINATES, strict=True))  # vx: x, ...
+_COORDINATE_OF: dict[str, str] = dict(zip(RATES, COORDINATES, strict=True))  # vx: x, ...
 
 
 class GivenState:

@@ -1,7 +1,7 @@
 """Places over the values of a driver where an angle or a displacement turns back, to rounding."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +15,10 @@ GRID = 721  # values of a driver over its range: half a degree apart over a turn
 SHIFT = 0.4142  # of a step: linkages are drawn in dead points, which shall lie within the range
 STILL = 1e-9  # relative to the fastest: slower is rounding
 NEWTON_STEPS = 5  # from a secant of the grid to rounding
+SECANTS = 7  # the same without the derivative, by secants that keep the zero between them
+
+
+Item = TypeVar("Item")
 
 
 class Combination(NamedTuple):
@@ -101,7 +105,38 @@ class Cycle:
             steps = np.divide(slope, curvature, out=np.zeros_like(slope), where=~dwells)
             value = np.clip(value - steps, low, high)
         points = [TurningPoint(float(v), float(h), bool(d)) for v, h, d in zip(value, height, dwells, strict=True)]
-        return [[point for point, k in zip(points, which, strict=True) if k == number] for number in range(len(measured))]
+        return _by_number(zip(which, points, strict=True), len(measured))
+
+    def speed_extremes(self, measured: Sequence[Combination]) -> list[list[tuple[float, float]]]:
+        """Return the values of the driver, in order, at which the rate of each combination by it is extreme, with these rates.
+
+        At these the second derivative is zero; it is found by the secants of Illinois, which also find places where it jumps. A
+        combination that moves in proportion to the driver has none.
+        """
+        curves = [one.of(self.ddq) for one in measured]
+        sizes = [np.max(np.abs(one.of(self.dq)), initial=0.0) for one in measured]
+        found = [(k, i) for k, (x, size) in enumerate(zip(curves, sizes, strict=True)) for i in _sign_changes(x, size)]
+        if not found:
+            return [[] for _ in measured]
+        which, index = np.array(found).T
+        ends, heights = self.values[np.stack([index, index + 1])], np.stack(curves)[which, np.stack([index, index + 1])]
+        value, rate, kept = ends[0], np.zeros(len(found)), np.full(len(found), -1)
+        for _ in range(SECANTS):
+            value = ends[0] - heights[0] * (ends[1] - ends[0]) / (heights[1] - heights[0])
+            order = np.argsort(value)
+            motion, back = self.at(value[order]), np.argsort(order)
+            rate, height = (
+                np.array([measured[k].of(np.asarray(x)[i : i + 1])[0] for i, k in zip(back, which, strict=True)])
+                for x in (motion.v, motion.a)
+            )
+            side = np.where(height * heights[0] > 0, 0, 1)  # the end that the new place replaces
+            everyone = np.arange(len(found))
+            heights[1 - side, everyone] *= np.where(side == kept, 0.5, 1.0)
+            ends[side, everyone], heights[side, everyone], kept = value, height, side
+            if np.all(heights[0] == heights[1]):
+                break
+        pairs = zip(which, value.tolist(), rate.tolist(), strict=True)
+        return _by_number(((k, (v, r)) for k, v, r in pairs), len(measured))
 
     def heights(self, one: Combination, turning: Sequence[TurningPoint]) -> np.ndarray:
         """Return the values of a combination among which are its least and its largest."""
@@ -110,10 +145,17 @@ class Cycle:
         return np.array([point.height for point in turning] + at_ends + inner)
 
 
-def _sign_changes(slopes: np.ndarray) -> list[int]:
-    """Return the indices before changes of sign. Rounding errors have none; a dwell ends with one."""
+def _by_number(pairs: Iterable[tuple[int, Item]], count: int) -> list[list[Item]]:
+    lists: list[list[Item]] = [[] for _ in range(count)]
+    for k, item in pairs:
+        lists[k].append(item)
+    return lists
+
+
+def _sign_changes(slopes: np.ndarray, size: float = 0.0) -> list[int]:
+    """Return the indices before changes of sign. Errors of rounding, of slopes or of another size, have none; a dwell has one."""
     signs = np.sign(slopes)
-    signs[np.abs(slopes) <= STILL * np.max(np.abs(slopes), initial=0.0)] = 0.0
+    signs[np.abs(slopes) <= STILL * max(size, np.max(np.abs(slopes), initial=0.0))] = 0.0
     last = np.maximum.accumulate(np.where(signs != 0.0, np.arange(len(signs)), 0))
     signs = signs[last]
     return np.flatnonzero(signs[:-1] * signs[1:] < 0.0).tolist()

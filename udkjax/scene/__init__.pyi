@@ -24,6 +24,7 @@ from udkjax.scene.drawing import circles as circles
 from udkjax.scene.drawing import on_line as on_line
 from udkjax.scene.drawing import on_rail as on_rail
 from udkjax.scene.drawing import polar as polar
+from udkjax.scene.drawing import stacked as stacked
 from udkjax.scene.drawing.drawing_tables import LISTS as LISTS
 from udkjax.scene.drawing.drawn_forces import shift_motion as shift_motion
 from udkjax.scene.drawing.drawn_quantities import Units as Units

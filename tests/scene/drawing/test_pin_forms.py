@@ -54,6 +54,57 @@ def test_places_follow_from_lengths_and_angles():
     assert udk.check(four_bar()).residual_before < 1e-15
 
 
+def umbrella(**more):
+    """Two ribs on each side of a pole, with stretchers from its runner; those of one side lie in two layers."""
+    pins, links = {"N": (0, 400), "R": (0, 80)}, {"runner": {"pins": ["R"], "mass": 0.05, "width": 30}}
+    for side, name in ((1, "r"), (-1, "l")):
+        pins |= {f"J{name}1": udk.circles(("N", "R"), (200, 240), "left" if side > 0 else "right")}
+        pins |= {f"T{name}1": udk.polar("N", 500, 0, line=("N", f"J{name}1")), f"J{name}2": udk.stacked(f"J{name}1")}
+        pins |= {f"T{name}2": udk.stacked(f"T{name}1")}
+        for k in (1, 2):
+            links[f"rib {name}{k}"] = {"pins": ["N", f"J{name}{k}", f"T{name}{k}"], "mass": 0.04, "width": 5}
+            links[f"stretcher {name}{k}"] = {"pins": ["R", f"J{name}{k}"], "mass": 0.02}
+    slides, motors = {"pole": {"link": "runner", "direction": [0, 1]}}, {"push": {"slide": "pole", "speed": "100 mm/s"}}
+    return udk.Drawing(pins | more, links, ["N"], slides=slides, motors=motors, units={"length": "mm"})
+
+
+def test_stacked_pins_do_not_join_the_links_of_two_layers():
+    mech = umbrella().mechanism()
+    pairs = [joint.bodies for joint in mech.joints.values()]
+    assert ("rib r2", "stretcher r2") in pairs and len(pairs) == 13 and not {("rib r1", "rib r2")} & {*pairs}
+    count = udk.analyse(mech)
+    assert count.degrees_of_freedom == 0 and count.redundant == ()  # separate pins leave no redundant row
+    one = np.asarray(udk.simulate(mech, [0.0, 0.3]).q[-1])
+    layers = [[mech.body_names.index(f"rib r{k}") for k in (1, 2)], [mech.body_names.index(f"stretcher l{k}") for k in (1, 2)]]
+    for first, second in layers:
+        assert_allclose(one[first], one[second], atol=1e-9)
+    moved = mech.with_parameters({"pin.Jr1.length": [0.21, 0.24]})
+    found = places(moved)
+    assert_allclose(found["Jr2"], found["Jr1"])
+    assert_allclose(np.hypot(*(found["Jr2"] - found["N"])), 210)
+    text = udk.dumps(mech)
+    assert 'Jr2 = {stacked = "Jr1"}' in text and udk.dumps(udk.loads(text)) == text
+
+    def points(lengths):
+        return mech.with_parameters({"pin.Jr1.length": lengths}).joints["Jr2"].points
+
+    slope = jax.jit(jax.jacfwd(points))(jnp.array([0.2, 0.24]))
+    assert np.all(np.isfinite(slope)) and np.any(slope)
+
+
+def test_stacks_may_be_high_but_not_circular():
+    pins = {"O": (0, 0), "C": udk.stacked("B"), "B": udk.stacked("A"), "A": (0, 1)}
+    links = {f"arm {end}": {"pins": ["O", end], "mass": 1} for end in "ABC"}
+    arms = udk.Drawing(pins, links, ["O"], velocities={"A": (2, 0), "C": (1, 0)}).mechanism()
+    assert_allclose(arms.v0[:, 2], [-2, -2, -1])  # the pin below moves the others, unless they have velocities of their own
+    with pytest.raises(udk.SceneError, match=r'or write \{stacked = "Jr1"\} if its links lie in another layer'):
+        umbrella(Jr2=udk.circles(("N", "R"), (200, 240), "left")).mechanism()
+    with pytest.raises(udk.SceneError, match="refers to"):
+        umbrella(Jr1=udk.stacked("Jr2"))
+    with pytest.raises(udk.SceneError, match='no pin named "Q"'):
+        umbrella(Jr2=udk.stacked("Q"))
+
+
 NUMBERS = ["pin.B.length", "pin.P.length", "pin.P.angle", "pin.O", "pin.A.length", "pin.A.angle", "pin.C.length", "pin.C.along"]
 NUMBERS += ["pin.M.share", "pin.N.length", "pin.N.off"]
 

@@ -17,7 +17,9 @@ from udkjax.scene.drawing.pin_forms import LinePin as LinePin
 from udkjax.scene.drawing.pin_forms import Pin as Pin
 from udkjax.scene.drawing.pin_forms import PolarPin as PolarPin
 from udkjax.scene.drawing.pin_forms import RailPin as RailPin
+from udkjax.scene.drawing.pin_forms import StackedPin as StackedPin
 from udkjax.scene.drawing.pin_tables import circles as circles
 from udkjax.scene.drawing.pin_tables import on_line as on_line
 from udkjax.scene.drawing.pin_tables import on_rail as on_rail
 from udkjax.scene.drawing.pin_tables import polar as polar
+from udkjax.scene.drawing.pin_tables import stacked as stacked

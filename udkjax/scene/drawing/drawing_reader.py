@@ -15,7 +15,7 @@ from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, Scre
 from udkjax.scene.drawing.drawn_quantities import Units, without_failed
 from udkjax.scene.drawing.link import Link, with_concrete_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, pin_mistakes, shape_mistakes, where
-from udkjax.scene.drawing.pin_forms import AbstractPin, places_of
+from udkjax.scene.drawing.pin_forms import AbstractPin, PointArray, lowest_of_stack, places_of
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.drivers import Driver
 from udkjax.scene.element_setup import as_leaves
@@ -92,7 +92,7 @@ def read_drawing(
     problems += layout_mistakes(layout, groups, fixed_pins, all_read)
     if not is_traced((groups["pin"], groups["link"])):
         drawn = concrete_elements(groups)
-        problems += shape_mistakes(places_of(drawn["pin"]), drawn["link"], {slot.pin for slot in drawn["slot"].values()})
+        problems += shape_mistakes(drawn["pin"], drawn["link"], {slot.pin for slot in drawn["slot"].values()})
         if not problems:
             problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
     return DrawingElements(groups, gravity, problems)
@@ -139,10 +139,17 @@ def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str])
     """Return the placement of the elements of a drawing, with NumPy or traced numbers."""
     links = groups["link"]
     places = places_of(groups["pin"])
-    speeds = {name: np.zeros(2) if pin.velocity is None else by_numpy(pin.velocity) for name, pin in groups["pin"].items()}
+    speeds = {name: _velocity(groups["pin"], name) for name in groups["pin"]}
     drawn = {name: link.body(places, speeds) for name, link in links.items()}
     frames = {name: Frame.at(by_numpy(body.position), by_numpy(body.angle)) for name, body in groups["body"].items()}
     return Placement(PinLayout(links, ground, groups["slide"]), places, drawn, frames)
+
+
+def _velocity(pins: Mapping[str, AbstractPin], name: str) -> PointArray:
+    """Return the initial velocity of a pin (m/s); a stacked one moves as the pin below, unless its own is given."""
+    given = pins[name].velocity
+    given = pins[lowest_of_stack(pins, name)].velocity if given is None else given
+    return np.zeros(2) if given is None else by_numpy(given)
 
 
 def concrete_elements(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -11,7 +11,14 @@ from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, twice_area, with_concrete_numbers
-from udkjax.scene.drawing.pin_forms import AbstractPin, PointArray, in_order, reference_mistakes
+from udkjax.scene.drawing.pin_forms import (
+    AbstractPin,
+    PointArray,
+    in_order,
+    lowest_of_stack,
+    places_of,
+    reference_mistakes,
+)
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.wording import quote
 
@@ -144,15 +151,19 @@ def pin_mistakes(pins: Mapping[str, AbstractPin], units: Units) -> Iterator[str]
             return
 
 
-def shape_mistakes(places: Mapping[str, PointArray], links: Mapping[str, Link], guided: Collection[str] = ()) -> Iterator[str]:
+def shape_mistakes(pins: Mapping[str, AbstractPin], links: Mapping[str, Link], guided: Collection[str] = ()) -> Iterator[str]:
     """Iterate over implausible pins and shapes; all numbers are concrete and finite.
 
-    Pins that are `guided` by slots may be at the places of other pins.
+    Pins that are stacked, or `guided` by slots, may be at the places of other pins.
     """
-    size = extent(list(places.values()))
+    places = places_of(pins)
+    size, lowest = extent(list(places.values())), {name: lowest_of_stack(pins, name) for name in pins}
     for pin1, pin2 in combinations(places, 2):
-        if pin1 not in guided and pin2 not in guided and np.linalg.norm(places[pin2] - places[pin1]) <= SAME_PLACE * size:
-            yield f"pins.{pin2}: is at the same place as pin {quote(pin1)}: give all links there one pin, or move it"
+        if {pin1, pin2} & {*guided} or lowest[pin1] == lowest[pin2]:
+            continue
+        if np.linalg.norm(places[pin2] - places[pin1]) <= SAME_PLACE * size:
+            layers = f"or write {{stacked = {quote(pin1)}}} if its links lie in another layer"
+            yield f"pins.{pin2}: is at the same place as pin {quote(pin1)}: give all links there one pin, move it, {layers}"
     yield from _far_pins(places)
     for k, (name, link) in enumerate(links.items()):
         yield from (f"{where('link', k, name)}{problem}" for problem in _shape_mistakes(places, link))

@@ -227,6 +227,27 @@ class LinePin(AbstractPin):
             yield ".to: must be another pin than from"
 
 
+class StackedPin(AbstractPin):
+    """A pin at the place of another one, in another layer: the links of the two are not joined to each other there."""
+
+    stacked: str = eqx.field(static=True, metadata=PIN)  # the other pin
+    velocity: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m/s; None: at rest
+
+    @property
+    def references(self):
+        return (self.stacked,)
+
+    def place(self, places):
+        return places[self.stacked]
+
+
+def lowest_of_stack(pins: Mapping[str, AbstractPin], name: str) -> str:
+    """Return the pin on which a pin is stacked, directly or on others; the pin itself if it is on none. There are no circles."""
+    while isinstance(pin := pins[name], StackedPin):
+        name = pin.stacked
+    return name
+
+
 def norm(vector: PointArray) -> Any:
     """Return the length of a vector."""
     return array_namespace(vector).sqrt(vector @ vector)
@@ -254,6 +275,8 @@ def _left_of(vector: PointArray) -> PointArray:
 
 def form_of(table: Mapping[str, object]) -> type[AbstractPin]:
     """Return the class of a pin whose table has these keys."""
+    if "stacked" in table:
+        return StackedPin
     if "on" in table:
         return RailPin
     if isinstance(table.get("from"), list | tuple) or "side" in table:

@@ -80,5 +80,19 @@ def on_line(
     return _table(**{"from": start}, to=end, share=share, length=length, off=off)
 
 
+def stacked(pin: str) -> dict[str, Any]:
+    """Return a pin at the place of another one, for `Drawing(pins={"A": (0, 1), "B": udk.stacked("A"), ...})`.
+
+    The links at one of them are not joined to those at the other, as in linkages whose links lie in several layers.
+
+    Args:
+        pin: The other pin.
+
+    Returns:
+        The pin as a table with the keys of a file.
+    """
+    return _table(stacked=pin)
+
+
 def _table(**given: Any) -> dict[str, Any]:
     return {key: value for key, value in given.items() if value is not None}

@@ -4,7 +4,7 @@
 import {inOrder, loosened, pinAt, placesOf, referencesOf, withNames} from "./pin_forms.js";
 import {length, written} from "./units.js";
 
-export const LISTS = ["link", "slide", "slot", "gear", "cam", "motor", "spring", "damper", "load", "body", "joint", "driver", "force"];
+export const LISTS = ["link", "slide", "slot", "gear", "screw", "cam", "motor", "spring", "damper", "load", "body", "joint", "driver", "force"];
 // Keys of tables that name pins and links.
 const PIN_KEYS = ["pin", "pins", "along", "between"], LINK_KEYS = ["link", "on", "links", "of", "carrier", "bodies", "body"];
 const GROUND = "ground";

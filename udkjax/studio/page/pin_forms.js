@@ -10,13 +10,13 @@ const unit = a => { const size = Math.hypot(...a); return size > 0 ? [a[0] / siz
 const turned = (a, by) => [a[0] * by[0] - a[1] * by[1], a[0] * by[1] + a[1] * by[0]];
 
 /** The pins that a pin refers to. */
-export const referencesOf = value => (isTable(value) ? [value.from, value.to, value.on, value.line].flat().filter(name => typeof name === "string") : []);
+export const referencesOf = value => (isTable(value) ? [value.stacked, value.from, value.to, value.on, value.line].flat().filter(name => typeof name === "string") : []);
 
 /** A pin that refers to other names. */
 export function withNames(value, swap) {
   if (!isTable(value)) return value;
   const again = names => (Array.isArray(names) ? names.map(swap) : swap(names));
-  return Object.fromEntries(Object.entries(value).map(([key, x]) => [key, ["from", "to", "on", "line"].includes(key) ? again(x) : x]));
+  return Object.fromEntries(Object.entries(value).map(([key, x]) => [key, ["stacked", "from", "to", "on", "line"].includes(key) ? again(x) : x]));
 }
 
 /** The places (m) of all pins that have one, by name. */
@@ -47,6 +47,7 @@ function axisOf({line, along}, at) {
 
 function formPlace(form, at, document) {
   const metres = value => length(value, document);
+  if (form.stacked !== undefined) return at[form.stacked] ?? null;
   if (Array.isArray(form.from)) {
     const [start, end] = form.from.map(name => at[name]), [r, s] = (Array.isArray(form.length) ? form.length : []).map(metres);
     if (!start || !end) return null;
@@ -79,7 +80,7 @@ export function pinAt(document, name, place) {
   const old = document.pins?.[name], at = placesOf(document);
   if (!isTable(old)) return place.map((x, k) => written(x, document, old?.[k]));
   const metres = (x, key) => written(x, document, old[key]);
-  if (!referencesOf(old).every(other => at[other])) return old;
+  if (old.stacked !== undefined || !referencesOf(old).every(other => at[other])) return old;
   if (Array.isArray(old.from)) {
     const [start, end] = old.from.map(other => at[other]), lengths = [start, end].map(p => Math.hypot(...minus(place, p)));
     return {...old, length: lengths.map((x, k) => written(x, document, old.length?.[k])), side: cross(minus(end, start), minus(place, start)) < 0 ? "right" : "left"};
