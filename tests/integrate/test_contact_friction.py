@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import udkjax as udk
 from examples.gallery import woodpecker
 from tests.friction import G
-from udkjax.complementarity.linear import solve_general_complementarity
+from udkjax.complementarity.linear import general_complementary_set
 from udkjax.integrate.events.impacts import ContactRows, Contacts, impulses_with_friction
 from udkjax.show.player.measure_curves import sticking_spans
 
@@ -100,9 +100,18 @@ def problem_of_friction(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_lemke_solves_problems_of_friction():
     for M, q in map(problem_of_friction, range(8)):
-        found = solve_general_complementarity(M[None], q[None], np.ones((1, len(q)), bool), np)
-        size = np.max(abs(q))
-        assert np.min(found.x) >= -1e-12 and np.min(found.y) >= -1e-11 * size and np.max(abs(found.x * found.y)) <= 1e-10 * size
+        passive, is_solved = general_complementary_set(M, q, np.ones(len(q), bool), np)
+        x = np.zeros(len(q))
+        x[passive] = np.linalg.solve(M[np.ix_(passive, passive)], -q[passive])
+        y, size = M @ x + q, np.max(abs(q))
+        assert is_solved and np.min(x) >= -1e-12 and np.min(y) >= -1e-11 * size and np.max(abs(x * y)) <= 1e-10 * size
+
+
+def test_lemke_tells_where_there_is_no_solution():
+    """y = -x - 1 is never positive, whatever else takes part."""
+    for xp in (np, jnp):
+        _, is_solved = general_complementary_set(xp.asarray(np.diag([-1.0, 1.0])), xp.array([-1.0, -1.0]), np.ones(2, bool), xp)
+        assert not is_solved
 
 
 def impact_with_friction(rng: np.random.Generator, has_one_restitution: bool) -> tuple[float, float]:
@@ -139,10 +148,10 @@ def test_energy_never_grows_in_impacts(count):
 
 @pytest.mark.slow
 def test_both_forms_of_lemke_agree():
-    M, q = (np.array(x) for x in zip(*map(problem_of_friction, range(3)), strict=True))
-    all_ = np.ones(q.shape, bool)
-    found = solve_general_complementarity(jnp.asarray(M), jnp.asarray(q), jnp.asarray(all_))
-    np.testing.assert_allclose(found.x, solve_general_complementarity(M, q, all_, np).x, atol=1e-12)
+    for M, q in map(problem_of_friction, range(3)):
+        all_ = np.ones(q.shape, bool)
+        forms = general_complementary_set(jnp.asarray(M), jnp.asarray(q), all_), general_complementary_set(M, q, all_, np)
+        assert all(np.array_equal(x, y) for x, y in zip(*forms, strict=True))
 
 
 @pytest.mark.slow

@@ -19,6 +19,9 @@ from udkjax.transforms.gradients import stop_gradients
 # Tolerance on y >= 0, relative to max |b|, for rows of unit size. Rounding errors are some 1e-15, more for nearly dependent rows.
 TIGHT = 1e-12
 LEMKE_STEPS = 10  # for each row; Lemke's method takes about as many steps as rows
+# Bound on the variable x0, relative to max |q|, where Lemke's method ends on a ray: in degenerate problems, a smaller one is a
+# rounding error, and the problem is solved.
+ON_RAY = 1e-9
 STEPS_PER_ROW = 6  # Lawson and Hanson observed half a step per row; the limit stops cycles caused by rounding
 
 
@@ -66,34 +69,21 @@ def solve_complementarity(
     return Complementary(x, times(W, x) + b, passive)
 
 
-def solve_general_complementarity(
-    M: Float[Any, "*m n n"], q: Float[Any, "*m n"], takes_part: Bool[Any, "*m n"], xp: ModuleType = jnp
-) -> Complementary:
-    """Solve 0 <= x, y = M x + q >= 0, x y = 0, by Lemke's method, which finds a solution for copositive M (Cottle et al. 1992).
+def general_complementary_set(
+    M: Float[Any, "n n"], q: Float[Any, "n"], takes_part: Bool[Any, "n"], xp: ModuleType = jnp
+) -> tuple[Bool[Any, "n"], Bool[Any, ""]]:
+    """Return the set of positive x in 0 <= x, y = M x + q >= 0, x y = 0, and whether there is a solution.
+
+    Lemke's method finds a solution for copositive M (Cottle, Pang and Stone 1992). The set has no derivatives.
 
     Args:
         M: need not be symmetric.
         q: y for x = 0.
         takes_part: mask of the x that may be positive; all others are zero, whatever y is.
         xp: jax.numpy, or NumPy.
-
-    Returns:
-        x and y, with derivatives for the final passive set; NaN where the method ends without a solution.
     """
-    pairs = takes_part[..., None, :] & takes_part[..., :, None]
-    reduced, right = xp.where(pairs, M, np.eye(q.shape[-1])), xp.where(takes_part, q, 1.0)
-    if xp is np:
-        found = [_lemke(*one, np) for one in zip(reduced.reshape(-1, *M.shape[-2:]), right.reshape(-1, q.shape[-1]), strict=True)]
-        passive, solved = (
-            np.array(x).reshape(shape) for x, shape in zip(zip(*found, strict=True), (q.shape, q.shape[:-1]), strict=True)
-        )
-    else:
-        passive, solved = jnp.vectorize(lambda M, q: _lemke(M, q, jnp), signature="(n,n),(n)->(n),()")(
-            *stop_gradients((reduced, right))
-        )
-    x = xp.where(passive, _solve_passive(reduced, right, passive, xp), 0.0)
-    x = xp.where(solved[..., None], x, xp.nan)
-    return Complementary(x, times(M, x) + q, passive)
+    reduced, right = xp.where(takes_part & takes_part[:, None], M, np.eye(len(q))), xp.where(takes_part, q, 1.0)
+    return _lemke(*((reduced, right) if xp is np else stop_gradients((reduced, right))), xp)
 
 
 class _Tableau(NamedTuple):
@@ -108,7 +98,6 @@ class _Tableau(NamedTuple):
 
 
 def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bool[Any, "n"], Bool[Any, ""]]:
-    """Return the set of positive x, and whether there is a solution."""
     n = len(q)
 
     def pivot(state: _Tableau, row: Any) -> _Tableau:
@@ -135,8 +124,10 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
             ratio = xp.where(candidates, values / divisor, xp.inf)
             least = xp.min(ratio)
             candidates = candidates & (ratio <= least + TIGHT * xp.maximum(1.0, xp.abs(least)))
-        new = pivot(state, xp.argmax(candidates))
-        return new._replace(fails=fails)
+        failed = state._replace(fails=fails)
+        if xp is np:
+            return failed if fails else pivot(state, np.argmax(candidates))
+        return jax.tree.map(lambda x, y: xp.where(fails, x, y), failed, pivot(state, xp.argmax(candidates)))
 
     def goes_on(state: _Tableau) -> Any:
         return ~(state.done | state.fails) & (state.steps < LEMKE_STEPS * n)
@@ -144,18 +135,21 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
     right = q / xp.maximum(xp.max(xp.abs(q)), np.finfo(float).tiny)
     table = xp.concatenate([np.eye(n) + 0 * M, -M, xp.zeros_like(q)[:, None] - 1, right[:, None]], axis=1)
     state = _Tableau(table, np.arange(n) + 0, xp.asarray(2 * n), xp.asarray(0), xp.all(right >= 0), xp.asarray(False))
+    leads = n - 1 - xp.argmax((right <= xp.min(right) + TIGHT)[::-1])  # the last of equal rows: first in lexicographic order
     if xp is np:
         if not state.done:
-            state = pivot(state, np.argmin(right))
+            state = pivot(state, leads)
         while goes_on(state):
             state = step(state)
     else:
         state = state._replace(basic=jnp.asarray(state.basic))
-        first = pivot(state, xp.argmin(right))
+        first = pivot(state, leads)
         state = jax.tree.map(lambda x, y: xp.where(state.done, x, y), state, first)
         state = jax.lax.while_loop(goes_on, step, state)
     passive = xp.any(state.basic[:, None] == n + np.arange(n), axis=0)
-    return passive, state.done
+    x0 = xp.sum(xp.where(state.basic == 2 * n, state.table[:, -1], 0.0))
+    solved = state.done | (state.fails & (x0 <= ON_RAY))
+    return passive & solved, solved
 
 
 def eliminate(
@@ -199,7 +193,17 @@ def _solve_passive(W: Any, b: Any, passive: Any, xp: ModuleType) -> Any:
     """Return x with (W x + b) = 0 in the passive set, and x = 0 elsewhere."""
     passive_pairs = passive[..., None, :] & passive[..., :, None]
     matrix = xp.where(passive_pairs, W, xp.eye(W.shape[-1]))
-    return xp.linalg.solve(matrix, xp.where(passive, -b, 0.0)[..., None])[..., 0]
+    return solve(matrix, xp.where(passive, -b, 0.0), xp)
+
+
+def solve(A: Float[Any, "*m n n"], b: Float[Any, "*m n"], xp: ModuleType) -> Float[Any, "*m n"]:
+    """Return the solution of A x = b; NaN or infinity if A is singular."""
+    try:
+        return xp.linalg.solve(A, b[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        if b.ndim == 1:
+            return np.full(b.shape, np.nan)
+        return np.stack([solve(*member, xp) for member in zip(A, b, strict=True)])
 
 
 def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, equalities: Any, xp: ModuleType) -> Any:

@@ -25,15 +25,8 @@ If one of the contacts has friction, the rows of its sliding along its line, s_d
 
     |Lambda_s| <= mu Lambda_i,        s_dot+ = 0 within this limit, else opposite to Lambda_s,
 
-and the law is Poisson's (Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996, chapter 8): a phase of
-compression without restitution, with the impulses L, and one of expansion with P, whose normal parts have P_i >= s e_i L_i and
-g_dot+ >= 0, one of them an equality. Each is a linear complementarity problem (Stewart and Trinkle 1996). In the metric W, and
-with e L the impulses L, normal and along the line, each times the e of its contact,
-
-    T+ - T- <= <P, s e L> - |P|^2 / 2 - |L|^2 / 2 <= (|s e L|^2 - |L|^2) / 2 <= 0,        s = min(1, |L| / |e L|).
-
-s is one unless contacts with different e act on each other strongly; without s energy could grow. If the sliding keeps its
-direction in each phase, the result is Routh's.
+and the law is Poisson's, followed from one small impulse to the next (`rubbing_impact`): friction opposes the sliding at each
+moment of the impact, not only at its end.
 
 Contacts whose g_dot stays zero are in complementarity in accelerations: 0 <= lambda, g_ddot = g_ddot(lambda = 0) + W lambda >= 0,
 one of them zero. Those with lambda > 0 are held, as constraints. If one of them is too slow to rebound, the impact is repeated
@@ -55,9 +48,9 @@ from udkjax.complementarity.linear import (
     diagonal,
     eliminate,
     solve_complementarity,
-    solve_general_complementarity,
     times,
 )
+from udkjax.complementarity.rubbing_impacts import RubbingContacts, rubbing_impact
 from udkjax.complementarity.stick_or_slip import AT_REST
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.textbook import TextbookEquations
@@ -181,48 +174,20 @@ def impulses_with_friction(
     floor: Float[Any, "*m E"],
     xp: ModuleType = jnp,
 ) -> Impulses:
-    """Return the impulses of an impact with friction by Poisson's law of restitution: see the module."""
+    """Return the impulses of an impact with friction by Poisson's law of restitution (`rubbing_impact`)."""
     normals = np.flatnonzero(contacts.impacts)
     rubbing = np.flatnonzero(contacts.tangents[normals] >= 0)  # among the normals
     along = contacts.tangents[normals[rubbing]]
-    N, F = len(normals), len(rubbing)
-    size = xp.sqrt(xp.where(diagonal(rows.W, xp) > 0, diagonal(rows.W, xp), 1.0))
-    W = rows.W / size[..., None, :] / size[..., :, None]
-    columns = np.concatenate([normals, along, along])
-    signs = np.concatenate([np.ones(N + F), -np.ones(F)])
-    coefficient = contacts.friction[..., normals[rubbing]] * size[..., along] / size[..., normals[rubbing]]
+    columns, E = np.concatenate([normals, along]), rows.W.shape[-1]
+    free = rows.free[..., columns]
+    size = xp.sqrt(xp.where(free, diagonal(rows.W, xp)[..., columns], 1.0))
+    W = rows.W[..., columns, :][..., :, columns] / size[..., None, :] / size[..., :, None]
+    W = xp.where(free[..., None, :] & free[..., :, None], W, 0.0)
+    sizes = size[..., : len(normals)][..., rubbing], size[..., len(normals) :]
+    coefficient = contacts.friction[..., normals[rubbing]] * sizes[1] / sizes[0]
     takes_part = (closed & rows.free)[..., normals]
-    takes_part = xp.concatenate([takes_part, *[takes_part[..., rubbing]] * 3], axis=-1)
-
-    of_impulses = W[..., columns, :][..., :, columns] * signs * signs[:, None]
-    pairs = np.arange(N)[rubbing, None] == np.arange(N)
-    bounds = xp.concatenate([coefficient[..., None] * pairs, *[xp.zeros_like(of_impulses[..., :F, :F]) - np.eye(F)] * 2], axis=-1)
-    along_both = np.concatenate([np.zeros((N, F)), np.eye(F), np.eye(F)]) + xp.zeros_like(of_impulses[..., :F])
-    M = xp.concatenate(
-        [
-            xp.concatenate([of_impulses, along_both], axis=-1),
-            xp.concatenate([bounds, xp.zeros_like(bounds[..., :F])], axis=-1),
-        ],
-        axis=-2,
-    )
-
-    def solve(rates: Any, least: Any) -> Any:
-        """Return the impulses (*m, E) in units of unit rows, if normal ones are at least `least` (*m, N)."""
-        known = xp.concatenate([least, xp.zeros_like(M[..., 0, N:])], axis=-1)
-        given = xp.concatenate([rates[..., columns] * signs, xp.zeros_like(coefficient)], axis=-1) + times(M, known)
-        x = solve_general_complementarity(M, given, takes_part, xp).x + known
-        spread = np.eye(rows.W.shape[-1])[columns] * signs[:, None]
-        return x[..., : len(columns)] @ spread
-
-    rates = rate / size
-    compression = solve(rates, xp.zeros_like(rates[..., normals]))
-    owner = np.arange(rows.W.shape[-1])
-    owner[along] = normals[rubbing]
-    rest = xp.where(closed, restitution, 0.0)[..., owner] * compression
-    energies = [xp.sum(x * times(W, x), axis=-1, keepdims=True) for x in (compression, rest)]
-    is_less = energies[1] <= energies[0]
-    share = xp.sqrt(xp.where(is_less, 1.0, energies[0] / xp.where(is_less, 1.0, energies[1])))
-    impulse = (compression + solve(rates + times(W, compression), (share * rest)[..., normals])) / size
+    given = RubbingContacts(W, rate[..., columns] / size, restitution[..., normals], coefficient, takes_part)
+    impulse = (rubbing_impact(given, rubbing, xp) / size) @ np.eye(E)[columns]
     after = rate + times(rows.W, impulse)
     limit = floor + STILL * _largest(rate, closed, xp)
     return Impulses(impulse, after, xp.any(closed & ~(after >= -limit), -1))  # NaN: there is no solution
