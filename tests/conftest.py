@@ -1,10 +1,12 @@
 """Fixtures that tests of several folders share."""
 
 import gc
+import importlib
 import json
 import math
 import os
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import jax
@@ -20,6 +22,7 @@ CACHE_SIZE = 2**30  # bytes; a cache that is larger before a run begins anew
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 import udkjax as udk
 from tests.quick_code import optimize
+from tests.skipped import skipped_for
 from udkjax import arrays
 from udkjax.folders import is_writable
 from udkjax.native import primitive
@@ -47,6 +50,18 @@ def pytest_configure(config):
     size = sum(x.stat().st_size for x in Path(CACHE).rglob("*") if x.is_file())
     if config.getoption("cacheclear", False) or size > CACHE_SIZE:
         shutil.rmtree(CACHE, ignore_errors=True)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_terminal_summary(terminalreporter):
+    """Say at the very end what was skipped, and what would bring it."""
+    result = yield
+    lines = skipped_for(terminalreporter.stats.get("skipped", ()))
+    if lines:
+        terminalreporter.section("skipped")
+        for line in lines:
+            terminalreporter.write_line(line)
+    return result
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -110,10 +125,14 @@ def linkage():
 @pytest.fixture(scope="module")
 def browser():
     """Headless Chromium for the tests of a module. While it runs, its thread cannot run another event loop."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install '.[browser]'")
     path = next((path for path in CHROMIUM if Path(path).exists()), None)
-    if path is None:
-        pytest.skip("there is no Chromium: apt-get install chromium")
+    missing = {
+        "playwright (sh install.sh --test --browser)": find_spec("playwright") is None,
+        "Chromium (apt-get install chromium)": path is None,
+    }
+    if any(missing.values()):
+        pytest.skip(f"a browser is needed: {' and '.join(name for name, is_missing in missing.items() if is_missing)}")
+    sync_api = importlib.import_module("playwright.sync_api")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield browser

@@ -1,5 +1,6 @@
 """The parts of `.ci/slow` contain every slow test once, and a part that has passed is not run again."""
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -40,7 +41,7 @@ def project(slow, tmp_path, monkeypatch):
     (tmp_path / ".gitignore").write_text("*.fails\n*.stops\n.pytest_cache/\n__pycache__/\n")
     for words in (["init", "-q"], ["add", "."], ["-c", "user.name=x", "-c", "user.email=x@x", "commit", "-qm", "All"]):
         subprocess.run(["git", *words], cwd=tmp_path, check=True)
-    none = {"ONLY_SLOW": {}, "LOWEST_TESTS": (), "OLDEST_TESTS": (), "TYPED": ()}
+    none = {"ONLY_SLOW": {}, "LOWEST_TESTS": (), "PYTHON_TESTS": (), "LANES_TESTS": (), "TYPED": ()}
     for name, value in {"ROOT": tmp_path, "PARTS": {"a": ("tests/a",)}, **none}.items():
         monkeypatch.setattr(slow, name, value)
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # they import JAX
@@ -120,4 +121,29 @@ exit 1
     assert slow.run_types(tmp_path / "other" / "python", ["tests"])["result"] == "skipped"
     assert slow.run_fast(None, ["tests"], [])["result"] == "skipped"
     configured = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pyright"]["include"]
-    assert set(slow.TYPED) == set(configured) and all((ROOT / path).exists() for path in slow.OLDEST_TESTS)
+    assert set(slow.TYPED) == set(configured) and all((ROOT / path).exists() for path in slow.PYTHON_TESTS)
+    assert all((ROOT / path).exists() for path in slow.LANES_TESTS)
+
+
+def test_lanes_are_set_for_their_part_alone_and_skipped_where_the_processor_lacks_them(slow, monkeypatch):
+    ran = []
+    monkeypatch.setattr(slow, "run_part", lambda python, tests, more, marked, own: ran.append((tests, marked, own)))
+    slow.run_named("lanes-1", Path(sys.executable), ["tests"], [])
+    assert ran == [(["tests"], "not slow", {"UDKJAX_LANES": "1"})]
+    entry = slow.run_lanes(Path(sys.executable), 3, ["tests"], [])
+    assert entry["result"] == "skipped" and "UDKJAX_LANES must be 1, 2, 4 or 8" in entry["words"] and len(ran) == 1
+
+
+def test_pages_are_run_where_their_packages_are(slow, monkeypatch):
+    ran = []
+    monkeypatch.setattr(slow, "environment", lambda name, *choices: Path(name, *choices))
+    monkeypatch.setattr(slow, "run_part", lambda *given: ran.append(given))
+    slow.run_named("pages", Path("python"), [], [])
+    assert ran == [(Path("browser", "--browser"), list(slow.PARTS["pages"]), [], "slow or not slow")]
+    in_a_browser = {
+        f"{file.relative_to(ROOT)}"
+        for folder in ("studio", "show/player")
+        for file in (ROOT / "tests" / folder).glob("test_*.py")
+        if re.search(r"def test_\w+\((.*, )?(browser|opened|studio|notebook)\b", file.read_text())
+    }
+    assert in_a_browser <= set(slow.PARTS["pages"])
