@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 
+from udkjax import folders
 from udkjax.native.base import code_cache, machine
 from udkjax.show import doctor
 
@@ -65,12 +66,12 @@ def test_files_of_others_and_files_that_others_may_write_are_not_used(folder, mo
         assert code_cache.read("name") is None
     code_cache.write("name", b"code")
     assert code_cache.read("name") == b"code"
-    monkeypatch.setattr(code_cache.os, "getuid", lambda: folder.stat().st_uid + 1, raising=False)
+    monkeypatch.setattr(folders.os, "getuid", lambda: folder.stat().st_uid + 1, raising=False)
     is_root = folder.stat().st_uid == 0  # whose code everybody runs
-    assert (code_cache.refusal(folder) is None) == is_root
+    assert (folders.refusal(folder) is None) == is_root
     assert code_cache.read("name") == (b"code" if is_root else None)
     status = os.stat_result((0o100600, 0, 0, 1, folder.stat().st_uid + 2, 0, 0, 0, 0, 0))
-    assert code_cache._distrust(status) == "it belongs to another user"
+    assert folders.distrust(status) == "it belongs to another user"
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of Unix")

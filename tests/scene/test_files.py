@@ -200,6 +200,9 @@ FROM_THE_GUESS = 'joint "rod" (joint[0]).length: must be '
     [
         (HEAD + "x = " + "[" * 3000 + "]" * 3000, "nest too deeply"),
         (HEAD + "x = " + "{a=" * 3000 + "1" + "}" * 3000, "nest too deeply"),
+        (HEAD + ".".join("a" * 100_000) + " = 1", "line 2: a key with more than 100 parts"),  # a minute, in the parser
+        (HEAD + "x = {" + ".".join("a" * 100_000) + " = 1}", "a key with more than 100 parts"),
+        (HEAD + "[[" + " . ".join(["'a b'"] * 100_000) + "]]", "a key with more than 100 parts"),
         (HEAD + BODY.replace("1.0", "1" + "0" * 5000), "not valid TOML: Exceeds the limit"),
         (HEAD + BODY.replace("1.0", "1" + "0" * 400), "must be finite, not inf"),
         (HEAD + BODY + "x" * 10_000 + " = 1\n", 'xxx...": unknown key'),

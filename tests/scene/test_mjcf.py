@@ -436,3 +436,23 @@ def test_files_and_the_command_line(tmp_path, capsys):
     (tmp_path / "parts" / "arm.xml").write_text("<mujocoinclude><include file='parts/arm.xml'/></mujocoinclude>")
     assert udkjax("check", path) == 2
     assert "(line 1 of parts/arm.xml): file=" in capsys.readouterr().err
+
+
+def test_files_that_include_others_twice_on_each_level_are_refused(tmp_path):
+    """Seventeen levels have 131,072 copies of the last file, and each further level twice as many."""
+    for k in range(26):
+        (tmp_path / f"{k}.xml").write_text("<mujocoinclude>" + f"<include file='{k + 1}.xml'/>" * 2 + "</mujocoinclude>")
+    (tmp_path / "26.xml").write_text("<mujocoinclude/>")
+    path = tmp_path / "model.xml"
+    path.write_text("<mujoco><worldbody><include file='0.xml'/></worldbody></mujoco>")
+    with pytest.raises(udk.SceneError, match="more than 100,000 elements: include each of them once"):
+        udk.load(path)
+
+
+def test_files_that_include_each_other_on_many_levels_are_refused(tmp_path):
+    for k in range(400):
+        (tmp_path / f"{k}.xml").write_text(f"<mujocoinclude><include file='{k + 1}.xml'/></mujocoinclude>")
+    path = tmp_path / "model.xml"
+    path.write_text("<mujoco><worldbody><include file='0.xml'/></worldbody></mujoco>")
+    with pytest.raises(udk.SceneError, match="on more than 50 levels"):
+        udk.load(path)

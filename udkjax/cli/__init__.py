@@ -59,8 +59,8 @@ def store_compiled_programs() -> None:
     A folder named by the environment takes precedence. Nothing is changed if JAX is already imported, if the folder cannot be
     written, or if others may write it.
     """
-    from udkjax.folders import is_writable
-    from udkjax.native.base.code_cache import cache_folder, refusal
+    from udkjax.folders import is_writable, refusal
+    from udkjax.native.base.code_cache import cache_folder
 
     folder = cache_folder()
     if folder is None or "jax" in sys.modules or not is_writable(folder) or refusal(folder):

@@ -137,6 +137,11 @@ def _string(text: str) -> str:
     return '"' + re.sub(r"[\x00-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped) + '"'
 
 
+MOST_KEY_PARTS = 100  # more, and the time to read them, which grows with the square, would be noticed
+_KEY_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MOST_KEY_PARTS},}}")
+
+
 def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
     """Parse a TOML text.
 
@@ -151,6 +156,9 @@ def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
     Raises:
         Mistakes: `error`; the text is not TOML, nests too deeply, or contains a number with thousands of digits.
     """
+    if (key := _LONG_KEY.search(text)) is not None:
+        line = text.count("\n", 0, key.start()) + 1
+        raise error([f"line {line}: a key with more than {MOST_KEY_PARTS} parts between dots; three are enough"], source)
     try:
         return tomllib.loads(text.removeprefix("\ufeff"))
     except RecursionError:

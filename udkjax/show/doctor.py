@@ -12,10 +12,10 @@ import numpy as np
 
 from udkjax.devices import default_devices, host_device
 from udkjax.extras import EXTRAS
-from udkjax.folders import is_writable
+from udkjax.folders import is_writable, refusal
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
-from udkjax.native.base.code_cache import cache_folder, cached_files, refusal
+from udkjax.native.base.code_cache import cache_folder, cached_files
 from udkjax.native.base.processor import lanes
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import processor
@@ -99,8 +99,8 @@ def _advice(engine: str, reason: str) -> Iterator[str]:
     if os.environ.get("UDKJAX_CACHE") != "0" and (folder is None or not is_writable(folder)):
         location = "without a home folder" if folder is None else f"in {folder}"
         yield f"machine code cannot be stored {location}, and is compiled in each process: set UDKJAX_CACHE to a folder"
-    elif folder is not None and (reason := refusal(folder)):
+    elif folder is not None and (refused := refusal(folder)):
         yield (
-            f"machine code in {folder} is neither executed nor stored, because {reason}: "
+            f"machine code in {folder} is neither executed nor stored, because {refused}: "
             f"run chmod go-w {folder}, or set UDKJAX_CACHE to a folder of your own"
         )

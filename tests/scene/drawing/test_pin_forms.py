@@ -10,6 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.scene.drawing import pin_forms
+from udkjax.scene.drawing.mistakes import shape_mistakes
 
 MM = {"length": "mm", "angle": "deg"}
 PINS = {
@@ -273,3 +275,24 @@ def test_a_pin_that_only_others_refer_to_is_a_point_of_the_ground():
     """A construction point: no link has it."""
     mech = four_bar(X=udk.on_line("O", "C", 0.5), A=udk.polar("O", 40, 60, line=("O", "X")))
     assert mech.drawing.locate_pin("X")[0] == "ground"
+
+
+def test_references_are_followed_and_pins_are_compared_in_few_steps(monkeypatch):
+    """Each pin was compared with all pairs of the others, and each reference looked for in all pins."""
+    count, asked, norm = 400, [], np.linalg.norm
+
+    class CountedPin(pin_forms.PolarPin):
+        @property
+        def references(self):
+            asked.append(1)
+            return super().references
+
+    pins = {f"p{k}": CountedPin(f"p{k - 1}", 1.0, 0.1) for k in range(count, 0, -1)} | {"p0": pin_forms.Pin([0.0, 0.0])}
+    monkeypatch.setattr(np.linalg, "norm", lambda *given, **choices: asked.append(1) or norm(*given, **choices))
+    assert pin_forms.in_order(pins) == [f"p{k}" for k in range(count + 1)]
+    row = {f"p{k}": pin_forms.Pin([float(k), 0.0]) for k in range(count)}
+    assert list(shape_mistakes(row, {})) == []
+    assert len(asked) < 5 * count
+    found = list(shape_mistakes(row | {"far": pin_forms.Pin([1e6, 0.0]), "on": pin_forms.Pin([7.0 + 1e-7, 0.0])}, {}))
+    assert ["pins.on: is at the same place as pin" in x for x in found] == [True, False]
+    assert "pins.far: is 1e+06 m away from the other pins, which are within 399 m of each other" in found[1]

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import platformdirs
 
+from udkjax.folders import distrust, refusal
+
 MAX_BYTES = 2**28  # maximum total size of the files; each has 10 to 75 KiB
 WRITES_OF_CHECK = 500  # number of writes between two checks of the limit, as listing thousands of files takes 20 ms
 TOUCH_AFTER = 86_400.0  # accuracy (s) of a file's time of last use: most reads need not update it
@@ -48,22 +50,6 @@ def cached_files() -> list[tuple[float, int, Path]]:
     return files
 
 
-def refusal(folder: Path) -> str | None:
-    """Return why the code in a folder is not executed; None if it is, or if there is no such folder."""
-    try:
-        return _distrust(folder.stat())
-    except OSError:
-        return None
-
-
-def _distrust(status: os.stat_result) -> str | None:
-    if not hasattr(os, "getuid"):  # Windows: the user's own folders are closed to others by default
-        return None
-    if status.st_uid not in (os.getuid(), 0):
-        return "it belongs to another user"
-    return "others may write to it" if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else None
-
-
 def read(name: str) -> bytes | None:
     """Return the stored code of this name; None if the file is missing or incomplete, or cannot be trusted."""
     folder = cache_folder()
@@ -87,7 +73,7 @@ def _read_own(path: Path) -> bytes:
     handle = os.open(path, _READING)
     try:
         status = os.fstat(handle)
-        if not stat.S_ISREG(status.st_mode) or _distrust(status):
+        if not stat.S_ISREG(status.st_mode) or distrust(status):
             return b""
         with open(handle, "rb", closefd=False) as file:
             data = file.read()

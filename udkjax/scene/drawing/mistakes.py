@@ -31,6 +31,7 @@ SAME_PLACE = 1e-9
 FAR_POINT_RATIO = 100.0
 # Tolerance relative to the largest distance between two pins. Smaller gaps are usual in drawings to scale; assembly closes them.
 DRAWN_GAP = 0.01
+NUMBERS_OF_BLOCK = 2**20  # of distances that are held at once, 24 MiB with their differences
 
 
 def where(section: str, index: int, name: str) -> str:
@@ -157,34 +158,52 @@ def shape_mistakes(pins: Mapping[str, AbstractPin], links: Mapping[str, Link], g
     Pins that are stacked, or `guided` by slots, may be at the places of other pins.
     """
     places = places_of(pins)
-    size, lowest = extent(list(places.values())), {name: lowest_of_stack(pins, name) for name in pins}
-    for pin1, pin2 in combinations(places, 2):
-        if {pin1, pin2} & {*guided} or lowest[pin1] == lowest[pin2]:
-            continue
-        if np.linalg.norm(places[pin2] - places[pin1]) <= SAME_PLACE * size:
-            layers = f"or write {{stacked = {quote(pin1)}}} if its links lie in another layer"
-            yield f"pins.{pin2}: is at the same place as pin {quote(pin1)}: give all links there one pin, move it, {layers}"
-    yield from _far_pins(places)
+    names, points = list(places), _as_points(list(places.values()))
+    index = {name: k for k, name in enumerate(names)}
+    lowest = np.array([index[lowest_of_stack(pins, name)] for name in names], int)
+    free, size = np.array([name not in guided for name in names], bool), extent(points)
+    for first, distances in _distances(points):
+        for i, row in enumerate(distances, first):
+            at = np.flatnonzero(free[:i] & free[i] & (lowest[:i] != lowest[i]) & (row[:i] <= SAME_PLACE * size)).tolist()
+            if at:
+                pin = quote(names[at[0]])
+                layers = f"or write {{stacked = {pin}}} if its links lie in another layer"
+                yield f"pins.{names[i]}: is at the same place as pin {pin}: give all links there one pin, move it, {layers}"
+    yield from _far_pins(names, points)
     for k, (name, link) in enumerate(links.items()):
         yield from (f"{where('link', k, name)}{problem}" for problem in _shape_mistakes(places, link))
 
 
-def extent(points: Sequence[PointArray]) -> float:
+def _as_points(points: Sequence[PointArray] | np.ndarray) -> np.ndarray:
+    return np.array(points, float).reshape(-1, 2)
+
+
+def _distances(points: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Iterate over blocks of rows of the matrix of distances, each with the index of its first row, in little memory."""
+    rows = max(1, NUMBERS_OF_BLOCK // max(len(points), 1))
+    for first in range(0, len(points), rows):
+        yield first, np.linalg.norm(points[first : first + rows, None] - points[None], axis=-1)
+
+
+def extent(points: Sequence[PointArray] | np.ndarray) -> float:
     """Return the largest distance between two points (m)."""
-    p = np.array(points).reshape(-1, 2)
-    return float(np.max(np.linalg.norm(p[:, None] - p[None], axis=-1), initial=0.0))
+    return max((float(np.max(x, initial=0.0)) for _, x in _distances(_as_points(points))), default=0.0)
 
 
-def _far_pins(places: Mapping[str, PointArray]) -> Iterator[str]:
-    if len(places) < 3:
+def _far_pins(names: Sequence[str], points: np.ndarray) -> Iterator[str]:
+    if len(names) < 3:
         return
-    for name, position in places.items():
-        others = [other for key, other in places.items() if key != name]
-        distance, size = min(np.linalg.norm(position - other) for other in others), extent(others)
-        if distance > FAR_POINT_RATIO * size > 0:
+    nearest, size = np.zeros(len(names)), extent(points)
+    for first, distances in _distances(points):
+        np.fill_diagonal(distances[:, first:], np.inf)
+        nearest[first : first + len(distances)] = np.min(distances, axis=1)
+    # Such a pin is nearly as far from all others as the drawing is large, since size <= distance + (size of the others).
+    for k in np.flatnonzero(nearest > 0.5 * size).tolist():
+        of_others = extent(np.delete(points, k, axis=0))
+        if nearest[k] > FAR_POINT_RATIO * of_others > 0:
             yield (
-                f"pins.{name}: is {distance:.3g} m away from the other pins, which are within {size:.3g} m of each other: "
-                "is its unit right?"
+                f"pins.{names[k]}: is {nearest[k]:.3g} m away from the other pins, which are within {of_others:.3g} m of each "
+                "other: is its unit right?"
             )
 
 

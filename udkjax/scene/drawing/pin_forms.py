@@ -306,14 +306,21 @@ def places_of(pins: Mapping[str, AbstractPin]) -> dict[str, PointArray]:
 
 
 def in_order(pins: Mapping[str, AbstractPin]) -> list[str]:
-    """Return the names of pins, each behind those that it refers to; pins that cannot be reached are left out."""
-    found: dict[str, None] = {}
-    waiting = dict(pins)
-    while ready := [name for name, pin in waiting.items() if all(other in found for other in pin.references)]:
-        for name in ready:
-            found[name] = None
-            del waiting[name]
-    return list(found)
+    """Return the names of pins, each after those that it refers to; pins that cannot be reached are left out."""
+    rank, found = {name: k for k, name in enumerate(pins)}, []
+    missing = {name: len(set(pin.references)) for name, pin in pins.items()}  # references that are not placed yet
+    users: dict[str, list[str]] = {}
+    for name, pin in pins.items():
+        for other in set(pin.references):
+            users.setdefault(other, []).append(name)
+    ready = [name for name, count in missing.items() if not count]
+    while ready:
+        found += ready
+        following = [user for name in ready for user in users.get(name, ())]
+        for user in following:
+            missing[user] -= 1
+        ready = sorted({user for user in following if not missing[user]}, key=rank.__getitem__)
+    return found
 
 
 def reference_mistakes(pins: Mapping[str, AbstractPin]) -> Iterator[str]:
@@ -335,9 +342,9 @@ def reference_mistakes(pins: Mapping[str, AbstractPin]) -> Iterator[str]:
 
 def _circle_from(name: str, pins: Mapping[str, AbstractPin], reached: set[str]) -> list[str]:
     """Return the circle of references, from its first pin, to which the first unreachable references of a pin lead."""
-    path = [name]
+    path = {name: 0}
     while True:
-        following = next(other for other in pins[path[-1]].references if other not in reached)
-        if following in path:
-            return path[path.index(following) :]
-        path.append(following)
+        name = next(other for other in pins[name].references if other not in reached)
+        if name in path:
+            return list(path)[path[name] :]
+        path[name] = len(path)

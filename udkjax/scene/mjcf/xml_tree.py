@@ -9,6 +9,9 @@ import numpy as np
 from udkjax.scene.checks import SceneError
 from udkjax.wording import abbreviate, quote, suggestion
 
+MOST_INCLUDED = 100_000  # elements of included files, each counted as often as it is included, 0.5 s of reading
+MOST_LEVELS = 50  # of files that include each other
+
 
 class XmlElement:
     """An element: its tag, attributes, children, its first line, and the name of the included file that contains it, if any."""
@@ -32,7 +35,17 @@ class XmlElement:
             pending.extend((child, element) for child in reversed(element.children))
 
 
-def parse_xml(text: str, source: str, file: str = "", within: tuple[str, ...] = ()) -> XmlElement:
+class _Included:
+    """The files included so far: their texts, and the number of elements in all."""
+
+    def __init__(self):
+        self.texts: dict[str, str] = {}
+        self.elements = 0
+
+
+def parse_xml(
+    text: str, source: str, file: str = "", within: tuple[str, ...] = (), included: _Included | None = None
+) -> XmlElement:
     """Return the root element of a text, with each <include> replaced by the content of the file.
 
     Args:
@@ -40,10 +53,12 @@ def parse_xml(text: str, source: str, file: str = "", within: tuple[str, ...] = 
         source: The file of the model, whose folder contains included files; or empty.
         file: The name of the included file, if it is one.
         within: The files that include it.
+        included: The files included so far.
 
     Raises:
         SceneError: The text is not XML, or a file cannot be included.
     """
+    included = included or _Included()
     parser, roots, opened = expat.ParserCreate(), [], []
 
     def start(tag: str, attributes: dict[str, str]) -> None:
@@ -58,22 +73,30 @@ def parse_xml(text: str, source: str, file: str = "", within: tuple[str, ...] = 
         raise SceneError([f"{f'{file}: ' if file else ''}not valid XML: {error}"], source) from None
     for parent in [roots[0], *(element for element, _ in roots[0].walk())]:
         if any(child.tag == "include" for child in parent.children):
-            replacements = [_included(c, source, within) if c.tag == "include" else [c] for c in parent.children]
+            replacements = [_include(c, source, within, included) if c.tag == "include" else [c] for c in parent.children]
             parent.children = [child for elements in replacements for child in elements]
     return roots[0]
 
 
-def _included(element: XmlElement, source: str, within: tuple[str, ...]) -> list[XmlElement]:
+def _include(element: XmlElement, source: str, within: tuple[str, ...], included: _Included) -> list[XmlElement]:
     """Return the elements of the file that an <include> names."""
     name = element.attributes.get("file", "")
     try:
         if not source or name in within:
             why = "it includes itself" if source else "a string has no folder to find it in: read the model from its file"
             raise SceneError([f"{element.where}: file={quote(name)} cannot be included: {why}"], source)
-        text = (Path(source).parent / name).read_text(encoding="utf-8")
+        if len(within) >= MOST_LEVELS:
+            raise SceneError([f"{element.where}: files include each other on more than {MOST_LEVELS} levels"], source)
+        if name not in included.texts:
+            included.texts[name] = (Path(source).parent / name).read_text(encoding="utf-8")
+        text = included.texts[name]
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError([f"{element.where}: file={quote(name)} cannot be read: {error}"], source) from None
-    return parse_xml(text, source, name, (*within, name)).children
+    included.elements += max(text.count("<"), 1)
+    if included.elements > MOST_INCLUDED:
+        problem = f"files included again and again have more than {MOST_INCLUDED:,} elements: include each of them once"
+        raise SceneError([f"{element.where}: {problem}"], source)
+    return parse_xml(text, source, name, (*within, name), included).children
 
 
 class AttributeReader:
