@@ -136,5 +136,5 @@ def test_without_dask_or_a_client_the_cure_is_told(monkeypatch):
         with pytest.raises(ClusterError, match=r"client=distributed\.Client"):
             dask_engine()
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingExtraError, match=r"pip install '\.\[dask\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'udkjax\[dask\]'"):
         dask_engine()
