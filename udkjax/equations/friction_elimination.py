@@ -17,13 +17,21 @@ direction, such as those of slides, are exact once their signs are.
 
 One round leaves an error of s^8: it suffices if the coefficients are below about a thirtieth of those that jam the mechanism, as
 in most machines. Programs that a run evaluates often take one round, and report loads that have not settled; machine code then
-takes as many further rounds as are needed (`further`). Where rounds go back and forth between two sets of signs of the loads, it
-follows the solution from that without friction on, with a growing `friction_share` of G. Programs that are differentiated begin
-with the loads that settled in this way. Other programs take `ROUNDS`. If the loads do not settle, friction admits no motion (the
-mechanism jams), and the accelerations are NaN.
+takes as many further rounds as are needed (`further`). A round begins where the step of the last one ended if the correction was
+not small. Where rounds go back and forth between two sets of signs of the loads, machine code follows the solution from that
+without friction on, with a growing `friction_share` of G. Programs that are differentiated begin with the loads that settled in
+this way. Other programs take `ROUNDS`. If the loads do not settle, friction admits no motion (the mechanism jams), and the
+accelerations are NaN.
+
+A load may obey the equations twice: once as it grows out of the motion without friction, and once with another sign, against
+which friction drives it further. If joints yield ever so little, the second one runs away, so that it is no motion. There the
+matrix has lost its sign: the determinant is positive without friction, and negative at such a load. Several such loads may
+restore it, but then there are `negative` pivots. A solution with these counts only if it was followed from that without friction.
 """
 
 from collections.abc import Callable
+
+from jax import lax
 
 from udkjax.equations.block_elimination import BlockElimination
 from udkjax.equations.element_programs import RubbingPrograms
@@ -33,7 +41,7 @@ from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, d
 from udkjax.equations.skew_elimination import SkewElimination
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
-from udkjax.expressions.selection import greater, where
+from udkjax.expressions.selection import apply, either, greater, where
 
 # Rounds of programs that cannot ask for more. At 0.9 of the coefficients that jam pins, three are needed.
 ROUNDS = 4
@@ -41,6 +49,9 @@ CORRECTION = SOLVES  # the number of the system of corrections
 # Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
 # which is below the smallest tolerance of runs; one more round would end at rounding errors.
 SETTLED = 1e-10
+# Relative change of the loads of friction beyond which a correction, which has the factors of the loads before, is not one: where
+# the direction of a load turns within a step, it undoes what the step has gained. It decides only the number of rounds.
+LARGE_CORRECTION = 1 / 8
 
 
 class FrictionElimination:
@@ -59,20 +70,20 @@ class FrictionElimination:
     def settle(self, solve: int, v: str = "v", reports: bool = False) -> ProgramParts:
         """Replace x of a system, without friction, by x with friction, and jt_x by J^T x + G(x); NaN if x does not settle.
 
-        With `reports` there is one round, and `unsettled` is one if it does not suffice to settle x, which is `settled`.
+        With `reports` there is one round, `unsettled` tells whether it suffices (see `_unsettled`), and `settled` is x.
         """
         yield from self._skew.form_symmetric
         yield from self.sharing.find_null_space()
         yield from self.sharing.share(solve)
         yield from self._correct(solve, v, self._symmetric_substitute, has_slopes=False)
         for _ in range(1 if reports else ROUNDS):
-            yield from self._round(solve, v)
+            yield from self._round(solve, v, reports=reports)
         yield from self._finish(solve, v, reports)
 
     def further(self, solve: int, v: str = "v") -> ProgramParts:
         """Compute the results of `settle`, with `friction_share` times all friction, by a round that begins at x = `settled`."""
         yield from self._begin_at_settled(solve)
-        yield from self._round(solve, v, in_part=True)
+        yield from self._round(solve, v, reports=True, in_part=True)
         yield from self._finish(solve, v, reports=True, in_part=True)
 
     def settled(self, solve: int, v: str = "v") -> ProgramParts:
@@ -90,12 +101,14 @@ class FrictionElimination:
         yield from self._copy_solution("settled", f"x{solve}")
         yield from self.sharing.share(solve)
 
-    def _round(self, solve: int, v: str, in_part: bool = False) -> ProgramParts:
+    def _round(self, solve: int, v: str, reports: bool = False, in_part: bool = False) -> ProgramParts:
         yield from self._slopes(solve, v, in_part)
         yield from self._skew.factorize()
         yield from self.sharing.find_border()
         yield from self.substitute(solve)
         yield from self.sharing.share(solve)
+        if reports:
+            yield from self._copy_solution(f"x{solve}", "settled")
         yield from self._correct(solve, v, self.substitute, in_part=in_part)
 
     def substitute(self, solve: int, x: int | None = None) -> ProgramParts:
@@ -108,17 +121,22 @@ class FrictionElimination:
         yield from self._measure(solve, v, in_part)
         if reports:
             yield self.terms.single_iteration("unsettled", lambda w: w.write(_unsettled(w), "unsettled", None))
-            yield from self._copy_solution(f"x{solve}", "settled")
+            yield from self._copy_solution(f"x{solve}", "settled", if_small=True)
         yield from self._jt(solve, checked=True)
 
-    def _copy_solution(self, source: str, to: str) -> ProgramParts:
+    def _copy_solution(self, source: str, to: str, if_small: bool = False) -> ProgramParts:
+        """Copy the x of all rows; with `if_small` only if the last correction was small."""
         for group in self.terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 for i in range(len(group.rows)):
-                    w.write(w.read("from", RIGHT, i), "to", RIGHT, i)
+                    new = w.read("from", RIGHT, i)
+                    if if_small:
+                        is_large = greater(w.read("misfit", None), w.read("rubbing", None) * LARGE_CORRECTION**2)
+                        new = where(is_large, w.read("to", RIGHT, i), new)
+                    w.write(new, "to", RIGHT, i)
 
-            kernel = self.terms.kernel(("copy solution", len(group.rows)), write)
+            kernel = self.terms.kernel(("copy solution", len(group.rows), if_small), write)
             yield KernelLoop(kernel, group.table, {"from": source, "to": to})
 
     def solve(self, solve: int) -> ProgramParts:
@@ -226,7 +244,7 @@ class FrictionElimination:
             return
 
         def complete(w: KernelWriter):
-            failed = where(greater(_unsettled(w), w.graph.constant(0.5)), w.graph.constant(float("nan")), w.graph.constant(0.0))
+            failed = where(_fails(w), w.graph.constant(float("nan")), w.graph.constant(0.0))
             for k in range(3):
                 w.write(w.read("drag", BODY_COORDINATES, k) + failed, "jt_x", BODY_COORDINATES, k, ADD)
 
@@ -239,10 +257,17 @@ def _in_part(w: KernelWriter, x: Scalar) -> Scalar:
     return where(greater(share, zero), share * x, zero)
 
 
+def _fails(w: KernelWriter) -> Scalar:
+    """Return whether G(x) has not settled, or the determinant of the last factors is negative."""
+    limit, half = w.read("rubbing", None) * SETTLED**2, w.read("negative", None) * 0.5
+    is_odd = greater(half - apply(lax.floor_p, half.node.dtype, half), w.graph.constant(0.25))
+    return either(greater(w.read("misfit", None), limit), is_odd)
+
+
 def _unsettled(w: KernelWriter) -> Scalar:
-    """Return one if G(x) has not settled, else zero."""
-    limit = w.read("rubbing", None) * SETTLED**2
-    return where(greater(w.read("misfit", None), limit), w.graph.constant(1.0), w.graph.constant(0.0))
+    """Return the sum of one if x is no solution (`_fails`), and of two if pivots are negative."""
+    zero, one, two = map(w.graph.constant, (0.0, 1.0, 2.0))
+    return where(_fails(w), one, zero) + where(greater(w.read("negative", None), zero), two, zero)
 
 
 def _programs(group: ConstraintGroup) -> RubbingPrograms:

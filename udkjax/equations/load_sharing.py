@@ -123,7 +123,8 @@ class LoadSharing:
             one = [[w.graph.constant(float(i == j)) for j in range(k)] for i in range(k)]
             changes = _product(w.graph, inverse, gram)
             matrix = [[a - b for a, b in zip(*rows, strict=True)] for rows in zip(one, changes, strict=True)]
-            _write_square(w, "border", [[-s for s in row] for row in _product(w.graph, _inverse(w.graph, matrix), inverse)])
+            solved = _inverse(w.graph, matrix, lambda pivot: _count_negative(w, pivot))
+            _write_square(w, "border", [[-s for s in row] for row in _product(w.graph, solved, inverse)])
 
         yield terms.single_iteration(("border", k), close)
 
@@ -337,11 +338,17 @@ def _product(graph: Graph, a: SquareMatrix, b: SquareMatrix) -> SquareMatrix:
     return [[dot(graph, row, [other[j] for other in b]) for j in range(len(b))] for row in a]
 
 
-def _inverse(graph: Graph, matrix: SquareMatrix) -> SquareMatrix:
-    """Return the inverse of a matrix by elimination without pivoting."""
+def _count_negative(w: KernelWriter, pivot: Scalar) -> None:
+    zero, one = w.graph.constant(0.0), w.graph.constant(1.0)
+    w.write(where(greater(zero, pivot), one, zero), "negative", None, 0, ADD)
+
+
+def _inverse(graph: Graph, matrix: SquareMatrix, look: Callable[[Scalar], None] = lambda _: None) -> SquareMatrix:
+    """Return the inverse of a matrix by elimination without pivoting; `look` is called with each pivot."""
     k = len(matrix)
     rows = [[*row, *(graph.constant(float(i == j)) for j in range(k))] for i, row in enumerate(matrix)]
     for p in range(k):
+        look(rows[p][p])
         pivot = graph.constant(1.0) / rows[p][p]
         rows[p] = [s * pivot for s in rows[p]]
         for i in range(k):

@@ -6,13 +6,16 @@ With friction G(q, v, lambda) on the right-hand side, M a + Psi_q^T lambda = F +
 
 with D, b, weights w and D^+ as in udwadia_kalaba.py: with redundant rows they are those of least norm, or with compliances those
 of least elastic energy. Newton's method solves this from lambda = L(0). Loads have kinks where they change their signs, and with
-strong friction its steps may go back and forth between two sets of signs. Then the solution is followed from L(0) on, in
-`RunPrograms.STAGES` of growing friction: lambda = L(s G(lambda)). The implicit function theorem gives derivatives of any order.
-Where friction admits no motion (the mechanism jams), Newton's method does not end, and the multipliers are NaN.
+strong friction its steps may go back and forth between two sets of signs, or end at a second solution, which is no motion
+(friction_elimination.py): there 1 - L_g G_lambda has negative pivots. Then the solution is followed from L(0) on, in stages of
+growing friction, lambda = L(s G(lambda)): at once, in `RunPrograms.STAGES`, or in shorter stages where one of these fails. Where
+friction admits no motion (the mechanism jams), this does not end, and the multipliers are NaN. The implicit function theorem
+gives derivatives of any order.
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -212,32 +215,63 @@ def settle(
     def remainder(x: Array, share: Array | float = 1.0) -> Array:
         return x - multipliers(share * friction(x))
 
+    def attempt(x: Array, share: Array, begins: Array) -> tuple[Array, Array, Array]:
+        """Return the last of Newton's iterates with a share of friction, whether it is no solution, and its negative pivots."""
+
+        def step(x: Array) -> tuple[Array, Array, Array]:
+            def parts(x: Array) -> tuple[Array, tuple[Array, Array]]:
+                loads = friction(x)
+                left = x - multipliers(share * loads)
+                return left, (left, loads)
+
+            slope, (left, before) = jax.jacfwd(parts, has_aux=True)(x)
+            new = x - jnp.linalg.solve(slope, left)
+            after = friction(new)
+            return new, jnp.linalg.norm(root * (after - before)), jnp.linalg.norm(root * after)
+
+        found, is_open = repeated_newton(step, x, begins)
+        negative = _negative_pivots(jax.jacfwd(lambda x: remainder(x, share))(found))
+        return found, is_open | (negative % 2 == 1), negative
+
     def solve(_: Callable[[Array], Array], start: Array) -> Array:
-        def stage(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            """Solve with all friction in stage 0; where this fails, with growing shares of it, each from the last solution."""
-            x, fails, lost = state
-            share = jnp.where(k == 0, 1.0, k / RunPrograms.STAGES)
+        longest, shortest = 1 / RunPrograms.STAGES, 1 / RunPrograms.STAGES**2
 
-            def step(x: Array) -> tuple[Array, Array, Array]:
-                def parts(x: Array) -> tuple[Array, tuple[Array, Array]]:
-                    loads = friction(x)
-                    left = x - multipliers(share * loads)
-                    return left, (left, loads)
+        def grow(state: _Growth) -> _Growth:
+            share = jnp.minimum(state.reached + state.stage, 1.0)
+            x, fails, negative = attempt(state.x, share, state.goes_on)
+            fails = fails | ((negative > 0) & (state.stage > 1.5 * longest))
+            reached, x = jnp.where(fails, state.reached, share), jnp.where(fails, state.x, x)
+            stage = jnp.where(fails, jnp.minimum(state.stage / 2, longest), state.stage)
+            return _Growth(x, reached, stage, (reached < 1 - shortest / 2) & (stage > 0.75 * shortest))
 
-                slope, (left, before) = jax.jacfwd(parts, has_aux=True)(x)
-                new = x - jnp.linalg.solve(slope, left)
-                after = friction(new)
-                return new, jnp.linalg.norm(root * (after - before)), jnp.linalg.norm(root * after)
-
-            x = jnp.where((k == 1) & fails, start, x)
-            found, is_open = repeated_newton(step, x, (k == 0) | (fails & ~lost))
-            return found, jnp.where(k == 0, is_open, fails), (k > 0) & (lost | is_open)
-
-        x, fails, lost = jax.lax.fori_loop(0, RunPrograms.STAGES + 1, stage, (start, jnp.asarray(False), jnp.asarray(False)))
-        return jnp.where(fails & lost, jnp.nan, x)
+        found, fails, negative = attempt(start, jnp.ones(()), jnp.asarray(True))
+        fails = fails | (negative > 0)
+        grown = jax.lax.while_loop(lambda x: x.goes_on, grow, _Growth(start, jnp.zeros(()), jnp.asarray(longest), fails))
+        return jnp.where(fails, jnp.where(grown.reached < 1 - shortest / 2, jnp.nan, grown.x), found)
 
     def solve_for_tangent(linear: Callable[[Array], Array], y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(y), y)
 
     start = jax.lax.stop_gradient(multipliers(jnp.zeros(q.size)))
     return jax.lax.custom_root(remainder, start, solve, solve_for_tangent)
+
+
+class _Growth(NamedTuple):
+    """A solution with a share of friction that grows."""
+
+    x: Array
+    reached: Array  # the share
+    stage: Array  # by which it grows next
+    goes_on: Array
+
+
+def _negative_pivots(matrix: Float[Array, "m m"]) -> Array:
+    """Return the number of negative pivots of an elimination without exchanges."""
+
+    def eliminate(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        rest, count = state
+        pivot, below = rest[k, k], jnp.arange(len(matrix)) > k
+        factors = jnp.where(below, rest[:, k], 0.0) / jnp.where(pivot == 0, 1.0, pivot)
+        return rest - factors[:, None] * rest[k], count + (pivot < 0)
+
+    return jax.lax.fori_loop(0, len(matrix), eliminate, (matrix, jnp.asarray(0)))[1]

@@ -43,7 +43,8 @@ class RunPrograms:
     FURTHER: ClassVar[str] = "accelerations_further"
     """The program that goes on from `settled`."""
     STAGES: ClassVar[int] = 8
-    """Equal shares by which friction grows where its loads do not settle; fewer may do, but most mechanisms need none."""
+    """Shares by which friction grows where its loads do not settle, down to shares of a share where these are too long; fewer may
+    do, but most mechanisms need none."""
     is_linear: bool = True
     """True if constraints on velocities are linear in them."""
 

@@ -14,7 +14,7 @@ from udkjax.equations.front_substitution import FrontFactors, triangle
 from udkjax.equations.scene_layout import BODIES, BODY_CONSTANTS, ENTRIES, RIGHT, SLOPES, ConstraintGroup
 from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, dot
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
-from udkjax.expressions.selection import absolute, greater, where
+from udkjax.expressions.selection import absolute, both, greater, where
 from udkjax.pinv.elimination_order import Fronts
 
 FACTORS = FrontFactors("skew_factors", is_symmetric=False)
@@ -25,13 +25,14 @@ class SkewElimination:
 
     Their arrays are added to the layout after those of J C J^T in `symmetric`. `base` is J C J^T in the layout of `gram`; `skew`
     is the whole matrix: diagonal blocks, then for each pair of coupled blocks the lower and the upper one. `skew_factors` holds
-    L, D and U in the same places. Rows that `symmetric` leaves out are left out here.
+    L, D and U in the same places. Rows that `symmetric` leaves out are left out here. `negative` counts the
+    pivots below zero: without friction there are none.
     """
 
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
         self.terms, self._symmetric = terms, symmetric
         layout, sizes, pairs = terms.layout, symmetric.sizes, symmetric.off_diagonals
-        layout.sizes |= {"base": layout.sizes["gram"], "skew": 0}
+        layout.sizes |= {"base": layout.sizes["gram"], "skew": 0, "negative": 1}
         self._diagonals = [layout.reserve("skew", p * p) for p in sizes]
         self._lower = {pair: layout.reserve("skew", sizes[pair[0]] * sizes[pair[1]]) for pair in pairs}
         self._upper = {pair: layout.reserve("skew", sizes[pair[0]] * sizes[pair[1]]) for pair in pairs}
@@ -47,6 +48,7 @@ class SkewElimination:
     def factorize(self) -> ProgramParts:
         """Form the matrix from `base` and `slopes`, and factorize it."""
         yield from self._assemble
+        yield Reset("negative", 0, 1)
         yield from self._factors
 
     def substitute(self, solve: int, **names: str) -> ProgramParts:
@@ -201,6 +203,7 @@ def _eliminate(w: KernelWriter, p: int, later: tuple[int, ...]) -> None:
     ]
     for j in range(p):
         is_kept = greater(absolute(w.read("factors", 2, p + triangle(j, j))), zero)
+        w.write(where(both(is_kept, greater(zero, S[j][j])), one, zero), "negative", None, 0, ADD)
         inverse = where(is_kept, one / S[j][j], zero)
         for i in range(j + 1, p):
             lower = S[i][j] * inverse

@@ -127,6 +127,8 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "unsettled": "whether the loads of joints with friction need further rounds of Newton's method",
     "friction_share": "share of the friction that counts in further rounds",
     "staged": "whether the loads are followed from those without friction on",
+    "stage": "share of the friction by which it grows next",
+    "reached": "share of the friction with which the loads are known; negative before those without friction",
     "fallback": "whether this attempt is made by the fallback",
     "fallback_due": "whether the next attempt must be made by the fallback",
     "retries": "number of successive attempts that were shortened because of a pivot",

@@ -143,6 +143,7 @@ class Module(Running):
         if self.settles:
             self._add_arrays("", {"further a": n} | ({"settled": code.scratch["settled"]} if self.unrolled else {}))
             p.add("settled before", code.scratch["settled"] if plan.width > 1 else 0)
+            p.add("settled kept", code.scratch["settled"])
         if self.falls_back:
             self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
             if not self.eliminates_all_rows:

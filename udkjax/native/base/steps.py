@@ -38,6 +38,7 @@ SURE, EXPECTED = 0.85, 0.3
 
 # Further rounds of Newton's method for the loads of joints with friction. Five are needed at 0.99 of the jamming coefficients.
 SETTLING_ROUNDS = 20
+STAGE_ROUNDS = 8  # in a stage of growing friction, which is repeated with less of it if they do not suffice
 
 # Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.
 # Breakpoints closer to one another than the smallest step count as one.
