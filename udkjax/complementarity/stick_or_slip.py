@@ -180,6 +180,19 @@ class JointsAtRest(NamedTuple):
         contacts = ContactsAtRest.none(rest.shape[-1]) if contacts is None else contacts
         return cls(rest, sliding, W, size, locked, rested, unit, contacts)
 
+    def independent(self, wanted: Bool[Any, "*m F"], xp: ModuleType) -> Bool[Any, "*m F"]:
+        """Return a mask of joints among the `wanted` ones whose locks keep all at rest; those locked before are preferred."""
+        return self._eliminate(wanted, xp)[1]
+
+    def _eliminate(self, wanted: Bool[Any, "*m F"], xp: ModuleType) -> tuple[Any, Bool[Any, "*m F"]]:
+        """Return W of all joints once the `independent` ones are locked, and the mask of these."""
+        remainder, locked = self.W, wanted & False
+        least = xp.full(self.W.shape[:-1], AT_REST.carried)
+        for preferred in (wanted & self.locked, wanted & ~self.locked):
+            remainder, taken = eliminate(remainder, preferred, least, xp)
+            locked = locked | taken
+        return remainder, locked
+
     def decide(
         self,
         respond: Callable[[FrictionModes], Response],
@@ -206,7 +219,9 @@ class JointsAtRest(NamedTuple):
             modes = pivot.modes
             found, active = respond(modes), contacts.active(modes.held)
             a, reserves = found.accelerations, (found.forwards, found.backwards)
-            floor = AT_REST.still * xp.maximum(xp.abs(reserves[0]), xp.abs(reserves[1]))
+            # A force that could cause only an acceleration that is zero is zero, as where the load of a joint vanishes at rest.
+            smallest = self.unit / self.size**2
+            floor = AT_REST.still * xp.maximum(xp.maximum(xp.abs(reserves[0]), xp.abs(reserves[1])), smallest)
             beyond = [modes.locked & (x < -floor) for x in reserves]
             least = AT_REST.still * xp.maximum(xp.max(xp.abs(a), axis=-1, keepdims=True), self.unit)
             departs = modes.at_rest & (xp.abs(a) > least)
@@ -333,12 +348,9 @@ class JointsAtRest(NamedTuple):
 
     def _modes(self, pivot: _Pivot, xp: ModuleType) -> FrictionModes:
         """Return the modes for given joints within their limits; of these, joints with independent rows are locked."""
-        active, remainder, locked = self.contacts.active(pivot.held), self.W, self.rest & False
+        active = self.contacts.active(pivot.held)
         rest = self.rest & active
-        wanted, least = rest & pivot.within, xp.full(self.W.shape[:-1], AT_REST.carried)
-        for preferred in (wanted & self.locked, wanted & ~self.locked):
-            remainder, taken = eliminate(remainder, preferred, least, xp)
-            locked = locked | taken
+        remainder, locked = self._eliminate(rest & pivot.within, xp)
         moves = xp.diagonal(remainder, axis1=-2, axis2=-1) > AT_REST.carried
         at_rest = rest & ~locked & ~moves & ~pivot.departs
         driven = at_rest & (xp.diagonal(self.W, axis1=-2, axis2=-1) == 0)

@@ -11,6 +11,10 @@ from jaxtyping import Array, Bool, Float, Int
 # Bounds below which a condition, its first rate (per T) and its second rate (per T^2) are zero, relative to the condition's
 # scale: its change by a displacement of L or a turn of one radian. Rounding errors of a state are about 1e-15.
 ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
+# Speeds of joints that stick or slip, in absolute tolerances: smaller ones are no reversals. Steps leave errors of their
+# tolerance in the speed of a joint that hardly moves, and the polynomials between steps at the limit of stability several times
+# as much.
+SLOW = 10.0
 PARTS, DIVISIONS = 32, 6  # the bracket of a cubic's root is divided into 32 parts 6 times: to 1e-9 of its length
 NO_EVENT = -1
 
@@ -25,6 +29,11 @@ class ConditionValues(NamedTuple):
     rate_2: Float[Any, "*m E"]  # 0 for conditions that depend on velocities
     a: Float[Any, "*m n"]
     scale: Float[Any, "*m E"]  # the change of a condition by a displacement of L, by a turn of one radian, or within T
+
+
+def zero_of(slides: Bool[np.ndarray, "E"], atol: Float[Any, "*b 1"], xp: ModuleType = jnp) -> Float[Any, "*b E"]:
+    """Return below what conditions are zero along a motion, relative to their scales; `slides` marks the speeds of joints."""
+    return xp.where(slides, xp.maximum(SLOW * atol, ZERO), ZERO)
 
 
 def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType = jnp) -> Int[Any, "*m C"]:

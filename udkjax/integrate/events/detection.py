@@ -74,6 +74,7 @@ def detect(
     direction: Int[np.ndarray, "C"],
     sides: Int[Any, "C"],
     scale: Float[Any, "C"],
+    zero: Float[Any, "C"],
     located: Int[Any, ""],
     watched: Bool[Any, "C"],
     late: Float[Any, ""],
@@ -89,6 +90,7 @@ def detect(
         direction: direction of the crossings of each condition, 0 for either.
         sides: the sides of zero at the first node.
         scale: scale of each condition.
+        zero: bound below which it is zero, relative to its scale.
         located: the condition that certainly crosses zero in this window; -1: none.
         watched: mask of the watched conditions.
         late: time (s) by which an event may be early: at the first node, its condition may still be on the other side.
@@ -99,7 +101,7 @@ def detect(
     t, g, g_dot, good = nodes
     finite = xp.isfinite(g)
     g = xp.where(finite, g, 0.0)
-    zero_tol = xp.where(np.arange(len(scale)) == located, 0.0, ZERO * scale)
+    zero_tol = xp.where(np.arange(len(scale)) == located, 0.0, zero * scale)
     signs = xp.where((xp.abs(g) <= zero_tol) | ~good[:, None] | ~finite, 0, xp.sign(g)).astype(int)
     sides = carry_signs(sides, xp.concatenate([0 * signs[:1], signs[1:]]), xp)
     before, after = sides[:-1], sides[1:]
@@ -113,7 +115,7 @@ def detect(
     side = xp.where(before != 0, before, after)
     hits = (after == -before) & (before != 0)
     ends = g[:-1], slope[:-1], g[1:], slope[1:]
-    single, away = RESOLUTION.classify_interval(_Arithmetic(xp.minimum, xp.maximum), ends, step, error, side, ZERO * scale)
+    single, away = RESOLUTION.classify_interval(_Arithmetic(xp.minimum, xp.maximum), ends, step, error, side, zero * scale)
     usable = good[1:, None] & watched
     coarse = (usable & ~unresolved & ~xp.where(hits, single, away)) | (good[1:, None] & ~finite[1:])
     # A few coarse intervals in a short window contain a jump or a kink: finer windows would not help.

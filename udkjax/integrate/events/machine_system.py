@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.events.added_joints import AddedJoint, evaluate_joint
-from udkjax.integrate.events.crossings import NO_EVENT, ZERO
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO, zero_of
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.impacts import OPEN, Contacts
 from udkjax.integrate.events.kinks import FREE, MOST_KINKS, HeldElement
@@ -216,7 +216,7 @@ class MachineSystem:
         watched = self.plan.watched(runs.phase[one], runs.carried[one], np)[0]
         state, code = runs.state(one), self._phases[which]
         force, smallest = units.mass * units.length * units.rate**2, code.setting("smallest", member)
-        of_window = WindowUnits(units.rate, units.scene_rate, force, smallest)
+        of_window = WindowUnits(units.rate, units.scene_rate, force, smallest, code.setting("atol", member))
         motion = MachineMotion(self.plan, code, member, self.ts[member], of_window, self.coordinates[member], watched)
         start = RunState(state.t[0], state.q[0], state.v[0], state.phase[0], state.joints)
         end = advance_window(
@@ -338,8 +338,7 @@ class MachineSystem:
         room, C = self._rooms[which], len(where)
         watch[:, room : room + C] = runs.sides[members[:, None], where]
         watch[:, room + C : room + 2 * C] = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, where]
-        # Steps leave errors of their tolerance in the speed of a joint that hardly moves: they are no reversals.
-        zero = np.where(self.plan.slides, np.maximum(self._phases[which].atol(members), ZERO), ZERO)
+        zero = zero_of(self.plan.slides, self._phases[which].atol(members), np)
         watch[:, room + 2 * C : room + 2 * C + E] = zero * runs.scale[members]
         if (most := self._most_passed[which]) is not None:
             watch[:, room + 4 * C + 1] = self._events_to_pass(runs, members, most)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from udkjax.complementarity.stick_or_slip import AT_REST, BLOCK_STEPS, SINGLE_STEPS
 from udkjax.expressions import ScalarProgram
 from udkjax.integrate.events.added_joints import AddedJoint
-from udkjax.integrate.events.crossings import ZERO
+from udkjax.integrate.events.crossings import SLOW, ZERO
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.kinks import KinkPlaces
 from udkjax.integrate.events.phases import Phases
@@ -85,6 +85,7 @@ def _slides(plan: EventPlan, conditions: Conditions, added: Sequence[AddedJoint]
         "first_force": first_force,
         "locks": tuple(locks),
         "closed": AT_REST.closed,
+        "slow": SLOW,
         "still": AT_REST.still,
         "block_steps": BLOCK_STEPS,
         "single_steps": SINGLE_STEPS,

@@ -140,7 +140,7 @@ class PlainMotion:
 
     def __init__(self, hybrid: Hybrid):
         self.hybrid, self.plan, self.ts, self.projects = hybrid, hybrid.plan, hybrid.ts, hybrid.projects
-        self.units = WindowUnits(hybrid.rate, hybrid.scales.rate, hybrid.force, hybrid.smallest)
+        self.units = WindowUnits(hybrid.rate, hybrid.scales.rate, hybrid.force, hybrid.smallest, hybrid.atol)
         self.breakpoints = hybrid.phases.mechanisms[SCENE].breakpoints
 
     def size(self, v: Float[Array, "n"]) -> Float[Array, ""]:

@@ -6,7 +6,7 @@ limit, which joints stuck before, and which contacts do not separate.
 Arrays are JAX's, for one member, or NumPy's, for several (*m).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -64,14 +64,15 @@ def settle_friction(
     xp = system.xp
     before, code = modes_of(system, members, at), xp.full(at.t.shape, int(Result.successful))
     if given is None:
-        found, code = _decide(system, members, at if xp is np else stop_gradients(at), before, stopped, resting)
+        found, code, rest = _decide(system, members, at if xp is np else stop_gradients(at), before, stopped, resting)
     else:
-        found = given
+        found, rest = given, None
     new = found.locked & ~before.locked
     after = with_modes(system, members, _with_locks(system, members, at, new), found)
     if xp is np and not new.any():
         return after, code
-    _, v = system.project(members, after)
+    v = _known_velocities(found, rest, new) if xp is np else None
+    v = system.project(members, after)[1] if v is None else v
     return after._replace(v=xp.where(xp.any(new, axis=-1)[..., None], v, after.v)), code
 
 
@@ -90,6 +91,30 @@ def begin_with_friction(system: System, runs: MemberRuns, members: MemberIndices
     return runs.put(members, v=state.v, phase=state.phase, code=code, running=settles)._replace(joints=state.joints)
 
 
+class Rest(NamedTuple):
+    """The joints whose locks keep all joints at rest that are slow, and the velocities with these locks."""
+
+    modes: FrictionModes
+    v: Any
+
+
+def _with_rest(system: System, members: MemberIndices, at: RunState, modes: FrictionModes) -> Rest:
+    """Return velocities at which locked joints are at rest: a stiff damper makes a force of the error of a speed that is zero."""
+    xp = system.xp
+    if xp is np and not modes.locked.any():
+        return Rest(modes, at.v)
+    _, v = system.project(members, with_modes(system, members, at, modes))
+    return Rest(modes, xp.where(xp.any(modes.locked, axis=-1)[..., None], v, at.v))
+
+
+def _known_velocities(found: FrictionModes, rest: Rest | None, new: Bool[Any, "m F"]) -> Any:
+    """Return the velocities that the locks of modes allow, if they are known already; else None."""
+    if rest is None:
+        return None
+    same = (found.locked == rest.modes.locked).all(1) & (found.held == rest.modes.held).all(1)
+    return rest.v if same[new.any(1)].all() else None
+
+
 def _decide(
     system: System,
     members: MemberIndices,
@@ -97,7 +122,7 @@ def _decide(
     before: FrictionModes,
     stopped: Int[Any, "*m"],
     resting: Bool[Any, "*m E"] | None,
-) -> tuple[FrictionModes, Int[Any, "*m"]]:
+) -> tuple[FrictionModes, Int[Any, "*m"], Rest]:
     plan, xp = system.plan, system.xp
     may_change = before.held if resting is None else (resting & plan.held_at_rest) | before.held
     may_change = may_change & plan.has_rubbing_contacts
@@ -112,13 +137,16 @@ def _decide(
     contacts = ContactsAtRest(plan.contacts_that_rub, before.held, may_change, unit, most)
     if xp is np and not rest.any() and not may_change.any():
         modes = FrictionModes(rest, xp.sign(speed) * contacts.active(before.held), rest, rest, before.held)
-        return modes, xp.full(at.t.shape, int(Result.successful))
+        return modes, xp.full(at.t.shape, int(Result.successful)), Rest(modes, at.v)
     normals, directions = (x[..., forwards, :] for x in (state_values.by_v, state_values.directions))
     inverse_mass = take(system.inverse_mass, members)[..., None, :]
     mobility, W = (normals**2 * inverse_mass).sum(-1), directions / inverse_mass @ directions.swapaxes(-1, -2)
     at = _with_locks(system, members, at, rest & ~before.locked)
     rested = before.locked | before.at_rest
     joints = JointsAtRest.of(rest, xp.sign(speed), W, mobility, before.locked, rested, scale * rate, xp, contacts)
+    locked = joints.independent(rest & contacts.active(before.held), xp)
+    at_rest = _with_rest(system, members, at, before._replace(locked=locked))
+    at = at._replace(v=at_rest.v)
 
     def respond(modes: FrictionModes) -> Response:
         found = system.look(members, with_modes(system, members, at, modes), has_forces=True)
@@ -131,4 +159,4 @@ def _decide(
     direction = xp.where(left != 0, left, xp.where(started, xp.where(is_stopped[0], -1.0, 1.0), kept))
     modes, failed, by_contacts = joints.decide(respond, direction, started, (left != 0) | started, xp)
     code = xp.where(by_contacts, int(Result.painleve_paradox), int(Result.event_impossible))
-    return modes, xp.where(failed, code, int(Result.successful))
+    return modes, xp.where(failed, code, int(Result.successful)), at_rest

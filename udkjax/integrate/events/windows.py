@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.integrate.events.crossings import NO_EVENT, ZERO
+from udkjax.integrate.events.crossings import NO_EVENT, ZERO, zero_of
 from udkjax.integrate.events.detection import INTERVALS, NODES, Nodes, detect
 from udkjax.integrate.events.event_plan import EventPlan
 from udkjax.integrate.events.runs import RunState
@@ -49,6 +49,7 @@ class WindowUnits(NamedTuple):
     scene_rate: Any  # (1/s)
     force: Any  # characteristic force (N)
     smallest: Any  # the smallest step (s)
+    atol: Any  # the absolute tolerance
 
 
 class WatchedConditions(NamedTuple):
@@ -154,6 +155,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
         direction=plan.both_directions,
         sides=given.sides,
         scale=xp.append(given.scale, xp.zeros(E) + units.force),
+        zero=xp.append(zero_of(plan.slides, units.atol, xp), xp.full(E, ZERO)),
         located=window.event,
         watched=given.watched & ~lands,
         is_short=length * units.rate <= RESOLUTION.short,

@@ -55,6 +55,7 @@ class Sliding:
     first_force: int  # -1: the mechanism lacks the locks, and a run in which a joint sticks ends
     locks: tuple[SlideLock, ...]
     closed: float  # speed of a joint at rest, relative to the scale of its condition
+    slow: float  # speed below which reversals are not located, in absolute tolerances
     still: float  # smallest part of the largest acceleration or force that is not zero
     block_steps: int  # pivots per joint of all joints that violate the law, then of the first such joint
     single_steps: int

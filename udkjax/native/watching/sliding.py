@@ -15,6 +15,7 @@ from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.program import write
 from udkjax.native.run.manifold import project_output
+from udkjax.native.watching.conditions import LAST_CHANGE
 from udkjax.native.watching.passed_events import Sliding
 from udkjax.native.watching.passing import PassingRuns
 
@@ -123,7 +124,7 @@ class _Modes:
         f, s, module, slides = self._f, self._s, self._module, self._slides
         is_near = module.any_condition(f, lambda c, g, _, floor: ~(f.abs(g) > floor) & ~self._is_of_joint(c))
         found = f.variable(is_near, BOOL)
-        wider = f.max(slides.closed / f.max(s.atol, self._least), self._one)
+        wider = f.max(slides.closed / f.max(s.atol, self._least), self._one) / slides.slow
         all_ = f.const(True, BOOL, f.width)
 
         def look(j: Value, here: Value):
@@ -249,7 +250,9 @@ class _Modes:
 
             def judge(j: Value, _: Value):
                 stops, ahead = self._entry("joints that stop", j) > 0.5, self._acceleration(j) * self._entry("sides", j * 2)
-                wrong = stops & ~(ahead > largest * self._slides.still)
+                # A speed that is zero has an error, of which a stiff damper makes an acceleration.
+                error = f.abs(self._entry("condition g", j * 2 + self._slides.first)) * self._s.omega / LAST_CHANGE
+                wrong = stops & ~(ahead > f.max(largest * self._slides.still, error))
                 if self._slides.locks:
                     wrong = wrong | self._slips(j)[0]
                 obeys.value = obeys.value & ~wrong
