@@ -31,8 +31,6 @@ restore it, but then there are `negative` pivots. A solution with these counts o
 
 from collections.abc import Callable
 
-from jax import lax
-
 from udkjax.equations.block_elimination import BlockElimination
 from udkjax.equations.element_programs import RubbingPrograms
 from udkjax.equations.load_sharing import LoadSharing
@@ -41,7 +39,7 @@ from udkjax.equations.scene_terms import ProgramParts, SceneTerms, compliance, d
 from udkjax.equations.skew_elimination import SkewElimination
 from udkjax.expressions import Scalar
 from udkjax.expressions.loop_program import ADD, KernelLoop, KernelWriter, Reset
-from udkjax.expressions.selection import apply, either, greater, where
+from udkjax.expressions.selection import either, floor, greater, where
 
 # Rounds of programs that cannot ask for more. At 0.9 of the coefficients that jam pins, three are needed.
 ROUNDS = 4
@@ -260,7 +258,7 @@ def _in_part(w: KernelWriter, x: Scalar) -> Scalar:
 def _fails(w: KernelWriter) -> Scalar:
     """Return whether G(x) has not settled, or the determinant of the last factors is negative."""
     limit, half = w.read("rubbing", None) * SETTLED**2, w.read("negative", None) * 0.5
-    is_odd = greater(half - apply(lax.floor_p, half.node.dtype, half), w.graph.constant(0.25))
+    is_odd = greater(half - floor(half), w.graph.constant(0.25))
     return either(greater(w.read("misfit", None), limit), is_odd)
 
 

@@ -39,6 +39,8 @@ from udkjax.expressions.scalar_program import frontier as frontier
 from udkjax.expressions.scalar_program import operations as operations
 from udkjax.expressions.selection import absolute as absolute
 from udkjax.expressions.selection import both as both
+from udkjax.expressions.selection import either as either
+from udkjax.expressions.selection import floor as floor
 from udkjax.expressions.selection import greater as greater
 from udkjax.expressions.selection import maximum as maximum
 from udkjax.expressions.selection import where as where

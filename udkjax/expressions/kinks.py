@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from udkjax.expressions.graph import Graph, Node, Scalar
-from udkjax.expressions.selection import absolute, apply, both, where
+from udkjax.expressions.selection import absolute, apply, both, floor, where
 
 SIDE = "side"  # the group of the sides among the inputs of a graph
 NEAR = 1e-12  # relative to its terms, g is zero below this
@@ -185,10 +185,8 @@ class _Held:
             return None
         key = f"whole {u.sign}", u.index
         if key not in self._known:
-            distance = absolute(u - apply(lax.floor_p, u.node.dtype, u + 0.5))
-            side = self._new_side(
-                u, apply(lax.floor_p, u.node.dtype, u), _compare(lax.le_p, distance - (absolute(u) + 1.0) * NEAR, 0.0)
-            )
+            distance = absolute(u - floor(u + 0.5))
+            side = self._new_side(u, floor(u), _compare(lax.le_p, distance - (absolute(u) + 1.0) * NEAR, 0.0))
             self._known[key] = side, 1
             self._leave(side, u - side, 1.0, -1.0)
             self._leave(side, side + 1.0 - u, 1.0, 1.0)

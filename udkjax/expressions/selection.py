@@ -18,6 +18,11 @@ def absolute(a: Scalar) -> Scalar:
     return a.graph.apply(lax.abs_p, {}, (a,), a.node.dtype, np.abs)
 
 
+def floor(a: Scalar) -> Scalar:
+    """Return the largest whole number that is at most a."""
+    return apply(lax.floor_p, a.node.dtype, a)
+
+
 def greater(a: Scalar, b: Scalar) -> Scalar:
     """Return a > b."""
     return a.graph.apply(lax.gt_p, {}, (a, b), bool, np.greater)
