@@ -185,3 +185,17 @@ def test_tip_of_a_rod_on_a_driven_carriage(speed, mu):
         assert run.result == udk.Result.event_impossible
     else:
         assert float(run.v[-1, 1, 2]) == pytest.approx(-e * turn, abs=1e-9)
+
+
+def test_plate_lands_on_two_feet():
+    """It hops from foot to foot until both rest, whatever the coefficient."""
+    unit = np.sqrt(9.81)
+    velocity, turn = [-0.3189 * unit, -0.3959 * unit], -0.7586 * unit
+    plate = udk.Mechanism({"plate": udk.Body(1.0, 0.2566, [0.0, 1.2849], -0.1371, velocity=velocity, angular_velocity=turn)})
+    for mu in (0.3, 0.45, 0.5):
+        feet = [
+            udk.Contact("plate", [x, -0.2], restitution=e, coefficient=mu, name=name)
+            for x, e, name in ((-0.5, 0.144083, "left"), (0.5, 0.089157, "right"))
+        ]
+        run = udk.simulate(plate, [0.0, 3 / unit], events=feet, max_events=200)
+        assert np.max(np.abs(run.v[-1, 0, 1:])) < 1e-9
