@@ -30,6 +30,7 @@ from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
 from udkjax.native.runs import RunCotangents, goes_back
+from udkjax.native.sharding import call_by_members, divide_members
 from udkjax.native.shared_loads import bind_by_rows, call_by_rows
 from udkjax.native.unsupported import unsupported
 from udkjax.programs.identity_cache import cached_by_size
@@ -271,7 +272,11 @@ def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
     """Lower for the CPU."""
     if operation.code.shares_by_marks:
         return bind_by_rows(call_members, inputs, operation, times)
-    return _call_target(_select_code(inputs, operation).name, inputs, operation, times)
+
+    def call(*inputs: Any) -> Sequence[Array]:
+        return _call_target(_select_code(inputs, operation).name, inputs, operation, times)
+
+    return call_by_members(call, inputs, operation.shapes(inputs, times))
 
 
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
@@ -354,6 +359,7 @@ native_p.multiple_results = True
 native_p.def_impl(_call)
 native_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[native_p] = _batch
+divide_members(native_p)
 mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_others))
 mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
 mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_card), platform="cuda")
