@@ -18,7 +18,7 @@ from udkjax.equations.general import ConstrainedSystem
 from udkjax.positions.channels import RATES, channel_of
 from udkjax.positions.coordinates import Coordinate, coordinate_of, value_of
 from udkjax.printing import format_number
-from udkjax.requirements import ArgumentError, describe
+from udkjax.requirements import ArgumentError, describe, require_text
 from udkjax.scene.bodies import COORDINATES
 from udkjax.scene.checks import SceneError
 from udkjax.scene.drivers import Polynomial
@@ -43,6 +43,8 @@ class GivenState:
     def __init__(self, model: Mechanism | ConstrainedSystem, given: GivenValues):
         if not isinstance(given, Mapping):
             raise ArgumentError(f"given must map names to values, such as {{'q[0]': 1.0}}, {describe(given)}")
+        for name in given:
+            require_text("given: a name", name)
         self.model = model
         self.values = {name: _value_called(name, value) for name, value in given.items()}
         parse = self._entry if isinstance(model, ConstrainedSystem) else self._coordinate

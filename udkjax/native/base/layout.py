@@ -137,6 +137,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "farthest": "largest distance of an accepted state of a run that is not projected",
     "tolerance": "tolerance of the fastest velocity, in its unit",
     "rank": "rank of D found by the fallback",
+    "highest_rank": "largest rank that a dense method has found in the attempted step",
     "wanted": "whether a rank-revealing method is requested",
     "iterating": "whether Newton's method continues",
     "violated": "largest violation of Psi at an output, over the row's scale",

@@ -383,8 +383,8 @@ class Module(Running):
         """Compute the accelerations at the end of a step that is not projected, `result a`."""
         self.accelerate(f, "result a")
 
-    def rank(self, f: Function) -> Value | None:
-        """Return the rank of the rows that were factorized last; None if the method does not find one."""
+    def highest_rank(self, s: Lane) -> Value | None:
+        """Return the largest rank of the rows in the attempted step; None if the method does not find one."""
         return None
 
     def accelerate_end(self, f: Function):

@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from udkjax.arrays import ROUNDING
+
 
 @dataclass(frozen=True, eq=False)
 class Method:
@@ -75,8 +77,17 @@ class Method:
 
 
 def _product(a: Any, b: np.ndarray) -> np.ndarray:
-    """Return a @ b with the same bits on all machines: the order of NumPy's sums depends on the processor."""
-    return np.array([[math.fsum(x * y for x, y in zip(row, column, strict=True)) for column in b.T.tolist()] for row in a])
+    """Return a @ b with the same bits on all machines: the order of NumPy's sums depends on the processor.
+
+    Entries that vanish but for the rounding of their terms are zero, and code has no operation for them.
+    """
+
+    def entry(row: Any, column: Any) -> float:
+        terms = [x * y for x, y in zip(row, column, strict=True)]
+        found = math.fsum(terms)
+        return found if abs(found) > ROUNDING * math.fsum(map(abs, terms)) else 0.0
+
+    return np.array([[entry(row, column) for column in b.T.tolist()] for row in a])
 
 
 def row(text: str) -> np.ndarray:

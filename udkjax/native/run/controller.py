@@ -220,7 +220,7 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
             lost.value = f.select(misses, f.const(Status.MISSING_RANK, DOUBLE, f.width), lost.value)
         if module.measures_drift:
             lost.value = _judge_drift(module, f, s, accept)
-        rank = module.rank(f)
+        rank = module.highest_rank(s)
         if rank is not None:
             # Rows that depend on others along the whole motion are independent where these are violated, or by rounding, unless
             # the threshold of the rank is larger: they then hold back what is free to move.

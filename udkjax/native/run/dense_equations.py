@@ -11,7 +11,8 @@ systems at one state share a factorization.
 
 from collections.abc import Callable
 
-from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.base.ir import DOUBLE, POINTER, Function
+from udkjax.native.base.layout import Lane
 from udkjax.native.base.module import Module
 from udkjax.native.base.weighted_rows import WeightedRows
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -35,9 +36,11 @@ class DenseEquations:
                 s.safe = f.const(1.0, DOUBLE, f.width)
                 write(f)
 
-    def rank(self, f: Function) -> Value:
-        """Return the rank of the rows that were factorized last."""
-        return self._rows.matrices(f).row("rank").entry(0)
+    def _factor(self, f: Function, of_positions: bool = False):
+        """Factorize the rows, and note the largest rank of the attempted step: a stage or a projection may have a larger one."""
+        s = Lane(f, self._in.places)
+        self._rows.factor(f, of_positions)
+        s.highest_rank = f.max(s.highest_rank, self._rows.matrices(f).row("rank").entry(0))
 
     @property
     def _functions(self) -> dict[str, Callable[[Function], None]]:
@@ -55,18 +58,18 @@ class DenseEquations:
 
     def _accelerate(self, f: Function):
         self._in.invoke(f, "dense_accelerations")
-        self._rows.factor(f)
+        self._factor(f)
         self._rows.correct(f, self._rows.solve(f, "terms", self._in.n), "terms", "out", 1.0)
 
     def _correct_position(self, f: Function):
         self._in.invoke(f, "dense_newton_q")
-        self._rows.factor(f, of_positions=True)
+        self._factor(f, of_positions=True)
         self._rows.correct(f, self._rows.solve(f, "psi"), "state q", "corrected q")
 
     def _factor_and_correct_velocity(self, f: Function):
         def correct():
             self._in.invoke(f, "dense_newton_v")
-            self._rows.factor(f)
+            self._factor(f)
             self._rows.correct(f, self._rows.solve(f, "psi"), "state v", "result v")
 
         correct()
@@ -107,7 +110,7 @@ class DenseEquations:
         def terms():
             module.invoke(f, "equation_terms" if module.code.is_linear else "dense_accelerations")
             if not module.code.is_linear:
-                self._rows.factor(f)
+                self._factor(f)
 
         self._at(f, "state v", "result v", terms)
         self._rows.correct(f, self._rows.solve(f, "terms", module.n), "terms", "result a", 1.0)
@@ -118,7 +121,7 @@ class DenseEquations:
 
     def _tangent_part(self, f: Function):
         self._in.invoke(f, "dense_newton_q")
-        self._rows.factor(f)
+        self._factor(f)
         self._correct_changes(f)
 
     def _correct_changes(self, f: Function):
@@ -127,7 +130,7 @@ class DenseEquations:
         for x in ("dv", "dq") if rows.splits else ("dq", "dv"):
             change = f"state {x}"
             if x == "dq" and rows.splits:
-                rows.factor(f, of_positions=True)
+                self._factor(f, of_positions=True)
             if module.code.couples:
                 module.copy(f, change, "change")
                 module.invoke(f, "gather", "change")
@@ -135,5 +138,5 @@ class DenseEquations:
             rows.correct(f, rates, change, f"result {x}")
         if module.adds_drift_of_rates:
             self._at(f, "state dq", "result dq", lambda: module.invoke(f, "drift_of_rates"))
-            rows.factor(f)
+            self._factor(f)
             rows.correct(f, rows.solve(f, "drift"), "result dv", "result dv")

@@ -23,6 +23,8 @@ def write_attempt(module: Module):
     ones = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
     s.ok = ones()
     s.distance = f.const(np.inf, DOUBLE, f.width)
+    if module.highest_rank(s) is not None:
+        s.highest_rank = f.const(0.0, DOUBLE, f.width)
     begins = f.all_of((s.begin > 0.5) | (s.stepping < 0.5))
 
     def take_stages():

@@ -77,8 +77,8 @@ class Trajectory(Module):
         if self.measures_drift:
             self.invoke(f, "drift")
 
-    def rank(self, f: Function) -> Value | None:
-        return self.dense.rank(f) if self.dense else None
+    def highest_rank(self, s: Lane) -> Value | None:
+        return s.highest_rank if self.dense else None
 
     def accelerate_end(self, f: Function):
         if self.formulated:

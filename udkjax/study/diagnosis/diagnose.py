@@ -114,7 +114,7 @@ def diagnose(
         joint_rows=len(of_joints),
         can_move=bool(neighbours),
         redundancies=tuple(redundancies),
-        cure=_cure(search, redundancies),
+        cure=_cure(search, redundancies, positions, generic),
         branches=tuple(branches(mechanism, positions, current)),
         forces=_forces(mechanism, current, owners),
         singular_values=current.sigma,
@@ -135,12 +135,14 @@ def _with_fixes(search: FixSearch, sets: list[Dependency]) -> list[Redundancy]:
     return [Redundancy(x.constraints, x.redundancy, True, tuple(search.fixes_of(x))) for x in sets]
 
 
-def _cure(search: FixSearch, found: list[Redundancy]) -> tuple[Fix, ...]:
+def _cure(
+    search: FixSearch, found: list[Redundancy], positions: RankedPositions, generic: list[Configuration]
+) -> tuple[Fix, ...]:
     """Return the best fixes in sequence, each determined after applying the previous one, until nothing is redundant."""
     done: list[Fix] = []
-    of_first = [r.fixes[0] for r in found if r.permanent and r.fixes and not r.held]
+    of_first = [r.fixes[0] for r in found if r.permanent and r.fixes]
     best = max(of_first, key=lambda fix: (fix.removes, fix.conditioning), default=None)
-    after = search.after(best) if best else None
+    after = None if best is None else search.after(best) or _search_after(best, positions, generic)
     while best is not None and after is not None:
         done.append(best)
         left = dependencies_at(attached_bodies(best.mechanism), after.at[0], after.at, after.owners)[0]
@@ -148,6 +150,13 @@ def _cure(search: FixSearch, found: list[Redundancy]) -> tuple[Fix, ...]:
             return tuple(done)
         best, after = after.best(left) or (None, None)
     return ()
+
+
+def _search_after(fix: Fix, positions: RankedPositions, generic: list[Configuration]) -> FixSearch:
+    """Return the search after the fix of a held pin, which the search by the null space does not know."""
+    ranked = RankedPositions(fix.mechanism, positions.rank_tol)
+    owners = [name for name, _ in ranked.rows.names]
+    return FixSearch(fix.mechanism, ranked, [ranked.at(c.t, c.q) for c in generic], owners, ranked.row_unit)
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:

@@ -22,6 +22,7 @@ from udkjax.study.diagnosis.dependence import DEPENDS, Dependency, stress_of
 from udkjax.study.diagnosis.fixes import Fix, JointChange, apply_change, body_indices, changes_of
 
 SMALLEST_PIVOT = 1e-3  # least ratio of the smallest nonzero singular values after and before a fix
+DIGITS = 6  # by which measures of fixes are compared: further ones are rounding errors, which differ between processors
 
 
 class FixSearch:
@@ -29,7 +30,7 @@ class FixSearch:
 
     Args:
         mechanism: mechanism.
-        positions: those of the mechanism before all changes: its scales are those of all Jacobians.
+        positions: positions of the mechanism before all changes, with the scales of all Jacobians.
         at: generic configurations; the first determines the stress of a set.
         owners: the constraint of each row of J.
         row_unit: the scale of each row of J.
@@ -51,7 +52,7 @@ class FixSearch:
     def fixes_of(self, dependency: Dependency) -> list[Fix]:
         """Return the best verified change of each constraint of a dependent set, sorted by removed rows and conditioning."""
         found = [next(self._verify_in_turn(name, dependency), None) for name in dependency.constraints] if self.at else []
-        return sorted((x[0] for x in found if x), key=lambda fix: (-fix.removes, -fix.conditioning))
+        return sorted((x[0] for x in found if x), key=lambda fix: (-fix.removes, -_comparable(fix.conditioning)))
 
     def best(self, sets: Sequence[Dependency]) -> "tuple[Fix, FixSearch] | None":
         """Return the best fix of all sets and the search after it, or None. Candidates are verified one by one."""
@@ -60,7 +61,7 @@ class FixSearch:
             for name in dependency.constraints:
                 first = next(self._helpful_changes(name, dependency), None)
                 if first is not None:
-                    options.append((*first[:2], name, dependency))
+                    options.append((first[0], _comparable(first[1]), name, dependency))
         options.sort(key=lambda option: option[:2], reverse=True)
         found = (next(self._verify_in_turn(name, dependency), None) for *_, name, dependency in options)
         return next((x for x in found if x), None)
@@ -92,7 +93,7 @@ class FixSearch:
                     slides = enumerate(self.at if change.slides else ())
                     aligned = min((change.alignment(forces(k), c.q, places) for k, c in slides), default=1.0)
                     conditioning = self._conditioning_after(self._worst, indices, places, change)
-                    options.append((round(aligned, 6), round(conditioning, 12), change))
+                    options.append((_comparable(aligned), _comparable(conditioning), change))
             for _, conditioning, change in sorted(options, key=lambda option: option[:2], reverse=True):
                 yield count, conditioning, change
 
@@ -180,3 +181,8 @@ def _preserves_rank(removed: np.ndarray, N: np.ndarray) -> bool:
     """Return True if rows that are removed depend on the others, by the rows N of their constraint in the null space."""
     part = removed @ N
     return part.shape[0] <= part.shape[1] and bool(np.all(np.linalg.svd(part, compute_uv=False) > DEPENDS))
+
+
+def _comparable(measure: float) -> float:
+    """Return a measure of a fix without the digits that rounding errors change, so that equal fixes keep their order."""
+    return float(f"{measure:.{DIGITS}g}")
