@@ -104,6 +104,11 @@ def test_conditions_are_combined(code, width):
         assert_array_equal(binary(code, width, write, x, y), expected)
 
 
+def test_a_number_is_repeated_in_all_lanes_of_which_there_may_be_one(code, width):
+    x = np.linspace(0.1, 3.0, 11)
+    assert_array_equal(binary(code, width, lambda f, a, b: a * f.repeat(f.const(3.0, DOUBLE, 1), width), x, x), 3.0 * x)
+
+
 def test_intrinsics_are_called_lane_by_lane(code, width):
     x = np.linspace(0.1, 3.0, 11)
     for name, expected in (("sqrt", np.sqrt(x)), ("floor", np.floor(x)), ("fabs", x)):

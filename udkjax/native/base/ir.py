@@ -132,6 +132,8 @@ class Function:
         """Repeat a number in all lanes."""
         if x.width != 1:
             raise TypeError(f"{x.width} lanes for {width}")
+        if width == 1:
+            return x
         kind = llvm_type(x.base, width)
         first_lane = self.op(f"insertelement {kind} poison, {x.base} {x.name}, i64 0", x.base, width)
         return self.op(f"shufflevector {kind} {first_lane.name}, {kind} poison, <{width} x i32> zeroinitializer", x.base, width)

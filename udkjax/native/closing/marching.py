@@ -122,7 +122,7 @@ class Marching(Module):
         """Try one step towards `next` in the lanes that have not got there."""
         one, zero, tries = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width), going.tries(s.next)
         begins = going.begins.value > 0.5
-        begins = f.repeat(begins, f.width) if f.width > 1 else begins
+        begins = f.repeat(begins, f.width)
         rest = f.select(tries, s.next - going.value.value, zero)
         parts = f.max(f.intrinsic("ceil", f.abs(rest) / going.longest.value), one)
         h = rest / parts
