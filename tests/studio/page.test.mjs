@@ -7,7 +7,7 @@ const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
 const forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
-const {shapeProblem} = await page("checks"), cams = await page("cam_fields");
+const {withBar} = await page("dimensions"), {shapeProblem} = await page("checks"), cams = await page("cam_fields");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("motions"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
@@ -482,4 +482,56 @@ test("plates with pins almost in line are reported, and a gear has its own teeth
   found = actions.drawGear(found, at(0, 0, null, 0), at(0, 0, null, 1)).document;
   const rims = symbolsOf(found, 1e-4).filter(({of, points}) => of.kind === "gear" && points?.length > 50);
   assert.deepEqual(rims.map(({points}) => points.length / 5), [20, 20]);
+});
+
+/** The lengths (mm) of all bars after one of them is typed. */
+function typed(document, index, size, way = null) {
+  const link = document.link[index], ends = link.pins.map(pin => d.placeOf(document, pin)), turn = Math.atan2(ends[1][1] - ends[0][1], ends[1][0] - ends[0][0]);
+  const found = withBar(document, link, size / 1000, way ?? turn);
+  const lengths = found.document?.link.filter(({pins}) => pins.length === 2).map(({pins}) => +(1000 * Math.hypot(...d.placeOf(found.document, pins[0]).map((x, k) => x - d.placeOf(found.document, pins[1])[k]))).toFixed(6));
+  return {...found, lengths};
+}
+
+test("a length that was typed stays when another one is typed", () => {
+  for (const swapped of [[], [1], [0, 1, 2]]) {  // in whichever order a bar names its pins
+    let found = fourBar();
+    found = freeze({...found, link: found.link.map((link, k) => (swapped.includes(k) ? {...link, pins: link.pins.toReversed()} : link))});
+    const wanted = d.placeOf(found, "A") && [];
+    for (const [k, size] of [[0, 40], [1, 120], [2, 80], [0, 45], [2, 90]]) {
+      wanted[k] = size;
+      const next = typed(found, k, size);
+      assert.equal(next.problem, undefined);
+      assert.equal(next.note === "", wanted.length > 1);  // the coupler as it was drawn does not fit the first length
+      wanted.forEach((length, j) => assert.ok(Math.abs(next.lengths[j] - length) < 1e-6, `${next.lengths} for ${wanted}`));
+      found = freeze(next.document);
+    }
+    assert.deepEqual([found.pins.A, found.pins.D], [[0, 0], [100, 0]]);
+  }
+});
+
+const LOOP = freeze({units: {length: "mm", angle: "deg"}, ground: ["A", "D"],
+  pins: {A: [0, 0], B: {from: "A", length: 40, angle: 60}, D: {from: "A", along: [3, 0], length: 100}, C: {from: ["B", "D"], length: [120, 80], side: "left"}},
+  link: [["A", "B"], ["B", "C"], ["D", "C"]].map((pins, k) => ({name: `link${k + 1}`, pins}))});
+
+test("a pin given by two lengths changes the one of its bar", () => {
+  const found = LOOP, {document} = typed(found, 2, 90);
+  assert.deepEqual(document.pins.C, {from: ["B", "D"], length: [120, 90], side: "left"});
+  assert.deepEqual(typed(found, 0, 35).document.pins.B, {from: "A", length: 35, angle: 60});
+  const {problem} = typed(found, 2, 300);
+  assert.match(problem, /^link3 cannot be 300 mm long: link2 is 120 mm, and D and B are 87.178 mm apart; it needs between 32.822 mm and 207.178 mm$/);
+});
+
+test("the pin of a slider stays on its line", () => {
+  const found = freeze({units: {length: "mm"}, ground: ["O"], pins: {O: [0, 0], A: [0, 40], S: [100, -20]},
+    link: [{name: "crank", pins: ["O", "A"]}, {name: "rod", pins: ["A", "S"]}, {name: "block", pins: ["S"]}], slide: [{name: "rail", link: "block", direction: [1, 0]}]});
+  const {document, note} = typed(found, 1, 150);
+  assert.equal(note, "");
+  assert.ok(Math.abs(document.pins.S[1] + 20) < 1e-9 && Math.abs(document.pins.S[0] - Math.sqrt(150 ** 2 - 60 ** 2)) < 1e-6);
+  assert.match(typed(found, 1, 50).problem, /^rod cannot be 50 mm long: it needs at least 60 mm to the line of rail$/);
+});
+
+test("it is said which dimension gives way", () => {
+  const {note, document} = typed(LOOP, 2, 80, 1.2);
+  assert.match(note, /^link2 is now [0-9.]+ mm$/);
+  assert.equal(document.pins.C.length[1], 80);
 });

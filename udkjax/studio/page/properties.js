@@ -1,9 +1,10 @@
 // The fields of the selected element: each value with its unit, as written in the file.
 
-import {groundOf, list, movePin, nameOf, pinsOf, placeOf, renameElement, renamePin, settle, toggleGround, withKey, withValue} from "./document.js";
+import {groundOf, list, movePin, nameOf, pinsOf, placeOf, renameElement, renamePin, toggleGround, withKey, withValue} from "./document.js";
 import {readValue, valueText} from "./values.js";
 import {shapeProblem} from "./checks.js";
 import {copy, remove} from "./keys.js";
+import {withBar} from "./dimensions.js";
 import {swapPair} from "./actions.js";
 import {camFields} from "./cam_fields.js";
 import {carry} from "./motions.js";
@@ -172,11 +173,13 @@ export class PropertiesPanel {
     const facts = [mass === undefined || link.mass !== undefined ? "" : `mass ${shown(mass, "kg")}`].filter(Boolean).map(words => make("p", {}, words));
     const [a, b] = (link.pins ?? []).map(pin => placeOf(document, pin));
     if (link.pins?.length !== 2 || !a || !b) return [make("p", {}, lengthsText(document, link)), ...facts];
-    const moves = groundOf(document).includes(link.pins[1]) && !groundOf(document).includes(link.pins[0]) ? 0 : 1;
     const size = Math.hypot(b[0] - a[0], b[1] - a[1]), turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
     const put = (long, way) => {
-      const s = moves ? 1 : -1, from = moves ? a : b, found = movePin(document, link.pins[moves], [from[0] + s * long * Math.cos(way), from[1] + s * long * Math.sin(way)]);
-      return found === document && (long !== size || way !== turn) ? this.refuse("other pins that are given by lengths would have no place") : this.set(settle(found));
+      if (long === size && way === turn) return this.again();
+      const {document: found, note, problem} = withBar(document, link, long, way);
+      if (problem) return this.refuse(problem);
+      this.set(found);
+      return note && studio.say(note);
     };
     const field = (label, quantity, value, unit, take) => this.field(label, value, unit, text => {
       const next = {length, angle}[quantity](this.read(text, quantity), document);
