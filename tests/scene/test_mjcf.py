@@ -456,3 +456,12 @@ def test_files_that_include_each_other_on_many_levels_are_refused(tmp_path):
     path.write_text("<mujoco><worldbody><include file='0.xml'/></worldbody></mujoco>")
     with pytest.raises(udk.SceneError, match="on more than 50 levels"):
         udk.load(path)
+
+
+def test_a_connection_to_the_world_by_its_name_is_a_pin_of_the_ground():
+    free = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><joint axis="0 0 1"/>'
+    body = f'<body name="arm" pos="0 0 0">{free}<geom type="capsule" size=".1" fromto="0 0 0 1 0 0" mass="1"/></body>'
+    for names in ("body1='arm' body2='world'", "body1='world' body2='arm'"):
+        rest = f"<equality><connect name='pin' {names} anchor='0 0 0'/></equality>"
+        found = udk.read_mjcf(f"<mujoco><option gravity='0 -9.81 0'/><worldbody>{body}</worldbody>{rest}</mujoco>")
+        assert sorted(found.joints["pin"].bodies) == ["arm", "ground"]
