@@ -406,3 +406,66 @@ def test_a_joint_that_creeps_into_a_stiff_bumper_does_not_reverse_again_and_agai
     # About the pin, with the arm sqrt(1 - 0.3^2) m of the bumper: its force less the weights, at most mu r |R|.
     force, weight, arm = 1e7 * (-0.3 - run.q[-1, 1, 1]), 9.81 * 1.5, np.sqrt(1 - 0.3**2)
     assert abs(arm * (force - 9.81 * 1.0)) <= mu * radius * (weight - force) * (1 + 1e-3)
+
+
+class Dwell(udk.Motion):
+    """Turns by one radian in the first second, rests for half a second, and turns back."""
+
+    def __call__(self, t):
+        def rise(x):
+            return x**3 * (10 - 15 * x + 6 * x**2)
+
+        return 0.5 + rise(jnp.clip(t, 0.0, 1.0)) - rise(jnp.clip(t - 1.5, 0.0, 1.0))
+
+    @property
+    def breakpoints(self):
+        return [0.0, 1.0, 1.5, 2.5]
+
+
+def dwelling_slider_crank(motion: udk.Motion, coefficient: Any = 0.2, crank: float = 0.5) -> udk.Mechanism:
+    """Return a slider-crank, driven at the crank, with friction in slide and pin."""
+    c, s = np.cos(crank), np.sin(crank)
+    d = np.sqrt(4 - s**2)
+    return udk.Mechanism(
+        {
+            "crank": udk.Body(1.0, 0.1, [c / 2, s / 2], crank),
+            "rod": udk.Body(1.0, 0.1, [c + d / 2, s / 2], -np.arcsin(s / 2)),
+            "slider": udk.Body(1.0, 0.1, [c + d, 0.0]),
+        },
+        {
+            "A": udk.Revolute(["ground", "crank"], [[0.0, 0.0], [-0.5, 0.0]]),
+            "B": udk.Revolute(["crank", "rod"], [[0.5, 0.0], [-1.0, 0.0]]),
+            "C": udk.Revolute(["rod", "slider"], [[1.0, 0.0], [0.0, 0.0]]),
+            "S": udk.Prismatic(["ground", "slider"], [[0.0, 0.0], [0.0, 0.0]], 0.0),
+        },
+        {"motor": udk.Driver(["ground", "crank"], "angle", motion)},
+        {
+            "slide": udk.Friction("S", coefficient=coefficient, **STICKS),
+            "pin": udk.Friction("B", coefficient=coefficient, radius=0.05, **STICKS),
+        },
+    )
+
+
+DWELL_TIMES = np.array([0.5, 0.9, 1.1, 1.2, 1.4, 1.6, 2.0, 2.6, 3.0])
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+def test_a_joint_that_a_driver_holds_at_rest_sticks(engine):
+    """Its speed becomes zero and stays there without a change of sign; one that only turns round does not stick."""
+    rests = (DWELL_TIMES > 1.0) & (DWELL_TIMES < 1.5) | (DWELL_TIMES > 2.5)
+    run = udk.simulate(dwelling_slider_crank(Dwell()), [0.0, *DWELL_TIMES], engine=engine)
+    for joint in ("S", "B"):
+        np.testing.assert_array_equal(run.sticking[joint][1:], rests, err_msg=joint)
+    turning = udk.simulate(dwelling_slider_crank(udk.Polynomial([-0.5, 1.0]), crank=-0.5), [0.0, 0.4, 0.5, 0.6], engine=engine)
+    assert not turning.sticking["S"].any() and not turning.sticking["B"].any()  # at 0.5 s the slide turns round
+
+
+def test_joints_that_drivers_hold_stick_in_lanes():
+    @jax.jit
+    @jax.vmap
+    def sticking(coefficient):
+        return udk.simulate(dwelling_slider_crank(Dwell(), coefficient), DWELL_TIMES - 0.45).sticking["S"]
+
+    times = DWELL_TIMES - 0.45
+    rests = (times > 1.0) & (times < 1.5) | (times > 2.5)
+    np.testing.assert_array_equal(sticking(jnp.array([0.1, 0.2]))[:, 1:], [rests[1:]] * 2)

@@ -4,14 +4,19 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike, Time, Vector
 from udkjax.arrays import make_module
-from udkjax.complementarity.stick_or_slip import SIDES
-from udkjax.equations import rubbing
+from udkjax.complementarity.stick_or_slip import AT_REST, SIDES
+from udkjax.equations import constraints, determinacy, rubbing
+from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.analysis import Analysis
+from udkjax.pinv import SVD
+from udkjax.programs.deferred import deferred
 from udkjax.scene.fields import given_number
 from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Revolute
@@ -97,3 +102,37 @@ class DirectedMechanism(NamedTuple):
         """Return the units of displacements of the joints: one radian, or a length."""
         turns = np.array([isinstance(self.mechanism.joints[name], Revolute) for name, _ in self.joints], bool)
         return jnp.where(turns, 1.0, length)
+
+    @deferred
+    def held_by_drivers(
+        self, analysis: Analysis, ts: Float[Array, "T"], q: Float[Array, "T n"], v: Float[Array, "T n"]
+    ) -> Bool[Array, "T F"]:
+        """Return which joints the drivers hold at rest: they determine the sliding, and its speed and acceleration are zero.
+
+        A driver that comes to rest smoothly takes the speed of a joint to zero and leaves it there: no sign changes. The joint is
+        then at rest though it neither reaches a limit of friction nor needs a constraint.
+
+        Args:
+            analysis: The mechanism's `Analysis`.
+            ts: Times (s).
+            q: Positions (m, rad).
+            v: Velocities (m/s, rad/s).
+
+        Returns:
+            A mask of the joints.
+        """
+        scales = analysis.scales
+        units, unit = scales.coordinates(q.shape[1]), self.units(scales.length)
+
+        def at(t: Array, q: Array, v: Array) -> Array:
+            J = determinacy.scaled_jacobian(self.mechanism, t, q, analysis)
+            plus = uk.pseudoinverse(SVD(determinacy.STATIC_RANK_TOL), J)
+            rows = jax.jacfwd(self.sliding_speeds, 1)(q, v) * units / unit[:, None]
+            free = rows - (plus.T @ rows.T).T @ J
+            is_determined = jnp.sum(free**2, axis=1) <= AT_REST.blocked * jnp.sum(rows**2, axis=1)
+            a = units * (plus @ (constraints.gamma(self.mechanism, t, q, v) / scales.rows))
+            speed, rate = jax.jvp(self.sliding_speeds, (q, v), (v, a))
+            slow = AT_REST.closed * scales.rate * unit
+            return is_determined & (jnp.abs(speed) <= slow) & (jnp.abs(rate) <= slow * scales.rate)
+
+        return jax.vmap(at)(ts, q, v)

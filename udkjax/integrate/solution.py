@@ -128,7 +128,8 @@ class Solution(PrintsTable):
         bodies: the names of the bodies, in the order of q and v.
         unlocated: time (s) from which jumps and kinks of forces are not located, so that derivatives do not pass through them;
             infinite if all are located, None if there are none.
-        sticking: for each joint with set-valued friction, whether it sticks at the output times; None without any.
+        sticking: for each joint with set-valued friction, whether it sticks at the output times, or is held at rest by drivers;
+            None without any.
     """
 
     ts: Float[Array, "T"]

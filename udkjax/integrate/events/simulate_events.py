@@ -18,6 +18,7 @@ from udkjax.arrays import is_within_jit, make_module, number, put_arrays
 from udkjax.complementarity.stick_or_slip import SIDES
 from udkjax.devices import computing_on_host, on_host
 from udkjax.equations.analysis import Analysis
+from udkjax.equations.directed_friction import DirectedFriction
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
 from udkjax.integrate.events.condition_program import (
@@ -262,6 +263,7 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
     engine = f"{choices.integrator}: {why}" if all(reasons) else f"native, in some phases diffrax: {why}" if why else "native"
     settings = dict(choices.settings(why)) | {"engine": engine}
     settings |= {"max_events": str(given.max_events)} if names else {}
+    sticking = _with_joints_held_by_drivers(mechanism, given, found, sticking, xp)
     with jax.debug_nans(False):  # NaN stands for outputs after the end of a run
         q, v = (xp.where(xp.isinf(x), xp.nan, x).reshape(len(x), *bodies[1:]) for x in (found.q, found.v))
     return make_module(
@@ -281,6 +283,21 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
         sticking=sticking,
         found_cause=None,
     )
+
+
+def _with_joints_held_by_drivers(
+    mechanism: Any, given: Given, found: EventRun, sticking: dict[str, Array] | None, xp: ModuleType
+) -> dict[str, Array] | None:
+    """Return which joints stick at the output times, those included that drivers hold at rest."""
+    names = [x.name for x in given.phases.sticking if x.contact < 0]
+    analysis = given.phases.analyses[SCENE]
+    if not sticking or not names or not mechanism.drivers or analysis is None:
+        return sticking
+    # Outputs after the end of a run are infinite: nothing sticks there.
+    reached = xp.isfinite(found.q).all(axis=1, keepdims=True)
+    q, v = (xp.where(reached, x, 0.0) for x in (found.q, found.v))
+    held = reached & xp.asarray(DirectedFriction.put_in(mechanism).held_by_drivers(analysis, given.ts, q, v))
+    return sticking | {name: sticking[name] | held[:, k] for k, name in enumerate(names)}
 
 
 _compiled_solution = deferred(_solution)

@@ -141,6 +141,10 @@ def _decide(
     normals, directions = (x[..., forwards, :] for x in (state_values.by_v, state_values.directions))
     inverse_mass = take(system.inverse_mass, members)[..., None, :]
     mobility, W = (normals**2 * inverse_mass).sum(-1), directions / inverse_mass @ directions.swapaxes(-1, -2)
+    # Drivers that have just begun to move a joint take it along slowly: it does not wait for them again at another's event.
+    is_determined = xp.diagonal(W, axis1=-2, axis2=-1) <= AT_REST.blocked * mobility
+    goes_on = (before.direction * speed > 0) & ~before.at_rest & ~before.locked & is_determined
+    rest = rest & (~goes_on | is_stopped[0] | is_stopped[1])
     at = _with_locks(system, members, at, rest & ~before.locked)
     rested = before.locked | before.at_rest
     joints = JointsAtRest.of(rest, xp.sign(speed), W, mobility, before.locked, rested, scale * rate, xp, contacts)
