@@ -295,3 +295,25 @@ def test_a_long_chain_comes_to_rest_in_a_few_steps(monkeypatch):
     found = udk.equilibrium(udk.library.chain(30, angle=0.1))
     assert found.stable
     assert len(positions) < 10
+
+
+def weight_on_a_slide() -> udk.Mechanism:
+    """Return a slider-crank with a vertical slide, whose slider carries a weight, from its upper side."""
+    c, s = 0.5 * np.cos(1.2), 0.5 * np.sin(1.2)
+    return udk.Mechanism(
+        {"crank": udk.Body(1.0, 0.02, [c / 2, s / 2], 1.2), "rod": udk.Body(1.0, 0.02, [c / 2, 1.5 * s], np.pi - 1.2)},
+        {
+            "A": udk.Revolute(["ground", "crank"], [[0.0, 0.0], [-0.25, 0.0]]),
+            "B": udk.Revolute(["crank", "rod"], [[0.25, 0.0], [-0.25, 0.0]]),
+            "S": udk.Slot(["ground", "rod"], [[0.0, 0.0], [0.25, 0.0]], np.pi / 2),
+        },
+    )
+
+
+def test_several_starts_find_stable_equilibria_as_one_start_downhill_does():
+    """The nearest equilibrium, searched from every start, may be unstable everywhere; the lowest one is always found."""
+    scene = weight_on_a_slide()
+    lowest = udk.equilibrium(scene, stable=True)
+    assert bool(lowest.stable)
+    found = udk.equilibria(scene, starts=2)
+    assert any(bool(e.stable) and np.allclose(e.q[:, :2], lowest.q[:, :2], atol=1e-6) for e in found)

@@ -20,7 +20,8 @@ def statics(
 
     Args:
         scene: the mechanism; its drivers are held.
-        stable: find a stable equilibrium only, at lower energy than the initial guess.
+        stable: find a stable equilibrium only, at lower energy than the initial guess; otherwise the nearest equilibrium, or, if
+            there is none, the stable one.
         starts: number of positions to search from; with more than one, all equilibria found are listed.
         seed: seed of these positions.
         t: time of drivers and loads (s).
@@ -36,8 +37,11 @@ def statics(
     from udkjax.positions.channels import LOADS
     from udkjax.statics.resting_forces import force_lines, resting_forces
 
-    single = udk.equilibrium(mech, t=t, stable=stable) if starts == 1 else None
-    equilibria = ([single] if single.balanced else []) if single is not None else udk.equilibria(mech, starts, seed, t)
+    if starts == 1:  # without one nearby, that downhill, as in the studio
+        tried = (udk.equilibrium(mech, t=t, stable=x) for x in ([True] if stable else [False, True]))
+        equilibria = [x for x in tried if x.balanced][:1]
+    else:
+        equilibria = [x for x in udk.equilibria(mech, starts, seed, t) if x.stable or not stable]
     forces = [resting_forces(mech, e.q, t) for e in equilibria]
     results = {
         "bodies": mech.body_names,
@@ -71,4 +75,7 @@ def statics(
     )
     show(results, "\n".join(words), json)
     if not equilibria:
-        fail("no equilibrium was found near the initial guess; try --stable, or --starts 64")
+        kind = "stable equilibrium" if stable else "equilibrium"
+        near = f"no {kind} was found near the initial guess, nor downhill from it: search from other positions by --starts 64"
+        many = f"no {kind} was found from {starts} positions: loads may move the mechanism without end; or try another --seed"
+        fail(near if starts == 1 else many)

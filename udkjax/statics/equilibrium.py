@@ -155,7 +155,8 @@ def equilibria(
 ) -> list[Equilibrium]:
     """Return the different equilibria found from several positions: the given position and random positions.
 
-    Random positions turn every body by a random angle, and are then closed: any branch may be reached. The search is not
+    Random positions turn every body by a random angle, and are then closed: any branch may be reached. From each, one search goes
+    to the nearest equilibrium, stable or not, and one downhill, as with `equilibrium(..., stable=True)`. The search is not
     exhaustive.
 
     Args:
@@ -170,7 +171,11 @@ def equilibria(
     """
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)
-    batch = jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, analysis=analysis))(guesses)
+
+    def found(stable: bool) -> Equilibrium:
+        return jax.vmap(lambda q: equilibrium(mechanism, State(q, jnp.zeros_like(q)), t, stable, analysis))(guesses)
+
+    batch = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), found(stable=False), found(stable=True))
     different = [jax.tree.map(lambda x, k=k: x[k], batch) for k in distinct_positions(batch.q, batch.balanced, analysis.scales)]
     return sorted(different, key=lambda e: -float(jnp.min(e.omega2, initial=jnp.inf)))
 
