@@ -82,7 +82,7 @@ MOST_CALLS: dict[str, tuple[int, Callable[[Any, Any], object]]] = {
     "kinematics": (180, lambda state, run: udk.kinematics(DRAWN, "body.crank.angle", [1.0, 1.01, 1.02])),
     "inverse dynamics": (206, lambda state, run: udk.inverse_dynamics(DRIVEN, TS)),
     "another number": (131, lambda state, run: WITH_MOTOR.with_parameters({"force.motor.value": 1.0})),
-    "another drawing": (1850, lambda state, run: DRAWN.with_parameters({"link.crank.width": 0.02})),
+    "another drawing": (1890, lambda state, run: DRAWN.with_parameters({"link.crank.width": 0.02})),
 }
 
 
