@@ -49,6 +49,7 @@ def failure(status: Any, xp: ModuleType = jnp) -> Any:
         (Status.SINGULAR, Result.singular),
         (Status.SPURIOUS_RANK, Result.spurious_rank),
         (Status.MISSING_RANK, Result.missing_rank),
+        (Status.INTERRUPTED, Result.interrupted),
     ):
         code = xp.where(status == status_of, result, code)
     return code

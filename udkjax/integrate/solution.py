@@ -45,6 +45,7 @@ class Result(PrintsWords):
     spurious_rank = 15
     missing_rank = 16
     painleve_paradox = 17
+    interrupted = 18
 
     @property
     def is_success(self) -> bool:
@@ -89,6 +90,7 @@ CAUSES = {
     Result.painleve_paradox: "friction leaves a contact no force (Painleve's paradox): the harder it presses, the more its "
     "friction turns it into its line, and without a force it would be penetrated; rigid bodies with Coulomb's friction have no "
     "accelerations here: make the coefficient smaller, or the contact compliant (a spring)",
+    Result.interrupted: "Ctrl-C ended the run",
     Result.undefined_condition: "the condition of an event is not a number: look at what it divides by, or takes the root of",
 }
 

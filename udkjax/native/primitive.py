@@ -6,6 +6,7 @@ import time
 import weakref
 import zlib
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
 from functools import cached_property, lru_cache, partial
 from threading import Lock
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from jaxtyping import Array
 
 from udkjax.equations.scales import scales_p
 from udkjax.native import records
-from udkjax.native.base import host_program, machine, processor
+from udkjax.native.base import host_program, interrupts, machine, processor
 from udkjax.native.base.ffi import handler
 from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
 from udkjax.native.base.loading import Code, load
@@ -71,13 +72,31 @@ class PreparedCall(NamedTuple):
     def __call__(self) -> list[np.ndarray]:
         """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
         self.shared[:], address = (0, 0), ctypes.addressof(self.record)
+        interrupts.handler().install()
         others = [shared_threads().submit(self.run, address) for _ in range(self.threads - 1)]
-        self.run(address)
-        for other in others:
-            other.result()
+        try:
+            self.run(address)
+        finally:
+            if others:
+                _wait_for(others)  # they write to the arrays
         if self.shared[1]:
             raise MemoryError("no memory for a computation by machine code")
         return self.outputs
+
+
+def _wait_for(calls: Sequence[Future[Any]]) -> None:
+    """Wait for calls of machine code, even if interrupted meanwhile; raise their error, or the interruption."""
+    interruption: BaseException | None = None
+    for call in calls:
+        while not call.done():
+            try:
+                wait([call])
+            except KeyboardInterrupt as error:  # machine code ends, too
+                interruption = error
+    if interruption is not None:
+        raise interruption
+    for call in calls:
+        call.result()
 
 
 class LoadedCode:

@@ -9,7 +9,7 @@ from weakref import WeakValueDictionary
 
 import jax
 
-from udkjax.native.base import leaving, machine
+from udkjax.native.base import interrupts, leaving, machine
 
 
 class Later:
@@ -41,10 +41,14 @@ class Code:
     `load_later` loads the code of the later module of a module that runs may leave.
     """
 
-    def __init__(self, name: str, library: machine.Library, load_later: "Callable[[], Code] | None" = None):
+    def __init__(
+        self, name: str, library: machine.Library, is_interruptible: bool, load_later: "Callable[[], Code] | None" = None
+    ):
         self._name, self.library = name, library
         self.run: Any = machine.function(library["run"], ctypes.c_void_p)
         self.run.library, self.later = library, None
+        if is_interruptible:
+            interrupts.connect(library)
         if load_later is not None:
             self.run.later = self.later = Later(library, load_later)
             self.run.load_later = ctypes.CFUNCTYPE(ctypes.c_void_p)(self.later.load)
@@ -78,13 +82,14 @@ def load(text: str, level: int = machine.LEVEL, load_later: Callable[[], Code] |
     names = (
         "run",
         "call_frame",
+        *([interrupts.POINTER_NAME] if (is_interruptible := interrupts.GLOBAL in text) else ()),
         *(leaving.POINTERS if load_later else [leaving.RESUME] if f"@{leaving.RESUME}(" in text else []),
     )
     name = f"udkjax_{machine.digest(text)}"
     with _LOADING:
         code = _LOADED.get(name)
         if code is None:
-            code = Code(name, machine.library(text, names, level), load_later)
+            code = Code(name, machine.library(text, names, level), is_interruptible, load_later)
             if code.library.is_optimized:
                 _LOADED[name] = code
         return code

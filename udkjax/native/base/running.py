@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 
-from udkjax.native.base import leaving
+from udkjax.native.base import interrupts, leaving
 from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.base.layout import Lane
 from udkjax.native.base.loops import LoopWriter
@@ -29,12 +29,14 @@ class Running(Memory):
     apart: set[str]
     """The names of functions that are compiled apart from others, since only this module has them."""
     loops: LoopWriter
+    is_interruptible = True
+    """Whether Ctrl-C ends the runs of a module that takes steps; a page has no signals."""
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
         self.write_functions()
         self._write_run()
-        pointers = leaving.GLOBALS if self.plan.leaves else []
+        pointers = [*(leaving.GLOBALS if self.plan.leaves else []), *([interrupts.GLOBAL] if self._has_signals else [])]
         text = text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION)
         has_both = self.plan.leaves or self.plan.stiff is not None
         return f"{apart(self.apart | leaving.DIFFERENT)}\n{text}" if has_both else text
@@ -76,6 +78,10 @@ class Running(Memory):
         """Store the numbers that all members share, once per run, in zeroed memory."""
         for begin in self.begins:
             begin(f)
+
+    @property
+    def _has_signals(self) -> bool:
+        return self.is_interruptible and self.plan.steps
 
     @property
     def _memory_size(self) -> int:
@@ -138,7 +144,12 @@ class Running(Memory):
         def leaves() -> Value:
             return f.any_of(self.present(f, s) & (s.stiff > 0.5))
 
+        interruption = interrupts.Interruption(f) if self._has_signals else None
+
         with f.while_(lambda: f.any_of(self.present(f, s)) & ~leaves() if plan.leaves else f.any_of(self.present(f, s))):
+            if interruption:
+                with f.if_(interruption.has_come()):
+                    s.max_steps = f.const(-1.0, DOUBLE, width)
             self.step_all(f, s, fill)
         left = leaving.members_in_lanes(self, f, s, self.present(f, s)) if plan.leaves else None
         is_left = leaves() if plan.leaves else None

@@ -94,10 +94,11 @@ class Status:
     `SINGULAR`: a run that is not projected is too far from the manifold for the singular configuration that it is near.
     `SPURIOUS_RANK`: more rows counted as independent than are. `MISSING_RANK`: fewer, and the motion violates those left out.
     Runs that watch conditions also end as `CROSSED`, at a zero crossing, or `UNRESOLVED`, where a crossing is possible.
+    `INTERRUPTED`: by Ctrl-C.
     """
 
     RUNNING, DONE, STEP_LIMIT, STEP_TOO_SMALL, NOT_FINITE, LOST, SINGULAR, SPURIOUS_RANK, MISSING_RANK = range(9)
-    CROSSED, UNRESOLVED = range(9, 11)
+    CROSSED, UNRESOLVED, INTERRUPTED = range(9, 12)
 
 
 # Bounds of Psi after the projection of a step, each row over its scale. Projection usually leaves 1e-12. Where rows become

@@ -77,7 +77,8 @@ def write_decide(module: Module):
         s.behind = where(begun, first_step(module, f, s), s.behind)
     h = s.behind
     code = where(stepping & (h < s.smallest), f.const(Status.STEP_TOO_SMALL, DOUBLE, f.width), s.code)
-    code = where(code.is_(float(Status.RUNNING)) & stepping & (tried >= s.max_steps), Status.STEP_LIMIT, code)
+    is_over = code.is_(float(Status.RUNNING)) & stepping & (tried >= s.max_steps)
+    code = where(is_over, where(s.max_steps < 0.0, f.const(Status.INTERRUPTED, DOUBLE, f.width), Status.STEP_LIMIT), code)
     code = where(stepping & failed & begin & ~accept, where(code.is_(float(Status.RUNNING)), Status.STEP_TOO_SMALL, code), code)
     code = where(accept & (s.last > 0.5), Status.DONE, code)
     lost = _accept_step(module, f, s, accept)

@@ -37,6 +37,7 @@ def wasm_module(operation: Operation) -> WasmModule:
         UnsupportedError: machine code does not support the operation.
     """
     module = operation.module(1, 1, LANES)
+    module.is_interruptible = False  # pyright: ignore[reportAttributeAccessIssue]
     module.written_text = module.text()
     return WasmModule(compile_wasm(module.written_text, ("run",)), module)
 
