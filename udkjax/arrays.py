@@ -35,6 +35,11 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
+def without_derivatives(tree: Any) -> Any:
+    """Return a tree without tangents: its numbers are concrete where only derivatives trace them, as in `jax.grad(f)(x)`."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, tree)
+
+
 def is_within_jit() -> bool:
     """Return True while a program is traced, in which concrete numbers become constants."""
     return isinstance(_evaluated_p.bind(), Tracer)
@@ -99,6 +104,21 @@ def make_module(cls: type[Module], **fields: Any) -> Module:
     for name, value in fields.items():
         object.__setattr__(module, name, value)
     return module
+
+
+def solve_each(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return x (M, n) with A x = b for matrices (M, n, n) and vectors (M, n), NaN where a matrix is singular or not finite.
+
+    `numpy.linalg.solve` raises an error for all of them if one is singular.
+    """
+    is_finite = np.isfinite(A).all((1, 2))
+    regular = np.where(is_finite[:, None, None], A, np.eye(A.shape[-1]))
+    try:
+        x = np.linalg.solve(regular, b[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        is_finite &= np.linalg.slogdet(regular)[0] != 0
+        x = np.linalg.solve(np.where(is_finite[:, None, None], A, np.eye(A.shape[-1])), b[..., None])[..., 0]
+    return np.where(is_finite[:, None], x, np.nan)
 
 
 class QuickMethods(eqx.Module):

@@ -8,6 +8,7 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
+from udkjax.arrays import solve_each
 from udkjax.synthesis.search import loss_of
 from udkjax.synthesis.trials import Trials
 
@@ -364,3 +365,22 @@ def test_a_curve_that_wants_dead_points_has_designs_and_failures_say_why():
         FOUR_BAR, udk.PathGoal("P", heart), bounds={"pin.A": (-50.0, 50.0), "pin.O": (-50.0, 50.0)}, lengths=apart, starts=8
     )
     assert not len(none) and "exceeds the length O-A" in none.reason and "nothing was found" in str(none)
+
+
+def test_a_start_without_a_link_is_no_start():
+    """Clipped to a corner of their bounds, two pins coincide: a crank of no length has no derivatives, and no step."""
+    pins = {"O": (0, 0), "A": (0.5, 0.5), "B": (2, 1.5), "P": (1, 2), "C": (2, 0)}
+    links = {name: {"pins": pair, "mass": 1.0} for name, pair in (("crank", "OA"), ("coupler", "ABP"), ("rocker", "CB"))}
+    links = {name: link | {"pins": list(link["pins"])} for name, link in links.items()}
+    drawing = udk.Drawing(pins=pins, links=links, ground=["O", "C"], motors={"motor": {"pin": "O", "speed": 6.0}})
+    bounds = {f"pin.{name}": ([-4.0, -4.0], [4.0, 4.0]) for name in pins}
+    path = udk.PathGoal("P", [[-1, 1], [-0.5, 0], [0, -1], [0.5, 0], [1, 1]])
+    found = udk.design(drawing, path, starts=60, results=1, bounds=bounds)
+    assert found[0].loss < 1e-20
+
+
+def test_one_singular_matrix_of_a_batch_is_no_error():
+    A = np.array([np.diag([2.0, 4.0]), np.zeros((2, 2)), np.full((2, 2), np.nan), np.eye(2)])
+    expected = [[0.5, 0.25], [np.nan] * 2, [np.nan] * 2, [1.0, 1.0]]
+    np.testing.assert_array_equal(solve_each(A, np.ones((4, 2))), expected)
+    np.testing.assert_array_equal(solve_each(A[::3], np.ones((2, 2))), expected[::3])

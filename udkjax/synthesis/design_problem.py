@@ -295,7 +295,10 @@ class DesignProblem:
             by_x = table[:, :, G, 2:]  # derivatives at constant driver values: other residuals determine unknown ones
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
         terms, by_terms = self._terms_of(x, exists, threads)
-        return TrialResiduals(solved.q, r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, exists)
+        found = (r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes)
+        for numbers in found:  # a link without length has positions, but no direction
+            exists &= np.isfinite(numbers).reshape(members, -1).all(1)
+        return TrialResiduals(solved.q, *found, exists)
 
     def _terms_of(self, x: np.ndarray, exists: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the residuals of motion goals and their derivatives; trials without a motion are marked in `exists`."""

@@ -162,7 +162,7 @@ def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | 
     ddx, dds = equations.correct(bend_of_r, bend_of_limits)
     ratio = 2.0 * equations.length(ddx) / np.maximum(equations.length(dx), 1e-300)
     share = np.where(exists & (ratio <= MOST_BEND), 1.0, 0.0)[:, None]
-    return dx + share * ddx, ds + share * dds
+    return dx + np.where(share > 0, ddx, 0.0), ds + np.where(share > 0, dds, 0.0)
 
 
 def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):

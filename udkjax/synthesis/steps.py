@@ -11,6 +11,7 @@ leave their bounds are fixed.
 
 import numpy as np
 
+from udkjax.arrays import solve_each
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
@@ -66,7 +67,7 @@ class StepEquations:
             matrix[:, places, places] += self.damping[which, None] * size + REGULAR * (steepest + (steepest == 0))
             held = (low[which] & (gradient > 0)) | (high[which] & (gradient < 0))
             matrix = _held_out(matrix, held)
-            change = -np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None])[..., 0]
+            change = -solve_each(matrix, np.where(held, 0.0, gradient))
             self.matrix[which], self.size[which], self.held[which], dx[which] = matrix, size, held, change
             now = excess + (C @ change[..., None])[..., 0] > 0
             changed = (now != pressed).any(1)
@@ -83,7 +84,7 @@ class StepEquations:
         b, g = self._right_hand_side(r)
         force = self.weight[:, None] ** 2 * self.pressed * limits
         gradient = b + (force[:, None] @ self.found.limits_by_unknowns)[:, 0]
-        dx = -np.linalg.solve(self.matrix, np.where(self.held, 0.0, gradient)[..., None])[..., 0]
+        dx = -solve_each(self.matrix, np.where(self.held, 0.0, gradient))
         return dx, self._values(dx, g)
 
     def length(self, dx: np.ndarray) -> np.ndarray:
