@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import traceback
 from types import SimpleNamespace
 from typing import Any
 
@@ -310,3 +311,55 @@ def test_what_turns_out_to_be_of_no_use_is_the_result_of_a_member(events):
     np.testing.assert_allclose(q[0], udk.simulate(OTHER, TS, state).q, rtol=1e-12)
     assert np.isnan(q[1:, 1:]).all()
     np.testing.assert_array_equal(ts, np.stack([row[0] for row in rows]))
+
+
+def _with_length(p):
+    pins = {"O": (0, 0), "C": (0.1, 0), "A": udk.polar("O", 0.04, 1.0), "B": udk.circles(("A", "C"), (0.12, 0.08), "left")}
+    ends = {"crank": ["O", "A"], "coupler": ["A", "B"], "rocker": ["C", "B"]}
+    links = {name: {"pins": pair, "mass": 1} for name, pair in ends.items()}
+    return udk.Drawing(pins=pins, links=links, ground=["O", "C"]).mechanism().with_parameters({"pin.A.length": p})
+
+
+_STATE = udk.assemble(udk.library.four_bar())
+_USES = {
+    "simulate": lambda m: udk.simulate(m, [0.0, 1.0]).q[-1, 0, 2],
+    "assemble": lambda m: udk.assemble(m).q[0, 2],
+    "kinematics": lambda m: udk.kinematics(m, "body.crank.angle", [1.0]).q[0, 0, 2],
+    "equilibrium": lambda m: udk.equilibrium(m).q[0, 2],
+    "modes": lambda m: udk.modes(m).omega2.sum(),
+    "step": lambda m: udk.step(m, _STATE, {}, 0.01).q[0, 2],
+    "accelerations": lambda m: udk.accelerations(m, 0.0, _STATE.q, _STATE.v).sum(),
+    "energy": lambda m: udk.energy(m, udk.simulate(m, [0.0, 1.0])).kinetic.sum(),
+}
+_WRONG = {
+    "length": _with_length,
+    "mass": lambda p: udk.library.four_bar().with_parameters({"body.coupler.mass": -p}),
+}
+
+
+@pytest.mark.parametrize("wrong", _WRONG.values(), ids=_WRONG)
+@pytest.mark.parametrize("use", _USES.values(), ids=_USES)
+def test_eager_derivatives_raise_the_errors_of_the_call(use, wrong):
+    """Their numbers are concrete, although JAX traces them."""
+    run, messages = (lambda p: use(wrong(p))), []
+    for call in (run, jax.grad(run), jax.jacfwd(run)):
+        with pytest.raises((ValueError, udk.SimulationError)) as error:
+            call(0.5)
+        messages.append(f"{error.type.__name__} {error.value}")
+    assert messages[0] == messages[1] == messages[2]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda m: udk.step(m, _STATE, {"nothing": 1.0}, 0.01),
+        lambda m: jax.grad(lambda x: udk.step(m, _STATE, {"nothing": x}, 0.01).q.sum())(1.0),
+        lambda m: udk.kinematics(m, "nothing", [1.0]),
+    ],
+)
+def test_a_refusal_is_short(call):
+    """It names the place and the cure; the frames of JAX in which it was found say nothing to the user."""
+    with pytest.raises(udk.SceneError) as error:
+        call(udk.library.four_bar())
+    lines = "".join(traceback.format_exception(error.value)).splitlines()
+    assert "nothing" in str(error.value) and len(lines) < 20 and sum(line.startswith("Traceback") for line in lines) == 1

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from udkjax.arrays import is_traced
+from udkjax.arrays import is_traced, without_derivatives
 from udkjax.wording import abbreviate, article
 
 GivenArguments = Mapping[str, Any]  # all arguments of a call by name, including defaults
@@ -44,11 +44,11 @@ def describe(value: Any) -> str:
 
 
 def array(name: str, value: Any) -> "np.ndarray | Tracer":
-    """Return real numbers as an array; for anything else raise a `TypeError` that names the argument. Tracers are unchanged."""
+    """Return real numbers as an array without derivatives; for anything else raise a `TypeError` that names the argument."""
     if isinstance(value, Tracer):
-        numbers: Any = value
+        numbers: Any = without_derivatives(value)
     elif not isinstance(value, np.ndarray | float) and is_traced(value):
-        numbers = jnp.asarray(value)  # a list of traced numbers
+        numbers = without_derivatives(jnp.asarray(value))  # a list of traced numbers
     else:
         try:
             numbers = np.asarray(value)

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays
+from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays, without_derivatives
 from udkjax.devices import on_host
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.formulations import Formulation
@@ -226,6 +226,11 @@ def simulate(
     solution, missed, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
     if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(code):
         return _required(explained_system(solution if located is None else located, system, end), throw)
+    if isinstance(mechanism, Mechanism) and throw and not is_concrete and _has_failed(code):
+        found = without_derivatives((solution if located is None else located, mechanism, analysis, choices.drift_tol, end))
+        if not is_traced(found):  # as in a call of `jax.grad`
+            *known, tol, last = found
+            return _required(explained(*known, tol, solver, last), throw)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution if located is None else _as_located(solution, located), throw)
     if missed:

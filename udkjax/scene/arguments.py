@@ -13,8 +13,10 @@ from inspect import BoundArguments, Parameter, Signature, isclass, signature
 from types import UnionType
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
 
+import jax
 import numpy as np
 
+from udkjax.arrays import is_within_jit, without_derivatives
 from udkjax.requirements import (
     ArgumentCheck,
     ArgumentError,
@@ -24,6 +26,7 @@ from udkjax.requirements import (
     require_count,
     require_number,
 )
+from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism, require_valid_numbers
 from udkjax.scene.named_arguments import CHECKS, require_history, require_name_or_names, require_names
 from udkjax.wording import article, quote, suggestion
@@ -63,9 +66,21 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
                 check(name, bound[name], given=bound)
             elif name in given and if_none == "refuses":
                 raise ArgumentTypeError(f"{name} must be given, not None")
-        return function(*args, **kwargs)
+        try:
+            return function(*args, **kwargs)
+        except (ArgumentError, SceneError) as error:
+            if jax.config.jax_traceback_filtering == "off":  # pyright: ignore[reportAttributeAccessIssue]
+                raise
+            raise _refusal(error) from None
 
     return call
+
+
+def _refusal(error: Result) -> Result:
+    """Return an error whose message says all, without the frames in which it was found, and what JAX says about its own."""
+    if notes := getattr(error, "__notes__", None):
+        notes[:] = [note for note in notes if "JAX" not in note]
+    return error.with_traceback(None)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _binder(function: Callable[..., Any]) -> Callable[[tuple[Any, ...], dict[str, Any]], tuple[GivenArguments, GivenArguments]]:
@@ -240,7 +255,7 @@ def _require_usable(name: str, value: Any, given: GivenArguments) -> None:
     if (shape := np.shape(value._source.gravity)) != (2,):
         cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
         raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")
-    require_valid_numbers(value)
+    require_valid_numbers(value if value.is_concrete or is_within_jit() else without_derivatives(value))
 
 
 def require_mechanism(value: Any) -> Mechanism:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import is_traced, make_module, number
+from udkjax.arrays import is_traced, is_within_jit, make_module, number, without_derivatives
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.programs.control_flow import ConvertsItself
 from udkjax.programs.identity_cache import cached_within_trace, is_concrete
@@ -323,6 +323,8 @@ class Mechanism(PrintsTable, ConvertsItself):
         the drawing (`body.crank.mass`) may be given directly: it is a leaf from then on. Raises `SceneError`.
         """
         require_values(values, self.name)
+        if is_traced(dict(values)):
+            _check_without_derivatives(self, dict(values))
         origin = Origin(self) if is_traced(dict(values)) and self.is_concrete else self.origin
         if isinstance(self._source, Drawn):
             return self._redrawn(self._source, values, origin)
@@ -391,6 +393,15 @@ def require_valid_numbers(mechanism: Mechanism) -> None:
     if not numbers_are_valid(mechanism.elements):
         mechanism.with_parameters({})  # raises the error
     _USABLE[id(source)] = source
+
+
+def _check_without_derivatives(mechanism: Mechanism, values: dict[str, Any]) -> None:
+    """Raise the errors of `with_parameters` with concrete numbers, if the numbers are traced only by derivatives."""
+    if is_within_jit():
+        return
+    plain, known = without_derivatives((mechanism, values))
+    if plain.is_concrete and not is_traced(known):
+        plain.with_parameters(known)
 
 
 def _copy(module: Module, changes: dict[str, object]) -> Module:
