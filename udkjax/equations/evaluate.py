@@ -22,6 +22,7 @@ from udkjax.equations.constraints import BodyArray
 from udkjax.equations.general import ConstrainedSystem, singular_values_of_rows
 from udkjax.equations.state_arrays import StateArrays, by_numpy, state_arrays
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import defined
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
@@ -42,7 +43,7 @@ def compiled(function: Callable[Arguments, Result], numeric: Callable[..., Any] 
     Returns:
         A function with the same arguments and the same result.
     """
-    program, parameters = deferred(function), signature(function)
+    program, parameters = deferred(defined(function)), signature(function)
 
     @wraps(function)
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

@@ -21,6 +21,7 @@ from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import at_each, defined
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND
 from udkjax.scene.friction import Friction
@@ -241,6 +242,7 @@ def friction_loads(
 
 
 @deferred
+@defined
 def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation, multipliers):
     equations, flat = equations_of(mechanism, method, baumgarte, formulation, analysis), (q.ravel(), v.ravel())
     if multipliers and isinstance(equations, TextbookEquations):
@@ -252,23 +254,22 @@ def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation,
 
 @deferred
 def _multipliers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
-    equations, finite = prepare(mechanism, method, baumgarte, analysis), jnp.isfinite(q) & jnp.isfinite(v)
-    reached = jnp.all(finite, axis=(1, 2))
-    # States after a failure are replaced by the guess, because NaN would also make the derivatives of the other states NaN.
-    q, v = (jnp.where(reached[:, None, None], x, x0).reshape(len(ts), -1) for x, x0 in ((q, mechanism.q0), (v, mechanism.v0)))
-    of_state = lambda t, q, v, sticking: equations.known_to_stick(sticking).multipliers(t, q, v)  # noqa: E731
-    return jnp.where(reached[:, None], jax.vmap(of_state)(ts, q, v, sticking), jnp.nan)
+    def of_state(equations, t, q, v, sticking):
+        found = equations.known_to_stick(sticking).multipliers(t, q.ravel(), v.ravel())
+        return jnp.where(jnp.all(jnp.isfinite(q) & jnp.isfinite(v)), found, jnp.nan)
+
+    return at_each(of_state, prepare(mechanism, method, baumgarte, analysis), ts, q, v, sticking)
 
 
 @deferred
 def _friction_loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
     equations = prepare(mechanism, method, baumgarte, analysis)
 
-    def of_state(t, q, v, sticking):
+    def of_state(equations, t, q, v, sticking):
         found = equations.known_to_stick(sticking).friction_loads(t, q.ravel(), v.ravel())
         return {name: load.reshape(q.shape) for name, load in found.items()}
 
-    return jax.vmap(of_state)(ts, q, v, sticking)
+    return at_each(of_state, equations, ts, q, v, sticking)
 
 
 def _psi(equations: AbstractSystem, t: Array, q: Vector, v: Vector) -> Array:
@@ -296,4 +297,4 @@ def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: HistoryL
 def _evaluate(mechanism, analysis, ts, q, v, quantity):
     equations = equations_of(mechanism, SVD(), analysis=analysis)
     ts, q, v = jnp.asarray(ts), jnp.asarray(q).reshape(len(ts), -1), jnp.asarray(v).reshape(len(ts), -1)
-    return jax.vmap(lambda t, q, v: quantity(equations, t, q, v))(ts, q, v)
+    return at_each(quantity, equations, ts, q, v)

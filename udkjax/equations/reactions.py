@@ -27,6 +27,7 @@ from udkjax.equations.textbook import prepare
 from udkjax.equations.udwadia_kalaba import Baumgarte
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import at_each
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
 from udkjax.scene.drivers import Driver
@@ -122,7 +123,7 @@ def unique_reactions(
 @deferred
 def _of_system(system: Any, ts: Array, q: Array, v: Array, method: Pseudoinverse, baumgarte: Baumgarte | None) -> ByBody:
     equations = prepare_general(system, method, baumgarte)
-    loads, multipliers = (jax.vmap(f)(ts, q, v) for f in (equations.loads, equations.multipliers))
+    loads, multipliers = at_each(lambda x, *at: (x.loads(*at), x.multipliers(*at)), equations, ts, q, v)
     m = 0 if system.constraint is None else int(np.prod(jax.eval_shape(system.constraint, ts[0], q[0]).shape))
     named = {"constraint": (loads[:, 0], multipliers[:, :m]), "velocity_constraint": (loads[:, 1], multipliers[:, m:])}
     return {
@@ -224,11 +225,11 @@ def _loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte, soft, fra
     """Compute -Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
     equations = prepare(mechanism, method, baumgarte, analysis).with_compliances(soft)
 
-    def row_loads(t, q, v, sticking):
+    def row_loads(equations, t, q, v, sticking):
         multipliers = equations.known_to_stick(sticking).multipliers(t, q, v)
         return -equations.jacobian(t, q) * multipliers[:, None]
 
-    by_row, rows = jax.vmap(row_loads)(ts, q, v, sticking), [name for name, _ in analysis.row_names]
+    by_row, rows = at_each(row_loads, equations, ts, q, v, sticking), [name for name, _ in analysis.row_names]
     by_body = _split_by_body(mechanism, rows, q, by_row, lambda load: load.sum(0), frame, about)
     return [list(loads.values()) for loads in by_body.values()]
 

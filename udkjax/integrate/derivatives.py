@@ -19,6 +19,7 @@ from jaxtyping import Array
 from udkjax.integrate import native_engine
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.time_derivatives import run_of_times
+from udkjax.programs.undefined import defined_along
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.linear_map import DifferentiableFunction, Linear, change_along
 from udkjax.transforms.split_jvp import split_jvp
@@ -61,13 +62,13 @@ def _(primals, tangents):
         """Return the run, and a linear map of the direction."""
         raw, recorded = at[0].recorded(stop_gradients(at[1]), active)
         linear = Linear(function=at[0], inputs=at[1], run=recorded, active=active)
-        return list(_as_run(*at, raw)), linear.applied(direction)
+        return list(_as_run(*at, raw)), defined_along(linear.applied, direction, [raw[k] for k in SMOOTH])
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
         """Return the run, and its change along the direction, by forward mode."""
         function, inputs = at
         raw, change = function.run_and_jvp(inputs, active, direction)
-        return list(raw), change
+        return list(raw), [jnp.where(jnp.isnan(raw[k]), jnp.nan, dx) for k, dx in zip(SMOOTH, change, strict=True)]
 
     known = list(shapes), [shapes[k] for k in SMOOTH]
     raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], active), known)

@@ -25,6 +25,7 @@ from udkjax.native.base.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
 from udkjax.positions.assembly import Closure, State, close, moves_from_guess
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.undefined import whole
 from udkjax.requirements import ArgumentTypeError, describe
 from udkjax.scene.checks import numbers_are_valid
 from udkjax.scene.friction import Friction
@@ -222,6 +223,9 @@ def prepare_run(
     if isinstance(ts, Tracer):
         in_order = increases(stop_gradients(ts))
         good, ts = good & in_order, jnp.where(in_order, ts, jnp.arange(len(ts)))
+    if xp is jnp:
+        q, v = whole(start.q, start.v)
+        start = start._replace(q=q, v=v)
     runs, length, rate = good & start.is_closed, start.length, start.rate
     if analysis is not None:
         rate = xp.maximum(rate, 1 / (ts[-1] - ts[0]))

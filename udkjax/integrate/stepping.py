@@ -25,6 +25,7 @@ from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembly import State
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
+from udkjax.programs.undefined import defined
 from udkjax.requirements import ArgumentError, ArgumentTypeError, describe
 from udkjax.scene.arguments import checked
 from udkjax.scene.held import Held
@@ -131,7 +132,7 @@ def _advance(
     raw = differentiable(replace(run.problem, points=STORED_POINTS), has_fixed_times)
     good = stop_gradients(run.is_usable & raw.reached[-1] & jnp.isinf(raw.lost))
     failed = jnp.where(good, 0.0, jnp.nan)  # added, since `where` would store one more array for reverse mode
-    return State(*((y[-1] + failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
+    return State(*(defined(jnp.add)(y[-1], failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
 
 
 _advance_at_once = deferred(_advance)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, PyTree
 
 from udkjax.integrate.native_equations import equations_for_diffrax
 from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.programs.undefined import defined_along
 from udkjax.programs.varying_axes import zero_of
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.linear_map import DifferentiableFunction, Linear
@@ -121,7 +122,8 @@ def _(primals, tangents):
     function, inputs = primals
     active = tuple(dx is not None for dx in tangents[1])
     linear = Linear(function=function, inputs=inputs, run=(), active=active)
-    return _state_after(*primals), linear.applied(select(tangents[1], active))
+    values = _state_after(*primals)
+    return values, defined_along(linear.applied, select(tangents[1], active), values)
 
 
 @eqx.filter_custom_jvp

@@ -21,7 +21,17 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.arrays import ROUNDING, float_type, is_traced, is_within_jit, make_module, number, number_called, put_arrays
+from udkjax.arrays import (
+    ROUNDING,
+    float_type,
+    is_traced,
+    is_within_jit,
+    make_module,
+    number,
+    number_called,
+    put_arrays,
+    without_derivatives,
+)
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.element_programs import has_rheonomic_joints
@@ -37,6 +47,7 @@ from udkjax.positions.system_closure import close_system
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.undefined import defined, whole
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import size_of
 from udkjax.scene.mechanism import Mechanism
@@ -227,11 +238,12 @@ def _close(mechanism: Mechanism, analysis: Analysis, t: NumberLike, state: State
     q, v = number(guess.q).ravel(), number(guess.v).ravel()
     close = close_by_machine_code if native_closing.can_close(mechanism) else close_by_jax
     q, v, psi, psi_dot, rank = close(mechanism, analysis, number(t), q, v)
+    q, v = whole(q, v)
     closed = is_closed(analysis.scales, q, v, psi, psi_dot, jnp)
     return Closure(State(q.reshape(-1, 3), v.reshape(-1, 3)), psi, psi_dot, jnp.asarray(rank), analysis.scales, closed)
 
 
-_close_compiled = deferred(_close)
+_close_compiled = deferred(defined(_close))
 
 
 def require_closed(
@@ -240,6 +252,9 @@ def require_closed(
     """Raise an `AssemblyError` if the closure of a guess at time t (s) is not closed; traced values are not checked."""
     closed = closure.is_closed
     if isinstance(closed, Tracer) or closed:
+        return
+    mechanism, closure, t, guess = without_derivatives((mechanism, closure, t, guess))
+    if is_traced((mechanism, closure, t, guess)):  # other numbers of a batch
         return
     if isinstance(mechanism, ConstrainedSystem):
         worst = [float(jnp.max(jnp.abs(x), initial=0.0)) for x in (closure.psi, closure.psi_dot)]

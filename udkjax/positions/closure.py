@@ -16,6 +16,7 @@ from udkjax.equations.scales import Scales
 from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.pinv import SVD
 from udkjax.positions import native_closing
+from udkjax.programs.undefined import defined_along
 from udkjax.scene.drivers import Motion
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
@@ -171,7 +172,7 @@ def _(primals, tangents):
     if not any(has_tangent):
         return found, (None,) * len(found)
     linear = Linear(function=function, inputs=inputs, run=(), active=has_tangent)
-    return found, (*linear.applied(select(tangents[1], has_tangent)), None, None, None)
+    return found, (*defined_along(linear.applied, select(tangents[1], has_tangent), found[:2]), None, None, None)
 
 
 @jax.custom_jvp

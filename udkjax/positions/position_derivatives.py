@@ -12,6 +12,7 @@ numbers that each separate the branches, such as the lengths of two equal cranks
 returns the derivative along such a change; reverse mode, which treats each number alone, returns NaN.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from udkjax.positions.continuation import Points
 from udkjax.positions.crossing import FARTHEST_NODE, nodes, weights
 from udkjax.positions.curve import Curve
 from udkjax.programs.control_flow import sequential
+from udkjax.programs.undefined import defined_along
 from udkjax.programs.varying_axes import result_type
 from udkjax.transforms.gradients import stop_gradients
 
@@ -58,12 +60,19 @@ def _(primals, tangents):
     curve, values, *_, dddq, spacing, regular = primals
     found = _with_derivatives(*primals)
     moved, ds = tangents[:2]
-    moving = eqx.combine(tangents[:2], jax.tree.map(jnp.zeros_like, eqx.filter((curve, values), eqx.is_inexact_array)))
+    zeros = jax.tree.map(jnp.zeros_like, eqx.filter((curve, values), eqx.is_inexact_array))
+    changes, changed = jax.tree.flatten(eqx.combine(tangents[:2], zeros))
 
-    def positions(curve: Curve, values: Float[Array, "T"]) -> Three:
-        return jax.vmap(lambda s, q: _newton(curve, s, q))(values, found[0])
+    def regular_change(value: Array, at: tuple[Array, Array, Array], *ds: Array) -> list[Array]:
+        """Return the changes of q, q' and q'' at one value, undefined where these are."""
 
-    at_regular = eqx.filter_jvp(positions, (curve, values), moving)[1]
+        def along(directions: list[Array]) -> Sequence[Array]:
+            moving = jax.tree.unflatten(changed, directions)
+            return eqx.filter_jvp(lambda curve, s: _newton(curve, s, at[0]), (curve, value), moving)[1]
+
+        return defined_along(along, [*changes[:-1], *ds], at)
+
+    at_regular = jax.vmap(regular_change)(values, found, changes[-1])
     at_meetings = _by_numbers(curve, values, found, spacing, regular, moved)
     if ds is not None:
         third = jnp.where(regular[:, None] | (spacing[:, None] > 0), dddq, jnp.nan)

@@ -14,6 +14,7 @@ from udkjax.equations.position_closure import CLOSURE, close_position
 from udkjax.equations.quantities import equations_of
 from udkjax.pinv import SVD
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import defined
 from udkjax.transforms.gradients import stop_gradients
 
 
@@ -45,6 +46,7 @@ class ClosedSystem(NamedTuple):
 
 
 @deferred
+@defined
 def close_system(system: Any, t: Array, q: Vector, v: Vector) -> ClosedSystem:
     """Close a state of a system.
 

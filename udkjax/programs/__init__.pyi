@@ -26,6 +26,10 @@ from udkjax.programs.numpy_rules import RULES as RULES
 from udkjax.programs.numpy_rules import UFUNCS as UFUNCS
 from udkjax.programs.numpy_rules import exact_rule as exact_rule
 from udkjax.programs.structure_cache import cached_by_structure as cached_by_structure
+from udkjax.programs.undefined import at_each as at_each
+from udkjax.programs.undefined import defined as defined
+from udkjax.programs.undefined import defined_along as defined_along
+from udkjax.programs.undefined import whole as whole
 from udkjax.programs.varying_axes import result_type as result_type
 from udkjax.programs.varying_axes import vary_together as vary_together
 from udkjax.programs.varying_axes import zero_of as zero_of

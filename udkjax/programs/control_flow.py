@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, PyTree
 from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit, put_arrays
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.undefined import defined
 
 Carry = TypeVar("Carry")
 Result = TypeVar("Result")
@@ -129,6 +130,7 @@ def _concrete_module(module: eqx.Module) -> eqx.Module:
     return jax.tree.map(_by_numpy, module)
 
 
+@defined
 def _by_jax(function: Callable[..., Result], *arguments: Any) -> Result:
     return function(*arguments, BY_JAX)  # compared by identity: as an argument of a compiled function it would be a copy
 

@@ -24,6 +24,7 @@ from udkjax.arrays import QuickMethods, is_traced, make_module
 from udkjax.printing import PrintsTable
 from udkjax.programs.deferred import deferred_if_traced
 from udkjax.programs.identity_cache import cached_within_trace
+from udkjax.programs.undefined import defined
 from udkjax.scene.bodies import Body
 from udkjax.scene.checks import SceneError
 from udkjax.scene.direct_numbers import DirectNumbers
@@ -237,7 +238,7 @@ def is_number(leaf: object) -> bool:
     return isinstance(leaf, _NUMBERS)
 
 
-_derived = deferred_if_traced(lambda source: source.derived())
+_derived = defined(deferred_if_traced(lambda source: source.derived()))
 
 
 @cached_within_trace

@@ -19,6 +19,7 @@ from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
 from udkjax.positions.drive import Driven
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
 from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
+from udkjax.programs.undefined import whole
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.checks import SceneError
@@ -213,7 +214,7 @@ def _equilibrium(
     else:
         q = sequential(_settle, *stop_gradients((curve, near, t, start)), free, stable)
         assert isinstance(curve, Curve)
-        q = _rest_position(curve, analysis, t, q, free)
+        (q,) = whole(_rest_position(curve, analysis, t, q, free))
     xp, scale, at = by.xp, near.scale(t, q), near.linearize(t, q)
     unbalanced = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
     balanced = curve.is_closed(xp.append(q, t) / curve.units) & (unbalanced <= FORCE_TOL)

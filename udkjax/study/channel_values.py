@@ -18,6 +18,7 @@ from udkjax.equations.textbook import TextbookEquations, prepare
 from udkjax.pinv import SVD
 from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, LocalPoint, Quantity, StateHistory, locate, point_of_pin
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import defined
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import GROUND, Frame, Point, between
 from udkjax.scene.mechanism import Mechanism
@@ -100,6 +101,7 @@ def path(
 
 
 @deferred
+@defined
 def _path(mechanism, analysis, ts, q, v, a, sticking, local, body, derivative):
     motion, placed, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), sticking, analysis)
     return jnp.where((reached if derivative else placed)[:, None], jnp.stack(motion.point(body, local, derivative), -1), jnp.nan)

@@ -23,6 +23,7 @@ from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.positions.channels import StateHistory
 from udkjax.printing import PrintedTable, format_number, prints_table, units
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import at_each
 from udkjax.scene.arguments import checked
 from udkjax.scene.bodies import Frame
 from udkjax.scene.forces import ForceElement
@@ -118,7 +119,8 @@ def power_balance(
 def _powers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
     equations = prepare(mechanism, method, baumgarte, analysis)
 
-    def one(t, q, v, sticking):
+    def one(at, t, q, v, sticking):
+        equations, mechanism = at
         a, multipliers = equations.known_to_stick(sticking).motion(t, q, v)
         psi_t = jax.jvp(lambda t: constraints.psi(mechanism, t, q), (t,), (jnp.ones_like(t),))[1]
         kinetic = jax.jvp(lambda v: loads.kinetic_energy(mechanism, v), (v,), (a,))[1]
@@ -127,7 +129,7 @@ def _powers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
         drags = equations.rubbing_powers(t, q, v, multipliers)
         return multipliers * psi_t, _force_powers(mechanism, t, q, v, drags), by_joint, kinetic, potential
 
-    return jax.vmap(one)(ts, q, v, sticking)
+    return at_each(one, (equations, mechanism), ts, q, v, sticking)
 
 
 def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array, drags: dict[str, Array]) -> Float[Array, "forces"]:

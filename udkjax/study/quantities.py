@@ -15,6 +15,7 @@ from udkjax.equations.general import ConstrainedSystem
 from udkjax.equations.quantities import equations_of
 from udkjax.pinv import SVD
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import defined
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
@@ -94,6 +95,7 @@ def with_guess(model: Any, q: NumericArray, v: NumericArray) -> Any:
 
 
 @deferred
+@defined
 def jacobians_of_system(system: Any, t: Any, q: Any, v: Any) -> Any:
     """Return Psi_q, and the rows (Psi_q; phi_v), of a system of traced functions at a state."""
     equations: Any = equations_of(system, SVD())

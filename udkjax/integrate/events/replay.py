@@ -24,6 +24,7 @@ from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.control_flow import cond_of_batch
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import defined_along
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.traced_numbers import replaced, select
 
@@ -81,7 +82,10 @@ def _(primals, tangents):
     def replay_from(*active: Array) -> tuple[Array, ...]:
         return _replay(fixed, replaced(xs, has_tangent, active), stop_gradients(found), _zero(active[0]))
 
-    change = jax.jvp(replay_from, select(xs, has_tangent), select(tangents[1], has_tangent))[1]
+    def along(directions: list[Array]) -> Sequence[Array]:
+        return jax.jvp(replay_from, select(xs, has_tangent), directions)[1]
+
+    change = defined_along(along, select(tangents[1], has_tangent), found)
     return found, EventRun._make([*change, *(None for _ in found[len(change) :])])
 
 

@@ -91,7 +91,7 @@ def identify(
         seed: seed of the further first guesses.
         ignore: columns of tables that are not read.
         progress: None or "auto" shows a line after two seconds, True at once, False never; a callable gets each `Progress`.
-        settings: further arguments of `simulate`.
+        settings: further arguments of `simulate`, such as a `max_steps` that bounds runs with numbers far from the fit.
 
     Returns:
         The estimate. If the records do not determine every parameter, `Estimate.success` is False and `Estimate.message` names
