@@ -46,7 +46,7 @@ def undefined(p):
     return udk.State(jnp.where(p > GOOD, jnp.nan, STATE.q * p), jnp.where(p > GOOD, jnp.nan, STATE.v * p))
 
 
-EVENT = udk.Event(lambda q: q[0, 2] - 100.0, udk.Log())
+EVENT = udk.Event(lambda t, at: at["crank"].angle - 100.0, udk.Log())
 FUNCTIONS = {
     "simulate, loop": lambda p: states(udk.simulate(long(p), TS)),
     "simulate, state open": lambda p: states(udk.simulate(heavy(p), TS, udk.State(STATE.q + 0.3, STATE.v))),
