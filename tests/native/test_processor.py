@@ -12,7 +12,8 @@ CODE = """
 import jax, numpy as np, udkjax as udk
 from udkjax.native.base import machine, processor
 mech, ts = udk.library.parallelogram(), np.linspace(0.0, 1.0, 3)
-end = jax.vmap(lambda g: udk.simulate(mech.with_parameters({"gravity": g}), ts).q[-1])(np.linspace([0.0, -9.0], [0.0, -10.0], 5))
+batch = jax.jit(jax.vmap(lambda g: udk.simulate(mech.with_parameters({"gravity": g}), ts).q[-1]))
+end = batch(np.linspace([0.0, -9.0], [0.0, -10.0], 5))
 dense = udk.simulate(mech, ts, method=udk.SVD()).q[-1]
 print(processor.lanes(), processor.target()[0], machine.digest(""), *(float(x).hex() for x in (*np.ravel(end), *np.ravel(dense))))
 """
