@@ -25,9 +25,11 @@ JOINTS = {
     "screw": udk.Screw(["ground", "b"], P, 0.3, ["a", "c"], 0.2),
     "coupled slide": udk.Coupling(["c", "b"], ["ground", "a"], [0.3, -0.5, 0.2], axis=1.1, points=P),
     "coupled slides": udk.Coupling(["a", "b"], ["b", "c"], [0.1, 2.0], 0.3, -0.4, P),
+    "edge": udk.KnifeEdge(["a", "b"], P[0], 0.3),
+    "wheel": udk.Wheel(["ground", "b"], P[1], -0.2, ["c", "a"], 0.2),
     "cam": udk.Cam(["a", "b"], P, udk.Profile([-1.0, 0.5, 2.0, 4.0], [1.0, 1.1, 1.2, 1.1])),
 }
-ROWS = {"revolute": 2, "prismatic": 2, "weld": 3}  # how many; all other joints have one
+ROWS = {"revolute": 2, "prismatic": 2, "weld": 3, "wheel": 2}  # how many; all other joints have one
 DRIVERS = {
     "turn": udk.Driver(["ground", "b"], "angle", udk.Polynomial([0.1, 2.0, -0.7, 0.2])),
     "push": udk.Driver(["ground", "b"], "x", udk.Sine(1.0, 2.0, 0.3, -0.2)),

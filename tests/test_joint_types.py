@@ -31,25 +31,25 @@ from udkjax.study.diagnosis.fixes import Fix, changes_of
 from udkjax.study.report import row_label
 
 TABLE = """
-                  Revolute  Prismatic Slot      Weld      Distance  Angle     Gear      Rack      Screw     Coupling  Cam
-row labels        served    served    -         served    -         -         -         -         -         -         -
-marks             -         served    served    served    served    -         served    served    served    served    served
-followers         -         -         -         -         -         -         served    served    -         -         -
-mjcf, tree        served    served    served    served    served    served    served    refused   refused   refused   refused
-mjcf, loop        served    refused   refused   served    served    served    served    refused   refused   refused   refused
-drawings          served    served    served    refused   served    refused   served    refused   refused   refused   refused
-drawn fixes       -         -         served    -         -         -         -         -         -         -         -
-with_angle        served    -         -         served    -         -         -         -         -         -         -
-event limits      served    served    served    refused   refused   refused   refused   refused   refused   refused   refused
-dead points       served    -         -         -         -         -         -         -         -         -         -
-joint axes        -         served    served    -         served    -         -         served    served    served    -
-one compliance    served    refused   -         refused   -         -         -         -         -         -         -
-cam forces        -         -         -         -         -         -         -         -         -         -         served
-pin directions    served    -         -         served    -         -         -         -         -         -         -
-explained pins    served    -         -         served    -         -         -         -         -         -         -
-fixes             served    served    -         served    -         -         -         -         -         -         -
-transmission      served    refused   refused   refused   refused   refused   refused   refused   refused   refused   refused
-motion ranges     served    served    -         -         -         -         -         -         -         -         -
+                  Revolute Prismatic Slot    Weld    Distance Angle   Gear    Rack    Screw   Coupling KnifeEdge Wheel   Cam
+row labels        served   served    -       served  -        -       -       -       -       -        -         -       -
+marks             -        served    served  served  served   -       served  served  served  served   served    served  served
+followers         -        -         -       -       -        -       served  served  -       -        -         -       -
+mjcf, tree        served   served    served  served  served   served  served  refused refused refused  refused   refused refused
+mjcf, loop        served   refused   refused served  served   served  served  refused refused refused  refused   refused refused
+drawings          served   served    served  refused served   refused served  refused refused refused  refused   refused refused
+drawn fixes       -        -         served  -       -        -       -       -       -       -        -         -       -
+with_angle        served   -         -       served  -        -       -       -       -       -        -         -       -
+event limits      served   served    served  refused refused  refused refused refused refused refused  refused   refused refused
+dead points       served   -         -       -       -        -       -       -       -       -        -         -       -
+joint axes        -        served    served  -       served   -       -       served  served  served   served    served  -
+one compliance    served   refused   -       refused -        -       -       -       -       -        -         refused -
+cam forces        -        -         -       -       -        -       -       -       -       -        -         -       served
+pin directions    served   -         -       served  -        -       -       -       -       -        -         -       -
+explained pins    served   -         -       served  -        -       -       -       -       -        -         -       -
+fixes             served   served    -       served  -        -       -       -       -       -        -         -       -
+transmission      served   refused   refused refused refused  refused refused refused refused refused  refused   refused refused
+motion ranges     served   served    -       -       -        -       -       -       -       -        -         -       -
 """
 
 
@@ -77,6 +77,19 @@ class OwnAtPoints(Own):
         return self.other.points  # pyright: ignore[reportAttributeAccessIssue]
 
 
+class OwnRolling(udk.RollingJoint):
+    """The same for joints that restrict velocities alone."""
+
+    other: udk.RollingJoint
+
+    @property
+    def frame_names(self):
+        return self.other.frame_names
+
+    def rates(self, t, *frames):
+        return self.other.rates(t, *frames)
+
+
 class Motion(NamedTuple):
     """A motion through some states."""
 
@@ -86,6 +99,8 @@ class Motion(NamedTuple):
 
 
 def own(joint: udk.Joint) -> udk.Joint:
+    if isinstance(joint, udk.RollingJoint):
+        return OwnRolling(joint.bodies, joint)
     kind = OwnAtPoints if getattr(joint, "points", None) is not None else Own
     return kind(joint.bodies, joint)  # pyright: ignore[reportCallIssue]
 

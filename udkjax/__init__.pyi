@@ -93,6 +93,7 @@ from udkjax.scene import Friction as Friction
 from udkjax.scene import Gear as Gear
 from udkjax.scene import Held as Held
 from udkjax.scene import Joint as Joint
+from udkjax.scene import KnifeEdge as KnifeEdge
 from udkjax.scene import LiftProfile as LiftProfile
 from udkjax.scene import Link as Link
 from udkjax.scene import Mechanism as Mechanism
@@ -103,6 +104,7 @@ from udkjax.scene import Prismatic as Prismatic
 from udkjax.scene import Profile as Profile
 from udkjax.scene import Rack as Rack
 from udkjax.scene import Revolute as Revolute
+from udkjax.scene import RollingJoint as RollingJoint
 from udkjax.scene import SceneError as SceneError
 from udkjax.scene import Screw as Screw
 from udkjax.scene import Sine as Sine
@@ -113,6 +115,7 @@ from udkjax.scene import SwingProfile as SwingProfile
 from udkjax.scene import Torque as Torque
 from udkjax.scene import TorsionSpring as TorsionSpring
 from udkjax.scene import Weld as Weld
+from udkjax.scene import Wheel as Wheel
 from udkjax.scene import circles as circles
 from udkjax.scene import dumps as dumps
 from udkjax.scene import library as library

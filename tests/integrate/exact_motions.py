@@ -72,6 +72,20 @@ def _by_a_motor() -> ExactMotion:
     return ExactMotion(udk.Mechanism({"rod": rod}, {"pin": pin}, {"motor": motor}), np.linspace(0.0, 2.0, 11), exact)
 
 
+def _on_a_skate() -> ExactMotion:
+    """A skate on a slope along x, turning at omega: with a = g / (2 omega^2), it moves on a cycloid of height a."""
+    omega, slope = 3.0, 2.0
+    skate = udk.Body(0.7, 0.02, (0.0, 0.0), 0.0, (0.0, 0.0), omega)
+    edge = udk.KnifeEdge(("ground", "skate"), (0.0, 0.0), 0.0)
+
+    def exact(t):
+        a = slope / (2 * omega**2)
+        return _poses(a * np.sin(omega * t) ** 2, a * (omega * t - np.sin(2 * omega * t) / 2), omega * t)
+
+    mechanism = udk.Mechanism({"skate": skate}, {"edge": edge}, gravity=(slope, 0.0))
+    return ExactMotion(mechanism, np.linspace(0.0, 2.0, 11), exact)
+
+
 def _bouncing(restitution: float) -> ExactMotion:
     """A ball that falls from 1 m above the floor: two flights after the first impact, or at rest on the floor."""
     ball = udk.Body(1.0, 0.1, (0.0, 1.0), 0.0, (0.3, 0.0))
@@ -109,6 +123,7 @@ EXACT = {
     "thrown": _thrown(),
     "at a spring": _at_a_spring(),
     "by a motor": _by_a_motor(),
+    "on a skate": _on_a_skate(),
     "bouncing": _bouncing(0.8),
     "landing": _bouncing(0.0),
     "thrown by a table": _thrown_by_a_table(),

@@ -5,7 +5,8 @@ arrays; elements of the same structure are evaluated together (structure.py). Th
 
 In all functions t is the time (s), and q and v are coordinates and velocities: x, y (m) and angle (rad) of each body in turn, as
 (n,) or (bodies, 3), n = 3 bodies. The m rows are those of the joints in their order, then those of the drivers (`row_names`); a
-row is in m or in rad.
+row is in m or in rad. The rows of rolling joints restrict velocities alone: their Psi is zero, their Psi_q are the coefficients
+of the velocities, and their Psi_dot is Psi_q v.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,12 +14,15 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Number
 from udkjax.equations.structure import ElementKind, element_kinds, evaluate_by_kind, numbers_as_vector
 from udkjax.programs.deferred import traced_once
+from udkjax.scene.bodies import Frame
+from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.rolling import RollingJoint
 
 BodyArray = Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"]
 
@@ -53,7 +57,10 @@ def psi_q(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m n
     Returns:
         Psi_q (m, n).
     """
-    return jax.jacfwd(lambda q: psi(mechanism, t, q))(vector(q))
+    slopes = jax.jacfwd(lambda q: psi(mechanism, t, q))(vector(q))
+    if not rolling_rows(mechanism).any():
+        return slopes
+    return slopes + jax.jacfwd(lambda v: rolling_rates(mechanism, t, q, v))(jnp.zeros_like(vector(q)))
 
 
 @traced_once
@@ -69,7 +76,37 @@ def psi_dot(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> F
     Returns:
         Psi_dot (m,), in m/s or rad/s.
     """
-    return rate_along_motion(lambda t, q: psi(mechanism, t, q), t, q, v)
+    rate = rate_along_motion(lambda t, q: psi(mechanism, t, q), t, q, v)
+    return rate + rolling_rates(mechanism, t, q, v) if rolling_rows(mechanism).any() else rate
+
+
+def rolling_rates(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
+    """Return A v of the rows of rolling joints, which take the place of Psi_q v, and zero for all others.
+
+    Args:
+        mechanism: The scene.
+        t: Time (s).
+        q: Coordinates (m, rad), (n,) or (bodies, 3).
+        v: Velocities (m/s, rad/s), in the shape of q.
+
+    Returns:
+        The rates (m,), in m/s or rad/s.
+    """
+
+    def rates(constraint: Constraint, *frames: Frame) -> Array:
+        if isinstance(constraint, RollingJoint):
+            return vector(constraint.rates(t, *frames))
+        return jnp.zeros_like(vector(constraint.residual(t, *frames)))
+
+    kinds = evaluate_by_kind(rates, mechanism, [*mechanism.constraints.values()], bodies(q), bodies(v))
+    return jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])[_row_order(kinds)]
+
+
+def rolling_rows(mechanism: Mechanism) -> Bool[np.ndarray, "m"]:
+    """Return which rows restrict velocities alone: those of rolling joints."""
+    if not any(isinstance(joint, RollingJoint) for joint in mechanism.joints.values()):
+        return np.zeros(0, bool)
+    return np.array([isinstance(mechanism.constraints[name], RollingJoint) for name, _ in row_names(mechanism)], bool)
 
 
 @traced_once

@@ -1,6 +1,7 @@
 """One element, a constraint or a force, as scalars of a graph; the trace serves all elements of the same structure.
 
-For a constraint with residual Psi(t, q), forward differentiation of the residual along (1, v) gives
+A rolling joint gives A v in place of Psi_dot, A in place of Psi_q, and Psi = 0: its rows restrict no positions. For any other
+constraint with residual Psi(t, q), forward differentiation of the residual along (1, v) gives
 
     Psi_dot = Psi_q v + Psi_t        gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt
 
@@ -11,6 +12,7 @@ scalar}.
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +26,7 @@ from udkjax.expressions.differential import SparseRow
 from udkjax.scene.bodies import GROUND_FRAME, GROUND_FRAME_AT_REST, Frame
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.joints import Constraint
+from udkjax.scene.rolling import RollingJoint
 
 TraceFunction = Callable[..., list[np.ndarray]]  # evaluates a traced function in a graph (`trace`)
 
@@ -210,7 +213,11 @@ def _trace_piece_number(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, .
 
 
 def _residual(element: Constraint, ground: tuple[bool, ...], t: Array, q: Sequence[Array]) -> Array:
-    rows = element.residual(t, *_frames(ground, q))
+    return _as_rows(element.residual(t, *_frames(ground, q)))
+
+
+def _as_rows(rows: Any) -> Array:
+    """Return the rows of a joint as one vector."""
     rows = rows if isinstance(rows, list | tuple) else list(jnp.atleast_1d(jnp.asarray(rows)))
     return jnp.stack([jnp.asarray(r, jnp.result_type(float)) for r in rows])
 
@@ -225,7 +232,10 @@ def _trace_residual(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...])
     def first_derivative(leaves, numbers):
         element = jax.tree.unflatten(tree, leaves)
         t, q, dt, dq = numbers[0], numbers[1 : 1 + n], numbers[1 + n], numbers[2 + n :]
-        return jax.jvp(lambda t, q: _residual(element, ground, t, q), (t, q), (dt, dq))
+        value, rate = jax.jvp(lambda t, q: _residual(element, ground, t, q), (t, q), (dt, dq))
+        if isinstance(element, RollingJoint):  # rates that are those of no residual
+            rate = _as_rows(element.rates(t, *_frames(ground, q, dq)))
+        return value, rate
 
     def second_derivative(leaves, numbers):
         t, q, dt, dq = numbers[0], numbers[1 : 1 + n], numbers[1 + n], numbers[2 + n :]

@@ -33,6 +33,7 @@ from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, Point, between
 from udkjax.scene.drivers import Driver
 from udkjax.scene.joints import Constraint, Distance
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.rolling import RollingJoint
 
 Axes = Literal["ground", "body", "joint"]
 About = Literal["centre", "joint"]
@@ -198,7 +199,8 @@ def _joint_angle(element: Constraint, frames: list[Frame]) -> Number:
     if isinstance(element, Driver) and element.coordinate in ("x", "y"):
         return frames[0].angle if element.axis is None else frames[0].angle + element.axis
     if not isinstance(element, Driver) and getattr(element, "axis", None) is not None:  # of a user-defined joint, too
-        return frames[0].angle + element.axis  # pyright: ignore[reportAttributeAccessIssue]
+        holder = frames[1] if isinstance(element, RollingJoint) else frames[0]
+        return holder.angle + element.axis  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(element, Distance) or (isinstance(element, Driver) and element.coordinate == "distance"):
         line = between(element.points, *frames)
         return array_namespace(line.x).arctan2(line.y, line.x)

@@ -45,6 +45,8 @@ class RunPrograms:
     STAGES: ClassVar[int] = 8
     """Shares by which friction grows where its loads do not settle, down to shares of a share where these are too long; fewer may
     do, but most mechanisms need none."""
+    rolling_rows: tuple[int, ...] = ()
+    """The rows of a scene that restrict velocities alone: their Psi is zero."""
     is_linear: bool = True
     """True if constraints on velocities are linear in them."""
 

@@ -198,6 +198,15 @@ class SceneLayout:
         self.forces = [self._force_group(kind) for kind in forces]
         self.one = self.reserve("psi_q", 1)
         self.eliminated = [group for group in self.constraints if group.rows]
+        self.rolling_rows = tuple(
+            sorted(
+                start + row
+                for group in self.constraints
+                for row in range(group.programs.row_count)
+                if group.programs.outputs["psi"][row].is_zero
+                for start in group.table[:, ROW].tolist()
+            )
+        )
         self.sizes["pieces"] = 0
         self.pieces = [
             (group, self.reserve("pieces", len(group.table)) + np.arange(len(group.table)))

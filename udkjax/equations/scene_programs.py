@@ -58,6 +58,7 @@ class ScenePrograms(RunPrograms):
         self.scratch, self.row_names, self.has_piecewise_loads = layout.sizes, layout.row_names, layout.has_piecewise_loads
         self.coordinate_count, self.row_count = layout.coordinate_count, layout.row_count
         self.scale_count = ROWS + self.row_count  # the number of values that `scales` returns
+        self.rolling_rows = layout.rolling_rows
         self.constants = range(layout.constant_count)
         starts = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)])
         places = [np.arange(a, b).reshape(s) for a, b, (s, _) in zip(starts, starts[1:], shapes, strict=False)]

@@ -105,7 +105,7 @@ class SceneSolver:
     def tangent_parts(self, solve: int) -> ProgramParts:
         """Compute dq1 and dv1, the tangent parts of dq and dv, by the systems `solve` and `solve` + 1, and distance."""
         for k, change in enumerate(("dq", "dv"), solve):
-            yield from self.terms.rates(change, k)
+            yield from self.terms.rates(change, k, of_positions=change == "dq")
             yield from self.solve(k)
             yield self.terms.add(f"{change}1", start=change, solution=k, sign=-1)
         yield self.elimination.distance()

@@ -252,18 +252,22 @@ class SceneTerms:
 
     # --- products with the eliminated rows of Psi_q and their transpose
 
-    def rates(self, change: str, solve: int, subtract: bool = False) -> ProgramParts:
-        """Set the right-hand side of a linear system to Psi_q times a change of coordinates, or subtract the product from it."""
+    def rates(self, change: str, solve: int, subtract: bool = False, of_positions: bool = False) -> ProgramParts:
+        """Set the right-hand side of a linear system to Psi_q times a change of coordinates, or subtract the product from it.
+
+        `of_positions`: rows that restrict velocities alone, whose Psi is zero, allow any change.
+        """
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 dq = read_bodies(w, group, "change")
                 for i, row in enumerate(group.rows):
-                    rate = dot(w.graph, group.entries(w, row), dq)
+                    is_free = of_positions and group.programs.outputs["psi"][row].is_zero
+                    rate = w.graph.constant(0.0) if is_free else dot(w.graph, group.entries(w, row), dq)
                     w.write(-rate if subtract else rate, "right", RIGHT, i, ADD if subtract else SET)
 
             names = {"change": change, "right": f"right{solve}"}
-            yield KernelLoop(self.kernel(("rates", group, subtract), write), group.table, names)
+            yield KernelLoop(self.kernel(("rates", group, subtract, of_positions), write), group.table, names)
 
     def jt(self, solve: int) -> ProgramParts:
         """Compute jt_x = Psi_q^T x of a linear system."""

@@ -142,6 +142,9 @@ class TextbookEquations(MechanismSystem):
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """Return (I - M^(-1/2) D^+ D M^(1/2)) times dq and dv, the tangent parts of small changes at q."""
         mechanism, w = self.mechanism, self.weights
+        if constraints.rolling_rows(mechanism).any():
+            changes = (dq, True), (dv, False)
+            return TangentPart(*(uk.tangent_part(mechanism, t, q, x, self.method, w, is_dq) for x, is_dq in changes))
         tangent = jax.vmap(lambda change: uk.tangent_part(mechanism, t, q, change, self.method, w))  # with one D^+ for both
         return TangentPart(*tangent(jnp.stack([dq, dv])))
 
@@ -166,13 +169,19 @@ class TextbookEquations(MechanismSystem):
 
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """Return D and Psi, their rows weighted, and M^(-1/2), of all rows."""
-        w = self.scales.weights
+        w = self._weights_of_positions(self.scales.weights)
         return uk.D(self.mechanism, t, q, w), w * constraints.psi(self.mechanism, t, q), uk.inverse_sqrt_mass(self.mechanism)
 
     def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """Return D and Psi_dot, their rows weighted, and M^(-1/2), of all rows."""
-        D, _, root = self.weighted_rows(t, q)
-        return D, self.row_weights * constraints.psi_dot(self.mechanism, t, q, v), root
+        w = self.row_weights
+        rate = w * constraints.psi_dot(self.mechanism, t, q, v)
+        return uk.D(self.mechanism, t, q, w), rate, uk.inverse_sqrt_mass(self.mechanism)
+
+    def _weights_of_positions(self, w: Float[Array, "m"]) -> Float[Array, "m"]:
+        """Return weights in which rows that restrict velocities alone are left out."""
+        rolling = constraints.rolling_rows(self.mechanism)
+        return jnp.where(rolling, 0.0, w) if rolling.any() else w
 
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Kinetic and potential energy (J)."""
@@ -225,7 +234,7 @@ class TextbookEquations(MechanismSystem):
 
     @property
     def restricts_velocities(self) -> bool:
-        return False
+        return bool(constraints.rolling_rows(self.mechanism).any())
 
     @property
     def row_weights(self) -> Float[Array, "m"]:

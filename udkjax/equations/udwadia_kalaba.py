@@ -132,13 +132,23 @@ def project(
 
 
 def tangent_part(
-    mechanism: Mechanism, t: NumberLike, q: BodyArray, change: Float[Array, "n"], method: Pseudoinverse, w: Weights = None
+    mechanism: Mechanism,
+    t: NumberLike,
+    q: BodyArray,
+    change: Float[Array, "n"],
+    method: Pseudoinverse,
+    w: Weights = None,
+    of_positions: bool = False,
 ) -> Float[Array, "n"]:
-    """Return (I - M^(-1/2) D^+ D M^(1/2)) times a small change of q or v: its tangent part, which projection preserves."""
+    """Return (I - M^(-1/2) D^+ D M^(1/2)) times a small change of q or v: its tangent part, which projection preserves.
+
+    `of_positions`: the change is one of q, which rows of velocities alone do not restrict.
+    """
     matrix = D(mechanism, t, q, w)
-    return change - inverse_sqrt_mass(mechanism) * (
-        pseudoinverse(method, matrix) @ (matrix @ (change / inverse_sqrt_mass(mechanism)))
-    )
+    rates = matrix @ (change / inverse_sqrt_mass(mechanism))
+    if of_positions and (free := constraints.rolling_rows(mechanism)).any():
+        rates = jnp.where(free, 0.0, rates)
+    return change - inverse_sqrt_mass(mechanism) * (pseudoinverse(method, matrix) @ rates)
 
 
 def inverse_sqrt_mass(mechanism: Mechanism) -> Float[Array, "n"]:

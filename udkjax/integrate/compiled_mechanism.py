@@ -29,6 +29,7 @@ from udkjax.native.unsupported import unsupported
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.rolling import rolling_joints
 
 if TYPE_CHECKING:
     import diffrax
@@ -186,6 +187,8 @@ def _reason_for_diffrax(
         return f"{type(solver).__name__} is not a Runge-Kutta method with one tableau, explicit or singly diagonally implicit"
     if equations.solves_constraints and not is_explicit(solver):
         return f"it partitions coordinates with explicit methods only, and {type(solver).__name__} is implicit"
+    if equations.solves_constraints and rolling_joints(getattr(textbook_of(equations), "mechanism", None)):
+        return "it does not partition the coordinates of mechanisms with rolling joints"
     return _reason_for_equations(equations)
 
 

@@ -51,6 +51,7 @@ from udkjax.programs.undefined import defined, whole
 from udkjax.scene.arguments import checked
 from udkjax.scene.description import size_of
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.rolling import rolling_joints
 from udkjax.scene.suspicions import body_sizes
 
 
@@ -195,13 +196,16 @@ def close(
     """
     if isinstance(mechanism, ConstrainedSystem):
         return close_system_guess(mechanism, t, state)
+    if names := rolling_joints(mechanism):  # they restrict no positions: the others alone are closed first
+        positions = close(mechanism.without_joints(names), t, state).state.q
+        state = State(positions, mechanism.v0 if state is None else state.v)
     if not mechanism.is_concrete or is_traced((t, state)):
         analysis = analyse(mechanism) if analysis is None else analysis
-        close = _close if is_within_jit() else _close_compiled  # under jit concrete numbers become tracers, too
+        compiled = _close if is_within_jit() else _close_compiled  # under jit concrete numbers become tracers, too
         moment = mechanism.without_origin.at(t)
         if isinstance(t, Tracer) and not has_rheonomic_joints(moment):
             moment, t = from_moment(moment, t), 0.0
-        return close(moment, analysis, t, state)
+        return compiled(moment, analysis, t, state)
     if analysis is not None and isinstance(analysis.scales.length, Tracer):
         analysis = None  # a traced analysis cannot be cached
     return _closure_of_concrete(mechanism, np.asarray(t).item(), state, analysis)

@@ -30,6 +30,7 @@ from udkjax.scene.drivers import Driver, Motion, Polynomial
 from udkjax.scene.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.origin import Origin
+from udkjax.scene.position_only import refuse_rolling
 from udkjax.wording import join_names, quote
 
 MOVES = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians; less is rounding
@@ -77,6 +78,7 @@ def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mappin
     `held` has other values for them, or values of further coordinates, by name. Raises `SceneError` if there is no such driver or
     coordinate, or positions do not follow from its value.
     """
+    refuse_rolling(mechanism, "positions do not follow from a driver")
     if not mechanism.is_concrete or is_traced((driver, t, held)):
         return _drive(mechanism, driver, t, held)
     with jax.ensure_compile_time_eval():  # concrete even while something else is traced

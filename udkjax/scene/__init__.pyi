@@ -80,12 +80,17 @@ from udkjax.scene.number_fields import must_be_positive as must_be_positive
 from udkjax.scene.number_fields import parameters_of as parameters_of
 from udkjax.scene.number_fields import split_index as split_index
 from udkjax.scene.origin import Origin as Origin
+from udkjax.scene.position_only import refuse_rolling as refuse_rolling
 from udkjax.scene.profiles import LiftProfile as LiftProfile
 from udkjax.scene.profiles import Profile as Profile
 from udkjax.scene.profiles import SwingProfile as SwingProfile
 from udkjax.scene.reshaping import length_of as length_of
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length
+from udkjax.scene.rolling import KnifeEdge as KnifeEdge
+from udkjax.scene.rolling import RollingJoint as RollingJoint
+from udkjax.scene.rolling import Wheel as Wheel
+from udkjax.scene.rolling import rolling_joints as rolling_joints
 from udkjax.scene.sources import AbstractDrawing as AbstractDrawing
 from udkjax.scene.suspicions import body_sizes as body_sizes
 from udkjax.scene.suspicions import suspicions as suspicions

@@ -22,6 +22,7 @@ from udkjax.scene.friction import Friction
 from udkjax.scene.held import Held
 from udkjax.scene.joints import Cam, Coupling, Prismatic, Revolute, Screw, Slot
 from udkjax.scene.profiles import AbstractProfile, LawProfile, profile_class
+from udkjax.scene.rolling import Wheel
 from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
@@ -187,7 +188,7 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
         joint = table.get("joint")
         joint_class = known.get("rubbing", {}).get(joint) if isinstance(joint, str) else None
         yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table, joint_class))
-    if issubclass(cls, Cam | Screw | Coupling | LawProfile):
+    if issubclass(cls, Cam | Screw | Coupling | Wheel | LawProfile):
         yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table))
 
 

@@ -330,7 +330,7 @@ class Screw(Joint):
     @staticmethod
     def mistakes(table: Mapping[str, object]) -> Iterator[str]:
         """Iterate over the mistakes in the pair of bodies that turn, each with its key."""
-        yield from _mistakes_of_pair(table, "turning")
+        yield from mistakes_of_pair(table, "turning")
 
     def _travel(self, *frames: Frame) -> Number:
         """Return the displacement of the nut (m) minus the travel of the screw."""
@@ -379,7 +379,7 @@ class Coupling(Joint):
     @staticmethod
     def mistakes(table: Mapping[str, object]) -> Iterator[str]:
         """Iterate over the mistakes in the second pair of bodies, and in points without an axis, each with its key."""
-        yield from _mistakes_of_pair(table, "to")
+        yield from mistakes_of_pair(table, "to")
         for points, axis in (("points", "axis"), ("to_points", "to_axis")):
             if table.get(points) is not None and table.get(axis) is None:
                 yield f"{points}: an angle has no points: give {axis} for a slide, or leave them out"
@@ -434,7 +434,7 @@ class Cam(Joint):
         return frame1.local(between(self.points, frame1, frame2))
 
 
-def _mistakes_of_pair(table: Mapping[str, object], key: str) -> Iterator[str]:
+def mistakes_of_pair(table: Mapping[str, object], key: str) -> Iterator[str]:
     """Iterate over the mistakes in a second pair of bodies."""
     names = table.get(key)
     if isinstance(names, list | tuple) and (len(names) != 2 or names[0] == names[1]):

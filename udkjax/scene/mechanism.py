@@ -113,6 +113,14 @@ class Mechanism(PrintsTable, ConvertsItself):
         found = make_module(type(self), **fields_of(sections, self.gravity, self.name, origin))
         return found if drivers or not _is_checked(self) else _checked(found)
 
+    def without_joints(self, names: Sequence[str]) -> "Mechanism":
+        """For internal use: return the mechanism without some joints; nothing is checked."""
+        if not names:
+            return self
+        sections = {section: list(group.items()) for section, group in self.groups.items()}
+        sections["joint"] = [(name, joint) for name, joint in sections["joint"] if name not in names]
+        return make_module(type(self), **fields_of(sections, self.gravity, self.name, None))
+
     @classmethod
     def of_drawing(cls, source: Drawn, name: str, origin: Origin | None = None) -> "Mechanism":
         """Return the mechanism of a drawing; raise a `SceneError` that lists all mistakes of its elements."""

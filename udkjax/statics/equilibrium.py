@@ -26,6 +26,7 @@ from udkjax.scene.checks import SceneError
 from udkjax.scene.description import format_pose, size_of
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.position_only import refuse_rolling
 from udkjax.statics.admissible_reactions import friction_holds_around
 from udkjax.statics.linearization import Linearization, Linearizer, TracedLinearizer, linearizer, with_unit_mass
 from udkjax.statics.load_scale import LoadScale
@@ -41,6 +42,7 @@ SMALLEST_STIFFNESS = 1e-12  # relative to the scale of stiffnesses: smaller valu
 Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
 IsTrue: TypeAlias = Bool[Array, ""]  # named, since annotations of inner functions are evaluated at each call
 Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization at q, steps, whether the last was better
+REST = "an equilibrium needs positions that the constraints determine"
 
 
 class Equilibrium(PrintsTable):
@@ -142,6 +144,7 @@ def equilibrium(
     Raises:
         ValueError: all numbers are traced, so that the number of degrees of freedom is unknown.
     """
+    refuse_rolling(mechanism, REST)
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
     t = np.asarray(t, float) if mechanism.is_concrete and not is_traced(t) else number(t)
@@ -170,6 +173,7 @@ def equilibria(
     Returns:
         A list of `Equilibrium`, the most stable first: by their lowest omega^2, descending.
     """
+    refuse_rolling(mechanism, REST)
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)
 

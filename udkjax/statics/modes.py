@@ -17,6 +17,7 @@ from udkjax.programs.control_flow import ControlFlow, solve
 from udkjax.scene.arguments import checked
 from udkjax.scene.friction import Friction
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.position_only import refuse_rolling
 from udkjax.statics.equilibrium import degrees_of_freedom, equilibrium
 from udkjax.statics.linearization import linearizer, solver_of_mass, with_unit_mass
 from udkjax.transforms.gradients import stop_gradients
@@ -95,6 +96,7 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
     Returns:
         The `Modes` of the f degrees of freedom.
     """
+    refuse_rolling(mechanism, "modes need positions that the constraints determine")
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
     t = np.asarray(t, float) if mechanism.is_concrete and not is_traced(t) else number(t)

@@ -19,6 +19,7 @@ from udkjax.scene.forces import Wrench
 from udkjax.scene.friction import Friction
 from udkjax.scene.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.rolling import RollingJoint
 
 AnyConstraint = TypeVar("AnyConstraint", bound=Constraint)
 
@@ -39,7 +40,17 @@ def _switched(cls: type) -> Any:
             # Not a product: what is off may be undefined.
             return [jnp.where(self.active > 0.5, row, 0.0) for row in super().residual(t, *frames)]
 
-    return Switched
+    if not issubclass(cls, RollingJoint):
+        return Switched
+
+    class SwitchedRolling(Switched):
+        def residual(self, t, *frames):
+            return RollingJoint.residual(self, t, *frames)  # zero by structure
+
+        def rates(self, t, *frames):
+            return [jnp.where(self.active > 0.5, row, 0.0) for row in super().rates(t, *frames)]
+
+    return SwitchedRolling
 
 
 @cache

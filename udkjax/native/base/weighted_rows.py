@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from udkjax.native.base.ir import INT, POINTER, Function, Operand, Value
+from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.base.module import Module
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 
@@ -138,13 +138,16 @@ class WeightedRows(RowEntries):
         self._method.solve_transposed(d)
         return d.row("b")
 
-    def solve_rates(self, f: Function, change: str) -> MatrixRow:
-        """Return D^+ W Psi_q dq."""
+    def solve_rates(self, f: Function, change: str, of_positions: bool = False) -> MatrixRow:
+        """Return D^+ W Psi_q dq; of positions, rows that restrict velocities alone allow any change."""
         d = self.matrices(f)
         b = d.row("b")
         b.clear()
         for row, column, value in self.weighted_entries(f):
             b.put(row, f.fma(value, self.array(f, change, column), b.entry(row)))
+        for k, row in enumerate(self._chosen if of_positions else ()):
+            if int(row) in self._module.code.rolling_rows:
+                b.put(f.const(k, INT, 1), f.const(0.0, DOUBLE, f.width))
         return self.solve_right(f)
 
     def correct(self, f: Function, x: MatrixRow, start: str, to: str, sign: float = -1.0):

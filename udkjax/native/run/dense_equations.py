@@ -134,7 +134,7 @@ class DenseEquations:
             if module.code.couples:
                 module.copy(f, change, "change")
                 module.invoke(f, "gather", "change")
-            rates = rows.solve_rates(f, "change" if module.code.couples else change)
+            rates = rows.solve_rates(f, "change" if module.code.couples else change, of_positions=x == "dq")
             rows.correct(f, rates, change, f"result {x}")
         if module.adds_drift_of_rates:
             self._at(f, "state dq", "result dq", lambda: module.invoke(f, "drift_of_rates"))

@@ -110,7 +110,7 @@ def _write_singular_values(module: Module):
     for x in ("dq", "dv"):
         if x == "dv" and splits:
             rows.factor(f)
-        put(f, x, rows.solve_rates(f, f"fallback {x}" if couples else f"state {x}"), f"state {x}", -1.0)
+        put(f, x, rows.solve_rates(f, f"fallback {x}" if couples else f"state {x}", of_positions=x == "dq"), f"state {x}", -1.0)
 
     if module.adds_drift_of_rates:
         f = module.new_function("fallback_drift_of_lane", of_lane, 1)

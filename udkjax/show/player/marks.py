@@ -31,6 +31,7 @@ from udkjax.scene.joints import (
     Weld,
 )
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.rolling import KnifeEdge, Wheel
 from udkjax.show.player.mark_kinds import MarkKind
 from udkjax.show.player.mark_places import SAME_PLACE, body_points, corners_of, distinct, in_frame, to_ground
 
@@ -146,6 +147,12 @@ class _Drawing:
                 self._rack(joint)
             case Screw():
                 self._thread(joint)
+            case KnifeEdge():
+                self._edge(joint)
+            case Wheel():  # seen from above
+                self.elements.append(
+                    {"kind": MarkKind.BLOCK, **self._at(joint.bodies[1], joint.point), "axis": float(joint.axis)}
+                )
             case Coupling():
                 pass  # the joints that guide its bodies are drawn
             case Cam():
@@ -291,6 +298,12 @@ class _Drawing:
         start, end = self._travel(first, origin, axis, second, joint.points[1])
         span = [start - margin, end + margin]
         self.rails.append({"kind": MarkKind.RACK, **self._at(first, origin), "axis": axis, "span": span})
+
+    def _edge(self, joint: KnifeEdge) -> None:
+        k, axis, point = self.number[joint.bodies[1]], float(joint.axis), np.asarray(joint.point, float)
+        along = MARGIN * self.size * np.array([np.cos(axis), np.sin(axis)])
+        ends = ([k, *(point + sign * along).tolist()] for sign in (-1.0, 1.0))
+        self.elements.append({"kind": MarkKind.ROD, **dict(zip("ab", ends, strict=True))})
 
     def _travel(self, one: str, at: Numbers, axis: float, two: str, point: Numbers) -> tuple[float, float]:
         """Return the range (m) of a point of body `two` along an axis of body `one`, measured from the point `at` of `one`."""
