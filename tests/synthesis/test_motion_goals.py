@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.synthesis import goal_file
 
 LINKS = {
     name: {"pins": list(pins), "mass": mass}
@@ -118,3 +120,16 @@ def test_mistakes_are_named():
         udk.TorqueGoal()
     with pytest.raises(ValueError, match="one of them and any motion goals"):
         udk.design(FOUR_BAR, [udk.TorqueGoal(most=1.0)])
+
+
+def test_limits_and_speeds_of_goal_files_have_units():
+    problems = []
+
+    def read(**given):
+        return goal_file._read_motion(0, udk.library.four_bar(), given, Units({"length": "mm"}), problems)
+
+    found = read(kind="torque", most="2 N mm", least="1 N mm", speed="60 rpm")
+    np.testing.assert_allclose([found.most, found.least, found.speed], [2e-3, 1e-3, 2 * np.pi], rtol=1e-12)
+    np.testing.assert_allclose(read(kind="load", joint="A", most="3 kN").most, 3e3)
+    assert problems == []
+    assert read(kind="torque", most="2 kg", speed="60 rpm") is None and "motion[0].most" in problems[0]
