@@ -1,0 +1,188 @@
+"""The table of public functions and commands by models: `python -m experiments.parts.crossings [MINUTES] [K/N] [WORD ...]`.
+
+Each cell runs one function on one model, one after another in one process, and is compared with another way to the same numbers,
+or is refused by udkjax with a sentence. Anything else is a fault. K/N limits the table to every N-th model from the K-th, WORD to
+rows and models of this name.
+"""
+
+import contextlib
+import io
+import re
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import udkjax as udk
+from experiments.parts.crossing_functions import FUNCTIONS, TS, Case, WrongError, agree
+from experiments.parts.crossing_models import MODELS
+from udkjax.cli import main as udkjax_cli
+
+PACKAGE = Path(udk.__file__).parent
+SHORT = ("--t1", "0.2", "--dt", "0.05")
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "simulate": ("SCENE", *SHORT, "--out", "OUT.nc"),
+    "animate": ("SCENE", "--t1", "0.2", "--out", "OUT.html"),
+    "kinematics": ("SCENE", "--driver", "DRIVER", "--from", "FIRST", "--to", "LAST", "--count", "5"),
+    "inverse": ("SCENE", *SHORT),
+    "reactions": ("SCENE", *SHORT),
+    "statics": ("SCENE",),
+    "modes": ("SCENE",),
+    "check": ("SCENE",),
+    "convert": ("SCENE", "OUT.toml"),
+    "diagnose": ("SCENE",),
+    "explain": ("SCENE",),
+    "sweep": ("SCENE", "GRID", "--out", "OUT.sweep"),
+    "identify": ("SCENE", "DATA", "--parameters", "NUMBER", "--out", "OUT.found", "--quiet"),
+}
+# Commands that read no scene, or a question beside it that is about drawings alone.
+WITHOUT_SCENE = ("report", "studio", "doctor", "design")
+
+
+class Cell(NamedTuple):
+    """The result of a function and a model: "runs", "refuses" or "fault", with what it was compared with, or the reason."""
+
+    function: str
+    model: str
+    result: str
+    text: str
+    seconds: float
+
+
+def rows() -> list[str]:
+    """Return the names of all rows."""
+    functions = [f"{name} ({mode})" if mode else name for name, by_mode in FUNCTIONS.items() for mode in by_mode]
+    return functions + [f"udkjax {name}" for name in COMMANDS]
+
+
+def cell(row: str, case: Case) -> Cell:
+    """Compute a cell."""
+    start = time.process_time()
+    try:
+        if row.startswith("udkjax "):
+            result, text = command(row.removeprefix("udkjax "), case)
+        else:
+            found = re.fullmatch(r"(\w+)(?: \((\w+)\))?", row)
+            assert found is not None
+            result, text = "runs", FUNCTIONS[found[1]][found[2] or ""](case)
+    except WrongError as error:
+        result, text = "fault", f"wrong: {error}"
+    except Exception as error:
+        result = "refuses" if _is_ours(error) else "fault"
+        text = f"{type(error).__name__}: {error}"
+    return Cell(row, case.name, result, " ".join(text.split())[:300], time.process_time() - start)
+
+
+def _is_ours(error: Exception) -> bool:
+    """Return whether udkjax refuses by name: an exception of its own, or an error that a line of it raises, with a sentence."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    is_raised = (place.line or "").startswith("raise") and Path(place.filename).is_relative_to(PACKAGE)
+    return (type(error).__module__.startswith("udkjax") or is_raised) and len(str(error)) > 20
+
+
+def command(name: str, case: Case) -> tuple[str, str]:
+    """Run a command on the saved scene; return "runs" or "refuses", and what was compared, or its message."""
+    printed, said = io.StringIO(), io.StringIO()
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder) / "scene.toml"
+        udk.save(case.model, scene)  # an element of one's own is refused here
+        words = {"SCENE": str(scene), "DRIVER": str(case.driver), "NUMBER": case.number}
+        words |= {"FIRST": str(float(case.values()[0])), "LAST": str(float(case.values()[-1]))}
+        if name == "sweep":
+            grid = Path(folder) / "grid.toml"
+            value = float(np.ravel(case.model.parameters()[case.number])[0])
+            grid.write_text(
+                f't1 = 0.2\ndt = 0.05\nmeasures = ["final"]\n[axes]\n"{case.number}" = [{value!r}, {1.01 * value!r}]\n'
+            )
+            words["GRID"] = str(grid)
+        if name == "identify":
+            data, body = Path(folder) / "data.csv", case.model.body_names[0]
+            lines = [f"{t!r},{x!r}" for t, x in zip(TS.tolist(), np.asarray(case.alone.q)[:, 0, 2].tolist(), strict=True)]
+            data.write_text("\n".join([f"time,body.{body}.angle", *lines]))
+            words["DATA"] = str(data)
+        arguments = [words.get(x, x.replace("OUT", f"{folder}/out")) for x in COMMANDS[name]]
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
+            try:
+                udkjax_cli([name, *arguments])
+                code = 0
+            except SystemExit as end:
+                code = end.code
+        text = " ".join((said.getvalue() + printed.getvalue()).split())
+        if "Traceback" in text or not text:
+            raise WrongError(f"exit {code}: {text[-200:]}")
+        if code not in (0, None):
+            return "refuses", text
+        if name == "simulate":
+            import xarray
+
+            with xarray.open_dataset(f"{folder}/out.nc", engine="h5netcdf") as data:
+                return "runs", agree(data["q"].values, case.alone.q, "udk.simulate", 1e-5)
+    return "runs", "exit code 0"
+
+
+def cells(minutes: float = 1e9, words: tuple[str, ...] = (), part: tuple[int, int] = (0, 1)) -> Iterator[Cell]:
+    """Iterate over the cells of the table, model by model, within a time; of the models, every n-th from the k-th, (k, n)."""
+    end = time.time() + 60 * minutes
+    for name, model in list(MODELS.items())[part[0] :: part[1]]:
+        chosen = [row for row in rows() if not words or any(word in (name, row) or word in row.split() for word in words)]
+        case = Case(name, model) if chosen else None
+        for row in chosen:
+            if time.time() > end:
+                return
+            assert case is not None
+            yield cell(row, case)
+
+
+def table(found: list[Cell]) -> str:
+    """Return the table as text: functions by models; r: runs, and agrees; n: is refused by name; F: a fault."""
+    models, letters = list(dict.fromkeys(x.model for x in found)), {"runs": "r", "refuses": "n", "fault": "F"}
+    by_place = {(x.function, x.model): letters[x.result] for x in found}
+    lines = [f"{k:3d}  {model}" for k, model in enumerate(models)]
+    functions = list(dict.fromkeys(x.function for x in found))
+    width = max(map(len, functions), default=0)
+    for row in functions:
+        counts = Counter(x.result for x in found if x.function == row)
+        by = Counter(x.text for x in found if x.function == row and x.result == "runs").most_common(2)
+        marks = "".join(by_place.get((row, model), " ") for model in models)
+        compared = "; ".join(text for text, _ in by)
+        lines.append(f"{row:{width}}  {marks}  {counts['runs']:3d} run, {counts['refuses']:3d} refused, by {compared[:60]}")
+    return "\n".join([*lines, summary(found)])
+
+
+def summary(found: list[Cell]) -> str:
+    """Return the counts of the table."""
+    counts = Counter(x.result for x in found)
+    size = (
+        f"{len({x.function for x in found})} functions and commands, {len({x.model for x in found})} models, {len(found)} cells"
+    )
+    return f"{size}: {counts['runs']} run and agree, {counts['refuses']} are refused by name, {counts['fault']} faults"
+
+
+def main() -> None:
+    """Print each fault as it is found, then the table."""
+    warnings.simplefilter("ignore")
+    arguments, found = sys.argv[1:], []
+    minutes = float(arguments.pop(0)) if arguments and arguments[0].replace(".", "").isdigit() else 1e9
+    first, _, count = (
+        arguments.pop(0).partition("/") if arguments and re.fullmatch(r"\d+/\d+", arguments[0]) else "0/1".partition("/")
+    )
+    for x in cells(minutes, tuple(arguments), (int(first), int(count))):
+        found.append(x)
+        if x.result == "fault":
+            print(f"{x.model} | {x.function} | {x.text}", flush=True)
+    print(table(found))
+    for reason, count in Counter(re.sub(r'"[^"]*"|[\d.e+-]+', "*", x.text) for x in found if x.result == "refuses").most_common(
+        25
+    ):
+        print(f"{count:4d} refused: {reason[:150]}")
+
+
+if __name__ == "__main__":
+    main()
