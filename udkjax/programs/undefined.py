@@ -76,7 +76,7 @@ def at_each(function: Callable[..., Result], shared: Any, *members: Any) -> Resu
 def whole(*arrays: Array) -> list[Array]:
     """Return arrays that are NaN as a whole if any of their numbers is: a state that is partly undefined has no derivatives."""
     is_defined = functools.reduce(operator.and_, (jnp.all(~jnp.isnan(x)) for x in arrays))
-    return [jnp.where(is_defined, x, jnp.nan) for x in arrays]
+    return [x + jnp.where(is_defined, 0.0, jnp.nan) for x in arrays]  # cotangents pass, NaN as well
 
 
 def _with_rule(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
