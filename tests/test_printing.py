@@ -92,7 +92,7 @@ def objects() -> dict[str, object]:
 ELSEWHERE = {"Estimate", "GradientCheck", "Design", "Designs", "FoundDesign", "DesignSearch", "MotionPoint"}
 ELSEWHERE |= {"CompleteDesign", "CompleteDesigns"}
 ELSEWHERE |= {"SystemDiagnosis", "ConstraintState"}
-ABSTRACT = {"Constraint", "Joint", "Motion", "ForceElement"}
+ABSTRACT = {"Constraint", "Joint", "RollingJoint", "Motion", "ForceElement"}
 ABSTRACT |= {"MatrixPseudoinverse", "PointwiseFormulation", "Stabilization"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"
 

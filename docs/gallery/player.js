@@ -818,7 +818,7 @@ function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, lim
   }
 }
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes: more than any stack needs, the unit in which memory grows, alignment
-const STATUSES = ["running", "done", "step_limit", "step_too_small", "not_finite", "lost", "singular", "spurious_rank", "missing_rank", "crossed", "unresolved"];
+const STATUSES = ["running", "done", "step_limit", "step_too_small", "not_finite", "lost", "singular", "spurious_rank", "missing_rank", "crossed", "unresolved", "interrupted"];
 const UNFINISHED = {step_limit: "too many steps", step_too_small: "the step became too small", not_finite: "a number is not finite",
   lost: "the loops do not stay closed", unresolved: "the condition of an event varies too quickly"};
 const EPS = 2 ** -52;

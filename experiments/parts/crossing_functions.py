@@ -480,4 +480,5 @@ FUNCTIONS: dict[str, dict[str, Callable[[Case], str]]] = {
     "with_angle": {"": by_twin(lambda case, m: udk.with_angle(m, first_body(m), 0.2).q0)},
 }  # fmt: skip
 # Public functions that take no model: they make parts of drawings, or choices of other functions, which rows above use.
-WITHOUT_MODEL = {"circles": "drawn", "polar": "drawn", "on_line": "drawings", "on_rail": "drawings", "length": "Parameter"}
+WITHOUT_MODEL = {"circles": "drawn", "polar": "drawn", "on_line": "drawings", "on_rail": "drawings", "stacked": "drawings"}
+WITHOUT_MODEL |= {"length": "Parameter"}

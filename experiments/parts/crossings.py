@@ -42,12 +42,12 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "sweep": ("SCENE", "GRID", "--out", "OUT.sweep"),
     "identify": ("SCENE", "DATA", "--parameters", "NUMBER", "--out", "OUT.found", "--quiet"),
 }
-# Commands that read no scene, or a question beside it that is about drawings alone.
+# Commands that read no scene, or that answer a question about drawings alone.
 WITHOUT_SCENE = ("report", "studio", "doctor", "design")
 
 
 class Cell(NamedTuple):
-    """The result of a function and a model: "runs", "refuses" or "fault", with what it was compared with, or the reason."""
+    """The result of a function and a model: "runs", "refuses" or "fault", with the compared quantity or the reason."""
 
     function: str
     model: str

@@ -28,8 +28,9 @@ OTHERS = {
     "errors": "SimulationError AssemblyError SceneError IdentificationError SweepError",
     "studies": """Candidate Parameter Quantity Record Start Axis LatinHypercube Random Sobol Zipped EnergyGoal FrequencyGoal
         FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal ToleranceGoal TorqueGoal""",
-    "bases of classes": "Constraint ForceElement Joint Motion Profile Frame Point Link Drawing Mechanism",
-    "tested with all elements, in tests/elements.py": "Angle Distance Weld Coupling Screw Force Sine LiftProfile SwingProfile",
+    "bases of classes": "Constraint ForceElement Joint RollingJoint Motion Profile Frame Point Link Drawing Mechanism",
+    "tested with all elements, in tests/elements.py": """Angle Distance Weld Coupling Screw KnifeEdge Wheel Force Sine
+        LiftProfile SwingProfile""",
 }
 NOT_CLASSES = {"GROUND", "equations", "pinv", "library"}
 

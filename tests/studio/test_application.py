@@ -309,7 +309,7 @@ def test_unknown_subjects_are_refused(client):
 
 def test_deeply_nested_tables_are_a_mistake(client):
     answer = client.ask("compile", text=f"[{'.'.join(['a'] * 2000)}]\nx = 1").json()
-    assert answer["problems"] == ["tables are nested too deeply"]
+    assert answer["problems"] == ["line 1: a key with more than 100 parts between dots; three are enough"]
 
 
 def test_an_infinite_length_is_reported(client):

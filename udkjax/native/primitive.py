@@ -31,7 +31,7 @@ from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
 from udkjax.native.operations import FindScales, Operation
 from udkjax.native.runs import RunCotangents, goes_back
-from udkjax.native.sharding import call_by_members, divide_members
+from udkjax.native.sharding import call_by_members, divide_members, knows_devices
 from udkjax.native.shared_loads import bind_by_rows, call_by_rows
 from udkjax.native.unsupported import unsupported
 from udkjax.programs.identity_cache import cached_by_size
@@ -287,15 +287,21 @@ class MemberCalls:
         return self._prepared()
 
 
-def _lower(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
+def _lower(context: Any, *inputs: Any, operation: Operation, times: int) -> Any:
     """Lower for the CPU."""
+    lowered = partial(_call_on_cpu, divides=knows_devices(context))
+    return mlir.lower_fun(lowered)(context, *inputs, operation=operation, times=times)
+
+
+def _call_on_cpu(*inputs: Any, operation: Operation, times: int, divides: bool) -> Sequence[Array]:
+    """Call machine code; `divides` tells whether members may be divided among the devices of the program."""
     if operation.code.shares_by_marks:
         return bind_by_rows(call_members, inputs, operation, times)
 
     def call(*inputs: Any) -> Sequence[Array]:
         return _call_target(_select_code(inputs, operation).name, inputs, operation, times)
 
-    return call_by_members(call, inputs, operation.shapes(inputs, times))
+    return call_by_members(call, inputs, operation.shapes(inputs, times)) if divides else call(*inputs)
 
 
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
@@ -380,7 +386,7 @@ native_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[native_p] = _batch
 divide_members(native_p)
 mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_others))
-mlir.register_lowering(native_p, mlir.lower_fun(_lower), platform="cpu")
+mlir.register_lowering(native_p, _lower, platform="cpu")
 mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_card), platform="cuda")
 evaluate_as(native_p, call_members)
 

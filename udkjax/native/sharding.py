@@ -20,6 +20,14 @@ def divide_members(primitive: Primitive) -> None:
         _told_devices.add(primitive)
 
 
+def knows_devices(context: Any) -> bool:
+    """Return whether the devices of a program are known while it is lowered.
+
+    JAX looks for primitives of the set above in the program itself, not in the rules of other primitives, such as that of scales.
+    """
+    return getattr(context.module_context.axis_context, "device_assignment", ()) is not None
+
+
 def call_by_members(
     function: Callable[..., Sequence[Array]], inputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]
 ) -> Sequence[Array]:

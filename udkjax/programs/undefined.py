@@ -56,7 +56,8 @@ def defined(function: Callable[..., Result]) -> Callable[..., Result]:
             given = list(leaves)
             for k, x in zip(places, xs, strict=True):
                 given[k] = x
-            arrays, rest = eqx.partition(function(*jax.tree.unflatten(tree, given)), eqx.is_array)
+            # Results that do not depend on traced numbers stay concrete.
+            arrays, rest = eqx.partition(function(*jax.tree.unflatten(tree, given)), lambda x: isinstance(x, Tracer))
             results, structure = jax.tree.flatten(arrays)
             form[:] = structure, rest
             return results
