@@ -93,10 +93,12 @@ def rolling_rates(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray
         The rates (m,), in m/s or rad/s.
     """
 
+    now = jnp.asarray(t)
+
     def rates(constraint: Constraint, *frames: Frame) -> Array:
         if isinstance(constraint, RollingJoint):
-            return vector(constraint.rates(t, *frames))
-        return jnp.zeros_like(vector(constraint.residual(t, *frames)))
+            return vector(constraint.rates(now, *frames))
+        return jnp.zeros_like(vector(constraint.residual(now, *frames)))
 
     kinds = evaluate_by_kind(rates, mechanism, [*mechanism.constraints.values()], bodies(q), bodies(v))
     return jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])[_row_order(kinds)]

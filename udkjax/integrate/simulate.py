@@ -229,8 +229,8 @@ def simulate(
     if isinstance(mechanism, Mechanism) and throw and not is_concrete and _has_failed(code):
         found = without_derivatives((solution if located is None else located, mechanism, analysis, choices.drift_tol, end))
         if not is_traced(found):  # as in a call of `jax.grad`
-            *known, tol, last = found
-            return _required(explained(*known, tol, solver, last), throw)
+            run, scene, analysed, tol, last = found
+            return _required(explained(run, scene, analysed, tol, solver, last), throw)
     if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution if located is None else _as_located(solution, located), throw)
     if missed:
