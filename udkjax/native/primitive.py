@@ -287,13 +287,13 @@ class MemberCalls:
         return self._prepared()
 
 
-def _lower(context: Any, *inputs: Any, operation: Operation, times: int) -> Any:
-    """Lower for the CPU."""
-    lowered = partial(_call_on_cpu, divides=knows_devices(context))
+def _lower_on_cpu(context: Any, *inputs: Any, operation: Operation, times: int) -> Any:
+    """Lower for the CPU, with the devices of the program where they are known."""
+    lowered = partial(_lower, divides=knows_devices(context))
     return mlir.lower_fun(lowered)(context, *inputs, operation=operation, times=times)
 
 
-def _call_on_cpu(*inputs: Any, operation: Operation, times: int, divides: bool) -> Sequence[Array]:
+def _lower(*inputs: Any, operation: Operation, times: int, divides: bool = True) -> Sequence[Array]:
     """Call machine code; `divides` tells whether members may be divided among the devices of the program."""
     if operation.code.shares_by_marks:
         return bind_by_rows(call_members, inputs, operation, times)
@@ -386,7 +386,7 @@ native_p.def_abstract_eval(_abstract_eval)
 batching.primitive_batchers[native_p] = _batch
 divide_members(native_p)
 mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_others))
-mlir.register_lowering(native_p, _lower, platform="cpu")
+mlir.register_lowering(native_p, _lower_on_cpu, platform="cpu")
 mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_card), platform="cuda")
 evaluate_as(native_p, call_members)
 
