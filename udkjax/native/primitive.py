@@ -293,7 +293,7 @@ def _lower_on_cpu(context: Any, *inputs: Any, operation: Operation, times: int) 
     return mlir.lower_fun(lowered)(context, *inputs, operation=operation, times=times)
 
 
-def _lower(*inputs: Any, operation: Operation, times: int, divides: bool = True) -> Sequence[Array]:
+def _lower(*inputs: Any, operation: Operation, times: int, divides: bool = False) -> Sequence[Array]:
     """Call machine code; `divides` tells whether members may be divided among the devices of the program."""
     if operation.code.shares_by_marks:
         return bind_by_rows(call_members, inputs, operation, times)
