@@ -70,17 +70,17 @@ WITH_MOTOR = udk.Mechanism(DRAWN.bodies, DRAWN.joints, forces={"motor": udk.Torq
 
 # The calls of Python of a repeated call with concrete numbers, a few more than at the last count: a microsecond for three.
 MOST_CALLS: dict[str, tuple[int, Callable[[Any, Any], object]]] = {
-    "simulate": (105, lambda state, run: udk.simulate(DRAWN, TS, state)),
+    "simulate": (98, lambda state, run: udk.simulate(DRAWN, TS, state)),
     "step": (52, lambda state, run: udk.step(DRAWN, state, None, 1e-3)),
     "step with an input": (51, lambda state, run: udk.step(WITH_MOTOR, state, {"force.motor.value": 1.0}, 1e-3)),
     "step of another drawing": (54, lambda state, run: udk.step(DRAWN, state, {"link.crank.width": 0.02}, 1e-3)),
-    "assemble": (48, lambda state, run: udk.assemble(DRAWN)),
-    "accelerations": (140, lambda state, run: udk.accelerations(DRAWN, 0.0, state.q, state.v)),
+    "assemble": (27, lambda state, run: udk.assemble(DRAWN)),
+    "accelerations": (132, lambda state, run: udk.accelerations(DRAWN, 0.0, state.q, state.v)),
     "energy": (68, lambda state, run: udk.energy(DRAWN, run)),
     "violation": (69, lambda state, run: udk.violation(DRAWN, run)),
     "reactions": (290, lambda state, run: udk.reactions(DRAWN, run)),
-    "kinematics": (200, lambda state, run: udk.kinematics(DRAWN, "body.crank.angle", [1.0, 1.01, 1.02])),
-    "inverse dynamics": (245, lambda state, run: udk.inverse_dynamics(DRIVEN, TS)),
+    "kinematics": (190, lambda state, run: udk.kinematics(DRAWN, "body.crank.angle", [1.0, 1.01, 1.02])),
+    "inverse dynamics": (232, lambda state, run: udk.inverse_dynamics(DRIVEN, TS)),
     "another number": (131, lambda state, run: WITH_MOTOR.with_parameters({"force.motor.value": 1.0})),
     "another drawing": (1890, lambda state, run: DRAWN.with_parameters({"link.crank.width": 0.02})),
 }
@@ -244,7 +244,7 @@ def test_a_compiled_run_does_nothing_to_the_outputs_of_machine_code(of_run):
 
     numbers = 2 * mechanism.q0.size
     added = operations(401) - operations(3)
-    assert operations(3) < 1500 and (added == 0 if of_run is None else added <= 8 * numbers * 398)
+    assert operations(3) < (1000 if of_run is None else 1500) and (added == 0 if of_run is None else added <= 8 * numbers * 398)
 
 
 @pytest.mark.parametrize("count, transform", [(2, jax.grad), (3, jax.jacfwd)])

@@ -196,10 +196,8 @@ def close(
     """
     if isinstance(mechanism, ConstrainedSystem):
         return close_system_guess(mechanism, t, state)
-    if names := rolling_joints(mechanism):  # they restrict no positions: the others alone are closed first
-        positions = close(mechanism.without_joints(names), t, state).state.q
-        state = State(positions, mechanism.v0 if state is None else state.v)
     if not mechanism.is_concrete or is_traced((t, state)):
+        state = _with_closed_positions(mechanism, t, state)
         analysis = analyse(mechanism) if analysis is None else analysis
         compiled = _close if is_within_jit() else _close_compiled  # under jit concrete numbers become tracers, too
         moment = mechanism.without_origin.at(t)
@@ -211,9 +209,18 @@ def close(
     return _closure_of_concrete(mechanism, np.asarray(t).item(), state, analysis)
 
 
+def _with_closed_positions(mechanism: Mechanism, t: NumberLike, state: State | None) -> State | None:
+    """Return a state in which all joints but rolling ones are closed: these restrict no positions."""
+    if not (names := rolling_joints(mechanism)):
+        return state
+    positions = close(mechanism.without_joints(names), t, state).state.q
+    return State(positions, mechanism.v0 if state is None else state.v)
+
+
 @cached_by_identity  # a second run of a mechanism reuses its closure
 def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, analysis: Analysis | None) -> Closure:
     with jax.ensure_compile_time_eval():
+        state = _with_closed_positions(mechanism, t, state)
         scales = (analyse(mechanism) if analysis is None else analysis).scales
         guess = (mechanism.q0, mechanism.v0) if state is None else (state.q, state.v)
         q, v = (np.asarray(x, float).ravel() for x in guess)

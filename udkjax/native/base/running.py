@@ -30,7 +30,7 @@ class Running(Memory):
     """The names of functions that are compiled apart from others, since only this module has them."""
     loops: LoopWriter
     is_interruptible = True
-    """Whether Ctrl-C ends the runs of a module that takes steps; a page has no signals."""
+    """True if Ctrl-C ends runs: on a page, which has no signals, it cannot."""
 
     def text(self) -> str:
         """LLVM's text of the whole module."""
