@@ -54,6 +54,12 @@ def test_also_from_a_singular_configuration_that_is_passed(velocity):
     assert found.sum() == rank == 11
 
 
+@pytest.mark.parametrize("angle", [-row_marks.ASIDE.length, 0.0003])
+def test_also_if_the_step_leads_to_a_singular_configuration_or_begins_near_one(angle):
+    found, rank = marks(udk.library.parallelogram(angle=angle))
+    assert found.sum() == rank == 11
+
+
 def test_at_rest_where_branches_meet_no_row_is_left_out():
     found, _ = marks(udk.library.parallelogram(angle=0.0))
     assert_array_equal(found, np.ones(12))
@@ -68,7 +74,7 @@ def other_step(request, monkeypatch):
         primitive.machine_code.cache_clear()
 
     forget()
-    monkeypatch.setattr(row_marks, "STEP", request.param)
+    monkeypatch.setattr(row_marks, "ASIDE", row_marks.ASIDE._replace(length=request.param))
     yield
     forget()
 

@@ -22,6 +22,17 @@ from udkjax.arrays import ArrayLibrary
 from udkjax.equations.scales import Scales
 
 
+class StepAside(NamedTuple):
+    """A step from an initial position to one that is not singular, where rows that depend on others do so everywhere."""
+
+    # Length of the step in the scene's units. A row that depends on others only at the start of the step has a relative pivot of
+    # about its square at the end: much more than the threshold of dependence. The step is also short enough for Newton's method.
+    length: float = 0.03
+    stays: float = 0.5  # smallest distance from the start, as a fraction of the step: where branches meet, it may lead back
+    corrections: int = 6  # Newton steps; four are usual, as convergence is quadratic
+    free: float = 1e-6  # smallest tangent part of a direction or a velocity, in the scene's units; less is rounding
+
+
 class ClosingRule(NamedTuple):
     """Criteria of a closed position, and of the steps that approach it.
 
@@ -35,6 +46,7 @@ class ClosingRule(NamedTuple):
     steps: int = 40  # maximum number of Gauss-Newton steps; five or six are usual: convergence is quadratic
     pace_steps: int = 4  # steps over which the rate of convergence is measured: see `try_to_close`
     velocities: int = 2  # corrections of v: the second removes the rounding errors of the first
+    aside: StepAside = StepAside()  # from a position that may be singular
     halvings: int = 12  # maximum for one step: if 2^-12 of a step does not lower the residual, the position cannot be closed
 
     def shortening(self, size: AnyArray, xp: ArrayLibrary) -> AnyArray:

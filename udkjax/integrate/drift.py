@@ -1,5 +1,6 @@
-"""Drift of runs that are not projected, relative to the distance from singular configurations, for integrators of diffrax."""
+"""Reasons for which runs by integrators of diffrax end: drift beside singular configurations, and ranks that are too large."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import diffrax
@@ -9,13 +10,19 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.position_closure import CLOSURE
+from udkjax.equations.textbook import TextbookEquations
+from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solvers.counting import CountingController
 from udkjax.native.base.steps import Status
+from udkjax.pinv import SVD
 from udkjax.pinv.auto import NEAREST
 from udkjax.transforms.gradients import stop_gradients
 
 DEPENDENT = np.finfo(float).eps ** 0.5  # distance at or below which rows are dependent: eigenvalues are its square, with rounding
+
+ASIDE = CLOSURE.aside
 
 
 def distance(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, ""]:
@@ -26,6 +33,32 @@ def distance(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array,
     unit = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
     squares = jnp.linalg.eigvalsh(gram * unit[:, None] * unit)
     return jnp.sqrt(jnp.min(jnp.where(squares > DEPENDENT**2 * len(A), squares, 1.0), initial=1.0))
+
+
+def most_rank(problem: Problem, equations: TextbookEquations) -> Float[Array, ""]:
+    """Return the number of independent rows along a motion, which the rank of D does not exceed."""
+    if equations.redundant is not None:
+        return jnp.asarray(float(len(equations.scales.rows) - len(equations.redundant)))
+    if problem.marks is not None:
+        return jnp.sum(problem.marks > 0).astype(float)
+    return _rank_near_start(problem, equations)
+
+
+def _rank_near_start(problem: Problem, equations: TextbookEquations) -> Float[Array, ""]:
+    """Return the rank at the start or, if it is larger, one step away from it, as machine code finds it (row_marks.py)."""
+    scales, t, q, v = equations.scales, problem.ts[0], problem.q, problem.v
+    by_rank = replace(equations, method=SVD(equations.rank_tol))
+    random = np.random.default_rng(0).uniform(-1.0, 1.0, len(q)) * scales.coordinates(len(q))
+    along = jnp.where(scales.size(v) > ASIDE.free * problem.rate, v, random)
+    step = by_rank.tangent_part(t, q, v, along, jnp.zeros_like(v)).dq
+    size = scales.size(step)
+    is_free = size > ASIDE.free * scales.size(along)
+    t, moved = t + ASIDE.length / problem.rate, q + jnp.where(is_free, ASIDE.length / jnp.where(is_free, size, 1.0), 0.0) * step
+    moved = jax.lax.fori_loop(0, ASIDE.corrections, lambda _, x: by_rank.correct(t, x, jnp.zeros_like(x))[0], moved)
+    is_closed = scales.violation(by_rank.violation(t, moved, v)[0]) < CLOSURE.tol
+    is_found = is_closed & (~is_free | (scales.size(moved - q) > ASIDE.stays * ASIDE.length))
+    rank = jnp.maximum(by_rank.rank(problem.ts[0], q), by_rank.rank(t, moved))
+    return jnp.where(is_found, rank, len(scales.rows)).astype(float)
 
 
 class DriftState(NamedTuple):

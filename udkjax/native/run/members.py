@@ -28,6 +28,8 @@ def write_begin(module: Module):
             put(name, 0.0)
     given_settings = module.member_address(f, "settings", member)
     settings = dict.fromkeys(SETTINGS, f.const(1.0)) | {name: f.load(given_settings, j) for j, name in enumerate(module.settings)}
+    if "most_rank" in module.settings and module.code.marks_rows and not module.code.weighs_rows:
+        settings["most_rank"] = _marked_rank(module, f, member, settings["most_rank"])
     for name, value in settings.items():
         put(name, value)
     q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)
@@ -78,6 +80,14 @@ def write_begin(module: Module):
     else:
         f.call("enter", work, call, k)
     module.begin_member(f, k, member)
+
+
+def _marked_rank(module: Module, f: Function, member: Value, most: Value) -> Value:
+    """Return the number of rows that a member marks as independent; no bound, which is infinite, stays."""
+    numbers, marks, count = module.member_address(f, "numbers", member), module.code.marks, f.variable(0.0, width=1)
+    with f.each(marks.stop, start=marks.start) as i:
+        count.value = count.value + f.select(f.load(numbers, i) > 0.0, f.const(1.0), 0.0)
+    return f.select(most < np.inf, count.value, most)
 
 
 def write_finish(module: Module):

@@ -2,9 +2,10 @@
 
 Rows that depend on others everywhere must be distinguished from rows that do so only at the initial position, if it is singular.
 Therefore the mechanism is moved by one step: along its velocity or, at rest, along a random direction that its constraints allow,
-with its drivers slightly advanced. It is closed by Newton's method, and the rows that elimination retains are marked. If it does
-not close, or returns to the start, as it may at rest where two branches of its motion meet, all rows are marked: elimination then
-encounters small pivots, and the rank-revealing fallback takes every step.
+with its drivers slightly advanced. It is closed by Newton's method, and the rows that elimination retains are marked, or those
+that it retains at the start if there are more: the step may lead to a singular position. If it does not close, or returns to the
+start, as it may at rest where two branches of its motion meet, all rows are marked: elimination then encounters small pivots, and
+the rank-revealing fallback takes every step.
 """
 
 from collections.abc import Callable
@@ -20,12 +21,7 @@ from udkjax.native.base.tableau import EULER
 from udkjax.native.run.manifold import iterate_newton, largest_violation
 from udkjax.native.run.members import write_begin
 
-# Length of the step in the scene's units. A row that depends on others only at the start of the step has a relative pivot of
-# about its square at the end: much more than the threshold of dependence. The step is also short enough for Newton's method.
-STEP = 0.03
-STAYS = 0.5  # smallest distance from the start, as a fraction of the step: where branches meet, Newton's method may lead back
-CORRECTIONS = 6  # Newton steps; four are usual, as convergence is quadratic
-FREE = 1e-6  # smallest tangent part of a direction or a velocity, in the scene's units; less is rounding
+ASIDE = CLOSURE.aside
 
 
 class RowMarks(Module):
@@ -39,7 +35,8 @@ class RowMarks(Module):
         super().__init__(
             Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=unrolled, steps=False)
         )
-        self.places.add("independent", self.m)
+        for name in ("independent", "marks"):
+            self.places.add(name, self.m)
 
     def write_functions(self):
         self.write_programs()
@@ -51,57 +48,75 @@ class RowMarks(Module):
 
     @property
     def arrays(self):
-        return super().arrays | {"independent": ("work", self.places["independent"])}
+        return super().arrays | {name: ("work", self.places[name]) for name in ("independent", "marks")}
 
     def _find(self):
         """Write `find(work, call)`: mark the rows of the members in all lanes."""
         f, s = self.function("find", [(POINTER, "work"), (POINTER, "call")])
+        setattr(s, "state t", s.start)
+        with f.each(self.n) as i:
+            self.put_entry(f, "state q", i, self.entry(f, "point3 q", i))
+            self.put_entry(f, "state v", i, self.entry(f, "point3 v", i))
+            self.put_entry(f, "state dv", i, f.const(0.0, DOUBLE, self.plan.width))
+        count = self._mark_rows(f, None)
+        is_free = self._step_aside(f, s)
+        is_closed = largest_violation(self, f) < CLOSURE.tol
+        is_found = is_closed & ((self._distance(f) > ASIDE.stays * ASIDE.length) | ~is_free)
+        self._mark_rows(f, lambda found: found > count)
+        with f.each(self.m) as i:
+            self.put_entry(f, "marks", i, f.select(is_found, self.entry(f, "marks", i), 1.0))
+        with self.each_lane(f, s.active) as k:
+            to = self.result_address(f, "marks", self.to_int(f, f.lane(s.member, k)), self.m)
+            self.copy_lane(f, to, 0, "marks", k, count=self.m)
+
+    def _step_aside(self, f: Function, s: Lane) -> Value:
+        """Step along the velocity or a random direction, close, and compute Psi; return whether constraints leave any free."""
         width = self.plan.width
         direction = np.random.default_rng(0).uniform(-1.0, 1.0, self.n)
         self.loops.globals.append(
             f"@direction = private constant [{self.n} x double] [{', '.join(f'double {x!r}' for x in direction.tolist())}]"
         )
-
-        setattr(s, "state t", s.start)
         with f.each(self.n) as i:
-            self.put_entry(f, "state q", i, self.entry(f, "point3 q", i))
-            self.put_entry(f, "state v", i, self.entry(f, "point3 v", i))
-            self.put_entry(f, "state dv", i, f.const(0.0, DOUBLE, width))
             self.put_entry(f, "state dq", i, self.entry(f, "point3 v", i))
-        rate = self.largest(f, lambda r: [f.abs(self.vector(f, "state dq", r)) * self.vector(f, "inverse unit", r)])
-        moves = f.like(rate > s.omega * FREE, BOOL, width)
+        moves = f.like(self._size(f, "state dq") > s.omega * ASIDE.free, BOOL, width)
         with f.each(self.n) as i:
             random = f.like(f.load(Value(f, "@direction", POINTER), i), DOUBLE, width) / self.entry(f, "inverse unit", i)
             self.put_entry(f, "state dq", i, f.select(moves, self.entry(f, "state dq", i) / s.omega, random))
         self.invoke(f, "tangent_part")
-        size = self.largest(f, lambda r: [f.abs(self.vector(f, "result dq", r)) * self.vector(f, "inverse unit", r)])
-        is_free = size > FREE
-        scale = f.select(is_free, STEP / f.select(is_free, size, 1.0), 0.0)
-        scale = f.like(scale, DOUBLE, width)
+        size = self._size(f, "result dq")
+        is_free = size > ASIDE.free
+        scale = f.like(f.select(is_free, ASIDE.length / f.select(is_free, size, 1.0), 0.0), DOUBLE, width)
         with f.each(self.n) as i:
             self.put_entry(f, "state q", i, f.fma(self.entry(f, "result dq", i), scale, self.entry(f, "state q", i)))
-        setattr(s, "state t", s.start + STEP / s.omega)
-        active = s.active > 0.5
-        iterate_newton(self, f, s, active, lambda _: self.invoke(f, "newton_q"), CORRECTIONS)
+        setattr(s, "state t", s.start + ASIDE.length / s.omega)
+        iterate_newton(self, f, s, s.active > 0.5, lambda _: self.invoke(f, "newton_q"), ASIDE.corrections)
         self.invoke(f, "psi")
-        is_closed = largest_violation(self, f) < CLOSURE.tol
-        distance = self.largest(f, self._distance(f))
-        is_closed = is_closed & ((distance > STAYS * STEP) | ~f.like(is_free, BOOL, width))
-        self.invoke(f, "independent_rows")
-        with f.each(self.m) as i:
-            self.put_entry(f, "independent", i, f.select(is_closed, self.entry(f, "independent", i), 1.0))
-        with self.each_lane(f, s.active) as k:
-            to = self.result_address(f, "marks", self.to_int(f, f.lane(s.member, k)), self.m)
-            self.copy_lane(f, to, 0, "independent", k, count=self.m)
+        return f.like(is_free, BOOL, width)
 
-    def _distance(self, f: Function) -> Callable[[Value], list[Value]]:
-        """Return the distance of each coordinate from the initial position, in its unit."""
+    def _size(self, f: Function, name: str) -> Value:
+        """Return the size of a change of coordinates, in the scene's units."""
+        return self.largest(f, lambda r: [f.abs(self.vector(f, name, r)) * self.vector(f, "inverse unit", r)])
+
+    def _mark_rows(self, f: Function, where: Callable[[Value], Value] | None) -> Value:
+        """Find the independent rows at the state; return their number, and keep their marks, in lanes `where` this is better."""
+        self.invoke(f, "independent_rows")
+        count = f.variable(0.0)
+        with f.each(self.m) as i:
+            count.value = count.value + self.entry(f, "independent", i)
+        with f.each(self.m) as i:
+            marks = self.entry(f, "independent", i)
+            kept = marks if where is None else f.select(where(count.value), marks, self.entry(f, "marks", i))
+            self.put_entry(f, "marks", i, kept)
+        return count.value
+
+    def _distance(self, f: Function) -> Value:
+        """Return the distance from the initial position, in the scene's units."""
 
         def of_register(r: Value) -> list[Value]:
             moved = self.vector(f, "state q", r) - self.vector(f, "point3 q", r)
             return [f.abs(moved) * self.vector(f, "inverse unit", r)]
 
-        return of_register
+        return self.largest(f, of_register)
 
     def step_all(self, f: Function, s: Lane, fill):
         """Mark the rows of the members in all lanes, and load the next members."""
