@@ -103,7 +103,7 @@ class ContactChanges(NamedTuple):
     """The contacts at an event, and their states after it."""
 
     v: Float[Any, "*m n"]  # after the event
-    closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
+    closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW, with those whose rebound was left out
     hits: Bool[Any, "*m E"]
     held: Bool[Any, "*m E"]  # after the event
     rests: Bool[Any, "*m E"]  # contacts that do not separate after the event, held or not
@@ -254,15 +254,15 @@ def hit_contacts(
     stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
     scale, system = stop(before.scale), contacts.rate[..., None]
     floor = ZERO_RATE * scale * system
-    closed = closed if closed is not None else contact_states(contacts, k, held, before, rows.W, xp)
-    assert closed is not None
+    closed = contact_states(contacts, k, held, before, rows.W, xp) if closed is None else closed
     restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
-    rubs = (closed > OPEN) & (contacts.tangents >= 0)
+    touches = closed > OPEN
+    rubs = touches & (contacts.tangents >= 0)
 
     def impulses(restitution: Any) -> Impulses:
-        found = impulses_of_impact(rows, rate, restitution, closed > OPEN, floor, xp)
+        found = impulses_of_impact(rows, rate, restitution, touches, floor, xp)
         if np.any(contacts.tangents >= 0) and (xp is not np or rubs.any()):
-            rubbing = impulses_with_friction(contacts, rows, rate, restitution, closed > OPEN, floor, xp)
+            rubbing = impulses_with_friction(contacts, rows, rate, restitution, touches, floor, xp)
             found = Impulses(*(_where_any(rubs, x, y, xp) for x, y in zip(rubbing, found, strict=True)))
         return found
 
@@ -271,12 +271,13 @@ def hit_contacts(
 
     # The set of held contacts is discrete, and has no derivatives.
     W, fixed_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2 * scale * system**2
-    may_stay = (closed > OPEN) & rows.free & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
-    still = xp.maximum(floor, STILL * _largest(fixed_rate, closed > OPEN, xp))
+    may_stay = (touches) & rows.free & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
+    still = xp.maximum(floor, STILL * _largest(fixed_rate, touches, xp))
     slow = xp.maximum(still, REST * scale * system)
     impact = impulses(restitution)
-    stays, is_held = may_stay & (stop(impact.rate) <= slow), xp.where(closed > OPEN, False, held)
+    stays, is_held = may_stay & (stop(impact.rate) <= slow), xp.where(touches, False, held)
     ends, carried = xp.zeros_like(stays), xp.zeros_like(stays)
+    hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
     if xp is not np or stays.any():
         pull = second_rates(stop(velocities(impact)))
         solution = solve_complementarity(W, pull, stays, pressed, xp)
@@ -285,17 +286,17 @@ def hit_contacts(
         presses = solution.passive & (solution.x > 0)
         rises = xp.any(presses & (stop(impact.rate) > still), axis=-1, keepdims=True)
         if xp is not np or rises.any():
+            closed = xp.where(presses & rises, SLOW, closed)  # recorded: derivatives follow the impact that was chosen
             again = impulses(xp.where(presses & rises, 0.0, restitution))
             impact = Impulses(*(_where_any(rises, x, y, xp) for x, y in zip(again, impact, strict=True)))
         stays = may_stay & (stop(impact.rate) <= still)
         solution = solve_complementarity(W, pull, stays, pressed, xp)
         presses = solution.passive & (solution.x > 0)
-        is_held = xp.where(closed > OPEN, presses & contacts.hold, held)
+        is_held = xp.where(touches, presses & contacts.hold, held)
         is_slow, weak = may_stay & (stop(impact.rate) <= slow), xp.maximum(pressed, STILL * _largest(pull, stays, xp))
         carried = is_slow & ~is_held & (xp.abs(solution.y) <= weak) & _depends(W, is_held, contacts.impacts, xp)
         ends, stays = presses & contacts.stop, stays | carried
     v = velocities(impact)
-    hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
     return ContactChanges(v, closed, hits, is_held, stays, ends, carried, impact.remaining)
 
 
