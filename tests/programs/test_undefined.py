@@ -83,3 +83,25 @@ def test_a_state_is_undefined_as_a_whole():
     q, v = whole(jnp.array([1.0, jnp.nan]), jnp.array([2.0]))
     assert np.isnan(q).all() and np.isnan(v).all()
     np.testing.assert_array_equal(whole(jnp.array([1.0, 2.0]))[0], [1.0, 2.0])
+
+
+RESULTS = {
+    "of no number": lambda y, x: (x * y, jnp.zeros(2)),
+    "of no member": lambda y, x: (x * y, jnp.cos(y)),
+    "empty": lambda y, x: (x * y, jnp.zeros(0)),
+    "a rate of zero": lambda y, x: (x * y, jax.jvp(lambda t: jnp.sin(y), (x,), (1.0,))[1]),
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_members_have_derivatives_though_a_result_is_the_same_for_all(name):
+    """A program is traced before it is differentiated: with `jit`, results must not get the axis of members later."""
+    xs = jnp.array([1.0, 2.0, 4.0])
+    each = jax.jit(lambda y: at_each(RESULTS[name], y, xs))
+    values, slopes = jax.jvp(each, (2.0,), (1.0,))
+    others = [RESULTS[name](2.0, x) for x in xs]
+    np.testing.assert_array_equal(values[0], 2.0 * xs)
+    np.testing.assert_array_equal(values[1], jnp.stack([x[1] for x in others]))
+    np.testing.assert_array_equal(slopes[0], xs)
+    wanted = -np.sin(2.0) if name == "of no member" else 0.0
+    np.testing.assert_allclose(slopes[1], np.full(values[1].shape, wanted), rtol=1e-15)

@@ -60,13 +60,34 @@ def defined(function: Callable[..., Result]) -> Callable[..., Result]:
             arrays, rest = eqx.partition(function(*jax.tree.unflatten(tree, given)), lambda x: isinstance(x, Tracer))
             results, structure = jax.tree.flatten(arrays)
             form[:] = structure, rest
-            return results
+            return _as_mapped(results, xs)
 
         results = _with_rule(of_traced)(*(leaves[k] for k in places))
         structure, rest = form
         return eqx.combine(jax.tree.unflatten(structure, results), rest)
 
     return run
+
+
+def _as_mapped(results: list[Array], xs: Sequence[Array]) -> list[Array]:
+    """Return results that `vmap` maps wherever it maps an argument.
+
+    The tangents of all results are mapped then, by the token, and JAX requires it of the results that they belong to.
+    """
+    mapped = [x for x in xs if type(x) in _mapped_types() and x.size]
+    if not mapped:
+        return results
+    is_any = functools.reduce(operator.or_, (jnp.ravel(x)[0] == jnp.ravel(x)[0] for x in mapped))
+    return [jax.lax.select(jnp.broadcast_to(is_any, x.shape), x, x) for x in results]
+
+
+@functools.cache
+def _mapped_types() -> tuple[type, ...]:
+    """Return the types of numbers that `vmap` traces with."""
+    types: list[type] = []
+    with jax.ensure_compile_time_eval():
+        jax.vmap(lambda x: [types.append(type(x)), x][1])(np.zeros(1))
+    return tuple(types)
 
 
 def at_each(function: Callable[..., Result], shared: Any, *members: Any) -> Result:
