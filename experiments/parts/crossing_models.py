@@ -102,14 +102,18 @@ def drawn(**more: Any) -> Callable[[], udk.Mechanism]:
     ).mechanism()
 
 
-def pendulum(*, gravity: float = -9.81) -> udk.Mechanism:
-    """Two rods that hang in a row, for events."""
+def pendulum(driven: bool = False) -> udk.Mechanism:
+    """Two rods in a row, for events; or both of them driven."""
     bodies = {"a": udk.Body(1.0, 1 / 12, [0.5, 0.0]), "b": udk.Body(1.0, 1 / 12, [1.5, 0.0])}
     joints = {
         "top": udk.Revolute(["ground", "a"], [[0.0, 0.0], [-0.5, 0.0]]),
         "knee": udk.Revolute(["a", "b"], [[0.5, 0.0], [-0.5, 0.0]]),
     }
-    return udk.Mechanism(bodies, joints, gravity=[0.0, gravity])
+    drivers = {
+        "shoulder": udk.Driver(["ground", "a"], "angle", udk.Sine(0.3, 5.0)),
+        "elbow": udk.Driver(["a", "b"], "angle", udk.Polynomial([0.0, 1.0, 2.0])),
+    }
+    return udk.Mechanism(bodies, joints, drivers if driven else None, gravity=[0.0, -9.81])
 
 
 def wheels(kind: str) -> udk.Mechanism:
@@ -175,7 +179,8 @@ MODELS: dict[str, Model] = {
     "driver, spline": Model(
         lambda: with_driver(udk.Spline([0.0, 0.07, 0.3], [start_angle(), start_angle() + 0.1, start_angle() + 0.5]))()
     ),
-    "two drivers": Model(udk.library.excavator),
+    "two drivers": Model(lambda: pendulum(driven=True)),
+    "three freedoms": Model(udk.library.excavator),
     "friction torque": Model(rub(torque=0.01, velocity=0.01)),
     "friction by load": Model(rub(coefficient=0.1, radius=0.01)),
     "friction, set-valued": Model(set_valued),

@@ -5,11 +5,8 @@ or is refused by udkjax with a sentence. Anything else is a fault. K/N limits th
 rows and models of this name.
 """
 
-import contextlib
-import io
 import re
 import sys
-import tempfile
 import time
 import traceback
 import warnings
@@ -18,32 +15,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 import udkjax as udk
-from experiments.parts.crossing_functions import FUNCTIONS, TS, Case, WrongError, agree
+from experiments.parts.crossing_case import Case, WrongError
+from experiments.parts.crossing_commands import COMMANDS, RefusedError, command
+from experiments.parts.crossing_functions import FUNCTIONS
 from experiments.parts.crossing_models import MODELS
-from udkjax.cli import main as udkjax_cli
 
 PACKAGE = Path(udk.__file__).parent
-SHORT = ("--t1", "0.2", "--dt", "0.05")
-COMMANDS: dict[str, tuple[str, ...]] = {
-    "simulate": ("SCENE", *SHORT, "--out", "OUT.nc"),
-    "animate": ("SCENE", "--t1", "0.2", "--out", "OUT.html"),
-    "kinematics": ("SCENE", "--driver", "DRIVER", "--from", "FIRST", "--to", "LAST", "--count", "5"),
-    "inverse": ("SCENE", *SHORT),
-    "reactions": ("SCENE", *SHORT),
-    "statics": ("SCENE",),
-    "modes": ("SCENE",),
-    "check": ("SCENE",),
-    "convert": ("SCENE", "OUT.toml"),
-    "diagnose": ("SCENE",),
-    "explain": ("SCENE",),
-    "sweep": ("SCENE", "GRID", "--out", "OUT.sweep"),
-    "identify": ("SCENE", "DATA", "--parameters", "NUMBER", "--out", "OUT.found", "--quiet"),
-}
-# Commands that read no scene, or that answer a question about drawings alone.
-WITHOUT_SCENE = ("report", "studio", "doctor", "design")
 
 
 class Cell(NamedTuple):
@@ -67,13 +45,15 @@ def cell(row: str, case: Case) -> Cell:
     start = time.process_time()
     try:
         if row.startswith("udkjax "):
-            result, text = command(row.removeprefix("udkjax "), case)
+            result, text = "runs", command(row.removeprefix("udkjax "), case)
         else:
             found = re.fullmatch(r"(\w+)(?: \((\w+)\))?", row)
             assert found is not None
             result, text = "runs", FUNCTIONS[found[1]][found[2] or ""](case)
     except WrongError as error:
         result, text = "fault", f"wrong: {error}"
+    except RefusedError as error:
+        result, text = "refuses" if len(str(error)) > 20 else "fault", str(error)
     except Exception as error:
         result = "refuses" if _is_ours(error) else "fault"
         text = f"{type(error).__name__}: {error}"
@@ -85,46 +65,6 @@ def _is_ours(error: Exception) -> bool:
     place = traceback.extract_tb(error.__traceback__)[-1]
     is_raised = (place.line or "").startswith("raise") and Path(place.filename).is_relative_to(PACKAGE)
     return (type(error).__module__.startswith("udkjax") or is_raised) and len(str(error)) > 20
-
-
-def command(name: str, case: Case) -> tuple[str, str]:
-    """Run a command on the saved scene; return "runs" or "refuses", and what was compared, or its message."""
-    printed, said = io.StringIO(), io.StringIO()
-    with tempfile.TemporaryDirectory() as folder:
-        scene = Path(folder) / "scene.toml"
-        udk.save(case.model, scene)  # an element of one's own is refused here
-        words = {"SCENE": str(scene), "DRIVER": str(case.driver), "NUMBER": case.number}
-        words |= {"FIRST": str(float(case.values()[0])), "LAST": str(float(case.values()[-1]))}
-        if name == "sweep":
-            grid = Path(folder) / "grid.toml"
-            value = float(np.ravel(case.model.parameters()[case.number])[0])
-            grid.write_text(
-                f't1 = 0.2\ndt = 0.05\nmeasures = ["final"]\n[axes]\n"{case.number}" = [{value!r}, {1.01 * value!r}]\n'
-            )
-            words["GRID"] = str(grid)
-        if name == "identify":
-            data, body = Path(folder) / "data.csv", case.model.body_names[0]
-            lines = [f"{t!r},{x!r}" for t, x in zip(TS.tolist(), np.asarray(case.alone.q)[:, 0, 2].tolist(), strict=True)]
-            data.write_text("\n".join([f"time,body.{body}.angle", *lines]))
-            words["DATA"] = str(data)
-        arguments = [words.get(x, x.replace("OUT", f"{folder}/out")) for x in COMMANDS[name]]
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
-            try:
-                udkjax_cli([name, *arguments])
-                code = 0
-            except SystemExit as end:
-                code = end.code
-        text = " ".join((said.getvalue() + printed.getvalue()).split())
-        if "Traceback" in text or not text:
-            raise WrongError(f"exit {code}: {text[-200:]}")
-        if code not in (0, None):
-            return "refuses", text
-        if name == "simulate":
-            import xarray
-
-            with xarray.open_dataset(f"{folder}/out.nc", engine="h5netcdf") as data:
-                return "runs", agree(data["q"].values, case.alone.q, "udk.simulate", 1e-5)
-    return "runs", "exit code 0"
 
 
 def cells(minutes: float = 1e9, words: tuple[str, ...] = (), part: tuple[int, int] = (0, 1)) -> Iterator[Cell]:

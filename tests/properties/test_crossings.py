@@ -12,9 +12,11 @@ import pytest
 pytest.importorskip("experiments", reason="not in a source tree")
 
 import udkjax as udk
-from experiments.parts.crossing_functions import FUNCTIONS, WITHOUT_MODEL, Case
+from experiments.parts.crossing_case import Case
+from experiments.parts.crossing_commands import COMMANDS, WITHOUT_SCENE
+from experiments.parts.crossing_functions import FUNCTIONS, WITHOUT_MODEL
 from experiments.parts.crossing_models import MODELS
-from experiments.parts.crossings import COMMANDS, WITHOUT_SCENE, cell, rows
+from experiments.parts.crossings import cell, rows
 from udkjax import cli
 
 # Classes that are no part of a model, by what they are; their own tests cross them with scenes.

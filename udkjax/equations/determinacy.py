@@ -63,6 +63,8 @@ def scaled_jacobian(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
 def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None) -> Float[Array, "k"]:
     """Return the singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
 
+    Derivatives take L and the sizes of the rows, which are those of `analysis`, as constants.
+
     Args:
         mechanism: The scene.
         t: Time (s).

@@ -98,6 +98,8 @@ def singular_values(
 ) -> Float[Array, "k"]:
     """Return the singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
 
+    Derivatives take L and the sizes of the rows, which are those of `analysis`, as constants.
+
     Args:
         mechanism: The mechanism, or a `ConstrainedSystem`, whose J is (Psi_q; phi_v).
         t: Time (s).
