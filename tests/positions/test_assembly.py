@@ -9,7 +9,11 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.choices import fast
 from tests.textbook import terms
+from udkjax.equations import analyse
+from udkjax.equations.dense_rows import DenseRows
+from udkjax.equations.position_closure import close_position
 from udkjax.positions import assembly, native_closing
+from udkjax.positions.closure import close_by_jax
 from udkjax.positions.scene_check import check
 
 
@@ -334,3 +338,17 @@ def test_loads_need_no_derivatives_of_a_closed_state(monkeypatch):
         closed = lambda x, name=name: udk.assemble(pendulum.with_parameters({name: x})).q  # noqa: E731
         jax.jit(jax.jacfwd(closed)).lower(1.0)
         assert bool(asked) == moves, name
+
+
+def test_steps_that_do_not_lower_the_residual_are_halved_alike_by_numpy_and_jax():
+    """Two rods too short to meet approach each other by steps, nearly all of which have to be halved."""
+    rods = {name: udk.Body(1.0, 1 / 12, (x, 0.2), angle) for name, x, angle in (("a", 0.5, 0.3), ("b", 1.5, -0.4))}
+    joints = {"A": udk.Revolute(("ground", "a"), ((0, 0), (-0.5, 0))), "B": udk.Revolute(("a", "b"), ((0.5, 0), (-0.5, 0)))}
+    joints["C"] = udk.Revolute(("ground", "b"), ((2.5, 0), (0.5, 0)))
+    mechanism = udk.Mechanism(rods, joints)
+    found, q = analyse(mechanism), np.ravel(mechanism.q0)
+    rows = DenseRows(mechanism, found.scales)
+    by_numpy = close_position(rows, 0.0, np.asarray(q), np)
+    by_jax = jax.jit(lambda q: close_by_jax(mechanism, found, jnp.zeros(()), q, 0.0 * q)[0])(q)
+    assert np.linalg.norm(rows.residual(0.0, by_numpy)) < 0.8 * np.linalg.norm(rows.residual(0.0, np.asarray(q)))
+    assert_allclose(by_jax, by_numpy, rtol=0, atol=1e-12)

@@ -9,6 +9,7 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
+from udkjax.positions import continuation
 from udkjax.positions.continuation import Reached
 from udkjax.positions.curve import NumpyCurve
 from udkjax.positions.drive import drive
@@ -657,3 +658,14 @@ def test_a_value_of_the_guess_is_reached_near_a_toggle():
         )
         found = udk.kinematics(scene, "body.slider.x", [2 * c])
         np.testing.assert_allclose(found.q[0, 0, 2], angle, rtol=1e-9 / height)
+
+
+def test_each_value_adds_to_the_steps_that_continuation_may_take(monkeypatch):
+    """Many values in one call are reached as the same values one by one."""
+    monkeypatch.setattr(continuation, "MAX_TRIALS", 10)
+    mech = udk.library.four_bar()
+    driven, q = drive(mech, "body.crank.angle"), np.ravel(udk.assemble(mech).q)
+    start = float(driven.value(q))
+    values = start + np.linspace(0.05, 1.5, 30)
+    points = continuation.follow(NumpyCurve.of(driven), np.asarray(start), q, values, continuation.no_points(30, len(q), np), 0)
+    assert np.all(points.status == Reached.closed)

@@ -244,6 +244,14 @@ def start_of(mechanism, driver):
     return float(drive(mechanism, driver).value(mechanism.q0))
 
 
+def test_a_free_start_of_given_values_is_an_unknown():
+    """Without values there is no start, and a given start is not sought."""
+    targets, values = [[6, 12], [4, 10], [2, 8]], [0.0, 0.5, 1.0]
+    goals = [udk.PathGoal("P", targets), udk.PathGoal("P", targets, values), udk.PathGoal("P", targets, values, "free")]
+    problems = [udk.DesignSearch(FOUR_BAR, goal, ["pin.P"], rotation=False).problem for goal in goals]
+    assert [problem.unknowns - problem.free.count for problem in problems] == [0, 0, 1]
+
+
 @pytest.mark.slow
 def test_geared_cam_and_redundant_mechanisms_are_designed():
     places = np.array([[0, 0], [2, 1], [3, 3], [1, 4], [-1, 3], [0, 0.0]])
