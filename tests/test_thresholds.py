@@ -1,6 +1,7 @@
 """Thresholds and limits of repetitions ten times as large or as small leave motions and verdicts as they are."""
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import jax
@@ -22,9 +23,13 @@ from tests.integrate.test_own_system_events import coupled, swung
 from tests.integrate.test_sticking import block, oscillator, sticking
 from tests.native.test_implicit_stages import damped
 from tests.statics.test_holding import clamp, cranks, wedge
+from tests.study.test_geared_freedoms import MECHANISMS, mechanism_of
 from tests.synthesis.test_design import FOUR_BAR
 from tests.ten_times import multiplied
+from udkjax.equations.analysis import _with_rank_tol
+from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.redundancy import examine_rows
+from udkjax.equations.scales import concrete_scales
 from udkjax.integrate.solvers import method_of
 from udkjax.native.base.steps import LIMIT, STABLE
 
@@ -40,6 +45,18 @@ def held_pins() -> dict[str, Any]:
     scenes["flat"] = udk.library.parallelogram(1e-3)  # near a singular configuration
     rows = {name: examine_rows(mechanism) for name, mechanism in scenes.items()}
     return {name: (found.redundant, [pin.name for pin in found.held]) for name, found in rows.items()}
+
+
+def geared_rows() -> dict[str, Any]:
+    """Gears of large ratios: their redundant rows and units, and the velocities that a motor at the slow end gives."""
+    found: dict[str, Any] = {}
+    for kind, driven in product(MECHANISMS, ("first", "last")):
+        mechanism = mechanism_of(kind, driven, 1e5, 1.0)
+        rows = examine_rows(mechanism)
+        scales = _with_rank_tol(mechanism, concrete_scales(mechanism), rows)
+        *_, psi, rates, rank = DenseRows(mechanism, scales).assemble(0.0, np.ravel(mechanism.q0), np.zeros(mechanism.q0.size))
+        found[f"{kind}, {driven}"] = rows.redundant, rank, bool(max(np.abs(psi).max(), np.abs(rates).max()) < 1e-9)
+    return found
 
 
 def impacts_of_systems() -> dict[str, Any]:
@@ -161,6 +178,9 @@ def rests() -> dict[str, Any]:
 CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = {
     "FITS": (held_pins, ("equations.stationary_rows.FITS",), 0.0),
     "SMALL": (held_pins, ("equations.stationary_rows.SMALL",), 0.0),
+    "SAME": (geared_rows, ("equations.balance.SAME",), 0.0),
+    "ANCHOR": (geared_rows, ("equations.balance.ANCHOR",), 0.0),
+    "GEARED_SHARE": (geared_rows, ("equations.analysis.GEARED_SHARE",), 0.0),
     "BLOCKED_IN_SYSTEM": (impacts_of_systems, ("integrate.events.impacts.BLOCKED_IN_SYSTEM",), 0.0),
     "LONGEST": (feet_in_turns, ("integrate.events.hops.LONGEST",), 1e-9),
     "MOST_ROWS": (matrices_in_forces, ("expressions.matrix_rules.MOST_ROWS",), 1e-8),

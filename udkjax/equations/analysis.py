@@ -25,6 +25,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.arrays import is_traced, make_module, number
+from udkjax.equations.balance import BalancedUnits
+from udkjax.equations.dense_rows import DenseRows
 from udkjax.equations.redundancy import FoundRows, examine_rows
 from udkjax.equations.scales import Scales, concrete_scales, traced_scales
 from udkjax.equations.scene_programs import scene_programs
@@ -35,6 +37,9 @@ from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
+# Rank tolerance, relative to the smallest nonzero singular value of a generic position, where gears make it small. As in a scene
+# without gears, it is then about a hundredth of the usual values.
+GEARED_SHARE = 1e-2
 ANALYSIS_CACHE_SIZE = 256  # stored analyses; the least recently used one is dropped
 
 
@@ -46,6 +51,7 @@ class Analysis(PrintsTable):
         coordinates: number of coordinates.
         row_names: for each row of Psi, its constraint and its index within that constraint.
         redundant_rows: indices of the rows that depend on others; None: unknown.
+        balance: factors of the units of rows and coordinates in which ranks are counted, powers of ten; None: all are one.
         only_switched: whether all dependent rows belong to constraints that are switched off.
     """
 
@@ -54,6 +60,7 @@ class Analysis(PrintsTable):
     row_names: tuple[tuple[str, int], ...] = eqx.field(static=True)  # for each row of Psi: its constraint, its index in it
     # Rows of Psi to leave out; None if unknown: the guess cannot be closed or moved, or all numbers are traced.
     redundant_rows: tuple[int, ...] | None = eqx.field(static=True)
+    balance: BalancedUnits | None = eqx.field(static=True)
     only_switched: bool = eqx.field(static=True, default=False)
 
     def _table(self) -> PrintedTable:
@@ -94,6 +101,17 @@ class Analysis(PrintsTable):
         return None if self.rank is None else self.coordinates - self.rank
 
     @property
+    def row_units(self) -> Any:
+        """The units of rows (m,) in which ranks are counted."""
+        return self.scales.rows if self.balance is None else self.scales.rows * np.asarray(self.balance.rows)
+
+    @property
+    def coordinate_units(self) -> Any:
+        """The units of coordinates (n,) in which ranks are counted: L, L and one radian for each body, by the balance."""
+        units = self.scales.coordinates(self.coordinates)
+        return units if self.balance is None else units * np.asarray(self.balance.coordinates)
+
+    @property
     def length(self) -> Float[Array, ""]:
         """The characteristic length (m)."""
         return self.scales.length
@@ -120,7 +138,7 @@ class Analysis(PrintsTable):
         own = (concrete_scales if mechanism.is_concrete else traced_scales)(mechanism)
         xp = jnp if is_traced((self.scales, own)) else np
         scales = self.scales._replace(rows=own.rows, rank_tol=xp.minimum(self.scales.rank_tol, own.rank_tol))
-        return Analysis(jax.tree.map(number, scales), self.coordinates, _row_names(mechanism), None, only_switched)
+        return Analysis(jax.tree.map(number, scales), self.coordinates, _row_names(mechanism), None, None, only_switched)
 
 
 @checked
@@ -140,10 +158,13 @@ def analyse(mechanism: Mechanism) -> Analysis:
     """
     if not mechanism.is_concrete:
         if mechanism.origin is not None:
-            return replace(analyse(mechanism.origin.mechanism), scales=traced_scales(mechanism))
+            known, own = analyse(mechanism.origin.mechanism), traced_scales(mechanism)
+            if known.balance is not None:
+                own = own._replace(rank_tol=jnp.minimum(own.rank_tol, known.scales.rank_tol))
+            return replace(known, scales=own)
         mechanism = mechanism.without_origin
         count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
-        return Analysis(traced_scales(mechanism), count, names, _rows_of_concrete_geometry(mechanism))
+        return Analysis(traced_scales(mechanism), count, names, *_rows_of_concrete_geometry(mechanism))
     return _analyse_concrete(mechanism)
 
 
@@ -183,11 +204,27 @@ _found_rows: _Cache[FoundRows] = _Cache()
 
 def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
     with jax.ensure_compile_time_eval():  # also during a trace
-        scales = concrete_scales(mechanism)
-        rows = _rows_of(mechanism, kind).redundant
+        found = _rows_of(mechanism, kind)
+        scales = _with_rank_tol(mechanism, concrete_scales(mechanism), found)
         names, count = _row_names(mechanism), 3 * len(mechanism.body_names)
-        known: dict[str, Any] = {"coordinates": count, "row_names": names, "redundant_rows": rows, "only_switched": False}
+        known: dict[str, Any] = {
+            "coordinates": count,
+            "row_names": names,
+            "redundant_rows": found.redundant,
+            "only_switched": False,
+        }
+        known["balance"] = found.balance
         return make_module(Analysis, scales=scales, **known)
+
+
+def _with_rank_tol(mechanism: Mechanism, scales: Scales, found: FoundRows) -> Scales:
+    """Return the scales with a rank tolerance of D below the singular values that gears make small in any position."""
+    if found.position is None or found.redundant is None:
+        return scales
+    rows = DenseRows(mechanism, scales)
+    sigma = np.linalg.svd(rows.weights[:, None] * rows.jacobian(0.0, found.position) * rows.metric, compute_uv=False)
+    smallest = sigma[rows.count - len(found.redundant) - 1] / sigma[0]
+    return scales._replace(rank_tol=number(min(float(scales.rank_tol), GEARED_SHARE * smallest)))
 
 
 def _rows_of(mechanism: Mechanism, kind: Hashable) -> FoundRows:
@@ -218,13 +255,14 @@ def _held_pins(mechanism: Mechanism) -> tuple[HeldPin, ...]:
         return _rows_of(mechanism, structure(mechanism)).held
 
 
-def _rows_of_concrete_geometry(mechanism: Mechanism) -> tuple[int, ...] | None:
-    """Return the redundant rows of a mechanism with traced masses or loads; None if its geometry is traced as well."""
+def _rows_of_concrete_geometry(mechanism: Mechanism) -> tuple[tuple[int, ...] | None, BalancedUnits | None]:
+    """Return redundant rows and balance of a mechanism with traced masses or loads; None if its geometry is traced as well."""
     with jax.ensure_compile_time_eval():
         if is_traced(_geometry(mechanism)):
-            return None
+            return None, None
         concrete = jax.tree.map(lambda x: np.ones(np.shape(x)) if isinstance(x, Tracer) else x, mechanism)
-        return _analyse(concrete, structure(mechanism)).redundant_rows
+        found = _analyse(concrete, structure(mechanism))
+        return found.redundant_rows, found.balance
 
 
 def _geometry(mechanism: Mechanism) -> PyTree[Array]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
+from udkjax.equations.balance import balance_of
 from udkjax.equations.dense_pseudoinverse import FactoredPseudoinverse, TruncatedPseudoinverse, dense_pseudoinverse
 from udkjax.equations.eliminated_steps import EliminatedSteps
 from udkjax.equations.loads import mass_of
@@ -150,6 +151,7 @@ class DenseRows(DenseTerms):
         super().__init__(mechanism)
         self.scales = jax.tree.map(np.asarray, scales)
         self.metric, self._tol = 1 / np.sqrt(self.mass), float(scales.rank_tol)
+        self.weights = self.scales.weights
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi and Psi_dot."""
@@ -158,16 +160,20 @@ class DenseRows(DenseTerms):
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
         return self.psi(t, q) / self.scales.rows
 
+    def step_size(self, step: np.ndarray) -> float:
+        """Return the largest component of a step (n,), in rad or characteristic lengths."""
+        return float(self.scales.size(step, np))
+
     def jacobian(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Return Psi_q (m, n)."""
         return self.slopes(t, q)[0]
 
     def plus(self, t: Time, q: np.ndarray) -> FactoredPseudoinverse | TruncatedPseudoinverse:
         """Return D^+ of weighted rows in the metric."""
-        return dense_pseudoinverse(self.scales.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
+        return dense_pseudoinverse(self.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return -self.metric * (self.plus(t, q) @ (self.scales.weights * self.psi(t, q)))
+        return -self.metric * (self.plus(t, q) @ (self.weights * self.psi(t, q)))
 
     def assemble(self, t: Time, q: np.ndarray, v: np.ndarray) -> Assembly[np.ndarray]:
         """Return closed q, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
@@ -176,7 +182,7 @@ class DenseRows(DenseTerms):
         q = close_position(self, t, q, np)
         plus = self.plus(t, q)
         for _ in range(CLOSURE.velocities):
-            v = v - self.metric * (plus @ (self.scales.weights * self.geometry(t, q, v)[1]))
+            v = v - self.metric * (plus @ (self.weights * self.geometry(t, q, v)[1]))
         return q, v, *self.violation(t, q, v), plus.rank
 
 
@@ -215,17 +221,30 @@ class DensePosition(NamedTuple):
 
 
 class KinematicRows(DenseRows, PositionRows[DensePosition]):
-    """The rows of a mechanism with concrete numbers in the metric (A, A, 1) for each body, with A the longest lever arm."""
+    """The rows of a mechanism with concrete numbers in the metric (A, A, 1) for each body, with A the longest lever arm.
+
+    Where gears make some coordinates move much further than others, metric and rows are balanced (balance.py).
+    """
 
     def __init__(self, mechanism: Mechanism):
         super().__init__(mechanism, concrete_scales(mechanism))
         self.metric = np.tile([float(self.scales.arm), float(self.scales.arm), 1.0], self.size // 3)
+        self.balance = balance_of(mechanism)
+        if self.balance is not None:
+            self.metric, self.weights = self.metric * self.balance.coordinates, self.weights / self.balance.rows
         self.driver_time_step = driver_time_step(self.scales)
         self._steps: EliminatedSteps | None = None
 
     def leave_out(self, redundant_rows: tuple[int, ...]) -> None:
         """Eliminate coordinates in corrections where all other rows are clearly independent; the steps are the same."""
-        self._steps = self.eliminated_steps(redundant_rows, float(self.scales.arm))
+        if self.balance is None:
+            self._steps = self.eliminated_steps(redundant_rows, float(self.scales.arm))
+
+    def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
+        return super().residual(t, q) if self.balance is None else super().residual(t, q) / self.balance.rows
+
+    def step_size(self, step: np.ndarray) -> float:
+        return super().step_size(step if self.balance is None else step / self.balance.coordinates)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         found = self._steps and self._steps(np.asarray(t, float).item(), q)

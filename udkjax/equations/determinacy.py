@@ -4,7 +4,8 @@ If N spans the null space of Psi_q^T, lambda + N y satisfies M a + Psi_q^T lambd
 unique if and only if c^T N = 0, and a single multiplier if its row of N is zero.
 
 Rank and null space are those of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...) (`Scales`), with lengths in units
-of the characteristic length, angles in radians, and each row divided by its scale; masses do not enter. All functions are pure
+of the characteristic length, angles in radians, and each row divided by its scale; masses do not enter. Where gears make some
+coordinates move much further than others, the units are balanced (balance.py). All functions are pure
 and may be mapped over states (`jax.vmap`); without an `analysis` the scales are computed from the mechanism.
 """
 
@@ -18,7 +19,6 @@ from udkjax.annotations import NumberLike
 from udkjax.equations import constraints
 from udkjax.equations.analysis import Analysis, analyse
 from udkjax.equations.constraints import BodyArray
-from udkjax.equations.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
 # Rank tolerance of statics, relative to the largest singular value. The tolerance of motion, `RANK_TOL`, is larger because runs
@@ -56,8 +56,8 @@ def scaled_jacobian(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
     Returns:
         J (m, n).
     """
-    scales = _scales(mechanism, analysis)
-    return constraints.psi_q(mechanism, t, q) * scales.coordinates(3 * len(mechanism.body_names)) / scales.rows[:, None]
+    found = analyse(mechanism) if analysis is None else analysis
+    return constraints.psi_q(mechanism, t, q) * found.coordinate_units / found.row_units[:, None]
 
 
 def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None) -> Float[Array, "k"]:
@@ -122,7 +122,3 @@ def unique_direction(null_rows: np.ndarray) -> float | None:
     u, sigma, _ = np.linalg.svd(np.pad(null_rows, ((0, 0), (0, 2))))
     loose = int(np.sum(sigma > UNIQUE_TOL))
     return float(np.arctan2(u[1, 1], u[0, 1]) % np.pi) if loose == 1 else None
-
-
-def _scales(mechanism: Mechanism, analysis: Analysis | None) -> Scales:
-    return (analyse(mechanism) if analysis is None else analysis).scales

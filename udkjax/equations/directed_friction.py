@@ -122,7 +122,7 @@ class DirectedMechanism(NamedTuple):
             A mask of the joints.
         """
         scales = analysis.scales
-        units, unit = scales.coordinates(q.shape[1]), self.units(scales.length)
+        units, unit = analysis.coordinate_units, self.units(scales.length)
 
         def at(t: Array, q: Array, v: Array) -> Array:
             J = determinacy.scaled_jacobian(self.mechanism, t, q, analysis)
@@ -130,7 +130,7 @@ class DirectedMechanism(NamedTuple):
             rows = jax.jacfwd(self.sliding_speeds, 1)(q, v) * units / unit[:, None]
             free = rows - (plus.T @ rows.T).T @ J
             is_determined = jnp.sum(free**2, axis=1) <= AT_REST.blocked * jnp.sum(rows**2, axis=1)
-            a = units * (plus @ (constraints.gamma(self.mechanism, t, q, v) / scales.rows))
+            a = units * (plus @ (constraints.gamma(self.mechanism, t, q, v) / analysis.row_units))
             speed, rate = jax.jvp(self.sliding_speeds, (q, v), (v, a))
             slow = AT_REST.closed * scales.rate * unit
             return is_determined & (jnp.abs(speed) <= slow) & (jnp.abs(rate) <= slow * scales.rate)

@@ -66,7 +66,8 @@ def _units_of(analysis: Analysis) -> _Units:
     load = float(scales.mass * (scales.length * scales.rate) ** 2)
     independent = None if analysis.redundant_rows is None else np.array(analysis.independent_rows, int)
     redundant = np.array(analysis.redundant_rows or (), int)
-    return _Units(scales.weights, np.asarray(scales.coordinates(analysis.coordinates)), load, independent, redundant)
+    weights = scales.length / np.asarray(analysis.row_units)
+    return _Units(weights, np.asarray(analysis.coordinate_units), load, independent, redundant)
 
 
 def _efforts_at(

@@ -9,7 +9,7 @@ are closed by NumPy, without compilation; traced numbers take the same steps in 
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import equinox as eqx
 import jax
@@ -77,6 +77,14 @@ class Rows(Protocol[AnyArray]):
         ...
 
 
+class ConcreteRows(Rows[np.ndarray], Protocol):
+    """The rows of Psi of concrete numbers."""
+
+    def step_size(self, step: np.ndarray) -> float:
+        """Return the largest component of a step (n,), in rad or characteristic lengths."""
+        ...
+
+
 def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """Return the residual that rounding of the coordinates causes."""
     return CLOSURE.rounding * float(np.finfo(q.dtype).eps) * xp.maximum(1.0, scales.size(q, xp))
@@ -123,7 +131,7 @@ def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array) -> tuple[jax.Array
 def close_position(rows: Rows[Any], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
     """Take steps until the residual is at rounding level, or no step lowers it."""
     if xp is np:
-        *_, (closed, _) = _positions_by_numpy(rows, t, q)
+        *_, (closed, _) = _positions_by_numpy(cast(ConcreteRows, rows), t, q)
         return closed
 
     def goes_on(state: tuple[Any, jax.Array, int]) -> jax.Array:
@@ -137,7 +145,7 @@ def close_position(rows: Rows[Any], t: Time, q: AnyArray, xp: ArrayLibrary = jnp
     return jax.lax.while_loop(goes_on, body, (q, jnp.asarray(True), 0))[0]
 
 
-def _positions_by_numpy(rows: Rows[Any], t: Time, q: Any) -> Iterator[tuple[Any, float]]:
+def _positions_by_numpy(rows: ConcreteRows, t: Time, q: Any) -> Iterator[tuple[Any, float]]:
     """Take the steps of `close_position` by NumPy; return the first position and that after each step, with their residuals."""
     size = _norm(rows.residual(t, q))
     yield q, size
@@ -145,7 +153,7 @@ def _positions_by_numpy(rows: Rows[Any], t: Time, q: Any) -> Iterator[tuple[Any,
         if not size > rounding(rows.scales, q, np):
             return
         step = rows.correction(t, q)
-        longest = rows.scales.size(step, np)
+        longest = rows.step_size(step)
         if longest > CLOSURE.longest_step:
             step = step * (CLOSURE.longest_step / longest)
         for _ in range(CLOSURE.halvings):
@@ -164,7 +172,7 @@ def _norm(x: np.ndarray) -> float:
     return math.sqrt(x @ x)
 
 
-def try_to_close(rows: Rows[np.ndarray], t: Time, q: np.ndarray) -> np.ndarray:
+def try_to_close(rows: ConcreteRows, t: Time, q: np.ndarray) -> np.ndarray:
     """Close a position that may not exist, by NumPy: give up when the remaining steps would not suffice at the current rate.
 
     A successful closure converges fastest in its last steps. If the position does not exist, the residual keeps falling, but ever

@@ -76,6 +76,10 @@ class PositionRows(ABC, Generic[Position]):
         """Return Psi, each row divided by its scale."""
 
     @abstractmethod
+    def step_size(self, step: np.ndarray) -> float:
+        """Return the largest component of a step (n,), in rad or characteristic lengths."""
+
+    @abstractmethod
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         """Return -W D^+ Psi."""
 
@@ -111,7 +115,7 @@ class PositionRows(ABC, Generic[Position]):
             heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(self.size) / np.sqrt(self.size)
             heading = last.tangent_part(heading)  # keep the direction, so that the motion covers the range
             step = self.metric * heading
-            moved = last.q + CLOSURE.longest_step * step / max(self.scales.size(step, np), 1e-300)
+            moved = last.q + CLOSURE.longest_step * step / max(self.step_size(step), 1e-300)
             position = self.close(time_step * (k + 1), moved, give_up=True)
             if position is None or not position.is_clear or not np.any(heading):  # stuck: jump
                 heading, jump = random.standard_normal(self.size), random.uniform(-1.0, 1.0, self.size)

@@ -256,7 +256,7 @@ def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
     rows = [name for name, _ in analysis.row_names]
     unit = jnp.stack([1.0, 1.0, analysis.length])
     unique, rows_of = partial(_is_unique, unit=unit, xp=jnp), _rows_by_owner(rows)
-    by_body = _split_by_body(mechanism, rows, q, Psi_q / analysis.scales.rows[:, None], lambda c: c, frame, about)
+    by_body = _split_by_body(mechanism, rows, q, Psi_q / analysis.row_units[:, None], lambda c: c, frame, about)
     return [
         [unique(coefficients, N[:, np.array(rows_of[name])]) for coefficients in loads.values()]
         for name, loads in by_body.items()
@@ -286,7 +286,7 @@ def _uniqueness_by_numpy(
 ) -> list[list[Array]]:
     """Return the results of `_uniqueness_of_loads`."""
     arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
-    rows_of, scales = _rows_by_owner(rows), np.asarray(analysis.scales.rows)
+    rows_of, scales = _rows_by_owner(rows), np.asarray(analysis.row_units)
     unit = np.stack([1.0, 1.0, float(analysis.length)])
 
     def of_piece(ts: np.ndarray, q: np.ndarray) -> ByBody:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.equations.balance import BalancedUnits, balance_of
 from udkjax.equations.dense_rows import KinematicRows
 from udkjax.equations.position_closure import CLOSURE
 from udkjax.equations.position_rows import NEGLIGIBLE_SHARE, PositionRows
@@ -17,6 +18,8 @@ class FoundRows(NamedTuple):
 
     redundant: tuple[int, ...] | None  # the rows to leave out; None if the guess cannot be closed or moved
     held: tuple[HeldPin, ...]  # the pins that rows hold to second order only
+    balance: BalancedUnits | None  # factors of the units in which ranks are counted; None: all are one
+    position: np.ndarray | None = None  # with a balance: a closed position with the largest rank
 
 
 @np.errstate(all="ignore")  # non-finite coordinates are not closed
@@ -24,11 +27,13 @@ def examine_rows(mechanism: Mechanism) -> FoundRows:
     """Find redundant rows, and pins held to second order. All numbers are concrete."""
     rows = kinematic_rows(mechanism)
     if not rows.count:
-        return FoundRows((), ())
+        return FoundRows((), (), None)
     q = np.asarray(mechanism.q0, float).ravel()
     positions = rows.sample(q)
     redundant = rows.redundant(positions) if positions else None
-    return FoundRows(redundant, held_pins(mechanism, rows, q, len(redundant or ())) if isinstance(rows, KinematicRows) else ())
+    held = held_pins(mechanism, rows, q, len(redundant or ())) if isinstance(rows, KinematicRows) else ()
+    balance = balance_of(mechanism)
+    return FoundRows(redundant, held, balance, positions[-1].q if positions and balance else None)
 
 
 def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
@@ -61,7 +66,7 @@ def generic_position(mechanism: Mechanism) -> np.ndarray | None:
     if start is None:
         return None
     step = rows.metric * start.tangent_part(random)
-    size = rows.scales.size(step, np)
+    size = rows.step_size(step)
     moved = rows.close(0.0, start.q + CLOSURE.longest_step * step / size) if size > 0 else None
     return start.q if moved is None else moved.q
 

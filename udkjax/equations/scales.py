@@ -85,6 +85,7 @@ class UnitScales(Scales):
         return xp.max(xp.abs(q), initial=0.0)
 
 
+@cached_by_identity
 def concrete_scales(mechanism: Mechanism) -> Scales:
     """Return the scales of a mechanism with concrete numbers, by NumPy."""
     numbers = np.append(concrete_numbers(mechanism), NO_THRESHOLDS)

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
+from udkjax.equations.balance import balance_of
 from udkjax.equations.dense_rows import CLEAR_TOL, RowTerms
 from udkjax.equations.loads import mass_of
 from udkjax.equations.position_closure import CLOSURE, Assembly, close_position, driver_time_step, is_closed, try_to_close
@@ -105,6 +106,9 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
         self.scales = jax.tree.map(np.asarray, concrete_scales(mechanism))
         arm = float(self.scales.arm)
         self.metric = np.tile([arm, arm, 1.0], self.size // 3) if kinematic else 1 / np.sqrt(mass_of(mechanism, np))
+        self.balance = balance_of(mechanism) if kinematic else None
+        if self.balance is not None:
+            self.metric = self.metric * self.balance.coordinates
         self.driver_time_step = driver_time_step(self.scales)
 
     @cached_property
@@ -129,8 +133,12 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
         length[length <= ROUNDING * np.max(length, initial=0.0)] = 1.0  # rounding errors are not scaled up
         return csr_array((values / length[rows], self.entries), shape=(self.count, self.size)), length
 
+    def step_size(self, step: np.ndarray) -> float:
+        return float(self.scales.size(step if self.balance is None else step / self.balance.coordinates, np))
+
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
-        return self.psi(t, q) / self.scales.rows
+        residual = self.psi(t, q) / self.scales.rows
+        return residual if self.balance is None else residual / self.balance.rows
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
         psi, length, D = self.at(t, q)

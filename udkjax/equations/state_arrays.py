@@ -134,8 +134,7 @@ class StateArrays:
 
     def scaled_jacobian(self, t: np.ndarray, q: np.ndarray, analysis: Analysis) -> np.ndarray:
         """Return J = diag(1 / rows) Psi_q diag(L, L, 1, ...) (T, m, n), zero where q is not finite."""
-        scales = analysis.scales
-        J = self.jacobian(t, q) * np.asarray(scales.coordinates(self.size)) / np.asarray(scales.rows)[:, None]
+        J = self.jacobian(t, q) * np.asarray(analysis.coordinate_units) / np.asarray(analysis.row_units)[:, None]
         return np.where(np.isfinite(J).all((1, 2), keepdims=True), J, 0.0)
 
     def left_null_space(self, t: np.ndarray, q: np.ndarray, analysis: Analysis, rank_tol: float) -> tuple[np.ndarray, np.ndarray]:

@@ -155,7 +155,7 @@ def _motion(mechanism: Mechanism, start: DensePosition) -> Iterator[DensePositio
         if last is None:
             return
         step = rows.metric * last.tangent_part(heading)
-        size = rows.scales.size(step, np)
+        size = rows.step_size(step)
         t = rows.driver_time_step * (k + 1)
         moved = rows.close(t, last.q + (CLOSURE.longest_step * step / size if size > CLEAR_TOL else 0.0), give_up=True)
         last = last if moved is None else moved

@@ -91,7 +91,7 @@ def reactions_at(
         row: the row of the coordinate in Psi.
     """
     directed, scales = DirectedFriction.put_in(mechanism, every=True), analysis.scales
-    still, units = jnp.zeros_like(q), scales.coordinates(len(q))
+    still, units = jnp.zeros_like(q), analysis.coordinate_units
     J = determinacy.scaled_jacobian(mechanism, t, q, analysis)
     identity = jnp.eye(len(J))
     plus = uk.pseudoinverse(SVD(determinacy.STATIC_RANK_TOL), J) @ identity
@@ -106,9 +106,9 @@ def reactions_at(
     left = unbalanced(friction)
     takes_part = jnp.linalg.norm(left, axis=0) <= UNBALANCED * jnp.linalg.norm(friction, axis=0)
     found = Reactions(
-        multipliers=(plus.T @ force) / scales.rows,
-        by_friction=jnp.where(takes_part, plus.T @ friction, 0.0) / scales.rows[:, None],
-        internal=(identity - J @ plus) / scales.rows[:, None],
+        multipliers=(plus.T @ force) / analysis.row_units,
+        by_friction=jnp.where(takes_part, plus.T @ friction, 0.0) / analysis.row_units[:, None],
+        internal=(identity - J @ plus) / analysis.row_units[:, None],
         units=joint_units,
         row=row,
         scale=scale,

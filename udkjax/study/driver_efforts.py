@@ -59,7 +59,7 @@ def _by_jax(
     mechanism: Mechanism, analysis: Analysis, values: Sequence[Coordinate], w: Array, ts: Array, q: States, v: States, a: States
 ) -> Efforts:
     scales = analysis.scales
-    units, share = scales.coordinates(analysis.coordinates), 1 / jnp.sqrt(w)
+    units, share, weights = analysis.coordinate_units, 1 / jnp.sqrt(w), scales.length / analysis.row_units
     coordinates = [value_of(mechanism, element) for element in values]
     directed = DirectedFriction.put_in(mechanism)
     fastest = jax.lax.stop_gradient(scales.size(jnp.where(jnp.isfinite(v), v, 0.0)))
@@ -71,7 +71,7 @@ def _by_jax(
         sides = jax.lax.stop_gradient(jnp.stack([jnp.where(moves, jnp.sign(speed), 0.0), jnp.zeros(len(speed))], axis=-1))
         mechanism = directed.with_sides(sides)
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
-        J = scales.weights[:, None] * constraints.psi_q(mechanism, t, q) * units
+        J = weights[:, None] * constraints.psi_q(mechanism, t, q) * units
         free, determined = _free_part(J), jnp.asarray(True)
         given = loads.mass(mechanism) * a - loads.force(mechanism, t, q, v)
         if analysis.rank is not None:  # otherwise the number of degrees of freedom is unknown
@@ -88,7 +88,7 @@ def _by_jax(
 
         def multipliers(friction: Array) -> Array:
             carried = units * (given - friction - C.T @ efforts(friction))
-            return jnp.zeros(0) if bearing is None else -scales.weights * (bearing.T @ carried)
+            return jnp.zeros(0) if bearing is None else -weights * (bearing.T @ carried)
 
         friction = directed.friction(sides, multipliers, t, q, v)
         required, f = free(units * (given - friction)), efforts(friction)

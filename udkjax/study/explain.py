@@ -112,7 +112,7 @@ def _symbols(
         "a": a,
         "multipliers": multipliers,
         "unique": determinacy.uniqueness(mechanism, t, q, analysis).unique,
-        "null_rows": determinacy.left_null_space(mechanism, t, q, analysis).basis / analysis.scales.rows[:, None],
+        "null_rows": determinacy.left_null_space(mechanism, t, q, analysis).basis / analysis.row_units[:, None],
     }
 
 

@@ -160,6 +160,8 @@ class RankedPositions:
         length = float(rows.scales.length)
         self.unit = np.tile([length, length, 1.0], rows.size // 3)
         self.row_unit = np.asarray(rows.scales.rows, float)
+        if rows.balance is not None:
+            self.unit, self.row_unit = self.unit * rows.balance.coordinates, self.row_unit * rows.balance.rows
 
     def at(self, t: float, q: np.ndarray) -> Configuration:
         """Return the configuration at closed coordinates."""

@@ -101,6 +101,7 @@ def diagnose(
         changes = [fix_of_held_pin(mechanism, positions, current, *x) for x in joints]
         redundancies[k] = r._replace(fixes=tuple(x for x in changes if x), held=tuple(pin.name for pin in pins))
     redundancies += [Redundancy(d.constraints, d.redundancy, False, ()) for d in momentary]
+    loose = current.left / positions.row_unit[:, None]  # multipliers in equilibrium without loads
     of_joints = [k for k, name in enumerate(owners) if name in mechanism.joints]
     return Diagnosis(
         mechanism=mechanism,
@@ -121,7 +122,7 @@ def diagnose(
         clearance=clearance(positions, current, generic_rank, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
         held=tuple(pin.name for pin in held),
-        friction=joint_friction(prepare(mechanism, SVD()), current.t, current.q, current.left),
+        friction=joint_friction(prepare(mechanism, SVD()), current.t, current.q, loose * np.asarray(rows.scales.rows)[:, None]),
     )
 
 

@@ -119,7 +119,7 @@ def _inside(line: np.ndarray, space: np.ndarray) -> bool:
 
 def _follow(positions: RankedPositions, at: Configuration, tangents: np.ndarray, dimension: int) -> Branch:
     tangent = tangents @ np.ones(tangents.shape[1]) / np.sqrt(tangents.shape[1])
-    size = positions.rows.scales.size(positions.unit * tangent, np)
+    size = positions.rows.step_size(positions.unit * tangent)
     tangent = tangent / size * np.sign(tangent[np.argmax(np.abs(tangent))])
     tangent[np.abs(tangent) < DOUBLE_ZERO] = 0.0
     ends = [positions.displace(at, tangent, side * STEP_LENGTH) for side in (1.0, -1.0)]
@@ -127,7 +127,9 @@ def _follow(positions: RankedPositions, at: Configuration, tangents: np.ndarray,
         end for end, side in zip(ends, (1.0, -1.0), strict=True) if _reaches(positions, at, end, side * STEP_LENGTH * tangent)
     ]
     rank = max((end.rank for end in reached if end is not None), default=at.rank)
-    return Branch((positions.unit * tangent).reshape(-1, 3), dimension, rank, len(reached) == 2)
+    displacement = positions.unit * tangent
+    displacement = displacement / positions.rows.scales.size(displacement, np)
+    return Branch(displacement.reshape(-1, 3), dimension, rank, len(reached) == 2)
 
 
 def _reaches(positions: RankedPositions, at: Configuration, end: Configuration | None, tangent: np.ndarray) -> bool:
