@@ -119,7 +119,7 @@ class Case:
 
     @property
     def rate(self) -> float:
-        return 1.0 if not self.model.driver_names else float(np.diff(self.values(2))[0]) / 0.05
+        return 1.0 if self.is_system or not self.model.driver_names else float(np.diff(self.values(2))[0]) / 0.05
 
     def values(self, count: int = 4) -> np.ndarray:
         """Values of the driver near the start."""
@@ -130,6 +130,15 @@ class Case:
             with jax.ensure_compile_time_eval():  # within `jit`, too
                 return np.array([float(motion(t)) for t in np.linspace(0.0, 0.05, count)])
         return float(np.asarray(self.state.q)[0, 2]) + np.linspace(0.0, 0.05, count)
+
+    @cached_property
+    def output(self) -> str:
+        """The angle that turns most while the first body, or the driven one, moves."""
+        if self.is_system:
+            return "q[0]"
+        rates = np.abs(np.asarray(self.kinematics(self.model, 1, rate=1.0).v)[0, :, 2])
+        rates[0] *= 1e-3  # often the driver itself
+        return f"body.{self.model.body_names[int(np.argmax(rates))]}.angle"
 
     def kinematics(self, m: Any, count: int = 4, **more: Any) -> udk.Kinematics:
         return udk.kinematics(m, self.driver, self.values(count), held=self.held, **more)
@@ -202,8 +211,9 @@ def transformed(function: Function, tol: float = 1e-7, slope_tol: float = 1e-4) 
         for k in (0, 1):
             agree([y[k] for y in found], eager[k], "eager calls (jit, vmap)", tol)
         wanted = [(b - a) / (2 * STEP) for a, b in zip(*eager[2:], strict=True)]
-        agree([y[0] / s for y, s in zip(slopes, sizes, strict=True)], [y / s for y, s in zip(wanted, sizes, strict=True)],
-              "differences (jvp)", slope_tol)  # fmt: skip
+        # A relative change of 1 for a relative change of 1 is the scale of derivatives: less is rounding of the differences.
+        relative = [[1.0 + y / s for y, s in zip(ys, sizes, strict=True)] for ys in ([y[0] for y in slopes], wanted)]
+        agree(*relative, "differences (jvp)", slope_tol)
         agree(jax.grad(total)(0.0), jax.jvp(total, (0.0,), (1.0,))[1], "forward mode (grad)", 1e-6)
         return "eager calls and differences"
 

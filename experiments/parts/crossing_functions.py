@@ -36,7 +36,7 @@ def driven(function: Any) -> Any:
 
 
 def inverse(case: Case, m: Any) -> Any:
-    if m.driver_names:
+    if case.is_system or m.driver_names:
         return udk.inverse_dynamics(m, TS[:3]).efforts
     rest = udk.kinematics(m, case.driver, case.values(3), held=case.held, rate=1.0, acceleration=2.0)
     return udk.inverse_dynamics(m, TS[:3], rest, [case.driver, *(case.held or {})]).efforts
@@ -105,7 +105,9 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "coupler_curve": {"": positions.coupler_curve},
     "mechanical_advantage": {
         "": positions.mechanical_advantage,
-        "transformed": transformed(driven(lambda m, k: 1.0 / udk.mechanical_advantage(m, k, f"body.{m.body_names[-1]}.angle"))),
+        "transformed": transformed(
+            lambda case, m: 1.0 / udk.mechanical_advantage(m, case.kinematics(m, 3, rate=case.rate), case.output)
+        ),
     },
     "transmission_angle": {"": positions.transmission_angle},
     "workspace": {"": positions.workspace},

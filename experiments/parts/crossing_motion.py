@@ -126,7 +126,7 @@ def power(case: Case) -> str:
 def step_names(case: Case) -> str:
     """Each name of `parameters()` by itself is an input of `step`, as it is one of `with_parameters`."""
     m, dt, names, state = case.model, 0.01, 0, case.state
-    for name, x in m.independent_parameters().items():
+    for name, x in (m.parameters() if case.is_system else m.independent_parameters()).items():
         if name.endswith(".values"):  # of a `Held`, which takes no inputs
             continue
         given = {name: 1.001 * np.asarray(x) + 1e-6}

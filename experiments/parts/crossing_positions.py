@@ -43,8 +43,8 @@ def _endless(case: Case) -> str:
 
 
 def equilibria(case: Case) -> str:
-    m = still(case)
     found = udk.equilibria(case.model, starts=4)
+    m = still(case)
     for x in found:
         a = np.abs(np.asarray(udk.accelerations(m, 0.0, x.q, 0.0 * case.state.v))).max()
         claim(a <= 1e-5 * (9.81 + np.abs(np.asarray(m.gravity)).max()), f"accelerates by {a:.2g}")
@@ -175,7 +175,8 @@ def pin_motion(case: Case) -> str:
 def motion_at(case: Case) -> str:
     m = case.model
     value = case.values(1)[0]
-    found = udk.motion_at(m, count_of(m, case.driver).text(value), case.driver, held=case.held)
+    at = value if case.is_system else count_of(m, case.driver).text(value)
+    found = udk.motion_at(m, at, case.driver, held=case.held)
     agree(np.ravel(found.values), np.array([value]), "the value asked for", 1e-4)
     motion = udk.kinematics(m, case.driver, found.values, held=case.held, rate=found.rate)
     wanted = udk.pin_motion(m, motion)
@@ -205,11 +206,9 @@ def coupler_curve(case: Case) -> str:
 def mechanical_advantage(case: Case) -> str:
     """Power in is power out: the ratio of the rates."""
     motion = case.kinematics(case.model, rate=1.0)
-    body = getattr(case.model, "body_names", ("none",))[-1]
-    found = np.asarray(udk.mechanical_advantage(case.model, motion, f"body.{body}.angle"))
-    rate = np.asarray(motion.v)[:, -1, 2]
-    moving = np.abs(rate) > 1e-9
-    return agree(found[moving] * rate[moving], np.ones(moving.sum()), "the ratio of rates")
+    found = np.asarray(udk.mechanical_advantage(case.model, motion, case.output))
+    turning = case.model.body_names.index(case.output.split(".")[1])
+    return agree(1.0 / found, np.asarray(motion.v)[:, turning, 2], "the ratio of rates")
 
 
 def transmission_angle(case: Case) -> str:

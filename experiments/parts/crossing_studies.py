@@ -136,6 +136,8 @@ def design(case: Case) -> str:
 def design_all(case: Case) -> str:
     """Five poses of the coupler of the four-bar itself: it is among the four-bars that are found."""
     m, s = case.model, case.values(1)[0] + np.linspace(0.0, 1.5, 5)
+    if case.is_system:
+        udk.design_all(m, udk.PoseGoal("none", np.zeros((5, 3))), case.driver)
     coupler = "coupler" if "coupler" in m.body_names else m.body_names[-1]
     pins = [k[4:] for k in m.parameters() if re.fullmatch(r"pin\.\w+", k)]
     own = m.drawing.links[coupler].pins if m.drawing is not None and coupler in m.drawing.links else pins
