@@ -61,7 +61,9 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "analyse": {"": by_twin(lambda case, m: [*(udk.analyse(m).redundant_rows or ()), udk.analyse(m).length])},
     "singular_values": {
         "": motion.singular_values,
-        "transformed": transformed(lambda case, m: udk.singular_values(m, 0.0, case.state.q, udk.analyse(case.model))),
+        "transformed": transformed(
+            lambda case, m: udk.singular_values(m, 0.0, case.state.q, None if case.is_system else udk.analyse(case.model))
+        ),
     },
     "energy": {"": motion.energy, "transformed": transformed(along(udk.energy))},
     "violation": {"": motion.violation, "transformed": transformed(along(udk.violation))},

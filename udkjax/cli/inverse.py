@@ -33,7 +33,7 @@ def inverse(
     ts = output_times(t0, t1, dt)
     mech, text = load_to_write(scene, out, plot)
     if not mech.drivers:
-        refuse("the scene has no driver that prescribes a motion")
+        refuse("the scene has no driver that prescribes a motion: add one, such as a motor of the drawing")
     import numpy as np
 
     import udkjax as udk
