@@ -16,7 +16,16 @@ from udkjax.equations.differentiable_programs import DifferentiablePrograms
 from udkjax.equations.rest_program import RestProgram, write_rest_program
 from udkjax.equations.run_programs import RunPrograms
 from udkjax.equations.scale_program import ROWS, ScaleProgram, write_scales
-from udkjax.equations.scene_layout import BODY_COORDINATES, DROP_TOL, RIGHT, ROW, LoadShares, SceneLayout, abstract_mechanism
+from udkjax.equations.scene_layout import (
+    BODY_COORDINATES,
+    DROP_TOL,
+    RIGHT,
+    ROW,
+    SAFE_TOL,
+    LoadShares,
+    SceneLayout,
+    abstract_mechanism,
+)
 from udkjax.equations.scene_prologue import write_prologue
 from udkjax.equations.scene_solver import SceneSolver, program
 from udkjax.equations.scene_terms import SceneTerms, compliance
@@ -100,6 +109,11 @@ class ScenePrograms(RunPrograms):
     def drop_tol_index(self) -> int:
         """The index of `drop_tol` among the constants."""
         return DROP_TOL
+
+    @property
+    def safe_tol_index(self) -> int:
+        """The index of `safe_tol` among the constants."""
+        return SAFE_TOL
 
     @property
     def number_count(self) -> int:

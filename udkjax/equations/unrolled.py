@@ -96,6 +96,7 @@ class Unrolled:
         if drop_tol.index in graph.dependencies([s.index for s in outputs]):
             self.constants.insert(0, drop_tol)  # at the same place whatever else a module needs
         self.drop_tol_index = next((k for k, s in enumerate(self.constants) if s.index == drop_tol.index), None)
+        self.safe_tol_index = next((k for k, s in enumerate(self.constants) if s.index == self.numbers[-1].index), None)
         self.prologue = ScalarProgram(graph, self.numbers, self.constants)
         self._inputs = {s: ("constants", k) for k, s in enumerate(self.constants)}
         self._inputs |= {s: (x, k) for x, scalars in (state | begins).items() for k, s in scalars.items()}

@@ -158,6 +158,13 @@ class Module(Running):
         place = (self.unrolled or self.code).drop_tol_index
         return None if place is None else self.places["constants"] + place
 
+    @property
+    def safe_tol_place(self) -> int:
+        """The offset of the threshold of safe pivots in a module with friction that `settles` and falls back."""
+        place = (self.unrolled or self.code).safe_tol_index
+        assert place is not None  # its accelerations report whether pivots are safe
+        return self.places["constants"] + place
+
     def _add_arrays(self, prefix: str, sizes: Mapping[str, int]):
         for name, count in sizes.items():
             self.places.add(prefix + name, count)

@@ -1,8 +1,9 @@
 """The base of forward and reverse mode of a trajectory: the differentiated programs, evaluated at the same states."""
 
 from udkjax.native.base.ir import Function
-from udkjax.native.base.layout import Plan
+from udkjax.native.base.layout import Lane, Plan
 from udkjax.native.base.program_derivative import ProgramDerivative
+from udkjax.native.run.manifold import with_loads_of_fallback
 from udkjax.native.run.trajectory import Trajectory
 
 
@@ -27,15 +28,32 @@ class Differentiated(Trajectory):
 
     def evaluate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i with the intermediate results that derivatives need."""
-        self.settle(f, f"stage{i} a")
-        f.call("evaluation", f.given["work"], self.address(f, f"stage{i} a"), self.address(f, f"stage{i} linearization"))
+        self.evaluate_settled(f, f"stage{i} a", f"stage{i} linearization")
         if self.dense or self.formulated:
             self.accelerate(f, f"stage{i} a")  # derivatives are the same for all methods; values depend on the method
 
+    def evaluate_settled(self, f: Function, out: str, stored: str):
+        """Compute accelerations at `state`, with settled friction, and the intermediate results of their derivatives."""
+
+        def evaluate():
+            f.call("evaluation", f.given["work"], self.address(f, out), self.address(f, stored))
+
+        self.settle(f, out)
+        if not (self.settles and self.falls_back):
+            evaluate()
+            return
+        unsafe = Lane(f, self.places).safe < 0.5
+
+        def settle_and_evaluate():
+            with f.if_(f.any_of(unsafe)):
+                self.settle(f, out)
+            evaluate()
+
+        with_loads_of_fallback(self, f, settle_and_evaluate, unsafe)
+
     def _evaluate_solved(self, f: Function, i: int):
         """Evaluate what derivatives need at the state of a solved stage of an implicit method, and factorize its matrix there."""
-        self.settle(f, "residual a")
-        f.call("evaluation", f.given["work"], self.address(f, "residual a"), self.address(f, f"stage{i} linearization"))
+        self.evaluate_settled(f, "residual a", f"stage{i} linearization")
         f.call("factor_exact", f.given["work"])
 
     def _solve_transposed(self, f: Function, name: str):
@@ -52,7 +70,7 @@ class Differentiated(Trajectory):
         super().write_programs()
         for derivative in self._linearizations:
             derivative.evaluation()
-        if self.unrolled and self.of_projection:
+        if self.unrolled and self._shares_factors:
             names = ("accelerations", "projection")
             at = {f"stored {name}": (name, 0) for name in names} | self.arrays
             self.write_scalars(self.unrolled.evaluations(names), "evaluation_end", ("work", *names), at)
@@ -62,14 +80,18 @@ class Differentiated(Trajectory):
         """The differentiable programs of the module."""
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 
+    @property
+    def _shares_factors(self) -> bool:
+        """True if the programs of the end of a step share a factorization: friction may leave out more rows than a projection."""
+        return bool(self.unrolled and self.of_projection) and not self.settles
+
     def _evaluate_end(self, f: Function):
-        """Evaluate accelerations and a projection at the end of a step for their derivatives, from one factorization."""
-        accelerations = self.address(f, f"stage{self.last} linearization")
-        self.settle(f, "corrected q")
-        if self.unrolled and self.of_projection:
-            f.call("evaluation_end", f.given["work"], accelerations, self.address(f, "projection linearization"))
+        """Evaluate accelerations and a projection at the end of a step for their derivatives."""
+        stored = f"stage{self.last} linearization"
+        if self._shares_factors:
+            f.call("evaluation_end", f.given["work"], self.address(f, stored), self.address(f, "projection linearization"))
         else:
-            f.call("evaluation", f.given["work"], self.address(f, "corrected q"), accelerations)
+            self.evaluate_settled(f, "corrected q", stored)
             self._evaluate_projection(f)
 
     def _evaluate_projection(self, f: Function):

@@ -54,8 +54,7 @@ def _write_along_motion(module: Differentiated):
 
     differentiate("point3", f"stage{module.last} linearization", AFTER_STEP)
     go_to("point2")
-    module.settle(f, "corrected q")
-    f.call("evaluation", f.given["work"], module.address(f, "corrected q"), module.address(f, BEFORE))
+    module.evaluate_settled(f, "corrected q", BEFORE)
     differentiate("point2", BEFORE, BEFORE_STEP)
     go_to("point3")
 

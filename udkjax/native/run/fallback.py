@@ -18,7 +18,7 @@ from udkjax.native.base.steps import ROUNDING_PIVOT
 from udkjax.native.base.weighted_rows import WeightedRows
 from udkjax.native.pseudoinverses.dense import MatrixRow
 from udkjax.native.pseudoinverses.svd import SVDCode
-from udkjax.native.run.manifold import iterate_newton, with_threshold
+from udkjax.native.run.manifold import iterate_newton, with_loads_of_fallback, with_threshold
 
 
 def write_fallback(module: Module):
@@ -125,13 +125,13 @@ def _write_singular_values(module: Module):
             f.call(f"{name}_of_lane", f.given["work"], k)
 
     f, s = module.function("fallback", [(POINTER, "work"), (POINTER, "out")])
-    module.invoke(f, "rows_and_loads")
+    with_loads_of_fallback(module, f, lambda: module.invoke(f, "rows_and_loads"))
     each_lane(f, s, "fallback")
     if couples:
         for x, (start, *_) in solutions.items():
             spread(f, x, start)
     f, s = module.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
-    module.invoke(f, "rows_and_loads")
+    with_loads_of_fallback(module, f, lambda: module.invoke(f, "rows_and_loads"))
     if couples:
         for x in ("dq", "dv"):
             module.copy(f, f"state {x}", f"fallback {x}")

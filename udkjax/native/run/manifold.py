@@ -60,6 +60,22 @@ def with_threshold(f: Function, place: int | None, threshold: Value, do: Callabl
     f.store(before, f.given["work"], place * f.width, f.width)
 
 
+def with_loads_of_fallback(module: Module, f: Function, do: Callable[[], None], lanes: Value | None = None):
+    """Run `do` with the loads that friction has where the fallback takes a step; `lanes`: where only some pivots are unsafe.
+
+    Towards a singular configuration the loads of joints may grow without bounds, and friction by them may jam the mechanism in a
+    range that a step crosses. Rows without a safe pivot carry none of these loads, in runs and in their derivatives.
+    """
+    if not (module.settles and module.falls_back):
+        do()
+        return
+    safe_tol = f.load(f.given["work"], module.safe_tol_place * f.width, f.width)
+    place = module.drop_tol_place
+    if lanes is not None and place is not None:
+        safe_tol = f.select(lanes, safe_tol, f.load(f.given["work"], place * f.width, f.width))
+    with_threshold(f, place, safe_tol, do)
+
+
 def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value:
     """Return the tolerance of the fastest velocity, in its unit."""
     fastest = module.largest(f, lambda r: [f.abs(module.vector(f, name, r)) * module.vector(f, "inverse unit", r)])

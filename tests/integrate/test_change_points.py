@@ -1,0 +1,57 @@
+"""Friction by the loads of joints where a mechanism passes a change point: a parallelogram whose links are all in line."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+
+# Length of the cranks, distance of their pivots and radius of the pin that rubs (m), speed (rad/s), end of the run (s).
+SIZES = jnp.array([[0.5, 0.8, 0.01, 6.0, 0.3], [0.2, 1.0, 0.001, 9.0, 0.3], [0.005, 0.008, 1e-4, 60.0, 0.03]])
+
+
+def parallelogram(length, spacing, radius, speed, coefficient, **forces):
+    """Return a parallelogram with two cranks at 0.6 rad, which turn towards 0 at a `speed` (rad/s), and friction in a pin."""
+    e, half = jnp.array([jnp.cos(0.6), jnp.sin(0.6)]), 0.5 * length
+    along, across = jnp.array([1.0, 0.0]), jnp.array([-e[1], e[0]])
+    bodies = {
+        f"crank{i}": udk.Body(
+            1.2 + 0.2 * i, 0.08 * length**2, half * e + i * spacing * along, 0.6, -half * speed * across, angular_velocity=-speed
+        )
+        for i in range(2)
+    }
+    middle = length * e + 0.5 * spacing * along
+    bodies["coupler"] = udk.Body(0.7, 0.08 * spacing**2, middle, 0.0, -length * speed * across, angular_velocity=0.0)
+    joints = {}
+    for i in range(2):
+        joints[f"A{i}"] = udk.Revolute(("ground", f"crank{i}"), [(i * spacing, 0.0), (-half, 0.0)])
+        joints[f"B{i}"] = udk.Revolute(("coupler", f"crank{i}"), [((i - 0.5) * spacing, 0.0), (half, 0.0)])
+    rubs = {"rubs": udk.Friction("A1", coefficient=coefficient, radius=radius, speed=0.02)}
+    return udk.Mechanism(bodies, joints, forces=rubs | forces, gravity=(0.0, -9.81))
+
+
+@pytest.mark.parametrize("sticks", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_derivatives_pass_a_change_point_with_friction_by_load(sticks):
+    """Differences, forward and reverse mode agree for three parallelograms in lanes; with `sticks`, second derivatives, too."""
+
+    def angle(x, size):
+        other = {"sticks": udk.Friction("B1", coefficient=0.05, radius=0.3 * size[2], law="set-valued")} if sticks else {}
+        mech = parallelogram(*size[:4], 0.1 * x[0], **other).with_parameters({"body.coupler.mass": 0.7 * x[1]})
+        return udk.simulate(mech, jnp.array([0.0, 0.5, 1.0]) * size[4], rtol=1e-9, atol=1e-9, throw=False).q[-1, 0, 2]
+
+    one, step = jnp.ones(2), 1e-2
+    shifts = jnp.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
+    of_sizes = jax.jit(jax.vmap(lambda size: jax.vmap(lambda x: angle(x, size))(one + shifts)))
+    found = np.asarray(of_sizes(SIZES))
+    assert np.all(found < 0)  # past the change point at 0
+    differences = (found[:, ::2] - found[:, 1::2]) / (2 * step)
+    forward = jax.jit(jax.vmap(jax.jacfwd(angle), (None, 0)))(one, SIZES)
+    reverse = jax.jit(jax.vmap(jax.grad(angle), (None, 0)))(one, SIZES)
+    # Steps across the change point leave rows out, whose motion the differences include.
+    np.testing.assert_allclose(forward, differences, rtol=2e-3)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-4)
+    if sticks:
+        first = jax.jit(jax.vmap(lambda x: jax.jacfwd(angle)(x, SIZES[0])))(one + shifts)
+        second = jax.jit(jax.jacfwd(jax.jacfwd(angle)))(one, SIZES[0])
+        np.testing.assert_allclose(second[:, 1], (first[2] - first[3]) / (2 * step), rtol=0.03)
