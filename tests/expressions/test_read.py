@@ -7,6 +7,7 @@ import pytest
 from jax import lax
 
 from tests.choices import fast
+from tests.fresh_process import python
 from udkjax.programs.deferred import deferred
 
 
@@ -246,3 +247,17 @@ def test_single_precision_stays_single(emit):
     (found,) = jax.jit(emit(lambda x: jnp.sin(x) * 2.0 + x @ x, x).__call__)(x)
     assert found.dtype == jnp.float32
     np.testing.assert_allclose(found, jnp.sin(x) * 2.0 + x @ x, rtol=1e-6)
+
+
+def test_programs_without_double_precision_warn_of_nothing():
+    """A run by diffrax traces its programs again and again; JAX warns of each double that it makes a single."""
+    code = """
+import warnings, jax, numpy as np, udkjax as udk
+mech = udk.library.double_pendulum()
+run = lambda mass: udk.simulate(mech.with_parameters({"body.upper.mass": mass}), np.linspace(0.0, 0.1, 3), throw=False).q[-1, 0, 2]
+with warnings.catch_warnings(record=True) as found:
+    warnings.simplefilter("always")
+    lowered = jax.jit(jax.jacfwd(run)).lower(np.float32(1.0))
+print(lowered.out_info.dtype, *{str(warning.message) for warning in found})
+"""
+    assert python(code, JAX_ENABLE_X64=0).strip() == "float32"

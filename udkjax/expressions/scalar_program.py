@@ -9,6 +9,7 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -104,7 +105,7 @@ class ScalarProgram:
 
     def _typed(self, values: Sequence[Operand]) -> list[Operand]:
         typed_values = zip(values, (s.node.dtype for s in self.inputs), strict=True)
-        return [v if isinstance(v, jax.Array) and v.dtype == d else jnp.asarray(v, d) for v, d in typed_values]
+        return [_array(v, d) for v, d in typed_values]
 
     def _run(self, values: Sequence[Operand]) -> list[Operand]:
         computed: dict[int, Operand] = {s.index: v for s, v in zip(self.inputs, values, strict=True)}
@@ -286,11 +287,17 @@ def _apply(node: Node, values: list[Operand]) -> Operand:
     primitive, parameters = node.detail.primitive, node.detail.parameters
     if not floats:
         values = list(jnp.broadcast_arrays(*values)) if len({np.shape(v) for v in values}) > 1 else values
-        return primitive.bind(*(jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)), **parameters)
+        return primitive.bind(*(_array(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)), **parameters)
     with jax.ensure_compile_time_eval():
-        arrays = [jnp.asarray(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
+        arrays = [_array(v, a.node.dtype) for v, a in zip(values, node.arguments, strict=True)]
         result = np.asarray(primitive.bind(*arrays, **parameters))
         return result[()] if any(isinstance(v, np.generic) for v in values) else result.item()  # Python floats raise on 1/0
+
+
+def _array(value: Any, dtype: Any) -> jax.Array:
+    """Return a value as an array of a type, in single precision where JAX has no other."""
+    dtype = jax.dtypes.canonicalize_dtype(dtype)
+    return value if isinstance(value, jax.Array) and value.dtype == dtype else jnp.asarray(value, dtype)
 
 
 def _call(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[Operand]) -> list[Operand]:
@@ -307,10 +314,8 @@ def _arrays(details: BoundPrimitive, arguments: Sequence[Scalar], values: list[O
     arrays, start = [], 0
     for shape in details.shapes:
         size = int(np.prod(shape))
-        part = [
-            jnp.asarray(v, a.node.dtype)
-            for v, a in zip(values[start : start + size], arguments[start : start + size], strict=True)
-        ]
+        given = zip(values[start : start + size], arguments[start : start + size], strict=True)
+        part = [_array(v, a.node.dtype) for v, a in given]
         arrays.append(jnp.stack(part).reshape(shape) if part else jnp.zeros(shape))
         start += size
     return arrays
