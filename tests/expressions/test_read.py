@@ -254,7 +254,8 @@ def test_programs_without_double_precision_warn_of_nothing():
     code = """
 import warnings, jax, numpy as np, udkjax as udk
 mech = udk.library.double_pendulum()
-run = lambda mass: udk.simulate(mech.with_parameters({"body.upper.mass": mass}), np.linspace(0.0, 0.1, 3), throw=False).q[-1, 0, 2]
+changed = lambda mass: mech.with_parameters({"body.upper.mass": mass})
+run = lambda mass: udk.simulate(changed(mass), np.linspace(0.0, 0.1, 3), throw=False).q[-1, 0, 2]
 with warnings.catch_warnings(record=True) as found:
     warnings.simplefilter("always")
     lowered = jax.jit(jax.jacfwd(run)).lower(np.float32(1.0))
