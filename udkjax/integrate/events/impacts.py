@@ -254,7 +254,8 @@ def hit_contacts(
     stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
     scale, system = stop(before.scale), contacts.rate[..., None]
     floor = ZERO_RATE * scale * system
-    closed = contact_states(contacts, k, held, before, rows.W, xp) if closed is None else closed
+    closed = closed if closed is not None else contact_states(contacts, k, held, before, rows.W, xp)
+    assert closed is not None
     restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
     touches = closed > OPEN
     rubs = touches & (contacts.tangents >= 0)
