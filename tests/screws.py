@@ -58,7 +58,7 @@ def accelerations(
         matrix = equations(signs)
         a, of_thread, of_guide, of_turn = np.linalg.solve(matrix, [0.0, nut * G, -push, mass * G])
         if (
-            all(x * sign > 0 for x, sign in zip((of_turn, of_guide, of_thread), signs, strict=True))
+            all(x * sign > 0 for x, sign in zip((of_thread, of_guide, of_turn), signs, strict=True))
             and np.linalg.det(matrix) * without > 0
         ):
             found.append(float(a))

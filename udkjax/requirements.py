@@ -47,6 +47,7 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
     """Return real numbers as an array without derivatives; for anything else raise a `TypeError` that names the argument."""
     if isinstance(value, Tracer):
         numbers: Any = without_derivatives(value)
+        numbers = numbers if isinstance(numbers, Tracer) else np.asarray(numbers)  # derivatives of Python's numbers
     elif not isinstance(value, np.ndarray | float) and is_traced(value):
         numbers = without_derivatives(jnp.asarray(value))  # a list of traced numbers
     else:

@@ -63,7 +63,10 @@ class FixedPart(eqx.Module):
 @eqx.filter_custom_jvp
 def _run(fixed: FixedPart, xs: list[Array]) -> EventRun:
     hybrid = fixed.combine(xs)
-    return run_plain(hybrid) if fixed.conditions is None else run_by_machine_code(hybrid, fixed.conditions)
+    found = run_plain(hybrid) if fixed.conditions is None else run_by_machine_code(hybrid, fixed.conditions)
+    with jax.debug_nans(False):  # outputs after the end of a run are undefined, and so are their derivatives
+        q, v = (jnp.where(jnp.isinf(x), jnp.nan, x) for x in (found.q, found.v))
+    return found._replace(q=q, v=v)
 
 
 @_run.def_jvp

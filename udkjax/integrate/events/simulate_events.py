@@ -293,7 +293,7 @@ def _with_joints_held_by_drivers(
     analysis = given.phases.analyses[SCENE]
     if not sticking or not names or not mechanism.drivers or analysis is None:
         return sticking
-    # Outputs after the end of a run are infinite: nothing sticks there.
+    # Outputs after the end of a run are infinite or NaN: nothing sticks there.
     reached = xp.isfinite(found.q).all(axis=1, keepdims=True)
     q, v = (xp.where(reached, x, 0.0) for x in (found.q, found.v))
     held = reached & xp.asarray(DirectedFriction.put_in(mechanism).held_by_drivers(analysis, given.ts, q, v))
