@@ -8,10 +8,10 @@ import jax
 import numpy as np
 
 from udkjax.native import primitive, records
-from udkjax.native.base import machine, processor
-from udkjax.native.base.layout import INPUTS
+from udkjax.native.code import machine, processor
 from udkjax.native.derivatives.record import FIRST_POINTS, Recorded
 from udkjax.native.gpu.kernel import VECTOR, KernelCode, kernel_code
+from udkjax.native.module.layout import INPUTS
 from udkjax.native.operations import Operation
 from udkjax.native.primitive import BREAKS
 

@@ -8,8 +8,8 @@ import numpy as np
 
 import udkjax as udk
 from benchmarks.common import cpu_seconds, in_turn, ratio
-from udkjax.equations.textbook import prepare
-from udkjax.equations.unrolled import Unrolled
+from udkjax.equations.programs.unrolled import Unrolled
+from udkjax.equations.states.textbook import prepare
 
 MACHINES = {
     "four-bar": udk.library.four_bar,

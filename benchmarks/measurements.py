@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
-from udkjax.positions.channels import channel_of
+from udkjax.positions.assembling.channels import channel_of
 from udkjax.study.channel_values import measure
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.unknowns import Unknowns, apply_values
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.problem.unknowns import Unknowns, apply_values
 
 LINKS = ("link1", "link2", "link3")
 CYLINDERS = ("boom cylinder", "stick cylinder", "bucket cylinder")

@@ -16,8 +16,8 @@ from scipy.optimize import fsolve, minimize_scalar
 
 import udkjax as udk
 from benchmarks.common import cpu_seconds, in_turn
-from udkjax.positions.drive import drive
-from udkjax.positions.march import march
+from udkjax.positions.following.drive import drive
+from udkjax.positions.following.march import march
 
 CRANK, COUPLER, ROCKER, GROUND = 0.5, 1.2, 0.8, 1.0
 START, TURN = math.pi / 3, 2 * math.pi

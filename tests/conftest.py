@@ -26,7 +26,7 @@ from tests.skipped import skipped_for
 from udkjax import arrays
 from udkjax.folders import is_writable
 from udkjax.native import primitive
-from udkjax.native.base import code_cache
+from udkjax.native.code import code_cache
 
 optimize(False)  # but in tests/native
 if folder := code_cache.cache_folder():  # what one process has compiled, however small, serves the other

@@ -1,6 +1,6 @@
 """Whether machine code fuses multiplications with additions: it rounds once where the processor can, else twice."""
 
-from udkjax.native.base import processor
+from udkjax.native.code import processor
 
 
 def is_fused() -> bool:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.expressions.loop_program import ADD, ALL, MAXIMUM, Address, KernelLoop, LoopProgram, Reset
+from udkjax.expressions.loops.loop_program import ADD, ALL, MAXIMUM, Address, KernelLoop, LoopProgram, Reset
 
 
 def run(program: LoopProgram, arrays: dict[str, np.ndarray]) -> None:

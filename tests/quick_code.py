@@ -1,7 +1,7 @@
 """Machine code that LLVM does not optimize, in a quarter of the time: it rounds alike, and few tests are about its speed."""
 
 from udkjax.native import primitive
-from udkjax.native.base import machine
+from udkjax.native.code import machine
 
 _PASSES, _TARGET_MACHINE = machine.PASSES, machine._target_machine
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.equations.unrolled import Unrolled, UnrolledProgram
+from udkjax.equations.programs.scene_programs import ScenePrograms
+from udkjax.equations.programs.unrolled import Unrolled, UnrolledProgram
 
 
 def run(program: UnrolledProgram, given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

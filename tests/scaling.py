@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 import udkjax as udk
-from udkjax.scene.units import units_of
+from udkjax.scene.numbers.units import units_of
 
 
 def scaled(mechanism: udk.Mechanism, length: float = 1.0, time: float = 1.0, mass: float = 1.0) -> udk.Mechanism:

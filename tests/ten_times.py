@@ -9,6 +9,9 @@ from typing import Any
 import jax
 import pytest
 
+# What serves machine code of any constants.
+MACHINE = tuple(f"udkjax.native.{folder}" for folder in ("language", "code", "module", "host"))
+
 
 def _multiplied(value: Any, factor: float) -> Any:
     """Return a number, or numbers, times a factor; counts stay whole, and at least one."""
@@ -20,7 +23,7 @@ def _multiplied(value: Any, factor: float) -> Any:
 def _forget_programs() -> None:
     """Drop what was traced or compiled with other constants; results by identity belong to mechanisms, which tests build anew."""
     for name, module in list(sys.modules.items()):
-        if name.startswith("udkjax.") and not name.startswith("udkjax.native.base"):
+        if name.startswith("udkjax.") and not name.startswith(MACHINE):
             for value in list(vars(module).values()):
                 if callable(clear := getattr(value, "cache_clear", None)) and not isinstance(value, type):
                     clear()

@@ -13,7 +13,7 @@ CODE = """
 from jaxtyping import TypeCheckError, install_import_hook
 
 methods = "svd varga greville householder gram_schmidt elimination auto orthogonal".split()
-modules = [f"udkjax.equations.{name}" for name in ("constraints", "loads", "udwadia_kalaba", "determinacy")]
+modules = [f"udkjax.equations.{name}" for name in ("terms.constraints", "terms.loads", "laws.udwadia_kalaba", "rows.determinacy")]
 with install_import_hook([*modules, *(f"udkjax.pinv.{name}" for name in methods)], "beartype.beartype"):
     import udkjax as udk
     from udkjax.equations import constraints, determinacy, loads

@@ -183,7 +183,7 @@ def test_a_folder_is_not_called_as_a_file_is(tmp_path, monkeypatch, capsys, comm
 
 def test_a_run_is_written_in_the_kind_that_its_name_says(tmp_path, capsys):
     """All formats contain the same numbers; identification can read the table."""
-    from udkjax.study.identify.record_reader import records_of
+    from udkjax.study.identify.records.record_reader import records_of
 
     scene = EXAMPLES / "simple_pendulum.toml"
     assert udkjax("simulate", scene, "--t1", 0.2, "--out", tmp_path / "run.csv") == 0

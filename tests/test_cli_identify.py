@@ -119,7 +119,9 @@ def test_options_reach_the_identification(tmp_path, monkeypatch, data):
 
 
 def test_choices_and_defaults_are_those_of_the_library():
-    from udkjax.study.identify import identify, optimizer, records
+    from udkjax.study.identify import identify
+    from udkjax.study.identify.records import records
+    from udkjax.study.identify.search import optimizer
 
     mine, theirs = (inspect.signature(function).parameters for function in (command, identify))
     for name in ("loss", "n_starts", "tol", "seed"):

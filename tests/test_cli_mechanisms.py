@@ -14,7 +14,7 @@ import xarray
 from tests.command_line import udkjax
 from udkjax.cli.datasets import save
 from udkjax.cli.exits import exit_codes
-from udkjax.positions.assembly import AssemblyWarning
+from udkjax.positions.assembling.assembly import AssemblyWarning
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import udkjax
-from udkjax.equations import evaluate
+from udkjax.equations.states import evaluate
 
 NO_SUBJECT = re.compile("(What|Whatever|Whether|Which|Who|Whose|How|Where|When|As|Those|That)\\b")
 OBJECT = re.compile("(?:Return|Iterate over) (what|whatever|who|how many|how far|how much|how often|where)\\b")  # likewise

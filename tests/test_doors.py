@@ -87,12 +87,12 @@ def test_floors_import_only_what_stands_in_a_door():
 
 def test_an_import_past_the_door_is_caught(tmp_path):
     (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "__init__.pyi").write_text("from udkjax.scene.bodies import Body as Body")
+    (tmp_path / "scene" / "__init__.pyi").write_text("from udkjax.scene.elements.bodies import Body as Body")
     (tmp_path / "show").mkdir()
-    for line in ("from udkjax.scene.bodies import Body", "from udkjax.scene import Body"):
+    for line in ("from udkjax.scene.elements.bodies import Body", "from udkjax.scene import Body"):
         (tmp_path / "show" / "plots.py").write_text(line)
         assert violations(tmp_path) == []
-    for line in ("from udkjax.scene.bodies import secret", "def late():\n    from udkjax.scene import bodies"):
+    for line in ("from udkjax.scene.elements.bodies import secret", "def late():\n    from udkjax.scene.elements import bodies"):
         (tmp_path / "show" / "plots.py").write_text(line)
         assert violations(tmp_path)
 

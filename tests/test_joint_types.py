@@ -19,10 +19,10 @@ import pytest
 import udkjax as udk
 from tests.elements import BODIES, JOINTS, P
 from udkjax.integrate.causes.reach import Reach, dead_point
-from udkjax.integrate.events.conditions import joint_coordinate
-from udkjax.show.player.marks import marks
-from udkjax.show.player.symbol_updates import symbol_updates
-from udkjax.show.player.symbols import symbols_of
+from udkjax.integrate.events.law.conditions import joint_coordinate
+from udkjax.show.player.marks.marks import marks
+from udkjax.show.player.marks.symbol_updates import symbol_updates
+from udkjax.show.player.marks.symbols import symbols_of
 from udkjax.statics.reaction_peaks import cam_forces
 from udkjax.studio.drawn_fixes import drawn_fix
 from udkjax.studio.drawn_scenes import drawing_text_of

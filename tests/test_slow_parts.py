@@ -95,7 +95,7 @@ def test_each_slow_test_is_in_one_part_and_what_is_named_exists(slow):
     for file, own in slow.ONLY_SLOW.items():
         text = (ROOT / file).read_text()
         assert all(f"def {name.rpartition('::')[2]}(" in text for name in own if name) and "pytest.mark.slow" in text
-    assert slow.part_of("tests/native/test_ir.py") == "native"
+    assert slow.part_of("tests/native/language/test_ir.py") == "native"
     assert slow.part_of("tests/native/wasm/test_engine.py") == "webassembly"
     assert slow.part_of("tests/test_cli.py") == "rest"
 

@@ -13,25 +13,25 @@ import udkjax as udk
 from tests.equations.test_rubbing import states
 from tests.equations.test_stationary_rows import rod_between_guides
 from tests.friction import cart, drawer, pendulum, rubbing
-from tests.integrate.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, floor
-from tests.integrate.own_systems import G
-from tests.integrate.own_systems import pendulum as spatial_pendulum
-from tests.integrate.test_impacts import rocking
-from tests.integrate.test_kinks import swinging
+from tests.integrate.events.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, floor
+from tests.integrate.events.instant.test_impacts import rocking
+from tests.integrate.events.instant.test_own_system_events import coupled, swung
+from tests.integrate.events.instant.test_sticking import block, oscillator, sticking
+from tests.integrate.events.law.test_kinks import swinging
+from tests.integrate.systems.own_systems import G
+from tests.integrate.systems.own_systems import pendulum as spatial_pendulum
 from tests.integrate.test_matrices_in_forces import SolvedSpring
-from tests.integrate.test_own_system_events import coupled, swung
-from tests.integrate.test_sticking import block, oscillator, sticking
 from tests.native.test_implicit_stages import damped
 from tests.statics.test_holding import clamp, cranks, wedge
 from tests.study.test_geared_freedoms import MECHANISMS, mechanism_of
 from tests.synthesis.test_design import FOUR_BAR
 from tests.ten_times import multiplied
-from udkjax.equations.analysis import _with_rank_tol
-from udkjax.equations.dense_rows import DenseRows
-from udkjax.equations.redundancy import examine_rows
-from udkjax.equations.scales import concrete_scales
+from udkjax.equations.programs.scales import concrete_scales
+from udkjax.equations.rows.analysis import _with_rank_tol
+from udkjax.equations.rows.dense_rows import DenseRows
+from udkjax.equations.rows.redundancy import examine_rows
 from udkjax.integrate.solvers import method_of
-from udkjax.native.base.steps import LIMIT, STABLE
+from udkjax.native.module.steps import LIMIT, STABLE
 
 pytestmark = pytest.mark.slow
 TIGHT: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-9, "throw": False}
@@ -176,23 +176,23 @@ def rests() -> dict[str, Any]:
 
 
 CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = {
-    "FITS": (held_pins, ("equations.stationary_rows.FITS",), 0.0),
-    "SMALL": (held_pins, ("equations.stationary_rows.SMALL",), 0.0),
-    "SAME": (geared_rows, ("equations.balance.SAME",), 0.0),
-    "ANCHOR": (geared_rows, ("equations.balance.ANCHOR",), 0.0),
-    "GEARED_SHARE": (geared_rows, ("equations.analysis.GEARED_SHARE",), 0.0),
-    "BLOCKED_IN_SYSTEM": (impacts_of_systems, ("integrate.events.impacts.BLOCKED_IN_SYSTEM",), 0.0),
-    "LONGEST": (feet_in_turns, ("integrate.events.hops.LONGEST",), 1e-9),
-    "MOST_ROWS": (matrices_in_forces, ("expressions.matrix_rules.MOST_ROWS",), 1e-8),
+    "FITS": (held_pins, ("equations.rows.stationary_rows.FITS",), 0.0),
+    "SMALL": (held_pins, ("equations.rows.stationary_rows.SMALL",), 0.0),
+    "SAME": (geared_rows, ("equations.rows.balance.SAME",), 0.0),
+    "ANCHOR": (geared_rows, ("equations.rows.balance.ANCHOR",), 0.0),
+    "GEARED_SHARE": (geared_rows, ("equations.rows.analysis.GEARED_SHARE",), 0.0),
+    "BLOCKED_IN_SYSTEM": (impacts_of_systems, ("integrate.events.instant.impacts.BLOCKED_IN_SYSTEM",), 0.0),
+    "LONGEST": (feet_in_turns, ("integrate.events.instant.hops.LONGEST",), 1e-9),
+    "MOST_ROWS": (matrices_in_forces, ("expressions.reading.matrix_rules.MOST_ROWS",), 1e-8),
     "REPETITIONS": (sticking_joints, ("complementarity.stick_or_slip.REPETITIONS",), 1e-9),
     "SWEEPS": (sticking_joints, ("complementarity.stick_or_slip.SWEEPS",), 1e-9),
     "SAME_SHARE": (sticking_joints, ("complementarity.stick_or_slip.SAME_SHARE",), 1e-9),
     "BLOCK_STEPS": (sticking_joints, ("complementarity.stick_or_slip.BLOCK_STEPS",), 1e-9),
     "SINGLE_STEPS": (sticking_joints, ("complementarity.stick_or_slip.SINGLE_STEPS",), 1e-9),
-    "SETTLED": (rubbing_joints, ("equations.friction_elimination.SETTLED",), 1e-8),
+    "SETTLED": (rubbing_joints, ("equations.elimination.friction_elimination.SETTLED",), 1e-8),
     "LAST_CHANGE": (rubbing_joints, ("transforms.newton_steps.LAST_CHANGE",), 1e-8),
-    "ROUNDS": (rubbing_joints, ("equations.friction_elimination.ROUNDS",), 1e-8),
-    "SETTLING_ROUNDS": (rubbing_joints, ("native.base.steps.SETTLING_ROUNDS",), 1e-8),
+    "ROUNDS": (rubbing_joints, ("equations.elimination.friction_elimination.ROUNDS",), 1e-8),
+    "SETTLING_ROUNDS": (rubbing_joints, ("native.module.steps.SETTLING_ROUNDS",), 1e-8),
     "MOST_STEPS": (rubbing_joints, ("transforms.newton_steps.MOST_STEPS",), 1e-8),
     "BLOCKS, HELD": (held_mechanisms, tuple(f"complementarity.linear_program.{x}" for x in ("BLOCKS", "HELD")), 1e-9),
     "STEPS_PER_ROW": (held_mechanisms, ("complementarity.linear_program.STEPS_PER_ROW",), 1e-9),
@@ -203,18 +203,18 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
         tuple(f"statics.admissible_reactions.{x}" for x in ("MOST_TANGENTS", "LAST_CHANGE", "STEP_ASIDE", "PRELOAD")),
         1e-9,
     ),
-    "STAGE_ROUNDS": (rubbing_joints, ("native.base.steps.STAGE_ROUNDS",), 1e-8),
-    "LARGE_CORRECTION": (rubbing_joints, ("equations.friction_elimination.LARGE_CORRECTION",), 1e-8),
-    "SLOW": (sticking_joints, ("integrate.events.crossings.SLOW",), 1e-9),
-    "STAGES": (rubbing_joints, ("equations.run_programs.RunPrograms.STAGES",), 1e-8),
+    "STAGE_ROUNDS": (rubbing_joints, ("native.module.steps.STAGE_ROUNDS",), 1e-8),
+    "LARGE_CORRECTION": (rubbing_joints, ("equations.elimination.friction_elimination.LARGE_CORRECTION",), 1e-8),
+    "SLOW": (sticking_joints, ("integrate.events.law.crossings.SLOW",), 1e-9),
+    "STAGES": (rubbing_joints, ("equations.programs.run_programs.RunPrograms.STAGES",), 1e-8),
     "MOST_AIMS": (located_events, ("native.watching.conditions.MOST_AIMS",), 1e-8),
     "MOST_LANDINGS": (located_events, ("native.watching.conditions.MOST_LANDINGS",), 1e-8),
     "LAST_CHANGE, of events": (located_events, ("native.watching.conditions.LAST_CHANGE",), 1e-8),
     "LEAST_STEP": (located_events, ("native.watching.conditions.LEAST_STEP",), 1e-8),
-    "SHORT_STEP": (located_events, ("native.base.steps.SHORT_STEP",), 1e-8),
-    "WORTH": (rests, ("equations.eliminated_steps.WORTH",), 1e-9),
-    "CLEAR": (rests, ("equations.eliminated_steps.CLEAR",), 1e-9),
-    "FEW_OPERATIONS": (rests, ("expressions.float_loops.FEW_OPERATIONS",), 1e-9),
+    "SHORT_STEP": (located_events, ("native.module.steps.SHORT_STEP",), 1e-8),
+    "WORTH": (rests, ("equations.programs.eliminated_steps.WORTH",), 1e-9),
+    "CLEAR": (rests, ("equations.programs.eliminated_steps.CLEAR",), 1e-9),
+    "FEW_OPERATIONS": (rests, ("expressions.loops.float_loops.FEW_OPERATIONS",), 1e-9),
     "ROUNDS, of starts": (designs, ("synthesis.starts.ROUNDS",), 1e-6),
     "LEAST_FALL": (designs, ("synthesis.search.LEAST_FALL",), 1e-6),
     "JAMMING_TIMES": (jams, ("integrate.causes.jamming.JAMMING_TIMES",), 0.0),
@@ -266,5 +266,5 @@ def test_early_trials_of_implicit_steps_change_little():
     """Trials begin far from the limit, or are as long as has to pay: stiff runs go on implicitly, others never."""
     expected = usual(stiff_runs)
     for factor, name in ((0.1, "LIMIT"), (0.5, "CLEARLY"), (2.0, "CLEARLY")):
-        with multiplied(factor, f"native.base.steps.{name}"):
+        with multiplied(factor, f"native.module.steps.{name}"):
             assert_same(stiff_runs(), expected, 3e-5)

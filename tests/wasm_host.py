@@ -74,7 +74,7 @@ def record_of(
     following: int,
 ) -> list[int]:
     """Return the words of the call record of `run`."""
-    from udkjax.native.base.layout import INPUTS
+    from udkjax.native.module.layout import INPUTS
 
     names, outputs = (*INPUTS, *module.inputs), (*module.results, *module.outputs)
     fields: dict[str, int] = {"members": shapes[0][0], "next": following}
@@ -88,7 +88,7 @@ def record_of(
 
 def run_without_contraction(module: Any, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
     """Run the same code on this processor, compiled without fused multiply-add."""
-    from udkjax.native.base import machine, processor
+    from udkjax.native.code import machine, processor
 
     llvm = processor.llvm()
     target = llvm.Target.from_default_triple().create_target_machine(

@@ -31,7 +31,10 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home = homes[name]
-        value = import_module(f"{home}.{name}") if home == package else getattr(import_module(home), name)
+        if home == package or not hasattr(holder := import_module(home), name):
+            value = import_module(f"{home}.{name}")  # a module of this folder, or of one of its subfolders
+        else:
+            value = getattr(holder, name)
         setattr(sys.modules[package], name, value)
         return value
 

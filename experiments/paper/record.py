@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.integrate.solution import versions
-from udkjax.positions.assembly import State
+from udkjax.positions.assembling.assembly import State
 from udkjax.scene import Mechanism, dumps
 from udkjax.study.members import machine
 

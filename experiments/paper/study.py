@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from udkjax.equations import Baumgarte, energy
-from udkjax.equations.textbook import prepare
+from udkjax.equations.states.textbook import prepare
 from udkjax.integrate import Projection, Result, simulate
 from udkjax.integrate.solvers import solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, OneOf, Pseudoinverse, Varga
-from udkjax.positions.assembly import State, assemble
+from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.scene import Mechanism
 from udkjax.scene.library import parallelogram
 from udkjax.study.accuracy import exact_coordinates

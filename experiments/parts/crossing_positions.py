@@ -6,7 +6,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.parts.crossing_case import TS, Case, WrongError, agree, by_twin, claim
-from udkjax.positions.counting import count_of
+from udkjax.positions.answers.counting import count_of
 
 
 def first_body(m: Any) -> str:

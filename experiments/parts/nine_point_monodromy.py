@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from udkjax.positions.path_tracking import ACCEPTED
+from udkjax.positions.following.path_tracking import ACCEPTED
 from udkjax.synthesis.complete.dyads import JOINTS, POINTS
 from udkjax.synthesis.complete.nine_points import CLASSES, CLOSE, class_keys, distinct, tracker, turns_of
 

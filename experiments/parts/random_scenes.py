@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 
 import udkjax as udk
 from experiments.parts.reference_equations import closed_spline, evaluate
-from udkjax.scene.schema import CLASSES_BY_TYPE, SECTIONS
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, SECTIONS
 
 Table = dict[str, Any]
 

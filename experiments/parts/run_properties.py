@@ -14,7 +14,7 @@ import udkjax as udk
 from experiments.parts.random_scenes import RandomScene, build, random_scene, state_of
 from experiments.parts.state_properties import growth, names_of, solve
 from experiments.parts.tally import Property, Tally
-from udkjax.equations.scales import traced_scales
+from udkjax.equations.programs.scales import traced_scales
 
 TOL = 1e-10  # of integration
 SPAN = 0.5  # of the scene's own time

@@ -18,14 +18,14 @@ from experiments.parts.random_scenes import RandomScene, Table, build, random_sc
 from experiments.parts.reference_equations import Terms, evaluate
 from experiments.parts.scene_views import can_be_turned, in_units, moved, renamed, with_copies
 from experiments.parts.tally import Property, Tally, relative
-from udkjax.equations.scene_arrays import SceneArrays
-from udkjax.equations.scene_layout import LoadShares
-from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_vector
-from udkjax.equations.unrolled import Unrolled
+from udkjax.equations.programs.scene_arrays import SceneArrays
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.programs.unrolled import Unrolled
+from udkjax.equations.terms.scene_layout import LoadShares
+from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.expressions import ScalarProgram
 from udkjax.pinv.rank_policy import RankPolicy
-from udkjax.scene.friction import SLIDING_SPEED
+from udkjax.scene.elements.friction import SLIDING_SPEED
 
 SAFE = 1e-12  # pivots relative to their rows above which elimination is trusted here: half of the digits
 GAP = 1e-6, 1e-11  # singular values of D relative to the largest: those that count, and those that do not; in between, neither

@@ -15,8 +15,8 @@ from udkjax.equations import prepare
 from udkjax.integrate.diffrax_engine import derivative
 from udkjax.integrate.solution import Result
 from udkjax.pinv import Pseudoinverse
-from udkjax.study.identify.least_squares import Fit, minimize_squares
-from udkjax.study.identify.residuals import Residuals
+from udkjax.study.identify.problem.residuals import Residuals
+from udkjax.study.identify.search.least_squares import Fit, minimize_squares
 
 SCENES = ("parallelogram", "four-bar")
 DEGREES = -45.0  # the parallelogram's start, at rest

@@ -11,11 +11,13 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.choices import fast
-from udkjax.equations import dense_rows, position_closure, position_rows, redundancy, scale_program, scales, sparse_rows
-from udkjax.equations.scene_arrays import SceneArrays
-from udkjax.equations.scene_programs import _scene_programs as scene_program_cache
-from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_vector
+from udkjax.equations.programs import scales
+from udkjax.equations.programs.scene_arrays import SceneArrays
+from udkjax.equations.programs.scene_programs import _scene_programs as scene_program_cache
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.rows import dense_rows, position_closure, position_rows, redundancy, sparse_rows
+from udkjax.equations.terms import scale_program
+from udkjax.equations.terms.structure import numbers_as_vector
 
 
 def test_a_duplicated_joint_is_named():
@@ -52,7 +54,7 @@ def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
     """Mechanisms that differ only in masses and loads share the result."""
     mechanism = udk.library.parallelogram(-0.6)
     udk.analyse(mechanism)
-    monkeypatch.setattr("udkjax.equations.analysis.examine_rows", None)
+    monkeypatch.setattr("udkjax.equations.rows.analysis.examine_rows", None)
     for name in ("body.coupler.mass", "body.link1.inertia", "gravity"):
         changed = mechanism.with_parameters({name: 2.0 * mechanism.parameters()[name]})
         assert udk.analyse(changed).redundant_rows == udk.analyse(mechanism).redundant_rows

@@ -6,8 +6,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.dense_pseudoinverse import FEW_ROWS, FactoredPseudoinverse, TruncatedPseudoinverse, dense_pseudoinverse
-from udkjax.equations.state_arrays import StateArrays
+from udkjax.equations.elimination.dense_pseudoinverse import (
+    FEW_ROWS,
+    FactoredPseudoinverse,
+    TruncatedPseudoinverse,
+    dense_pseudoinverse,
+)
+from udkjax.equations.states.state_arrays import StateArrays
 
 TOL = 1e-4
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.equations import equations_of
-from udkjax.equations.formulations import solve_regular
+from udkjax.equations.laws.formulations import solve_regular
 from udkjax.programs.deferred import deferred
 
 LU = udk.Augmented()

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import fresnel
 
 import udkjax as udk
-from udkjax.equations.quantities import equations_of
+from udkjax.equations.states.quantities import equations_of
 from udkjax.programs.deferred import deferred
 
 G = 9.81

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.equations import redundancy
-from udkjax.equations.position_rows import GENERIC_TOL
+from udkjax.equations.rows import redundancy
+from udkjax.equations.rows.position_rows import GENERIC_TOL
 
 # --- redundant rows
 

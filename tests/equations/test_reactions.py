@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from udkjax.equations.compliance import sharing
-from udkjax.equations.determinacy import scaled_jacobian
+from udkjax.equations.friction.compliance import sharing
+from udkjax.equations.rows.determinacy import scaled_jacobian
 
 G = 9.81
 

@@ -10,12 +10,12 @@ import pytest
 import udkjax as udk
 from tests.friction import cart, drawer, pendulum, rubbing
 from tests.run_programs import evaluate_programs
-from udkjax.equations import friction_elimination
-from udkjax.equations.rubbing import rubbing_loads, settled_multipliers
-from udkjax.equations.scene_programs import ScenePrograms
-from udkjax.equations.structure import structure
-from udkjax.equations.textbook import prepare
-from udkjax.equations.unrolled import Unrolled
+from udkjax.equations.elimination import friction_elimination
+from udkjax.equations.friction.rubbing import rubbing_loads, settled_multipliers
+from udkjax.equations.programs.scene_programs import ScenePrograms
+from udkjax.equations.programs.unrolled import Unrolled
+from udkjax.equations.states.textbook import prepare
+from udkjax.equations.terms.structure import structure
 from udkjax.pinv.rank_policy import RankPolicy
 
 MOVING = {"a": udk.Body(1.0, 0.1, [0.4, 0.1], 0.3), "b": udk.Body(2.0, 0.3, [0.9, 0.3], 0.3)}

@@ -11,12 +11,12 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
 from udkjax.equations import constraints, loads, prepare
-from udkjax.equations.dense_rows import DenseTerms
-from udkjax.equations.scene_arrays import SceneArrays, arrays_in_time
-from udkjax.equations.scene_programs import _scene_programs, scene_programs
-from udkjax.expressions import float_loops
-from udkjax.expressions.array_loops import ArrayLoops
-from udkjax.expressions.float_loops import _WORTH_WRITING_FOR_MANY, FloatLoops
+from udkjax.equations.programs.scene_arrays import SceneArrays, arrays_in_time
+from udkjax.equations.programs.scene_programs import _scene_programs, scene_programs
+from udkjax.equations.rows.dense_rows import DenseTerms
+from udkjax.expressions.loops import float_loops
+from udkjax.expressions.loops.array_loops import ArrayLoops
+from udkjax.expressions.loops.float_loops import _WORTH_WRITING_FOR_MANY, FloatLoops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.deferred import deferred
 

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import pytest
 
 import udkjax as udk
-from udkjax.equations.analysis import analyse
-from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.unrolled import Unrolled, UnrolledProgram
-from udkjax.expressions.loop_derivative import FORWARD, REVERSE
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.programs.unrolled import Unrolled, UnrolledProgram
+from udkjax.equations.rows.analysis import analyse
+from udkjax.expressions.loops.loop_derivative import FORWARD, REVERSE
 from udkjax.pinv.rank_policy import RankPolicy
 
 GROUND = "ground"

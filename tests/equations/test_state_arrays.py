@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.equations import state_arrays
+from udkjax.equations.states import state_arrays
 
 SCENES = {
     "redundant": lambda: udk.library.parallelogram(),

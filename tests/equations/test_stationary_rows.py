@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.equations.analysis import analyse, hold_pins
+from udkjax.equations.rows.analysis import analyse, hold_pins
 
 TS = np.linspace(0, 1, 5)
 

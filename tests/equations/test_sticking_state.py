@@ -11,7 +11,7 @@ import pytest
 
 import udkjax as udk
 from tests.friction import G
-from tests.integrate.test_sticking import STICKS, belt, block, oscillator, sticking
+from tests.integrate.events.instant.test_sticking import STICKS, belt, block, oscillator, sticking
 
 TOL: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-10}
 

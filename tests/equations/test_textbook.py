@@ -14,8 +14,8 @@ from tests.choices import fast
 from tests.run_programs import dense, evaluate_programs
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_vector
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.deferred import deferred
 

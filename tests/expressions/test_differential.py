@@ -8,7 +8,7 @@ from jax import lax
 
 from tests.expressions.test_read import FUNCTIONS as READ
 from udkjax.expressions import Differential, Graph, ScalarProgram, cotangents, tangents, trace
-from udkjax.expressions.differential import common_factors
+from udkjax.expressions.algebra.differential import common_factors
 
 X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
 FUNCTIONS = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from udkjax.expressions import Graph, ScalarProgram
-from udkjax.expressions.elimination import SymbolicFactors
+from udkjax.expressions.algebra.elimination import SymbolicFactors
 
 
 def system(seed, m, n):

@@ -5,8 +5,9 @@ import math
 
 import pytest
 
-from udkjax.expressions import float_loops, scalar_program
-from udkjax.expressions.written_steps import PythonFunction
+from udkjax.expressions.loops import float_loops
+from udkjax.expressions.scalars import scalar_program
+from udkjax.expressions.scalars.written_steps import PythonFunction
 
 VALUES = (-2.0, -0.0, 0.0, 1.5, 3.0, math.inf, math.nan)
 FUNCTIONS = {

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.unrolled import Unrolled
+from udkjax.equations.programs.unrolled import Unrolled
 from udkjax.native import primitive, runs
 
 TS = np.linspace(0.0, 2.0, 21)

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import udkjax as udk
-from udkjax.scene.splines import natural_spline
+from udkjax.scene.elements.splines import natural_spline
 
 TS = np.linspace(0.0, 2.0, 401)
 KNOTS, VALUES = np.array([0.0, 0.37, 0.71, 1.13, 1.6]), np.array([0.0, 0.12, -0.1, 0.15, 0.05])

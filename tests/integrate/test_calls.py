@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.expressions import read_jaxpr
-from udkjax.integrate.events import condition_program
+from udkjax.integrate.events.run import condition_program
 from udkjax.native import primitive
 from udkjax.programs.deferred import _trace, deferred_p
 

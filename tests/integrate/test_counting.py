@@ -12,7 +12,7 @@ import pytest
 
 import udkjax as udk
 from tests.integrate.scenes import TS
-from udkjax.equations.abstract_system import TangentPart
+from udkjax.equations.laws.abstract_system import TangentPart
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.solvers.counting import NOT_COUNTED, CountingController, count_evaluations, evaluations
 from udkjax.integrate.solvers.multistep import Multistep, tolerances_from_controller

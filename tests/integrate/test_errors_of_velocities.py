@@ -6,12 +6,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations.general import prepare_general
-from udkjax.equations.traced_system import trace_system
+from udkjax.equations.systems.general import prepare_general
+from udkjax.equations.systems.traced_system import trace_system
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import native_equations
-from udkjax.native.base.steps import NEAREST_STAGE
+from udkjax.native.module.steps import NEAREST_STAGE
 
 LAG, RATE = 1e-4, 2.0  # s, rad/s
 

@@ -12,7 +12,7 @@ import udkjax as udk
 from tests import elements
 from udkjax.equations import prepare
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.formulations import Formulation
+from udkjax.equations.laws.formulations import Formulation
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import ConcreteRates, native_equations

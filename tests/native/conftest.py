@@ -10,10 +10,10 @@ import pytest
 
 from tests.quick_code import optimize
 from udkjax.expressions import Graph, ScalarProgram, trace
-from udkjax.native.base import machine, processor
-from udkjax.native.base.ir import POINTER, Function
-from udkjax.native.base.program import write
-from udkjax.native.base.text import text_of_module
+from udkjax.native.code import machine, processor
+from udkjax.native.language.ir import POINTER, Function
+from udkjax.native.language.program import write
+from udkjax.native.language.text import text_of_module
 
 WIDTHS = sorted({1, 2, processor.lanes()})
 

@@ -18,10 +18,10 @@ import udkjax as udk
 from tests.choices import fast
 from udkjax import threads
 from udkjax.native import primitive, records
-from udkjax.native.base import code_cache, machine
-from udkjax.native.base.ffi import handler
-from udkjax.native.base.memory import Memory
+from udkjax.native.code import code_cache, machine
 from udkjax.native.derivatives import record
+from udkjax.native.host.ffi import handler
+from udkjax.native.module.memory import Memory
 from udkjax.programs.deferred import deferred_p
 from udkjax.show import doctor
 
@@ -453,8 +453,8 @@ def test_equal_programs_are_equal_texts_in_every_process():
     """Otherwise the code of derivatives would be compiled again in each."""
     program = """
 import udkjax as udk
-from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.unrolled import Unrolled
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.programs.unrolled import Unrolled
 import hashlib
 mechanism = udk.library.parallelogram()
 programs = scene_programs(mechanism, udk.analyse(mechanism).redundant_rows)

@@ -11,7 +11,8 @@ import pytest
 import udkjax as udk
 from tests.native.test_implicit_stages import damped
 from udkjax.native import primitive
-from udkjax.native.base import leaving, loading, machine
+from udkjax.native.code import machine
+from udkjax.native.module import leaving, loading
 
 TS = np.linspace(0.0, 0.5, 3)
 STIFF, SOFT = 1e5, 0.1

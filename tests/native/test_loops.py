@@ -16,14 +16,14 @@ from tests.choices import fast
 from tests.run_programs import run
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.analysis import analyse
-from udkjax.equations.scene_arrays import constants_of
-from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.unrolled import Unrolled
-from udkjax.expressions.loop_derivative import PREFIXES, TWICE, LoopDerivative
-from udkjax.expressions.loop_program import KernelLoop, Reset
-from udkjax.native.base import processor
-from udkjax.native.base.loops import LoopWriter
+from udkjax.equations.programs.scene_arrays import constants_of
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.programs.unrolled import Unrolled
+from udkjax.equations.rows.analysis import analyse
+from udkjax.expressions.loops.loop_derivative import PREFIXES, TWICE, LoopDerivative
+from udkjax.expressions.loops.loop_program import KernelLoop, Reset
+from udkjax.native.code import processor
+from udkjax.native.language.loops import LoopWriter
 from udkjax.pinv.elimination_order import order_blocks
 from udkjax.pinv.rank_policy import RankPolicy
 

@@ -14,11 +14,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.choices import fast
 from tests.pinv.matrices import read_exact
 from udkjax import pinv
-from udkjax.native.base import machine, processor
-from udkjax.native.base.ir import POINTER, Function
-from udkjax.native.base.layout import Layout
-from udkjax.native.base.memory import Memory
-from udkjax.native.base.text import text_of_module
+from udkjax.native.code import machine, processor
+from udkjax.native.language.ir import POINTER, Function
+from udkjax.native.language.text import text_of_module
+from udkjax.native.module.layout import Layout
+from udkjax.native.module.memory import Memory
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 

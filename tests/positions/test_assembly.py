@@ -10,11 +10,11 @@ import udkjax as udk
 from tests.choices import fast
 from tests.textbook import terms
 from udkjax.equations import analyse
-from udkjax.equations.dense_rows import DenseRows
-from udkjax.equations.position_closure import close_position
-from udkjax.positions import assembly, native_closing
-from udkjax.positions.closure import close_by_jax
-from udkjax.positions.scene_check import check
+from udkjax.equations.rows.dense_rows import DenseRows
+from udkjax.equations.rows.position_closure import close_position
+from udkjax.positions.answers.scene_check import check
+from udkjax.positions.assembling import assembly, native_closing
+from udkjax.positions.assembling.closure import close_by_jax
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.positions.assembly import AssemblyWarning
+from udkjax.positions.assembling.assembly import AssemblyWarning
 
 MECH = udk.library.four_bar()
 

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize_scalar
 
 import udkjax as udk
-from udkjax.positions.characteristics import acute_range
-from udkjax.positions.linkage_type import four_bars, mobility
+from udkjax.positions.answers.characteristics import acute_range
+from udkjax.positions.answers.linkage_type import four_bars, mobility
 
 MM = {"length": "mm", "angle": "deg"}
 

@@ -9,11 +9,11 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
-from udkjax.positions import continuation
-from udkjax.positions.continuation import Reached
-from udkjax.positions.curve import NumpyCurve
-from udkjax.positions.drive import drive
-from udkjax.positions.march import march, march_at_once
+from udkjax.positions.following import continuation
+from udkjax.positions.following.continuation import Reached
+from udkjax.positions.following.curve import NumpyCurve
+from udkjax.positions.following.drive import drive
+from udkjax.positions.following.march import march, march_at_once
 
 TURN = np.linspace(np.pi / 3, np.pi / 3 + 2 * np.pi, 73)
 VALUES = np.linspace(1.1, 1.5, 12)  # as many as all tests take that compile something
@@ -135,7 +135,7 @@ def geared_five_bar():
 def test_travel_without_a_limit_is_followed_once_if_a_turn_leads_back(mechanism, driver, limits, monkeypatch):
     found = udk.travel(mechanism(), driver)
     assert tuple(bool(np.isfinite(x)) for x in (found.lower, found.upper)) == limits
-    monkeypatch.setattr(import_module("udkjax.positions.kinematics"), "_returns", lambda *given: False)
+    monkeypatch.setattr(import_module("udkjax.positions.following.kinematics"), "_returns", lambda *given: False)
     both_ways = udk.travel(mechanism(), driver)
     for name in ("lower", "upper", "lower_q", "upper_q", "status"):
         np.testing.assert_allclose(getattr(found, name), getattr(both_ways, name), rtol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.positions.drive import drive
+from udkjax.positions.following.drive import drive
 
 FOUR_BAR = udk.Drawing(
     pins={"O": (0, 0), "A": (0.03, 0.04), "B": (0.12, 0.09), "P": (0.06, 0.12), "C": (0.1, 0)},

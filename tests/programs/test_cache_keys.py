@@ -15,7 +15,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.study.identify import prediction
+from udkjax.study.identify.problem import prediction
 
 TS = np.linspace(0.0, 0.2, 3)
 EXACT: Any = {"rtol": 1e-10, "atol": 1e-10}
@@ -147,7 +147,7 @@ QUICK = ("torque or coefficient", "damped spring", "lower or upper limit")
 
 
 @pytest.mark.parametrize("name", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in PAIRS])
-@pytest.mark.filterwarnings("ignore::udkjax.positions.assembly.AssemblyWarning")
+@pytest.mark.filterwarnings("ignore::udkjax.positions.assembling.assembly.AssemblyWarning")
 def test_scenes_that_differ_in_absent_numbers_are_told_apart(name):
     """In turn, eagerly and in one compiled function; with events, too. The first is computed again after the second."""
     pair, found = PAIRS[name], {"eager": [], "jit": []}

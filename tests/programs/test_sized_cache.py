@@ -9,7 +9,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from udkjax.native import primitive
-from udkjax.native.base import loading
+from udkjax.native.module import loading
 from udkjax.programs import identity_cache
 from udkjax.programs.identity_cache import cached_by_size
 

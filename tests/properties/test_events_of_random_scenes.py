@@ -10,7 +10,7 @@ import pytest
 
 import udkjax as udk
 from experiments.parts.random_scenes import build, random_scene, state_of
-from tests.integrate.event_scenes import Level
+from tests.integrate.events.event_scenes import Level
 
 COORDINATES = ("x", "y", "angle", "vx", "vy", "omega")
 

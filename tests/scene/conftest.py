@@ -6,7 +6,7 @@ import pytest
 import udkjax.scene as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS
 from udkjax.scene import GROUND, Frame
-from udkjax.scene.bodies import GROUND_FRAME_AT_REST
+from udkjax.scene.elements.bodies import GROUND_FRAME_AT_REST
 
 
 def frames(mechanism, q, v=None):

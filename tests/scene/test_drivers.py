@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
-from udkjax.scene.held import rows_of, with_row
+from udkjax.scene.elements.held import rows_of, with_row
 
 ONE = udk.Frame(1.0, 2.0, 0.5, np.cos(0.5), np.sin(0.5))
 TWO = udk.Frame(-1.0, 0.5, 2.0, np.cos(2.0), np.sin(2.0))

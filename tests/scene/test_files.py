@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from udkjax.scene import dumps, loads
-from udkjax.scene.checks import name_mistake
-from udkjax.scene.schema import CLASSES_BY_TYPE
+from udkjax.scene.tables.checks import name_mistake
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE
 
 HEAD = "format = 1\n"
 BODY = '[[body]]\nname = "link1"\nmass = 1.0\ninertia = 1\n'

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
-from udkjax.scene.units import units_of
+from udkjax.scene.numbers.units import units_of
 
 V = jnp.array([[0.3, -0.2, 1.1], [0.5, 0.4, -0.7], [0.0, 0.1, 0.2]])
 

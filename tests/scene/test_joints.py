@@ -7,8 +7,8 @@ from scipy.interpolate import CubicSpline
 
 import udkjax.scene as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, ROWS, P
-from udkjax.scene import splines
-from udkjax.scene.schema import CLASSES_BY_TYPE
+from udkjax.scene.elements import splines
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE
 
 
 def evaluate(mechanism, name, at, q):

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from udkjax import simulate
-from udkjax.equations.dense_rows import DenseTerms
+from udkjax.equations.rows.dense_rows import DenseTerms
 from udkjax.scene import library
 
 ROOT = Path(__file__).parents[2]

@@ -12,8 +12,9 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from tests.elements import P
-from udkjax.scene import element_setup, library
-from udkjax.scene.checks import numbers_are_valid
+from udkjax.scene import library
+from udkjax.scene.tables import element_setup
+from udkjax.scene.tables.checks import numbers_are_valid
 
 
 def test_the_order_is_the_users(everything):

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.positions.assembly import close
+from udkjax.positions.assembling.assembly import close
 
 LINKS = ("link1", "link2", "link3")
 

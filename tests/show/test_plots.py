@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import udkjax as udk
-from udkjax.equations.quantities import Energy
+from udkjax.equations.states.quantities import Energy
 from udkjax.integrate import Result, Solution
 from udkjax.show import plots
 from udkjax.show.plots import farthest_instants, trajectory

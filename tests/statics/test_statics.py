@@ -9,7 +9,7 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
-from udkjax.positions.curve import NumpyCurve
+from udkjax.positions.following.curve import NumpyCurve
 from udkjax.statics import linearization
 from udkjax.statics.linearization import NumpyLinearizer, TracedLinearizer
 

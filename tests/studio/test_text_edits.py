@@ -4,7 +4,7 @@ import copy
 
 import pytest
 
-from udkjax.scene.checks import SceneError
+from udkjax.scene.tables.checks import SceneError
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.text_edits import merge_document, read_document
 

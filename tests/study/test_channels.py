@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.positions.channels import Quantity, channel_of, channels_of
+from udkjax.positions.assembling.channels import Quantity, channel_of, channels_of
 from udkjax.programs.deferred import deferred
 from udkjax.study.channel_values import measure
 

@@ -11,9 +11,9 @@ import udkjax as udk
 from experiments.parts.random_scenes import build, random_scene
 from tests.friction import rubbing
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.determinacy import left_null_space
-from udkjax.equations.rubbing import rubbing_names, settle, single_rubbing_loads
-from udkjax.equations.textbook import prepare
+from udkjax.equations.friction.rubbing import rubbing_names, settle, single_rubbing_loads
+from udkjax.equations.rows.determinacy import left_null_space
+from udkjax.equations.states.textbook import prepare
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.equations import analyse
-from udkjax.positions.linkage_type import mobility
+from udkjax.positions.answers.linkage_type import mobility
 
 RATIOS = 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6
 LENGTHS = 1e-6, 1.0, 1e3  # of a crank (m)

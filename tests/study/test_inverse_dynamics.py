@@ -8,7 +8,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from tests.elements import DRIVERS
-from udkjax.positions.coordinates import Coordinate, coordinate_value
+from udkjax.positions.assembling.coordinates import Coordinate, coordinate_value
 
 SCENES = {"driven pendulum": udk.library.driven_pendulum, "slider crank": lambda: udk.library.slider_crank(0.3, 4.0)}
 

@@ -14,9 +14,9 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.choices import fast
-from udkjax.equations import eliminated_steps
-from udkjax.equations.scene_arrays import SceneArrays
-from udkjax.positions.drive import without_drivers
+from udkjax.equations.programs import eliminated_steps
+from udkjax.equations.programs.scene_arrays import SceneArrays
+from udkjax.positions.following.drive import without_drivers
 from udkjax.study import driver_efforts
 
 TIMES = np.linspace(0.0, 1.0, 11)

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from experiments.parts.closed_chains import bennett, bricard
-from tests.integrate.own_systems import G, disc
-from udkjax.scene.checks import SceneError
+from tests.integrate.systems.own_systems import G, disc
+from udkjax.scene.tables.checks import SceneError
 from udkjax.study.sweep.dimensions import SweepError
 
 TS = np.linspace(0.0, 1.0, 5)

@@ -48,7 +48,7 @@ PARALLELOGRAM = udk.Drawing(
 
 def motion(mechanism, count, span=1.8):
     """Values of the first driver, starting from the drawn one, and the motion for these values."""
-    from udkjax.positions.drive import drive
+    from udkjax.positions.following.drive import drive
 
     name = mechanism.driver_names[0]
     values = float(drive(mechanism, name).value(mechanism.q0)) + np.linspace(0.1, span, count)
@@ -239,7 +239,7 @@ def require_slopes(problem, s):
 
 
 def start_of(mechanism, driver):
-    from udkjax.positions.drive import drive
+    from udkjax.positions.following.drive import drive
 
     return float(drive(mechanism, driver).value(mechanism.q0))
 

@@ -60,7 +60,7 @@ def store_compiled_programs() -> None:
     written, or if others may write it.
     """
     from udkjax.folders import is_writable, refusal
-    from udkjax.native.base.code_cache import cache_folder
+    from udkjax.native.code.code_cache import cache_folder
 
     folder = cache_folder()
     if folder is None or "jax" in sys.modules or not is_writable(folder) or refusal(folder):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from udkjax import Mechanism
-    from udkjax.show.player.measure_curves import ShownMotion
+    from udkjax.show.player.marks.measure_curves import ShownMotion
 
     ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # with further measures by name
 

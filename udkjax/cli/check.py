@@ -12,7 +12,7 @@ def check(scene: Scene, /, json: Json = False) -> None:
         scene: the mechanism.
     """
     mech, _ = load(scene)
-    from udkjax.positions.scene_check import check as checked
+    from udkjax.positions.answers.scene_check import check as checked
     from udkjax.show.summary import check_summary
 
     report = checked(mech)

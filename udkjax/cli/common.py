@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from udkjax import Mechanism
-    from udkjax.positions.channels import Channel, StateHistory
+    from udkjax.positions.assembling.channels import Channel, StateHistory
 
     Columns = dict[str, tuple[np.ndarray, str]]  # values over time, and their unit, by name
 
@@ -118,7 +118,7 @@ def show(results: Mapping[str, object], text: str, json: bool) -> None:
 
 def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
     """Return the channels with the given names; exit with a message if a name is invalid."""
-    from udkjax.positions.channels import channel_of
+    from udkjax.positions.assembling.channels import channel_of
 
     channels = []
     for name in names:
@@ -147,7 +147,7 @@ def choose_driver(mech: "Mechanism", given: str | None) -> str:
     if given is None and len(mech.driver_names) > 1:
         refuse(f"--driver: the scene has {len(mech.driver_names)} drivers; name one of {', '.join(mech.driver_names)}")
     if given is None and not mech.driver_names:
-        from udkjax.positions.drive import suggested_coordinate
+        from udkjax.positions.following.drive import suggested_coordinate
 
         refuse(f"--driver: the scene has no driver; name a coordinate, such as {suggested_coordinate(mech)}")
     return next(iter(mech.drivers)) if given is None else given

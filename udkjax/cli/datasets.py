@@ -61,7 +61,7 @@ def write(
     if out is None:
         return
     from udkjax.integrate.solution import versions
-    from udkjax.scene.bodies import COORDINATES
+    from udkjax.scene.elements.bodies import COORDINATES
 
     with OptionalImport():
         import xarray

@@ -151,7 +151,7 @@ def _page(candidate: Any, goal: Any) -> Any:
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.drive import constant_speed
+    from udkjax.positions.following.drive import constant_speed
 
     mech, driver = candidate.mechanism, candidate.driver
     traces = [goal.point] if isinstance(goal, udk.PathGoal) and goal.at is None else None

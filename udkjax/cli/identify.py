@@ -13,7 +13,7 @@ from udkjax.extras import NETCDF, require
 
 if TYPE_CHECKING:
     from udkjax import Estimate
-    from udkjax.study.identify.profile_likelihood import ProfileLikelihood
+    from udkjax.study.identify.answers.profile_likelihood import ProfileLikelihood
 
 # The names in udkjax.study.identify, which cannot be imported here, since it imports JAX.
 Loss = Literal["least_squares", "huber", "soft_l1"]
@@ -118,7 +118,7 @@ def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], result
 
     import udkjax as udk
     from udkjax.show.identify_figures import save_fit_pictures
-    from udkjax.study.identify.estimate import Row
+    from udkjax.study.identify.answers.estimate import Row
     from udkjax.study.report import plain
 
     out.mkdir(exist_ok=True)

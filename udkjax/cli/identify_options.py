@@ -7,9 +7,9 @@ from typing import Any, TypeVar
 
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify import IdentificationError, Parameter, Record, Start
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.record_reader import records_of
-from udkjax.study.identify.records import Estimated
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.records.record_reader import records_of
+from udkjax.study.identify.records.records import Estimated
 from udkjax.wording import quote, suggestion
 
 Groups = Iterable[Iterable[str]]

@@ -11,8 +11,8 @@ from udkjax.extras import OptionalImport
 if TYPE_CHECKING:
     from udkjax import Mechanism
     from udkjax.annotations import Numbers
-    from udkjax.positions.counting import Count
-    from udkjax.positions.kinematics import Kinematics, Travel
+    from udkjax.positions.answers.counting import Count
+    from udkjax.positions.following.kinematics import Kinematics, Travel
 
 with OptionalImport():
     import tyro
@@ -63,9 +63,9 @@ def kinematics(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.coordinates import value_of
-    from udkjax.positions.counting import count_of, nearest_turn, read_number
-    from udkjax.positions.pin_motion import of_kinematics, rate_text, usual_rate
+    from udkjax.positions.answers.counting import count_of, nearest_turn, read_number
+    from udkjax.positions.answers.pin_motion import of_kinematics, rate_text, usual_rate
+    from udkjax.positions.assembling.coordinates import value_of
     from udkjax.printing import text_table
     from udkjax.show.summary import table
 
@@ -167,7 +167,7 @@ def _centres(mech: "Mechanism", motion: "Kinematics", counted: "Count") -> str:
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.counting import direction_text
+    from udkjax.positions.answers.counting import direction_text
     from udkjax.printing import PrintedTable, format_number, text_table
 
     rows, unit, size = [], counted.units.shown("m"), counted.units.size("m")

@@ -32,7 +32,7 @@ def reactions(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.channels import LOADS
+    from udkjax.positions.assembling.channels import LOADS
     from udkjax.printing import PrintedTable, format_number, text_table
     from udkjax.statics.reaction_peaks import cam_forces, unique_pin_forces
 

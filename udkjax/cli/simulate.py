@@ -81,7 +81,7 @@ def simulate(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.assembly import AssemblyWarning, moves_of_assembly
+    from udkjax.positions.assembling.assembly import AssemblyWarning, moves_of_assembly
     from udkjax.show.figures import channels_figure
     from udkjax.show.plots import trajectory
     from udkjax.show.summary import run_summary

@@ -34,7 +34,7 @@ def statics(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.channels import LOADS
+    from udkjax.positions.assembling.channels import LOADS
     from udkjax.statics.resting_forces import force_lines, resting_forces
 
     if starts == 1:  # without one nearby, that downhill, as in the studio

@@ -9,18 +9,18 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.equations.analysis import Analysis
-from udkjax.equations.elements import has_pieces
-from udkjax.equations.formulations import Formulation, WrappedSystem
-from udkjax.equations.quantities import equations_of
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.equations.textbook import TextbookEquations
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.abstract_system import AbstractSystem
+from udkjax.equations.laws.formulations import Formulation, WrappedSystem
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.states.quantities import equations_of
+from udkjax.equations.states.textbook import TextbookEquations
+from udkjax.equations.terms.elements import has_pieces
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import has_method, is_explicit, method_of
 from udkjax.integrate.stabilization import Stabilization
-from udkjax.native.base.program import UnsupportedError
+from udkjax.native.language.program import UnsupportedError
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
 from udkjax.native.run.method_code import MethodCode
@@ -28,8 +28,8 @@ from udkjax.native.runs import RunStates
 from udkjax.native.unsupported import unsupported
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.scene.elements.rolling import rolling_joints
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.rolling import rolling_joints
 
 if TYPE_CHECKING:
     import diffrax

@@ -10,8 +10,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.equations.textbook import TextbookEquations
+from udkjax.equations.laws.abstract_system import AbstractSystem
+from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import eliminates
 from udkjax.integrate.constrained import Constrained
 from udkjax.integrate.drift import DriftController, most_rank
@@ -21,7 +21,7 @@ from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.integrate.projection import STATES_AT_ONCE, project, project_all, violation
 from udkjax.integrate.solvers import is_explicit
 from udkjax.integrate.solvers.counting import NOT_COUNTED, CountingController, evaluations
-from udkjax.native.base.steps import FACTORS, Status
+from udkjax.native.module.steps import FACTORS, Status
 from udkjax.transforms.gradients import stop_gradients
 
 

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.textbook import TextbookEquations
+from udkjax.equations.laws.abstract_system import AbstractSystem
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solvers.counting import CountingController
-from udkjax.native.base.steps import Status
+from udkjax.native.module.steps import Status
 from udkjax.pinv import SVD
 from udkjax.pinv.auto import NEAREST
 from udkjax.transforms.gradients import stop_gradients

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.abstract_system import AbstractSystem
-from udkjax.equations.scene_programs import scene_programs
-from udkjax.equations.structure import numbers_as_vector
+from udkjax.equations.laws.abstract_system import AbstractSystem
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, formulation_of, textbook_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
-from udkjax.native.base.steps import Status
+from udkjax.native.module.steps import Status
 from udkjax.native.operations import MarkRows
 from udkjax.native.packing import ActiveNumbers
 from udkjax.native.primitive import call_concrete, native_p

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Time, Vector
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart
-from udkjax.equations.analysis import analyse
-from udkjax.equations.formulations import WrappedSystem
-from udkjax.equations.scales import Scales
-from udkjax.equations.structure import numbers_as_vector
-from udkjax.equations.textbook import TextbookEquations
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.abstract_system import AbstractSystem, TangentPart
+from udkjax.equations.laws.formulations import WrappedSystem
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.programs.scales import Scales
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.states.textbook import TextbookEquations
+from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_concrete, evaluation_of
 from udkjax.integrate.native_engine import SceneInputs, mark_rows, scene_inputs
 from udkjax.integrate.problem import Problem

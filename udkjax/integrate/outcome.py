@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.laws.abstract_system import AbstractSystem
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
-from udkjax.native.base.steps import LOOK_AHEAD, Status
+from udkjax.native.module.steps import LOOK_AHEAD, Status
 
 # The least `atol`, relative to the scene's scales: errors cannot be below rounding, and a coordinate near zero has no other
 # tolerance.

@@ -10,10 +10,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from udkjax.arrays import number
-from udkjax.equations.analysis import Analysis, analyse, hold_pins
-from udkjax.equations.formulations import Formulation
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.formulations import Formulation
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.rows.analysis import Analysis, analyse, hold_pins
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.outcome import LEAST_ATOL, increases, usable
@@ -21,15 +21,15 @@ from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import has_method
 from udkjax.integrate.stabilization import Stabilization
-from udkjax.native.base.steps import SMALLEST_STEP
+from udkjax.native.module.steps import SMALLEST_STEP
 from udkjax.pinv import Auto, Pseudoinverse
-from udkjax.positions.assembly import Closure, State, close, moves_from_guess
+from udkjax.positions.assembling.assembly import Closure, State, close, moves_from_guess
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.undefined import whole
 from udkjax.requirements import ArgumentTypeError, describe
-from udkjax.scene.checks import numbers_are_valid
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import numbers_are_valid
 from udkjax.transforms.gradients import stop_gradients
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def with_kinks(system: Any, choices: Choices) -> tuple[Choices, bool]:
     """Return the choices with a remark on jumps and kinks of forces, and whether a run locates them."""
     if not _may_have_kinks(system):
         return choices, False
-    from udkjax.integrate.events.kinks import kinks_of  # most runs do not need it
+    from udkjax.integrate.events.law.kinks import kinks_of  # most runs do not need it
 
     found, without = kinks_of(system), choices.without_events
     return choices._replace(kinks=found.remark(f"with {without}" if without else "")), found.are_held and not without

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from udkjax.equations.abstract_system import AbstractSystem
+from udkjax.equations.laws.abstract_system import AbstractSystem
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.transforms.gradients import stop_gradients
 

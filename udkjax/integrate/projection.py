@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart
-from udkjax.native.base.steps import NORMAL_ERROR_WEIGHT
+from udkjax.equations.laws.abstract_system import AbstractSystem, TangentPart
+from udkjax.native.module.steps import NORMAL_ERROR_WEIGHT
 from udkjax.printing import PrintsLine
 from udkjax.transforms.gradients import stop_gradients
 

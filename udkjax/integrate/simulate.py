@@ -16,10 +16,10 @@ from jaxtyping import Array
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays, without_derivatives
 from udkjax.devices import on_host
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.formulations import Formulation
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.formulations import Formulation
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.causes.find import explained
 from udkjax.integrate.causes.system_causes import explained_system
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
@@ -46,7 +46,7 @@ from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
 from udkjax.integrate.stabilization import Stabilization
 from udkjax.pinv import Pseudoinverse
-from udkjax.positions.assembly import AssemblyWarning, Closure, State, close, require_closed
+from udkjax.positions.assembling.assembly import AssemblyWarning, Closure, State, close, require_closed
 from udkjax.programs.deferred import deferred
 from udkjax.requirements import ArgumentError, require_output_times
 from udkjax.scene.arguments import checked

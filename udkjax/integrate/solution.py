@@ -13,15 +13,15 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import Numbers
 from udkjax.arrays import number
-from udkjax.equations.quantities import efforts
+from udkjax.equations.states.quantities import efforts
 from udkjax.extras import OptionalImport
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
-from udkjax.scene.bodies import COORDINATES, Frame, frame_over_time
-from udkjax.scene.description import format_pose, size_of
+from udkjax.scene.elements.bodies import COORDINATES, Frame, frame_over_time
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.numbers.description import format_pose, size_of
 
 if TYPE_CHECKING:
-    from udkjax.integrate.events.event import Events
+    from udkjax.integrate.events.law.event import Events
 
 
 class Result(PrintsWords):
@@ -258,8 +258,8 @@ def format_work(stats: Mapping[str, ArrayLike]) -> str:
 
 def scene_text(mechanism: Mechanism) -> str:
     """Return a mechanism as the text of a scene file, or the reason why this is impossible."""
-    from udkjax.scene.checks import SceneError
     from udkjax.scene.files import dumps
+    from udkjax.scene.tables.checks import SceneError
 
     try:
         return dumps(mechanism)

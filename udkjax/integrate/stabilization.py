@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Time, Vector
-from udkjax.equations.abstract_system import AbstractSystem, TangentPart
-from udkjax.equations.formulations import WrappedSystem
-from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.laws.abstract_system import AbstractSystem, TangentPart
+from udkjax.equations.laws.formulations import WrappedSystem
+from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.pinv import SVD
 from udkjax.printing import PrintsLine
 

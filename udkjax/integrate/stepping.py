@@ -15,20 +15,20 @@ from jaxtyping import Array
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import float_type, is_traced, is_within_jit, make_module, number, stored
 from udkjax.devices import on_host
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate import simulate
-from udkjax.positions.assembly import State
+from udkjax.positions.assembling.assembly import State
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.programs.undefined import defined
 from udkjax.requirements import ArgumentError, ArgumentTypeError, describe
 from udkjax.scene.arguments import checked
-from udkjax.scene.held import Held
+from udkjax.scene.elements.held import Held
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 

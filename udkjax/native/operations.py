@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.equations.structure import numbers_as_vector
-from udkjax.native.base.layout import FORMULATION_SETTINGS, INPUTS, OUTPUTS, SETTINGS, SHARE
-from udkjax.native.base.memory import Memory
-from udkjax.native.base.module import Module
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.terms.structure import numbers_as_vector
+from udkjax.native.module.layout import FORMULATION_SETTINGS, INPUTS, OUTPUTS, SETTINGS, SHARE
+from udkjax.native.module.memory import Memory
+from udkjax.native.module.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.row_marks import RowMarks

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.scene.held import row_size, rows_of, with_row
+from udkjax.scene.elements.held import row_size, rows_of, with_row
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from udkjax.native.base.module import Module
 from udkjax.native.closing.closing import Closing
 from udkjax.native.closing.closing_derivatives import ClosingForward, ClosingReverse, ClosingTwice
 from udkjax.native.closing.marching import Marching
+from udkjax.native.module.module import Module
 from udkjax.native.operations import Operation
 
 

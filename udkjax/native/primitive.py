@@ -18,17 +18,18 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from udkjax.equations.scales import scales_p
+from udkjax.equations.programs.scales import scales_p
 from udkjax.native import records
-from udkjax.native.base import host_program, interrupts, machine, processor
-from udkjax.native.base.ffi import handler
-from udkjax.native.base.layout import INFO, INPUTS, OUTPUTS
-from udkjax.native.base.loading import Code, load
-from udkjax.native.base.memory import Memory
-from udkjax.native.base.steps import Status
-from udkjax.native.base.text import text_of_module
+from udkjax.native.code import interrupts, machine, processor
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
+from udkjax.native.host import host_program
+from udkjax.native.host.ffi import handler
+from udkjax.native.language.text import text_of_module
+from udkjax.native.module.layout import INFO, INPUTS, OUTPUTS
+from udkjax.native.module.loading import Code, load
+from udkjax.native.module.memory import Memory
+from udkjax.native.module.steps import Status
 from udkjax.native.operations import FindScales, Operation
 from udkjax.native.runs import RunCotangents, goes_back
 from udkjax.native.sharding import call_by_members, divide_members, knows_devices
@@ -391,7 +392,7 @@ mlir.register_lowering(native_p, mlir.lower_fun(_lower_for_card), platform="cuda
 evaluate_as(native_p, call_members)
 
 
-# --- the scales of traced mechanisms, by the primitive of equations/scales.py
+# --- the scales of traced mechanisms, by the primitive of equations/programs/scales.py
 
 
 def _scale_inputs(numbers: Any) -> list[Any]:

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
-from udkjax.native.base.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
-from udkjax.native.base.module import Module
-from udkjax.native.base.tableau import KVAERNO5, Method
 from udkjax.native.derivatives import record
 from udkjax.native.derivatives.backpropagation import Reverse
 from udkjax.native.derivatives.second_tangents import ForwardTwice
 from udkjax.native.derivatives.tangents import Forward
+from udkjax.native.module.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
+from udkjax.native.module.module import Module
+from udkjax.native.module.tableau import KVAERNO5, Method
 from udkjax.native.operations import Accelerate, Operation
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.formulations import FormulationCode

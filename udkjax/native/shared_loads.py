@@ -1,7 +1,7 @@
 """Calls of machine code where redundant rows share the loads of joints with friction, but are known only when it is called.
 
-Marks among the numbers of each member are negative for its redundant rows (equations/load_sharing.py). Members with the same
-redundant rows are run together, by machine code for these rows. Members without any, which are most, need no other code.
+Marks among the numbers of each member are negative for its redundant rows (equations/elimination/load_sharing.py). Members with
+the same redundant rows are run together, by machine code for these rows. Members without any, which are most, need no other code.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from udkjax.devices import computing_on_host
-from udkjax.native.base.host_function import call_host
-from udkjax.native.base.layout import INPUTS
+from udkjax.native.host.host_function import call_host
+from udkjax.native.module.layout import INPUTS
 from udkjax.native.operations import Operation
 
 NUMBERS, SETTINGS, ROWS = (INPUTS.index(name) for name in ("numbers", "settings", "rows"))

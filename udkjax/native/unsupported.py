@@ -1,9 +1,9 @@
 """Operations that machine code cannot compute."""
 
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.expressions.loop_program import Reset
-from udkjax.native.base.ir import Function
-from udkjax.native.base.program import UnsupportedError, Writer
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.expressions.loops.loop_program import Reset
+from udkjax.native.language.ir import Function
+from udkjax.native.language.program import UnsupportedError, Writer
 from udkjax.programs.identity_cache import cached_by_identity
 
 

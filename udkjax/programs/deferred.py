@@ -5,7 +5,7 @@ faster without compilation. NumPy therefore evaluates a program until the evalua
 on the compiled program runs, also on the host. The results agree up to rounding errors.
 
 For JAX such a program is one operation, whose derivatives and batches are again deferred programs. In programs of a graphics card
-the host runs it, if it has loops or factorizations (native/base/host_program.py).
+the host runs it, if it has loops or factorizations (native/host/host_program.py).
 
 All means of avoiding repeated work in the package, and their uses:
 

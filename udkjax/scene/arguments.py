@@ -26,9 +26,9 @@ from udkjax.requirements import (
     require_count,
     require_number,
 )
-from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism, require_valid_numbers
 from udkjax.scene.named_arguments import CHECKS, require_history, require_name_or_names, require_names
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import article, quote, suggestion
 
 Arguments = ParamSpec("Arguments")

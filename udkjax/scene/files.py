@@ -5,11 +5,11 @@ from pathlib import Path
 
 from udkjax.scene import mechanism_tables as tables
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import is_xml, parse_toml
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import abbreviate
 
 DRAWN_VERSION = 2  # version of the format of drawings, with pins and links

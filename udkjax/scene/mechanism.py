@@ -17,26 +17,16 @@ from udkjax.arrays import is_traced, is_within_jit, make_module, number, without
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.programs.control_flow import ConvertsItself
 from udkjax.programs.identity_cache import cached_within_trace, is_concrete
-from udkjax.scene.bodies import Body, stack_coordinates
-from udkjax.scene.checks import SceneError, gravity_mistakes, numbers_are_valid
-from udkjax.scene.description import mechanism_table
-from udkjax.scene.direct_numbers import DirectNumbers
-from udkjax.scene.drivers import Driver
-from udkjax.scene.element_setup import (
-    Groups,
-    attached_bodies,
-    check_elements,
-    complete,
-    completion_mistakes,
-    name_elements,
-    replaced,
-)
-from udkjax.scene.forces import ForceElement
-from udkjax.scene.friction import Friction
-from udkjax.scene.held import Held, row_at, row_size, sampled_fields, with_row
-from udkjax.scene.joints import Constraint, Joint
-from udkjax.scene.mechanism_fields import fields_of
-from udkjax.scene.number_fields import (
+from udkjax.scene.elements.bodies import Body, stack_coordinates
+from udkjax.scene.elements.drivers import Driver
+from udkjax.scene.elements.forces import ForceElement
+from udkjax.scene.elements.friction import Friction
+from udkjax.scene.elements.held import Held, row_at, row_size, sampled_fields, with_row
+from udkjax.scene.elements.joints import Constraint, Joint
+from udkjax.scene.numbers.description import mechanism_table
+from udkjax.scene.numbers.direct_numbers import DirectNumbers
+from udkjax.scene.numbers.mechanism_fields import fields_of
+from udkjax.scene.numbers.number_fields import (
     SECTIONS,
     ElementGroups,
     parameters_in,
@@ -46,8 +36,18 @@ from udkjax.scene.number_fields import (
     require_values,
     split_index,
 )
-from udkjax.scene.origin import Origin
-from udkjax.scene.sources import AbstractDrawing, Drawn, Elements, Source, elements_of, names_of
+from udkjax.scene.numbers.origin import Origin
+from udkjax.scene.numbers.sources import AbstractDrawing, Drawn, Elements, Source, elements_of, names_of
+from udkjax.scene.tables.checks import SceneError, gravity_mistakes, numbers_are_valid
+from udkjax.scene.tables.element_setup import (
+    Groups,
+    attached_bodies,
+    check_elements,
+    complete,
+    completion_mistakes,
+    name_elements,
+    replaced,
+)
 
 Element = TypeVar("Element", bound=eqx.Module)
 Module = TypeVar("Module", bound=eqx.Module)

@@ -10,11 +10,11 @@ import numpy as np
 
 from udkjax.annotations import TomlTable
 from udkjax.arrays import is_traced
-from udkjax.scene.checks import Mistakes, SceneEntry, SceneError, find_class, problems_of
-from udkjax.scene.element_setup import name_elements
-from udkjax.scene.fields import vector_as_angle
+from udkjax.scene.elements.fields import vector_as_angle
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
+from udkjax.scene.tables.checks import Mistakes, SceneEntry, SceneError, find_class, problems_of
+from udkjax.scene.tables.element_setup import name_elements
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
 from udkjax.wording import abbreviate, unknown_key
 
 FORMAT_VERSION = 1  # version of the format of scenes with bodies and joints

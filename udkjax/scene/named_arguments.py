@@ -29,7 +29,7 @@ from udkjax.requirements import (
     require_numbers_by_name,
     require_times,
 )
-from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 

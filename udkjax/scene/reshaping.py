@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Number, NumberLike, Numbers
 from udkjax.arrays import number
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
-from udkjax.scene.checks import SceneError
-from udkjax.scene.joints import Revolute, Weld
+from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
+from udkjax.scene.elements.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.spanning_tree import spanning_tree
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote, suggestion
 
 

@@ -5,7 +5,7 @@ from heapq import heappop, heappush
 from itertools import count
 from typing import NamedTuple
 
-from udkjax.scene.bodies import GROUND
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 
 

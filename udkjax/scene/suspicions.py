@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from udkjax.scene.bodies import GROUND
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.reshaping import attachments
 from udkjax.wording import quote

@@ -10,8 +10,8 @@ from udkjax.show.player import Animation as Animation
 from udkjax.show.player import animate as animate
 from udkjax.show.player import animate_modes as animate_modes
 from udkjax.show.player.animation import FailedRunWarning as FailedRunWarning
-from udkjax.show.player.measure_curves import ShownMotion as ShownMotion
-from udkjax.show.player.measure_curves import measures_of as measures_of
+from udkjax.show.player.marks.measure_curves import ShownMotion as ShownMotion
+from udkjax.show.player.marks.measure_curves import measures_of as measures_of
 from udkjax.show.player.run_files import read_run as read_run
 from udkjax.show.plots import trajectory as trajectory
 from udkjax.show.summary import check_summary as check_summary

@@ -15,8 +15,8 @@ from udkjax.extras import EXTRAS
 from udkjax.folders import is_writable, refusal
 from udkjax.integrate import Solution, simulate
 from udkjax.integrate.solution import versions
-from udkjax.native.base.code_cache import cache_folder, cached_files
-from udkjax.native.base.processor import lanes
+from udkjax.native.code.code_cache import cache_folder, cached_files
+from udkjax.native.code.processor import lanes
 from udkjax.scene.library import double_pendulum
 from udkjax.study.members import processor
 from udkjax.threads import cores, thread_count

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from udkjax.extras import OptionalImport
-from udkjax.positions.kinematics import Kinematics
+from udkjax.positions.following.kinematics import Kinematics
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.plots import draw_angles, draw_motion, draw_reactions
 from udkjax.show.style import COLOURS, DASHES, legend, plain

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations.analysis import analyse
-from udkjax.equations.quantities import Energy, energy, violation
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.states.quantities import Energy, energy, violation
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
-from udkjax.scene.bodies import GROUND
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show import fit_figures, sweep_figures
-from udkjax.show.player.mark_kinds import MarkKind
-from udkjax.show.player.mark_places import body_points, to_ground
-from udkjax.show.player.marks import marks
+from udkjax.show.player.marks.mark_kinds import MarkKind
+from udkjax.show.player.marks.mark_places import body_points, to_ground
+from udkjax.show.player.marks.marks import marks
 from udkjax.show.player.player_data import trace_anchors
 from udkjax.show.style import COLOURS, DASHES, MARKERS, legend, plain
 from udkjax.study.accuracy import largest_violation

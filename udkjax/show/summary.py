@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.equations.quantities import efforts
+from udkjax.equations.states.quantities import efforts
 from udkjax.integrate import Solution
 from udkjax.integrate.solution import format_work
-from udkjax.positions.scene_check import Check, check_lines, numbered
+from udkjax.positions.answers.scene_check import Check, check_lines, numbered
 from udkjax.printing import align_columns, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import Accuracy
@@ -17,7 +17,7 @@ from udkjax.wording import join_names, plural
 
 
 def check_summary(mech: Mechanism, check: Check) -> str:
-    """Describe the findings of `udkjax.positions.scene_check.check` about a mechanism."""
+    """Describe the findings of `udkjax.positions.answers.scene_check.check` about a mechanism."""
     lines = check_lines(check)
     lines["constraint equations"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
     lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in check.redundant) or "none"

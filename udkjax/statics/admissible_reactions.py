@@ -24,11 +24,11 @@ from udkjax.annotations import Time
 from udkjax.complementarity.linear_program import maximize
 from udkjax.equations import constraints, determinacy, loads
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.analysis import Analysis
-from udkjax.equations.directed_friction import DirectedFriction
+from udkjax.equations.friction.directed_friction import DirectedFriction
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.pinv import SVD
 from udkjax.programs.deferred import deferred
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.load_scale import load_sizes
 from udkjax.transforms.gradients import stop_gradients

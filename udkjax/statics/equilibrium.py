@@ -11,22 +11,22 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
 from udkjax.arrays import ArrayLibrary, is_traced, library_for, make_module, number, stored
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.positions.assembly import State, close
-from udkjax.positions.branches import distinct_positions, random_positions
-from udkjax.positions.curve import AbstractCurve, Curve, NumpyCurve
-from udkjax.positions.drive import Driven
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.positions.assembling.assembly import State, close
+from udkjax.positions.following.branches import distinct_positions, random_positions
+from udkjax.positions.following.curve import AbstractCurve, Curve, NumpyCurve
+from udkjax.positions.following.drive import Driven
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, format_numbers, units
 from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow, sequential, solve
 from udkjax.programs.undefined import whole
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import SceneError
-from udkjax.scene.description import format_pose, size_of
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.position_only import refuse_rolling
+from udkjax.scene.numbers.description import format_pose, size_of
+from udkjax.scene.tables.checks import SceneError
+from udkjax.scene.tables.position_only import refuse_rolling
 from udkjax.statics.admissible_reactions import friction_holds_around
 from udkjax.statics.linearization import Linearization, Linearizer, TracedLinearizer, linearizer, with_unit_mass
 from udkjax.statics.load_scale import LoadScale

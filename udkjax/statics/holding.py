@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.equations.analysis import Analysis
-from udkjax.positions.assembly import State
-from udkjax.positions.coordinates import Coordinate
-from udkjax.positions.drive import drive
-from udkjax.positions.kinematics import kinematics
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.positions.assembling.assembly import State
+from udkjax.positions.assembling.coordinates import Coordinate
+from udkjax.positions.following.drive import drive
+from udkjax.positions.following.kinematics import kinematics
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked

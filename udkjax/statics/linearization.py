@@ -20,9 +20,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.analysis import Analysis
-from udkjax.equations.dense_pseudoinverse import dense_pseudoinverse
-from udkjax.equations.dense_rows import DenseTerms
+from udkjax.equations.elimination.dense_pseudoinverse import dense_pseudoinverse
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.rows.dense_rows import DenseTerms
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.programs.identity_cache import cached_by_identity

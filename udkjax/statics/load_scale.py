@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import AnyArray, Time
 from udkjax.arrays import ArrayLibrary
 from udkjax.equations import loads
-from udkjax.equations.scales import Scales
+from udkjax.equations.programs.scales import Scales
 from udkjax.scene.mechanism import Mechanism
 
 

@@ -10,14 +10,14 @@ from jaxtyping import Array, Complex, Float, Int
 
 from udkjax.annotations import NumberLike
 from udkjax.arrays import ArrayLibrary, is_traced, library_for, number, stored
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.positions.assembly import State
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.positions.assembling.assembly import State
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.programs.control_flow import ControlFlow, solve
 from udkjax.scene.arguments import checked
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.position_only import refuse_rolling
+from udkjax.scene.tables.position_only import refuse_rolling
 from udkjax.statics.equilibrium import degrees_of_freedom, equilibrium
 from udkjax.statics.linearization import linearizer, solver_of_mass, with_unit_mass
 from udkjax.transforms.gradients import stop_gradients

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from udkjax.equations.reactions import reactions, unique_reactions
-from udkjax.positions.channels import StateHistory, has_point
+from udkjax.equations.states.reactions import reactions, unique_reactions
+from udkjax.positions.assembling.channels import StateHistory, has_point
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.joints import Cam, Revolute
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Cam, Revolute
 from udkjax.scene.mechanism import Mechanism
 
 UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_time="s", torque_time="s")

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.annotations import NumberLike
-from udkjax.equations.quantities import efforts
-from udkjax.positions.drive import with_halted_drivers
+from udkjax.equations.states.quantities import efforts
+from udkjax.positions.following.drive import with_halted_drivers
 from udkjax.printing import align_columns, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces

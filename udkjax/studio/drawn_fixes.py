@@ -7,12 +7,12 @@ from itertools import count
 import numpy as np
 
 from udkjax.annotations import JsonObject, Number
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing.drawing_tables import LISTS
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Revolute, Slot
 from udkjax.scene.files import loads
-from udkjax.scene.joints import Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.studio.text_edits import Document, merge_document, read_document
 from udkjax.study.diagnosis.fixes import Fix
 

@@ -11,16 +11,16 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.positions.assembly import assemble
-from udkjax.scene.bodies import GROUND, Body
-from udkjax.scene.checks import SceneError
+from udkjax.positions.assembling.assembly import assemble
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_forces import shift_motion
-from udkjax.scene.drivers import Driver, Polynomial
+from udkjax.scene.elements.bodies import GROUND, Body
+from udkjax.scene.elements.drivers import Driver, Polynomial
+from udkjax.scene.elements.forces import ForceElement, Spring, Torque, TorsionSpring
+from udkjax.scene.elements.joints import Distance, Gear, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.files import dumps
-from udkjax.scene.forces import ForceElement, Spring, Torque, TorsionSpring
-from udkjax.scene.joints import Distance, Gear, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 
 SAME_PLACE = 1e-9  # fraction of the extent: joints that are closer share a pin
 

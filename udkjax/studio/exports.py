@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from udkjax.integrate import Solution
-from udkjax.native.base.program import UnsupportedError
+from udkjax.native.language.program import UnsupportedError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player import Animation, animate
 from udkjax.studio.shown_runs import INSTANTS, duration_of, shown_run

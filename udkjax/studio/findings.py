@@ -8,13 +8,13 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.integrate import SimulationError
 from udkjax.integrate.causes.find import cause_of_standstill
-from udkjax.positions.assembly import AssemblyError, assemble
-from udkjax.positions.continuation import Reached
-from udkjax.positions.counting import count_of
-from udkjax.positions.kinematics import travel
-from udkjax.scene.checks import SceneError
-from udkjax.scene.joints import Revolute
+from udkjax.positions.answers.counting import count_of
+from udkjax.positions.assembling.assembly import AssemblyError, assemble
+from udkjax.positions.following.continuation import Reached
+from udkjax.positions.following.kinematics import travel
+from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.statics.equilibrium import equilibrium
 from udkjax.studio.drawn_fixes import drawn_fix
 from udkjax.studio.limits import RefusedError

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.positions.pin_motion import pin_motion
+from udkjax.positions.answers.pin_motion import pin_motion
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import loads
 from udkjax.studio.limits import RefusedError

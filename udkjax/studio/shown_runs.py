@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations.analysis import analyse
-from udkjax.equations.quantities import efforts
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.states.quantities import efforts
 from udkjax.integrate import Result, Solution, simulate
 from udkjax.integrate.causes.find import cause_of_standstill
-from udkjax.positions.assembly import close
-from udkjax.positions.channels import StateHistory
-from udkjax.positions.drive import constant_speed, with_halted_drivers
-from udkjax.scene.checks import SceneError
-from udkjax.scene.drivers import Driver
+from udkjax.positions.assembling.assembly import close
+from udkjax.positions.assembling.channels import StateHistory
+from udkjax.positions.following.drive import constant_speed, with_halted_drivers
+from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.mechanism import Mechanism
-from udkjax.show.player.measure_curves import measures_of
+from udkjax.scene.tables.checks import SceneError
+from udkjax.show.player.marks.measure_curves import measures_of
 from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
 
 TURNS = 2  # turns of the slowest motor in a run

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations.analysis import analyse
+from udkjax.equations.rows.analysis import analyse
 from udkjax.integrate.portable import portable_engine
-from udkjax.native.base.program import UnsupportedError
-from udkjax.positions.counting import count_of
+from udkjax.native.language.program import UnsupportedError
+from udkjax.positions.answers.counting import count_of
 from udkjax.scene import library
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.files import loads
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.studio.drawn_scenes import drawing_text_of
 from udkjax.studio.exports import exported
 from udkjax.studio.findings import examine

@@ -9,9 +9,9 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, Item, Table
 
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing.drawing_tables import LISTS
 from udkjax.scene.mechanism_tables import parse_toml
+from udkjax.scene.tables.checks import SceneError
 from udkjax.studio.limits import require_few, require_size
 
 Document = dict[str, Any]

@@ -6,13 +6,13 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations.analysis import analyse
-from udkjax.equations.quantities import energy, violation
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.states.quantities import energy, violation
 from udkjax.integrate import Solution
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.friction import Friction
-from udkjax.scene.held import Held
-from udkjax.scene.joints import Revolute
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.friction import Friction
+from udkjax.scene.elements.held import Held
+from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
 N_SAMPLES = 5  # times at which drivers and potentials are checked for change
@@ -60,7 +60,7 @@ def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
 
     A potential with sampled numbers is constant if these are.
     """
-    from udkjax.integrate.events.conditions import frames_of  # imports the code of events, which other studies do not need
+    from udkjax.integrate.events.law.conditions import frames_of  # imports the code of events, which other studies do not need
 
     frames = frames_of(mechanism.body_names, mechanism.q0.ravel(), mechanism.v0.ravel())
     ts = np.asarray(ts)  # in NumPy, since the minimum of a JAX array would compile a program

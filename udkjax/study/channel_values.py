@@ -12,15 +12,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Numbers
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.textbook import TextbookEquations, prepare
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.states.textbook import TextbookEquations, prepare
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
-from udkjax.positions.channels import LOADS, POINT_UNITS, Channel, LocalPoint, Quantity, StateHistory, locate, point_of_pin
+from udkjax.positions.assembling.channels import (
+    LOADS,
+    POINT_UNITS,
+    Channel,
+    LocalPoint,
+    Quantity,
+    StateHistory,
+    locate,
+    point_of_pin,
+)
 from udkjax.programs.deferred import deferred
 from udkjax.programs.undefined import defined
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import GROUND, Frame, Point, between
+from udkjax.scene.elements.bodies import GROUND, Frame, Point, between
 from udkjax.scene.mechanism import Mechanism
 
 

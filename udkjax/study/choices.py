@@ -5,9 +5,9 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TypeAlias
 
-from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
-from udkjax.equations.partitioning import CoordinatePartitioning
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
+from udkjax.equations.laws.partitioning import CoordinatePartitioning
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.integrate import Projection
 from udkjax.integrate.solvers import Solver, StepController, solver_named
 from udkjax.pinv import SVD, Auto, Elimination, GramSchmidt, Greville, Householder, Pseudoinverse, Varga

@@ -11,13 +11,13 @@ from udkjax.annotations import NumericArray
 from udkjax.arrays import is_traced
 from udkjax.complementarity.stick_or_slip import AT_REST
 from udkjax.equations import constraints, loads
-from udkjax.equations.analysis import Analysis
-from udkjax.equations.directed_friction import DirectedFriction
-from udkjax.equations.effort_arrays import efforts_by_numpy
-from udkjax.equations.scale_program import RANK_TOL
+from udkjax.equations.friction.directed_friction import DirectedFriction
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.states.effort_arrays import efforts_by_numpy
+from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.pinv import SVD
-from udkjax.positions.coordinates import Coordinate, constant_motion, element_of, slopes_of, value_of
-from udkjax.positions.drive import with_drivers
+from udkjax.positions.assembling.coordinates import Coordinate, constant_motion, element_of, slopes_of, value_of
+from udkjax.positions.following.drive import with_drivers
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism

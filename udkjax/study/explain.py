@@ -1,6 +1,6 @@
 """The derivation of the accelerations for one state, with the paper's symbols and numbers: `explain`.
 
-Each symbol is computed by a textbook function (equations/constraints.py, textbook.py, udwadia_kalaba.py). The
+Each symbol is computed by a textbook function (equations/terms/constraints.py, textbook.py, udwadia_kalaba.py). The
 equations of motion, the constraints, Penrose's four conditions and Gauss's principle are checked.
 """
 
@@ -13,15 +13,15 @@ from jaxtyping import Array, ArrayLike
 from udkjax.arrays import number
 from udkjax.equations import constraints, determinacy
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.textbook import prepare
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.states.textbook import prepare
 from udkjax.pinv import SVD
-from udkjax.positions.assembly import State, assemble
+from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.programs.deferred import deferred
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.joint_friction import joint_friction
 from udkjax.study.explanation import Explanation, Gauss, RubbingTerms

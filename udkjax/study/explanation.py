@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udkjax.equations import determinacy
-from udkjax.scene.joints import Revolute, Weld
+from udkjax.scene.elements.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.recommended import tolerance_lines
 from udkjax.study.report import plain, row_label

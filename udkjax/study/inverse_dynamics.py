@@ -27,18 +27,18 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
 from udkjax.arrays import is_traced, is_within_jit, library_for, make_module, number, number_called, put_arrays
-from udkjax.equations.analysis import analyse
-from udkjax.positions.channels import StateHistory
-from udkjax.positions.coordinates import Coordinate, choose_name, coordinate_value, element_of
-from udkjax.positions.drive import without_drivers
-from udkjax.positions.kinematics import Kinematics, motion_in_time
+from udkjax.equations.rows.analysis import analyse
+from udkjax.positions.assembling.channels import StateHistory
+from udkjax.positions.assembling.coordinates import Coordinate, choose_name, coordinate_value, element_of
+from udkjax.positions.following.drive import without_drivers
+from udkjax.positions.following.kinematics import Kinematics, motion_in_time
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import SceneError
-from udkjax.scene.drivers import Motion, Spline
-from udkjax.scene.fields import CALLED
-from udkjax.scene.forces import ForceElement
+from udkjax.scene.elements.drivers import Motion, Spline
+from udkjax.scene.elements.fields import CALLED
+from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.study.driver_efforts import driver_efforts, elements_of
 from udkjax.wording import quote
 

@@ -16,18 +16,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations import constraints, loads
-from udkjax.equations.analysis import analyse
-from udkjax.equations.textbook import TextbookEquations, prepare
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.states.textbook import TextbookEquations, prepare
 from udkjax.pinv import SVD, Pseudoinverse
-from udkjax.positions.channels import StateHistory
+from udkjax.positions.assembling.channels import StateHistory
 from udkjax.printing import PrintedTable, format_number, prints_table, units
 from udkjax.programs.deferred import deferred
 from udkjax.programs.undefined import at_each
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import Frame
-from udkjax.scene.forces import ForceElement
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.bodies import Frame
+from udkjax.scene.elements.forces import ForceElement
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
 

@@ -10,14 +10,14 @@ from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
 from udkjax.annotations import NumberLike, NumericArray
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.quantities import equations_of
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.states.quantities import equations_of
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
 from udkjax.programs.deferred import deferred
 from udkjax.programs.undefined import defined
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import parameters_of, split_index
+from udkjax.scene.numbers.number_fields import parameters_of, split_index
 from udkjax.scene.reshaping import with_angle, with_length
 
 StudyModel: TypeAlias = Mechanism | ConstrainedSystem  # the models of studies

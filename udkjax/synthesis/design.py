@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import Numbers
-from udkjax.positions.drive import Drive, only_driver
-from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.positions.following.drive import Drive, only_driver
+from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.requirements import require_count, require_number
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import parameters_of
+from udkjax.scene.numbers.number_fields import parameters_of
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import Designs
 from udkjax.synthesis.goals import Goal, PathGoal

@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.position_programs import trace_model
+from udkjax.equations.programs.position_programs import trace_model
+from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.expressions import Graph, ScalarProgram, trace
-from udkjax.positions.drive import Drive, drive
-from udkjax.positions.free_numbers import FreeNumbers, position_model
-from udkjax.positions.kinematics import FULL_TURN
-from udkjax.positions.position_batch import compile_programs, position_code
-from udkjax.scene.checks import SceneError
+from udkjax.positions.following.drive import Drive, drive
+from udkjax.positions.following.free_numbers import FreeNumbers, position_model
+from udkjax.positions.following.kinematics import FULL_TURN
+from udkjax.positions.following.position_batch import compile_programs, position_code
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.goals import Goal, PathGoal, goal_scale, place_of
 from udkjax.synthesis.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
 from udkjax.synthesis.motion_goals import MotionTerm

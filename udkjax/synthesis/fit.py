@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.positions.characteristics import characteristics
-from udkjax.positions.coordinates import element_of
+from udkjax.positions.answers.characteristics import characteristics
+from udkjax.positions.assembling.coordinates import element_of
 from udkjax.printing import format_number
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.designs import FoundDesign
 from udkjax.synthesis.goals import FunctionGoal, Goal, PoseGoal
 

@@ -6,11 +6,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.positions.drive import Drive
-from udkjax.positions.kinematics import FULL_TURN, Kinematics, kinematics
+from udkjax.positions.following.drive import Drive
+from udkjax.positions.following.kinematics import FULL_TURN, Kinematics, kinematics
 from udkjax.printing import PrintsTable, format_numbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.sources import AbstractDrawing
+from udkjax.scene.numbers.sources import AbstractDrawing
 
 
 class FoundMechanism(PrintsTable):

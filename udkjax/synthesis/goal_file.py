@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from udkjax.annotations import TomlTable
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import load
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import parse_toml
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.complete.complete_design import CompleteSearch
 from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal

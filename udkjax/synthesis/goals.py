@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers, NumericArray
-from udkjax.positions.channels import locate
-from udkjax.positions.coordinates import Coordinate, value_of
+from udkjax.positions.assembling.channels import locate
+from udkjax.positions.assembling.coordinates import Coordinate, value_of
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.requirements import require_choice, require_finite, require_names, require_number, require_numbers, require_text
-from udkjax.scene.bodies import GROUND, Frame
-from udkjax.scene.checks import SceneError
+from udkjax.scene.elements.bodies import GROUND, Frame
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote, suggestion
 
 

@@ -9,10 +9,10 @@ from jaxtyping import Array
 from scipy.spatial import ConvexHull, QhullError
 
 from udkjax.expressions import Differential, Graph, ScalarProgram, trace
-from udkjax.positions.free_numbers import FreeNumbers
-from udkjax.scene.checks import SceneError
+from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import must_be_positive, parameters_of, split_index
+from udkjax.scene.numbers.number_fields import must_be_positive, parameters_of, split_index
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote, suggestion
 
 Range = tuple[float, float]

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations import constraints, loads
-from udkjax.positions.drive import Driven
-from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.positions.following.drive import Driven
+from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.requirements import require_count, require_function, require_number, require_numbers_by_name, require_text
-from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.goals import check_place, place_of
 from udkjax.wording import quote, suggestion
 

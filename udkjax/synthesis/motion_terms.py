@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.motion_measures import MotionModel
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.position_programs import trace_model
-from udkjax.positions.drive import Drive, Driven
-from udkjax.positions.free_numbers import FreeNumbers, position_model
-from udkjax.positions.kinematics import FULL_TURN, kinematics
-from udkjax.positions.position_batch import compile_programs, position_code
+from udkjax.equations.programs.position_programs import trace_model
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.equations.terms.motion_measures import MotionModel
+from udkjax.positions.following.drive import Drive, Driven
+from udkjax.positions.following.free_numbers import FreeNumbers, position_model
+from udkjax.positions.following.kinematics import FULL_TURN, kinematics
+from udkjax.positions.following.position_batch import compile_programs, position_code
 from udkjax.programs.deferred import deferred
-from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.motion_goals import MotionPoint, MotionTerm
 
 

@@ -23,9 +23,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 import udkjax as udk
 from tests.choices import needs_deferred
 from udkjax.native import primitive, records
-from udkjax.native.base import ffi, host_function, host_program
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.driver import CudaError
+from udkjax.native.host import ffi, host_function, host_program
 from udkjax.programs.deferred import deferred
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")

@@ -18,10 +18,11 @@ import udkjax as udk
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import primitive, records
-from udkjax.native.base import ffi, processor
+from udkjax.native.code import processor
 from udkjax.native.gpu import launch, launch_handler, target
 from udkjax.native.gpu.driver import CudaError
 from udkjax.native.gpu.kernel import VECTOR
+from udkjax.native.host import ffi
 from udkjax.native.runs import RunCotangents
 
 emulation = pytest.importorskip("benchmarks.emulation", reason="not in a source tree")

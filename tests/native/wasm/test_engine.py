@@ -11,7 +11,7 @@ from udkjax.equations import analyse
 from udkjax.integrate import native_engine
 from udkjax.native import position_operations, primitive, runs
 from udkjax.native.wasm import wasm_module
-from udkjax.positions import native_closing
+from udkjax.positions.assembling import native_closing
 
 TIMES = np.linspace(0.0, 2.0, 41)
 SPANS = {"andrews_squeezer": 0.015}  # of it, for what moves in milliseconds

@@ -7,9 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tests.wasm_host import Host
-from udkjax.native.base import elementary, machine
-from udkjax.native.base.ir import POINTER, Function
-from udkjax.native.base.text import text_of_module
+from udkjax.native.code import machine
+from udkjax.native.language import elementary
+from udkjax.native.language.ir import POINTER, Function
+from udkjax.native.language.text import text_of_module
 from udkjax.native.wasm import compile_wasm
 from udkjax.native.wasm.object_code import MAGIC, Reader, leb128, link
 

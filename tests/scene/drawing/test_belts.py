@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.show.player.mark_kinds import MarkKind
-from udkjax.show.player.marks import marks
+from udkjax.show.player.marks.mark_kinds import MarkKind
+from udkjax.show.player.marks.marks import marks
 
 
 def drive(**belt):

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.scene.profiles import LAWS
+from udkjax.scene.elements.profiles import LAWS
 
 LAW = {"base": 40, "law": ["cycloidal", "dwell", "3-4-5", "dwell"], "angle": [120, 60, 90, 90], "lift": [20, 0, -20, 0]}
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
 from udkjax.scene.drawing import Drawing
-from udkjax.scene.units import read_quantity
+from udkjax.scene.numbers.units import read_quantity
 
 HEAD = "format = 2\n"
 MM = HEAD + 'units = {length = "mm", angle = "deg"}\n'

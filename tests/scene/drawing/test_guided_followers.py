@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.scene.profiles import SwingProfile
+from udkjax.scene.elements.profiles import SwingProfile
 
 SPEED = 10 * np.pi  # 300 rpm
 LAW = {"base": 40, "law": ["cycloidal", "dwell", "4-5-6-7", "dwell"], "angle": [120, 60, 90, 90]}

@@ -6,7 +6,7 @@ import pytest
 import udkjax as udk
 from tests.show.player.conftest import Motion
 from tests.show.player.pages import PLAYER, on_screen, picture, plain, rgb, ring_centre, until
-from udkjax.show.player.sketch import THEMES
+from udkjax.show.player.marks.sketch import THEMES
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from tests.integrate.own_systems import pendulum
+from tests.integrate.systems.own_systems import pendulum
 
 TS = np.linspace(0.0, 1.0, 6)
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.show.player.pages import PLAYER
-from udkjax.show.player.measure_curves import measures_of
+from udkjax.show.player.marks.measure_curves import measures_of
 from udkjax.show.player.pictures import svg
 
 

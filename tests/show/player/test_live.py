@@ -6,10 +6,10 @@ import pytest
 import udkjax as udk
 from tests.show.player.conftest import Motion
 from udkjax.integrate.portable import drawn_points
-from udkjax.scene.checks import SceneError
+from udkjax.scene.tables.checks import SceneError
 from udkjax.show.player.live_parameters import label_of, section_of, sliders_of, usual_range
+from udkjax.show.player.marks.symbol_updates import symbol_updates
 from udkjax.show.player.player_data import run_record
-from udkjax.show.player.symbol_updates import symbol_updates
 
 COUPLER_POINT = udk.Drawing(
     pins={"A": (0, 0), "B": (1, 2), "C": (3, 2), "D": (4, 0), "P": (2, 3)},

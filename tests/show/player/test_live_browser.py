@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
-from tests.integrate.event_scenes import BALL, PENDULUM
+from tests.integrate.events.event_scenes import BALL, PENDULUM
 from tests.show.player.conftest import Motion
 from tests.show.player.pages import PLAYER, on_screen, picture, plain, ring_centre, until
 from udkjax.show.player.animation import FailedRunWarning
-from udkjax.show.player.measure_curves import reaction_arrows
-from udkjax.show.player.sketch import THEMES
+from udkjax.show.player.marks.measure_curves import reaction_arrows
+from udkjax.show.player.marks.sketch import THEMES
 
 TS = np.linspace(0.0, 2.0, 41)
 LIVE = f"{PLAYER}.live"

@@ -10,14 +10,14 @@ import pytest
 from PIL import Image
 
 import udkjax as udk
-from udkjax.integrate.events.conditions import Gap
+from udkjax.integrate.events.law.conditions import Gap
 from udkjax.show.player import films
-from udkjax.show.player.marks import marks
+from udkjax.show.player.marks.marks import marks
+from udkjax.show.player.marks.sketch import THEMES, Sketch, Text, view_of
+from udkjax.show.player.marks.symbols import SYMBOLS, symbols_of
 from udkjax.show.player.page import module
 from udkjax.show.player.picture_labels import Placing, labels_of
 from udkjax.show.player.pictures import sketches
-from udkjax.show.player.sketch import THEMES, Sketch, Text, view_of
-from udkjax.show.player.symbols import SYMBOLS, symbols_of
 
 INK = np.array([int(THEMES["light"]["ink"][k : k + 2], 16) for k in (1, 3, 5)])
 REACH = 7  # px around the centre of a pin that contain its ring

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.show.player.conftest import CRANK, OMEGA, Motion
 from tests.show.player.pages import PLAYER
-from udkjax.show.player.measure_curves import measures_of
+from udkjax.show.player.marks.measure_curves import measures_of
 
 
 def test_speeds_and_transmission_angles_are_those_of_closed_forms(slider_crank, run):

@@ -11,12 +11,12 @@ import pytest
 
 import udkjax as udk
 from tests.show.player.conftest import Motion
-from udkjax.integrate.events.conditions import Gap
-from udkjax.native.base.steps import Status
+from udkjax.integrate.events.law.conditions import Gap
+from udkjax.native.module.steps import Status
 from udkjax.show.player.animation import FailedRunWarning
-from udkjax.show.player.mark_places import body_points, corners_of, to_ground
-from udkjax.show.player.marks import marks
-from udkjax.show.player.measure_curves import measures_of, reaction_arrows
+from udkjax.show.player.marks.mark_places import body_points, corners_of, to_ground
+from udkjax.show.player.marks.marks import marks
+from udkjax.show.player.marks.measure_curves import measures_of, reaction_arrows
 from udkjax.show.player.page import page
 from udkjax.show.player.player_data import PRECISION, run_record
 

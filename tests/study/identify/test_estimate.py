@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.optimizer import squares
-from udkjax.study.identify.records import Record, labels
-from udkjax.study.identify.uncertainty import Uncertainty
+from udkjax.study.identify.answers.estimate import Estimate
+from udkjax.study.identify.answers.uncertainty import Uncertainty
+from udkjax.study.identify.records.records import Record, labels
+from udkjax.study.identify.search.optimizer import squares
 from udkjax.study.report import format_value
 
 

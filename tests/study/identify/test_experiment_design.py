@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.scene.drivers import Sine
-from udkjax.study.identify.experiment_design import Candidate, design_experiment
-from udkjax.study.identify.records import Start
+from udkjax.scene.elements.drivers import Sine
+from udkjax.study.identify.answers.experiment_design import Candidate, design_experiment
+from udkjax.study.identify.records.records import Start
 
 NAMES = ("body.lower.inertia", "force.damper.damping")
 CHANNEL, NOISE = "body.lower.angle", 0.01

@@ -9,11 +9,11 @@ import pytest
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
 from udkjax.integrate.solution import Result
-from udkjax.study.identify.fit_problem import FitProblem, build_problem
-from udkjax.study.identify.gradient_check import compare_gradients
+from udkjax.study.identify.answers.gradient_check import compare_gradients
 from udkjax.study.identify.identification import identify
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.shooting import MultipleShooting
+from udkjax.study.identify.problem.fit_problem import FitProblem, build_problem
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.search.shooting import MultipleShooting
 
 DATA = {"time": TS, ANGLE: np.zeros(len(TS))}
 FIRST = 0.5, 0.15

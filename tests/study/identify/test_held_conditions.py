@@ -7,7 +7,7 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, pendulum
-from udkjax.study.identify.unknowns import conditions_of
+from udkjax.study.identify.problem.unknowns import conditions_of
 
 SETPOINT = "force.spring.angle"
 TS = np.linspace(0.0, 2.0, 21)

@@ -6,13 +6,13 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
-from udkjax.study.identify import prediction
-from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.identification import identify
-from udkjax.study.identify.initial_states import state_unknowns
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.search import horizons
-from udkjax.study.identify.unknowns import sample_guesses
+from udkjax.study.identify.problem import prediction
+from udkjax.study.identify.problem.fit_problem import FitProblem
+from udkjax.study.identify.problem.initial_states import state_unknowns
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.problem.unknowns import sample_guesses
+from udkjax.study.identify.search.search import horizons
 from udkjax.study.noise import whiteness_of
 
 TRUE = {"body.rod.inertia": 0.375, "force.spring.damping": 0.2}

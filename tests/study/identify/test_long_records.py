@@ -5,12 +5,12 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
-from udkjax.study.identify.fit_problem import FitProblem
-from udkjax.study.identify.growing_records import fit_growing_records, noise_of_records
 from udkjax.study.identify.identification import identify
-from udkjax.study.identify.optimizer import Minimizer
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.records import Record
+from udkjax.study.identify.problem.fit_problem import FitProblem
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.records.records import Record
+from udkjax.study.identify.search.growing_records import fit_growing_records, noise_of_records
+from udkjax.study.identify.search.optimizer import Minimizer
 from udkjax.study.noise import noise_of_differences, outlier_rows
 
 LOOSE_TOL = 1e-7, 1e-7

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.equations.position_rows import PositionRows
-from udkjax.equations.redundancy import kinematic_rows
-from udkjax.scene.joints import Gear, Revolute
-from udkjax.study.identify import loop_consistency
-from udkjax.study.identify.loop_consistency import loop_problems, tie_text
+from udkjax.equations.rows.position_rows import PositionRows
+from udkjax.equations.rows.redundancy import kinematic_rows
+from udkjax.scene.elements.joints import Gear, Revolute
+from udkjax.study.identify.problem import loop_consistency
+from udkjax.study.identify.problem.loop_consistency import loop_problems, tie_text
 
 
 def lengths(*groups):

@@ -9,11 +9,11 @@ import optax
 import pytest
 
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
-from udkjax.study.identify.fit_problem import FitProblem
 from udkjax.study.identify.identification import identify
-from udkjax.study.identify.optimizer import GradientMethod, Minimizer, minimize_by_gradient
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.records import IdentificationError, Record
+from udkjax.study.identify.problem.fit_problem import FitProblem
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.records.records import IdentificationError, Record
+from udkjax.study.identify.search.optimizer import GradientMethod, Minimizer, minimize_by_gradient
 
 TOL, NOISE = (1e-9, 1e-9), 1e-3
 

@@ -6,8 +6,8 @@ import pytest
 
 import udkjax as udk
 from udkjax.scene.reshaping import length_of
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.unknowns import apply_values
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.problem.unknowns import apply_values
 
 
 def _values(mechanism, unknowns, x):

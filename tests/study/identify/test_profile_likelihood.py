@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from udkjax.study.identify.profile_likelihood import fix_unknown, profile_likelihood, profiles_dataset, trace_profile
-from udkjax.study.identify.residuals import Residuals
+from udkjax.study.identify.answers.profile_likelihood import fix_unknown, profile_likelihood, profiles_dataset, trace_profile
+from udkjax.study.identify.problem.residuals import Residuals
 
 
 def linear(J, r0):

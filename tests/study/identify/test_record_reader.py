@@ -9,10 +9,10 @@ import xarray
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.positions.channels import Quantity
-from udkjax.scene.units import conversion_factor
-from udkjax.study.identify.record_reader import records_of
-from udkjax.study.identify.records import IdentificationError, Record, Start
+from udkjax.positions.assembling.channels import Quantity
+from udkjax.scene.numbers.units import conversion_factor
+from udkjax.study.identify.records.record_reader import records_of
+from udkjax.study.identify.records.records import IdentificationError, Record, Start
 
 DEG = math.pi / 180
 

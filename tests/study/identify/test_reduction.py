@@ -8,13 +8,13 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
-from udkjax.study.identify import fit_problem
-from udkjax.study.identify.fit_problem import FitProblem
-from udkjax.study.identify.least_squares import Fit
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.records import Record
-from udkjax.study.identify.residuals import reduce_rows
-from udkjax.study.identify.search import count_agreeing
+from udkjax.study.identify.problem import fit_problem
+from udkjax.study.identify.problem.fit_problem import FitProblem
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.problem.residuals import reduce_rows
+from udkjax.study.identify.records.records import Record
+from udkjax.study.identify.search.least_squares import Fit
+from udkjax.study.identify.search.search import count_agreeing
 
 TOL = 1e-7, 1e-7
 
@@ -97,8 +97,8 @@ PEAK = """
 import sys
 import numpy as np, udkjax as udk
 from tests.fresh_process import peak_memory
-from udkjax.study.identify import fit_problem
-from udkjax.study.identify.optimizer import Minimizer
+from udkjax.study.identify.problem import fit_problem
+from udkjax.study.identify.search.optimizer import Minimizer
 
 fit_problem.BLOCK_BYTES = fit_problem.WINDOW_BYTES = 2**23
 scene, ts = udk.library.four_bar(), np.linspace(0.0, 2.0, int(sys.argv[1]))

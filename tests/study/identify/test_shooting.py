@@ -7,14 +7,14 @@ import pytest
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum
-from udkjax.study.identify.fit_problem import FitProblem
-from udkjax.study.identify.growing_records import fit_growing_records
 from udkjax.study.identify.identification import identify
-from udkjax.study.identify.optimizer import Minimizer
-from udkjax.study.identify.parameters import unknowns_of
-from udkjax.study.identify.records import Record
-from udkjax.study.identify.search import explains, search
-from udkjax.study.identify.shooting import MultipleShooting, cut_records, fit_pieces
+from udkjax.study.identify.problem.fit_problem import FitProblem
+from udkjax.study.identify.problem.parameters import unknowns_of
+from udkjax.study.identify.records.records import Record
+from udkjax.study.identify.search.growing_records import fit_growing_records
+from udkjax.study.identify.search.optimizer import Minimizer
+from udkjax.study.identify.search.search import explains, search
+from udkjax.study.identify.search.shooting import MultipleShooting, cut_records, fit_pieces
 
 TOL = 1e-10, 1e-10
 NOISE = 1e-3

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from udkjax.study.identify.uncertainty import simplest_basis
+from udkjax.study.identify.answers.uncertainty import simplest_basis
 
 
 def test_a_common_factor_comes_first_also_of_bounded_parameters():

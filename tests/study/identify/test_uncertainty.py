@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.study.identify.residuals import Residuals, reduce_groups
-from udkjax.study.identify.uncertainty import Uncertainty, UnknownValues, describe, estimate_uncertainty
+from udkjax.study.identify.answers.uncertainty import Uncertainty, UnknownValues, describe, estimate_uncertainty
+from udkjax.study.identify.problem.residuals import Residuals, reduce_groups
 
 RNG = np.random.default_rng
 

@@ -10,8 +10,8 @@ from jaxtyping import Array
 
 from udkjax.equations import loads
 from udkjax.programs.deferred import deferred
-from udkjax.scene.bodies import Frame
-from udkjax.scene.forces import ForceElement
+from udkjax.scene.elements.bodies import Frame
+from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 
 TimedState = tuple[float, np.ndarray, np.ndarray]  # t (s), q and v (n,)

@@ -6,11 +6,11 @@ from functools import cached_property
 import numpy as np
 
 from udkjax.equations import constraints
-from udkjax.equations.analysis import Analysis
-from udkjax.equations.position_rows import PositionRows
-from udkjax.equations.redundancy import kinematic_rows
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.rows.position_rows import PositionRows
+from udkjax.equations.rows.redundancy import kinematic_rows
 from udkjax.integrate.solution import Result
-from udkjax.positions.open_rows import name_open_rows
+from udkjax.positions.assembling.open_rows import name_open_rows
 from udkjax.scene.mechanism import Mechanism
 
 

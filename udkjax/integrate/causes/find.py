@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.analysis import Analysis, analyse
+from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.integrate.causes.force_causes import explain_stiff_force, explain_undefined_law, explain_violent_force
 from udkjax.integrate.causes.jamming import explain_jamming
 from udkjax.integrate.causes.reach import explain_reach
 from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import is_explicit
-from udkjax.positions.open_rows import MOST_NAMED, explain_open, name_not_finite
+from udkjax.positions.assembling.open_rows import MOST_NAMED, explain_open, name_not_finite
 from udkjax.scene.mechanism import Mechanism
 
 NEAR_REACH = 1e-2  # fraction of the span by which a run may end before a dead point

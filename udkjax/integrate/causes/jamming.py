@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.textbook import prepare
+from udkjax.equations.states.textbook import prepare
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.pinv import SVD
-from udkjax.scene.friction import Friction
-from udkjax.scene.joints import Prismatic, Slot
+from udkjax.scene.elements.friction import Friction
+from udkjax.scene.elements.joints import Prismatic, Slot
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 

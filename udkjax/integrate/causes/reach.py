@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.redundancy import holders_of_driver
+from udkjax.equations.rows.redundancy import holders_of_driver
 from udkjax.integrate.causes.failed_run import FailedRun
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.drivers import Driver
-from udkjax.scene.joints import Revolute
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.drivers import Driver
+from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
 REACH_STEPS = 32  # number of steps from the last good state to the time of the failure

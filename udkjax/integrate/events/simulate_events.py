@@ -17,33 +17,28 @@ from jaxtyping import Array, Float
 from udkjax.arrays import is_within_jit, make_module, number, put_arrays
 from udkjax.complementarity.stick_or_slip import SIDES
 from udkjax.devices import computing_on_host, on_host
-from udkjax.equations.analysis import Analysis
-from udkjax.equations.directed_friction import DirectedFriction
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.friction.directed_friction import DirectedFriction
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
-from udkjax.integrate.events.condition_program import (
-    bodies_of,
-    coordinate_count,
-    watched_conditions,
-    with_cached_functions,
-)
-from udkjax.integrate.events.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
-from udkjax.integrate.events.event_plan import event_plan
-from udkjax.integrate.events.host_run import HostRun, concrete_plan, event_arrays
-from udkjax.integrate.events.hybrid import Hybrid
-from udkjax.integrate.events.kinks import FREE, renewed_sides, with_held_forces
-from udkjax.integrate.events.listing import listing, names_of_events
-from udkjax.integrate.events.phases import SCENE, Phases, phases_of
-from udkjax.integrate.events.replay import run_events
-from udkjax.integrate.events.runs import EventRun
-from udkjax.integrate.events.sticking_joints import with_sticking_joints
+from udkjax.integrate.events.instant.listing import listing, names_of_events
+from udkjax.integrate.events.instant.runs import EventRun
+from udkjax.integrate.events.law.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
+from udkjax.integrate.events.law.event_plan import event_plan
+from udkjax.integrate.events.law.kinks import FREE, renewed_sides, with_held_forces
+from udkjax.integrate.events.law.phases import SCENE, Phases, phases_of
+from udkjax.integrate.events.law.sticking_joints import with_sticking_joints
+from udkjax.integrate.events.run.condition_program import bodies_of, coordinate_count, watched_conditions, with_cached_functions
+from udkjax.integrate.events.run.host_run import HostRun, concrete_plan, event_arrays
+from udkjax.integrate.events.run.hybrid import Hybrid
+from udkjax.integrate.events.run.replay import run_events
 from udkjax.integrate.prepare import Choices, prepare_run
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.time_derivatives import moved
 from udkjax.native.watching.conditions import Conditions
-from udkjax.positions.assembly import Closure, State
+from udkjax.positions.assembling.assembly import Closure, State
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.transforms.gradients import stop_gradients

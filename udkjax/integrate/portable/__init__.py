@@ -14,7 +14,7 @@ events       null without events, else {names; directions in which zeros count, 
 held         engines of the same mechanism with the contact of one event at rest, by the index of that event; without "close"
 forces_watched  1 for an engine in `held`, whose run also ends where the contact would have to pull; else 0
 thresholds   thresholds of pivots, the inputs of a run after the numbers; closing uses those in `closing`
-closing      {thresholds, settings, tol and rounding: what counts as closed (equations/position_closure.py)}
+closing      {thresholds, settings, tol and rounding: what counts as closed (equations/rows/position_closure.py)}
 guess        {q, v}: places in `numbers` of the initial guess
 rows         scales of the rows of Psi (m, rad)
 scales       {length (m), rate (1/s), mass (kg)}

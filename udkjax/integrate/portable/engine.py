@@ -10,12 +10,12 @@ import jax
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations.analysis import Analysis, analyse
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.integrate.compiled_mechanism import compile_concrete
-from udkjax.integrate.events.event import ExpandsToEvents
+from udkjax.integrate.events.law.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
 from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
 from udkjax.integrate.portable.portable_events import PortableEvents, unknown_friction
@@ -23,18 +23,18 @@ from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
-from udkjax.native.base.steps import SMALLEST_STEP
+from udkjax.native.module.steps import SMALLEST_STEP
 from udkjax.native.operations import MarkRows, Operation
 from udkjax.native.position_operations import Close
 from udkjax.native.run.state_functions import Evaluation
 from udkjax.native.runs import RunStates
 from udkjax.native.wasm import compile_wasm, wasm_module
-from udkjax.positions.assembly import State
+from udkjax.positions.assembling.assembly import State
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.units import units_of
+from udkjax.scene.numbers.units import units_of
 
 STEPS_OF_A_PAGE = 20_000  # largest number of steps of a run in a page: with more the page would not respond for seconds
 

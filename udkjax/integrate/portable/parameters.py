@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.equations.structure import numbers_as_vector
+from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.expressions import Graph, Scalar, ScalarProgram, trace
-from udkjax.native.base.ir import Function
-from udkjax.native.base.program import vector_function
+from udkjax.native.language.ir import Function
+from udkjax.native.language.program import vector_function
 from udkjax.native.packing import SampleRows
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import split_index
+from udkjax.scene.numbers.number_fields import split_index
 
 
 def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) -> dict[str, float]:

@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.analysis import Analysis
-from udkjax.integrate.events import impacts as law
-from udkjax.integrate.events.condition_program import condition_numbers, watched_conditions, with_forces
-from udkjax.integrate.events.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
-from udkjax.integrate.events.event import Event, ExpandsToEvents, expand_events
-from udkjax.integrate.events.phases import HeldContact, Switches
-from udkjax.native.base.program import UnsupportedError
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.integrate.events.instant import impacts as law
+from udkjax.integrate.events.law.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
+from udkjax.integrate.events.law.event import Event, ExpandsToEvents, expand_events
+from udkjax.integrate.events.law.phases import HeldContact, Switches
+from udkjax.integrate.events.run.condition_program import condition_numbers, watched_conditions, with_forces
+from udkjax.native.language.program import UnsupportedError
 from udkjax.native.operations import EvaluateEvents
 from udkjax.native.runs import RunStates
 from udkjax.native.watching.conditions import Conditions
 from udkjax.requirements import ArgumentError
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import join_names, quote
 

@@ -4,9 +4,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.scene.bodies import Point
-from udkjax.scene.fields import NOT_NEGATIVE, given_number
-from udkjax.scene.forces import ForceElement, Wrench
+from udkjax.scene.elements.bodies import Point
+from udkjax.scene.elements.fields import NOT_NEGATIVE, given_number
+from udkjax.scene.elements.forces import ForceElement, Wrench
 from udkjax.scene.mechanism import Mechanism
 
 PREFIX = "pull of "  # prefix of the names of the elements

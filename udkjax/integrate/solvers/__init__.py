@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from udkjax.native.base.tableau import DOPRI8, Method
+from udkjax.native.module.tableau import DOPRI8, Method
 
 if TYPE_CHECKING:
     import diffrax

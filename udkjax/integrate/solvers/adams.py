@@ -42,7 +42,7 @@ RATE_MEMORY = 0.3  # CRDOWN: largest decrease of the rate of convergence in an i
 LARGEST = 2.0
 HALF = 0.5
 # Constants of this package: with these the error of many steps is a small multiple of the tolerance, with no more right-hand
-# sides than STEP or VODE (tests/integrate/test_adams.py).
+# sides than STEP or VODE (tests/integrate/solvers/test_adams.py).
 SHARE = 0.25  # target error of the next step, relative to the tolerance; 0.5 in STEP, whose steps only halve or double
 RUNGS = 4.0  # a step changes by powers of 2^(1/4), to be independent of rounding errors of the estimate
 SMALLEST = 0.25  # smallest factor of a step; STEP halves once or twice

@@ -38,7 +38,7 @@ NO_DIVISION_BY_ZERO = 1e-6  # ADDON
 # Ratio of the tolerance to the estimated error of the next step at orders k - 1, k and k + 1 (BIAS1, BIAS2, BIAS3: 6, 6, 10), in
 # addition to STRICTER; and the fraction of the error that an iteration may leave (CORTES: 0.1). The numbers in brackets
 # are those of VODE. With the values below, the error of many steps is a small multiple of the tolerance, and the same error needs
-# no more right-hand sides than with VODE (tests/integrate/test_bdf.py).
+# no more right-hand sides than with VODE (tests/integrate/solvers/test_bdf.py).
 LOWER, SAME, HIGHER = 10.0, 10.0, 15.0
 NEWTON_SHARE = 0.02
 # Constants of this package.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.native.base.tableau import row
+from udkjax.native.module.tableau import row
 
 TABLEAU = diffrax.ButcherTableau(
     c=row("1/6 4/15 2/3 5/6 1 1/15 1"),

@@ -5,10 +5,10 @@ import ctypes
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.base import machine, processor
-from udkjax.native.base.ir import INT, POINTER, Function
-from udkjax.native.base.program import Writer, from_memory
-from udkjax.native.base.text import text_of_module
+from udkjax.native.code import machine, processor
+from udkjax.native.language.ir import INT, POINTER, Function
+from udkjax.native.language.program import Writer, from_memory
+from udkjax.native.language.text import text_of_module
 
 
 class BatchProgram:

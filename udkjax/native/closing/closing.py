@@ -1,4 +1,4 @@
-"""Machine code that closes a mechanism: the loop of equations/position_closure.py at run time, also for traced numbers.
+"""Machine code that closes a mechanism: the loop of equations/rows/position_closure.py at run time, also for traced numbers.
 
     q <- q - s C J^T y,      J C J^T y = Psi,      J = Psi_q,      C = M^(-1)
 
@@ -10,15 +10,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.native.base.ir import INT, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.module import Module
-from udkjax.native.base.tableau import EULER
-from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.native.closing.corrections import EliminationCorrection, LeastNormCorrection
+from udkjax.native.language.ir import INT, POINTER, Function, Value
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.module import Module
+from udkjax.native.module.tableau import EULER
 from udkjax.native.pseudoinverses.svd import SVDCode
+from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 from udkjax.native.run.members import write_begin
 
 CORRECTED = "qv"  # corrected quantities, by their index in a record

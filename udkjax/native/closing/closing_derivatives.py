@@ -9,14 +9,14 @@ tangents.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.expressions.loop_derivative import FORWARD, REVERSE, TWICE
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import Layout
-from udkjax.native.base.program_derivative import GIVEN, WAYS, ProgramDerivative
-from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.expressions.loops.loop_derivative import FORWARD, REVERSE, TWICE
 from udkjax.native.closing.closing import CORRECTED, Closing
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.module.layout import Layout
+from udkjax.native.module.program_derivative import GIVEN, WAYS, ProgramDerivative
+from udkjax.native.module.prologue import PROLOGUE, write_prologue_derivative
 
 
 class ClosingDerivative(Closing):

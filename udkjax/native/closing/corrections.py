@@ -17,12 +17,12 @@ the violation, at most 1e-6.
 Large scenes use elimination of all rows, with dependent rows left out.
 """
 
-from udkjax.expressions.loop_derivative import COTANGENT, TANGENT, LoopDerivative
-from udkjax.expressions.loop_program import LoopProgram, Reset
-from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
-from udkjax.native.base.module import Module
-from udkjax.native.base.program_derivative import ProgramDerivative
-from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.expressions.loops.loop_derivative import COTANGENT, TANGENT, LoopDerivative
+from udkjax.expressions.loops.loop_program import LoopProgram, Reset
+from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.module.module import Module
+from udkjax.native.module.program_derivative import ProgramDerivative
+from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
 
 class EliminationCorrection(ProgramDerivative):

@@ -13,15 +13,15 @@ side of that value is zero.
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.module import Module
-from udkjax.native.base.program import PointerPlace
-from udkjax.native.base.tableau import EULER
-from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.language.program import PointerPlace
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.module import Module
+from udkjax.native.module.tableau import EULER
 from udkjax.native.pseudoinverses.lu import LUCode
+from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 from udkjax.native.run.manifold import largest_violation
 from udkjax.native.run.members import write_begin
 

@@ -1,4 +1,4 @@
-"""Machine code of the positions of batches of mechanisms (equations/position_programs.py), W members at a time.
+"""Machine code of the positions of batches of mechanisms (equations/programs/position_programs.py), W members at a time.
 
 The constants are computed once for each member. Then q is predicted, closed by Newton's method, and measured, at one position
 after another. A march follows positions from the drawn position on; otherwise each position starts from a given guess.
@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.position_programs import PositionPrograms
-from udkjax.native.base import machine, processor
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value, Variable
-from udkjax.native.base.program import consecutive, write
-from udkjax.native.base.text import ALLOCATION, text_of_module
+from udkjax.equations.programs.position_programs import PositionPrograms
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.native.code import machine, processor
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value, Variable
+from udkjax.native.language.program import consecutive, write
+from udkjax.native.language.text import ALLOCATION, text_of_module
 from udkjax.threads import thread_count
 
 # A Newton step shorter than this, in units of the coordinates, is the last: the next would be of the order of its square.

@@ -8,7 +8,7 @@ step before it, and through the sums
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
 of the stages of this step, the last first, to the previous point. The stages are evaluated again with the intermediate results
-that derivatives need; the transposed programs are those of expressions/differential.py. Those of
+that derivatives need; the transposed programs are those of expressions/algebra/differential.py. Those of
 an implicit method are solved again (stage_equations.py), and cotangents of their accelerations are those of their equations by
 the transpose of D.
 
@@ -17,15 +17,15 @@ Members in lanes are backpropagated together; the next ones are loaded when all 
 
 from collections.abc import Sequence
 
-from udkjax.expressions.loop_derivative import REVERSE
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Operand, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
-from udkjax.native.base.running import Repeat
-from udkjax.native.base.samples import ARGUMENTS, count_breakpoints, numbers_of_row
-from udkjax.native.base.steps import POINTS
-from udkjax.native.base.tableau import Method
+from udkjax.expressions.loops.loop_derivative import REVERSE
 from udkjax.native.derivatives.record import Recorded
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Operand, Value
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.module.running import Repeat
+from udkjax.native.module.samples import ARGUMENTS, count_breakpoints, numbers_of_row
+from udkjax.native.module.steps import POINTS
+from udkjax.native.module.tableau import Method
 from udkjax.native.run.dense_output import write_differences_back
 from udkjax.native.run.runge_kutta import stage_state
 

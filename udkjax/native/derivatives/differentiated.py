@@ -1,8 +1,8 @@
 """The base of forward and reverse mode of a trajectory: the differentiated programs, evaluated at the same states."""
 
-from udkjax.native.base.ir import Function
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.program_derivative import ProgramDerivative
+from udkjax.native.language.ir import Function
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.program_derivative import ProgramDerivative
 from udkjax.native.run.manifold import with_loads_of_fallback
 from udkjax.native.run.trajectory import Trajectory
 

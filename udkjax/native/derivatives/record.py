@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.running import Repeat
-from udkjax.native.base.samples import ARGUMENTS
 from udkjax.native.derivatives.differentiated import Differentiated
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.running import Repeat
+from udkjax.native.module.samples import ARGUMENTS
 from udkjax.native.run.members import kept_outputs
 
 STORED = 200  # capacity in points of the record passed to the second call: as much memory as 300 outputs

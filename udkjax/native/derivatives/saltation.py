@@ -9,10 +9,10 @@ and f the rate of the state (the saltation matrix, one order higher: Leine and N
 length leads across (run/pieces.py), so that [a' x] is the difference of the tangents of the accelerations at its two ends.
 """
 
-from udkjax.expressions.loop_derivative import TWICE
-from udkjax.native.base.ir import DOUBLE, POINTER, Value
-from udkjax.native.base.steps import EDGE
+from udkjax.expressions.loops.loop_derivative import TWICE
 from udkjax.native.derivatives.differentiated import Differentiated
+from udkjax.native.language.ir import DOUBLE, POINTER, Value
+from udkjax.native.module.steps import EDGE
 
 MOTION, BEFORE = "tangents of the motion", "linearization before"  # arrays
 AFTER_STEP, BEFORE_STEP = "difference0", "difference1"  # tangents of accelerations along the motion

@@ -1,11 +1,11 @@
 """Second derivatives of a trajectory in forward mode, along pairs of directions, computed with each step."""
 
-from udkjax.expressions.loop_derivative import TWICE
-from udkjax.native.base.ir import Function, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.program_derivative import WAYS
+from udkjax.expressions.loops.loop_derivative import TWICE
 from udkjax.native.derivatives.saltation import add_memory, write_saltation
 from udkjax.native.derivatives.tangents import Forward
+from udkjax.native.language.ir import Function, Value
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.program_derivative import WAYS
 
 
 class ForwardTwice(Forward):

@@ -6,8 +6,8 @@ the tangents of the stages are the sums
     dq_i = dq + h c_i dv + h^2 sum_j (A A)_ij da_j,        dv_i = dv + h sum_j A_ij da_j,
 
 and the tangents of the accelerations, the end of a step and the projected outputs come from the programs of derivatives
-(expressions/differential.py), which need intermediate results of the evaluation. Interpolation is linear. A stage of an implicit
-method is the solution of a_i = a(t_i, Q_i + h^2 g^2 a_i, V_i + h g a_i) (stage_equations.py), so that
+(expressions/algebra/differential.py), which need intermediate results of the evaluation. Interpolation is linear. A stage of an
+implicit method is the solution of a_i = a(t_i, Q_i + h^2 g^2 a_i, V_i + h g a_i) (stage_equations.py), so that
 
     D da_i = a_q dQ_i + a_v dV_i + a_p dp.
 """
@@ -15,15 +15,15 @@ method is the solution of a_i = a(t_i, Q_i + h^2 g^2 a_i, V_i + h g a_i) (stage_
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
-from udkjax.expressions.loop_derivative import FORWARD
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Layout, Plan
-from udkjax.native.base.program_derivative import GIVEN
-from udkjax.native.base.prologue import PROLOGUE, write_prologue_derivative
-from udkjax.native.base.samples import row_address
-from udkjax.native.base.steps import POINTS
-from udkjax.native.base.tableau import Method
+from udkjax.expressions.loops.loop_derivative import FORWARD
 from udkjax.native.derivatives.differentiated import Differentiated
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.module.layout import Lane, Layout, Plan
+from udkjax.native.module.program_derivative import GIVEN
+from udkjax.native.module.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.module.samples import row_address
+from udkjax.native.module.steps import POINTS
+from udkjax.native.module.tableau import Method
 from udkjax.native.run.dense_output import write_between, write_differences
 from udkjax.native.run.members import kept_outputs
 

@@ -2,10 +2,10 @@
 
 import ctypes
 
-from udkjax.native.base import machine
-from udkjax.native.base.ffi import CONTEXT, CREATE_ERROR, INTERNAL, STREAM, arguments_struct, call_api, call_with, text_of, word
-from udkjax.native.base.ir import INT, POINTER, Function, Value
+from udkjax.native.code import machine
 from udkjax.native.gpu.driver import CudaDriver
+from udkjax.native.host.ffi import CONTEXT, CREATE_ERROR, INTERNAL, STREAM, arguments_struct, call_api, call_with, text_of, word
+from udkjax.native.language.ir import INT, POINTER, Function, Value
 
 PLATFORM = "CUDA"  # XLA's name of the platform
 CONTEXT_OF_STREAM, PUSH, POP = "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"

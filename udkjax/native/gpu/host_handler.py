@@ -16,8 +16,21 @@ from threading import Lock
 
 import jax
 
-from udkjax.native.base import machine
-from udkjax.native.base.ffi import (
+from udkjax.native.code import machine
+from udkjax.native.gpu.driver import CudaDriver, driver
+from udkjax.native.gpu.driver_calls import (
+    CONTEXT_OF_STREAM,
+    GIVEN,
+    PLATFORM,
+    POP,
+    PUSH,
+    TO_DEVICE,
+    TO_HOST,
+    WAIT,
+    Words,
+    stream_of,
+)
+from udkjax.native.host.ffi import (
     API,
     ARGUMENTS,
     BUFFERS,
@@ -32,21 +45,8 @@ from udkjax.native.base.ffi import (
     no_memory,
     word,
 )
-from udkjax.native.base.ir import BOOL, INT, POINTER, Function, Value, Variable
-from udkjax.native.base.text import ALLOCATION, text_of_module
-from udkjax.native.gpu.driver import CudaDriver, driver
-from udkjax.native.gpu.driver_calls import (
-    CONTEXT_OF_STREAM,
-    GIVEN,
-    PLATFORM,
-    POP,
-    PUSH,
-    TO_DEVICE,
-    TO_HOST,
-    WAIT,
-    Words,
-    stream_of,
-)
+from udkjax.native.language.ir import BOOL, INT, POINTER, Function, Value, Variable
+from udkjax.native.language.text import ALLOCATION, text_of_module
 from udkjax.threads import cores
 
 # The handler of the operation, the number of threads, and the address and the number of bytes of the pinned memory.

@@ -9,12 +9,12 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from udkjax.native.base.ir import SHARED_SPACE
-from udkjax.native.base.memory import Memory, ThreadCode
-from udkjax.native.base.module import Module
-from udkjax.native.base.program import UnsupportedError
-from udkjax.native.base.text import external_functions, text_of_module, with_evaluated
 from udkjax.native.derivatives.record import Recorded
+from udkjax.native.language.ir import SHARED_SPACE
+from udkjax.native.language.program import UnsupportedError
+from udkjax.native.language.text import external_functions, text_of_module, with_evaluated
+from udkjax.native.module.memory import Memory, ThreadCode
+from udkjax.native.module.module import Module
 from udkjax.native.operations import Operation
 from udkjax.native.runs import RunStates
 

@@ -13,14 +13,14 @@ from typing import Any
 
 import jax
 
-from udkjax.native.base import machine
-from udkjax.native.base.program import UnsupportedError
-from udkjax.native.base.text import text_of_module
+from udkjax.native.code import machine
 from udkjax.native.gpu import target
 from udkjax.native.gpu.driver import CudaDriver, driver
 from udkjax.native.gpu.driver_calls import PLATFORM
 from udkjax.native.gpu.kernel import NAME, KernelCode, kernel_code
 from udkjax.native.gpu.launch_handler import WORDS, launch_handler
+from udkjax.native.language.program import UnsupportedError
+from udkjax.native.language.text import text_of_module
 from udkjax.native.operations import Operation
 from udkjax.threads import thread_count
 

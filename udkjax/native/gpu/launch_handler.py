@@ -6,7 +6,10 @@ the buffer has room. If a run takes more steps than in the first pass, because i
 all members run again with longer records.
 """
 
-from udkjax.native.base.ffi import (
+from udkjax.native.derivatives.record import FIRST_POINTS, Recorded
+from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, POP, PUSH, TO_DEVICE, TO_HOST, WAIT, Words, stream_of
+from udkjax.native.gpu.kernel import KernelCode
+from udkjax.native.host.ffi import (
     ALLOCATE,
     CONTEXT,
     DESTROY_ERROR,
@@ -18,10 +21,7 @@ from udkjax.native.base.ffi import (
     call_with,
     word,
 )
-from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Operand, Value
-from udkjax.native.derivatives.record import FIRST_POINTS, Recorded
-from udkjax.native.gpu.driver_calls import CONTEXT_OF_STREAM, POP, PUSH, TO_DEVICE, TO_HOST, WAIT, Words, stream_of
-from udkjax.native.gpu.kernel import KernelCode
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Operand, Value
 
 BLOCK = 128  # threads of a block; of 64, 128 and 256 the fastest for the paper's linkage on an H100
 LAUNCH, KERNEL = "cuLaunchKernel", "kernel"

@@ -9,7 +9,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from udkjax.native.base import code_cache, machine
+from udkjax.native.code import code_cache, machine
 
 TRIPLE = "nvptx64-nvidia-cuda"
 PTX = "+ptx78"  # the version, of CUDA 11.8: the first for sm_90

@@ -8,8 +8,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from udkjax.native.base.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
-from udkjax.native.base.memory import Memory
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
+from udkjax.native.module.memory import Memory
 
 UNROLLED = 16  # operations on this many registers are unrolled; operations on longer rows are loops over as many
 SUMS = 4  # independent partial sums of a scalar product, to hide the latency of additions

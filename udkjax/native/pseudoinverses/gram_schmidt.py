@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from udkjax.native.base.ir import BOOL, Operand
+from udkjax.native.language.ir import BOOL, Operand
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import add_to_rows, choose_pivot, combine_rows, start_pivoting, use_column
 

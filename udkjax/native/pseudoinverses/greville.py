@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from udkjax.native.base.ir import Operand
+from udkjax.native.language.ir import Operand
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
 

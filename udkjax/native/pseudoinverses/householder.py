@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from udkjax.native.base.ir import INT, Operand, Value
+from udkjax.native.language.ir import INT, Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 from udkjax.native.pseudoinverses.qr import (
     apply_q_transposed,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from udkjax.native.base.ir import Operand, Value
+from udkjax.native.language.ir import Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import reversed_each
 
@@ -14,7 +14,7 @@ class LUCode(DenseMethod):
     """P D = L U: rows of `upper` are the pivot rows when chosen; row k of `lower` holds the multipliers of step k.
 
     If `refuses_singular`, a pivot that is a rounding error of the other entries in its column of U counts as zero, and the
-    solution is NaN: see `udkjax.equations.formulations.solve_regular`.
+    solution is NaN: see `udkjax.equations.laws.formulations.solve_regular`.
     """
 
     refuses_singular: bool = False

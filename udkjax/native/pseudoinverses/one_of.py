@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from udkjax.native.base.ir import Operand, Value
+from udkjax.native.language.ir import Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
 

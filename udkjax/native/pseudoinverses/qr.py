@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from udkjax.native.base.ir import BOOL, INT, Operand, Value
+from udkjax.native.language.ir import BOOL, INT, Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, MatrixRow
 
 

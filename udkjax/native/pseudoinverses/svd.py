@@ -10,7 +10,7 @@ The rows of R are nearly orthogonal initially, which saves sweeps (Drmac, Veseli
 
 from dataclasses import dataclass
 
-from udkjax.native.base.ir import INT, Operand, Value
+from udkjax.native.language.ir import INT, Operand, Value
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q, apply_q_transposed, pivoted_qr, qr_matrices
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from udkjax.native.base.ir import DOUBLE, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SHORTEST_LAST
+from udkjax.native.language.ir import DOUBLE, Function, Value
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.module import Module
+from udkjax.native.module.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SHORTEST_LAST
 
 
 def aim(module: Module, f: Function, s: Lane):

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.power import power
-from udkjax.native.base.steps import (
+from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.language.power import power
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.module import Module
+from udkjax.native.module.steps import (
     CLEARLY,
     CLOSED_TOL,
     CORRECTIONS,

@@ -11,11 +11,11 @@ systems at one state share a factorization.
 
 from collections.abc import Callable
 
-from udkjax.native.base.ir import DOUBLE, POINTER, Function
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.native.language.ir import DOUBLE, POINTER, Function
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.module import Module
 from udkjax.native.pseudoinverses.dense import DenseMethod
+from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
 
 class DenseEquations:

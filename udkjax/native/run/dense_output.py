@@ -1,9 +1,9 @@
 """States between steps: Newton's divided differences of the last four states with their velocities and accelerations."""
 
-from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Layout
-from udkjax.native.base.module import Module
-from udkjax.native.base.steps import POINTS, SHORT_STEP, STRETCH
+from udkjax.native.language.ir import BOOL, DOUBLE, POINTER, Function, Value
+from udkjax.native.module.layout import Lane, Layout
+from udkjax.native.module.module import Module
+from udkjax.native.module.steps import POINTS, SHORT_STEP, STRETCH
 from udkjax.native.run.manifold import project_output
 
 

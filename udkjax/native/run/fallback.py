@@ -11,13 +11,13 @@ with dependent rows left out, which near singular configurations has about half 
 
 import numpy as np
 
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.steps import ROUNDING_PIVOT
-from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.module import Module
+from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.pseudoinverses.dense import MatrixRow
 from udkjax.native.pseudoinverses.svd import SVDCode
+from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 from udkjax.native.run.manifold import iterate_newton, with_loads_of_fallback, with_threshold
 
 

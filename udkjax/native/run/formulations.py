@@ -1,11 +1,11 @@
-"""Accelerations by other formulations (`udkjax.equations.formulations`) as machine code, instead of the Udwadia-Kalaba equation.
+"""Accelerations by other formulations (`udkjax.equations.laws.formulations`) as machine code, not by the Udwadia-Kalaba equation.
 
 With the unconstrained accelerations a_F, their change x by the constraints, and A = Psi_q,
 
     M x + A^T lambda = 0,        A x = b,        a = a_F + x,
 
 all in the scene's own units, in which coordinates, rows and masses are of order one. States are projected by the pseudoinverse.
-A mass matrix that is not diagonal, M = L C^(-1) L^T, is diagonal in the coordinates L^T x of equations/system_solver.py:
+A mass matrix that is not diagonal, M = L C^(-1) L^T, is diagonal in the coordinates L^T x of equations/systems/system_solver.py:
 there the rows are A L^(-T), and the program `spread` leads back.
 """
 
@@ -14,13 +14,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from udkjax.native.base.ir import INT, POINTER, Function, Operand, Value
-from udkjax.native.base.layout import FORMULATION_SETTINGS
-from udkjax.native.base.module import Module
-from udkjax.native.base.weighted_rows import RowEntries
+from udkjax.native.language.ir import INT, POINTER, Function, Operand, Value
+from udkjax.native.module.layout import FORMULATION_SETTINGS
+from udkjax.native.module.module import Module
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
 from udkjax.native.pseudoinverses.svd import SVDCode
+from udkjax.native.pseudoinverses.weighted_rows import RowEntries
 
 TOL, MASS = FORMULATION_SETTINGS
 FORMULATE = "formulate"

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from udkjax.native.base.ir import DOUBLE, INT, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
+from udkjax.native.language.ir import DOUBLE, INT, Function, Value
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.module import Module
+from udkjax.native.module.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
 
 
 def newton(module: Module, f: Function, s: Lane):

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.samples import enter_first_row, write_enter
-from udkjax.native.base.steps import LOOK_AHEAD, PATIENCE, POINTS, Status
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.module.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
+from udkjax.native.module.module import Module
+from udkjax.native.module.samples import enter_first_row, write_enter
+from udkjax.native.module.steps import LOOK_AHEAD, PATIENCE, POINTS, Status
 from udkjax.native.run.manifold import largest_violation, project_output
 
 

@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple
 
-from udkjax.equations.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
-from udkjax.equations.partitioning import CoordinatePartitioning
-from udkjax.equations.scale_program import RANK_TOL
-from udkjax.equations.scales import Scales
-from udkjax.native.base.layout import FORMULATION_SETTINGS
-from udkjax.native.base.program import UnsupportedError
+from udkjax.equations.laws.formulations import Augmented, Formulation, NullSpaceQR, NullSpaceSVD
+from udkjax.equations.laws.partitioning import CoordinatePartitioning
+from udkjax.equations.programs.scales import Scales
+from udkjax.equations.terms.scale_program import RANK_TOL
+from udkjax.native.language.program import UnsupportedError
+from udkjax.native.module.layout import FORMULATION_SETTINGS
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.pseudoinverses.lu import LUCode

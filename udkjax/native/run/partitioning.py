@@ -1,4 +1,4 @@
-"""Coordinate partitioning (equations/partitioning.py) as machine code: steps in the independent coordinates alone.
+"""Coordinate partitioning (equations/laws/partitioning.py) as machine code: steps in the independent coordinates alone.
 
 The partition of a step follows from its first state, by the pivots of D, and is two arrays of zeros and ones, `dependent q` and
 `dependent v`. At each stage, at the end of the step and at each output,
@@ -14,13 +14,13 @@ as if it integrated only these; the dependent ones are the first guess of Newton
 
 import numpy as np
 
-from udkjax.equations.partitioning import PARTITION_NEWTON
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import FORMULATION_SETTINGS, Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.weighted_rows import WeightedRows
+from udkjax.equations.laws.partitioning import PARTITION_NEWTON
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.module.layout import FORMULATION_SETTINGS, Lane
+from udkjax.native.module.module import Module
 from udkjax.native.pseudoinverses.householder import HouseholderCode
+from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 from udkjax.native.run.formulations import FORMULATE, FormulatedAccelerations, FormulationCode
 from udkjax.native.run.manifold import iterate_newton, take_newton_step
 

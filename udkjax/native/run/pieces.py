@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value
-from udkjax.native.base.module import Module
-from udkjax.native.base.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, HALVINGS, NEAR_END, TRIES
+from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.module.module import Module
+from udkjax.native.module.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, HALVINGS, NEAR_END, TRIES
 from udkjax.native.run.runge_kutta import stage_state
 
 

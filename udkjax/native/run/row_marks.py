@@ -12,12 +12,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from udkjax.equations.position_closure import CLOSURE
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.native.base.ir import BOOL, DOUBLE, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.module import Module
-from udkjax.native.base.tableau import EULER
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.rows.position_closure import CLOSURE
+from udkjax.native.language.ir import BOOL, DOUBLE, POINTER, Function, Value
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.module import Module
+from udkjax.native.module.tableau import EULER
 from udkjax.native.run.manifold import iterate_newton, largest_violation
 from udkjax.native.run.members import write_begin
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from udkjax.native.base.ir import DOUBLE, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.module import Module
-from udkjax.native.base.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
-from udkjax.native.base.tableau import Method
+from udkjax.native.language.ir import DOUBLE, Function, Value
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.module import Module
+from udkjax.native.module.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
+from udkjax.native.module.tableau import Method
 from udkjax.native.run.manifold import newton, with_threshold
 from udkjax.native.run.partitioning import begin_step, close, close_end, judge_independent
 

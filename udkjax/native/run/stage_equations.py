@@ -20,11 +20,11 @@ lane whose iteration does not converge repeats its step with a shorter one.
 
 import numpy as np
 
-from udkjax.native.base.ir import DOUBLE, INT, Function, Operand, Value
-from udkjax.native.base.layout import Lane, Layout
-from udkjax.native.base.module import Module
-from udkjax.native.base.program_derivative import SLOPES, ProgramDerivative
-from udkjax.native.base.steps import DIVERGING, EAGER, FADING, RENEWALS, SLOW, STAGE_ITERATIONS, STAGE_TOL
+from udkjax.native.language.ir import DOUBLE, INT, Function, Operand, Value
+from udkjax.native.module.layout import Lane, Layout
+from udkjax.native.module.module import Module
+from udkjax.native.module.program_derivative import SLOPES, ProgramDerivative
+from udkjax.native.module.steps import DIVERGING, EAGER, FADING, RENEWALS, SLOW, STAGE_ITERATIONS, STAGE_TOL
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 from udkjax.native.pseudoinverses.lu import OrderedLUCode
 from udkjax.native.run.runge_kutta import check_pivots, error_of_velocities, stage_state

@@ -4,21 +4,21 @@ StateAccelerations    accelerations of a state, by elimination or a dense method
 StateProjection       q and v projected onto the constraint manifold
 StateTangentPart      the tangent part of small changes of q and v
 Evaluation            accelerations with multipliers, and energies, for pages
-ScaleCode             the characteristic scales (equations/scale_program.py), from the numbers of a scene
+ScaleCode             the characteristic scales (equations/terms/scale_program.py), from the numbers of a scene
 """
 
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
 
-from udkjax.equations.run_programs import RunPrograms
-from udkjax.native.base.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import Lane, Layout, Plan
-from udkjax.native.base.loops import LoopWriter
-from udkjax.native.base.memory import Memory, ThreadCode
-from udkjax.native.base.steps import NEAREST_STAGE, ROUNDING_PIVOT
-from udkjax.native.base.tableau import EULER
-from udkjax.native.base.text import ALLOCATION, text_of_module
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.language.loops import LoopWriter
+from udkjax.native.language.text import ALLOCATION, text_of_module
+from udkjax.native.module.layout import Lane, Layout, Plan
+from udkjax.native.module.memory import Memory, ThreadCode
+from udkjax.native.module.steps import NEAREST_STAGE, ROUNDING_PIVOT
+from udkjax.native.module.tableau import EULER
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.fallback import write_fallback
 from udkjax.native.run.formulations import FormulationCode

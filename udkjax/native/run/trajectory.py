@@ -7,7 +7,7 @@ A method's tableau (A, b, c) is diffrax's. Since q' = v, its stages only need ac
 The stages of an implicit method are solved one after another (stage_equations.py). A run by the default method, which is
 explicit, goes on with an implicit one where long implicit steps turn out to be accurate, and returns where they do not pay
 (controller.py). Runs begin in a module without the implicit method, and leave it for one that has both when they first need it
-(base/leaving.py); there each lane chooses for its next step.
+(module/leaving.py); there each lane chooses for its next step.
 Each accepted step is projected onto the constraint manifold. Outputs lie on the polynomial of degree 11 through the positions,
 velocities and accelerations of four consecutive accepted states, which is as accurate as the states and costs no evaluation, and
 are projected as well. Where the motion is not smooth, a step ends and the run begins anew.
@@ -22,11 +22,11 @@ All functions of a module work on one block of memory (`Layout`): `run` loads me
 
 from collections.abc import Callable, Sequence
 
-from udkjax.native.base.ir import DOUBLE, Function, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.module import Module
-from udkjax.native.base.samples import enter_first_row, write_next_breakpoint
-from udkjax.native.base.steps import Status
+from udkjax.native.language.ir import DOUBLE, Function, Value
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.module import Module
+from udkjax.native.module.samples import enter_first_row, write_next_breakpoint
+from udkjax.native.module.steps import Status
 from udkjax.native.run.breakpoints import aim
 from udkjax.native.run.controller import write_decide
 from udkjax.native.run.dense_equations import DenseEquations

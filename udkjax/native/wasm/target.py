@@ -6,8 +6,8 @@ rounded separately. The functions of memory management (malloc, free) are import
 
 from typing import NamedTuple
 
-from udkjax.native.base import code_cache, machine
-from udkjax.native.base.memory import Memory
+from udkjax.native.code import code_cache, machine
+from udkjax.native.module.memory import Memory
 from udkjax.native.operations import Operation
 from udkjax.native.wasm.object_code import LinkedModule, link
 

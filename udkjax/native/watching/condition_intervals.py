@@ -1,7 +1,7 @@
 """Classification of the intervals between nodes: no crossing, a crossing, or unresolved (watching.py)."""
 
-from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value, Variable
-from udkjax.native.base.layout import Lane
+from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value, Variable
+from udkjax.native.module.layout import Lane
 from udkjax.native.watching.conditions import (
     LAST_CHANGE,
     MIDDLE,

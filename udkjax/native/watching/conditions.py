@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.base.steps import UNIT
+from udkjax.native.module.steps import UNIT
 
 
 class Resolution(NamedTuple):

@@ -14,9 +14,9 @@ A direction d = P M^(-1) g_q^T is the change of velocity by a unit impulse along
 so that W_ij = g_q,i d_j. For conditions that depend on velocities, g_v takes the place of g_q.
 """
 
-from udkjax.native.base.ir import Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.program import write
+from udkjax.native.language.ir import Function, Value
+from udkjax.native.language.program import write
+from udkjax.native.module.layout import Lane
 from udkjax.native.run.state_functions import StateAccelerations, StateTangentPart
 from udkjax.native.watching.conditions import Conditions
 from udkjax.native.watching.watched_forces import write_forces

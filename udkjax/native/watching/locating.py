@@ -4,9 +4,9 @@ On the polynomial, Newton's method finds the first zero, between bounds: each st
 the other bound, and bisection replaces steps that leave the bounds.
 """
 
-from udkjax.native.base.ir import DOUBLE, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.steps import POINTS, UNIT, Status
+from udkjax.native.language.ir import DOUBLE, Function, Value
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.steps import POINTS, UNIT, Status
 from udkjax.native.watching.conditions import FIRST, LAST_CHANGE, LEAST_STEP, MOST_AIMS, MOST_LANDINGS, UNDER_WAY, WANTED
 from udkjax.native.watching.watch_memory import WatchMemory
 

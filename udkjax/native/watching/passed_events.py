@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.base.layout import Layout
+from udkjax.native.module.layout import Layout
 
 
 @dataclass(frozen=True)

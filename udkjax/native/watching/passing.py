@@ -8,10 +8,10 @@ events goes on.
 
 from typing import Any
 
-from udkjax.native.base.ir import BOOL, DOUBLE, Function, Value
-from udkjax.native.base.layout import INFO, Lane
-from udkjax.native.base.samples import enter_first_row
-from udkjax.native.base.steps import POINTS, Status
+from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.module.layout import INFO, Lane
+from udkjax.native.module.samples import enter_first_row
+from udkjax.native.module.steps import POINTS, Status
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.passed_events import Passing
 

@@ -11,9 +11,9 @@ directions obey the law of friction, and where pivots do not end.
 
 from collections.abc import Callable
 
-from udkjax.native.base.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.program import write
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.language.program import write
+from udkjax.native.module.layout import Lane
 from udkjax.native.run.manifold import project_output
 from udkjax.native.watching.conditions import LAST_CHANGE
 from udkjax.native.watching.passed_events import Sliding

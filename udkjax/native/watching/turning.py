@@ -1,8 +1,8 @@
-"""Kinks of forces that a run passes: the sides of their comparisons turn (integrate/events/kinks.py)."""
+"""Kinks of forces that a run passes: the sides of their comparisons turn (integrate/events/law/kinks.py)."""
 
-from udkjax.native.base.ir import DOUBLE, POINTER, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.program import write
+from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.language.program import write
+from udkjax.native.module.layout import Lane
 from udkjax.native.watching.passed_events import Turning
 from udkjax.native.watching.passing import PassingRuns
 

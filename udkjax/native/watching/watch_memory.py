@@ -1,8 +1,8 @@
 """The memory of runs that watch conditions (watching.py): inputs and outputs, and the length of intervals."""
 
-from udkjax.native.base.ir import DOUBLE, Function, Value
-from udkjax.native.base.layout import Lane, Plan
-from udkjax.native.base.steps import UNIT, Status
+from udkjax.native.language.ir import DOUBLE, Function, Value
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.steps import UNIT, Status
 from udkjax.native.watching.conditions import MIDDLE, RESOLUTION, SECOND, TURN, VARIES, Conditions
 from udkjax.native.watching.passed_events import Passing
 from udkjax.native.watching.passing import PassingRuns

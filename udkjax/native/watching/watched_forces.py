@@ -1,7 +1,7 @@
 """The program of the forces that a run watches (`Conditions.forces`), for modules with multipliers in their memory."""
 
-from udkjax.native.base.ir import Function
-from udkjax.native.base.program import write
+from udkjax.native.language.ir import Function
+from udkjax.native.language.program import write
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import Conditions
 

@@ -10,10 +10,10 @@ conditions that still vary have a jump or a kink. If jumps repeat, or a conditio
 continues.
 """
 
-from udkjax.native.base.ir import BOOL, DOUBLE, INT, Function, Value
-from udkjax.native.base.layout import Lane
-from udkjax.native.base.program import write
-from udkjax.native.base.steps import POINTS, Status
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Value
+from udkjax.native.language.program import write
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.steps import POINTS, Status
 from udkjax.native.run.manifold import project_output
 from udkjax.native.watching.condition_intervals import write_classification
 from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, LAST_CHANGE, MIDDLE, SECOND, THIRD, WANTED

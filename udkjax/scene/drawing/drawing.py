@@ -11,9 +11,6 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Numbers, TomlTable
 from udkjax.arrays import by_numpy, make_module, number
 from udkjax.printing import PrintedTable, has_numbers
-from udkjax.scene.bodies import GROUND, Body
-from udkjax.scene.checks import SceneEntry, SceneError
-from udkjax.scene.description import drawing_table
 from udkjax.scene.drawing.drawing_reader import (
     BY_HAND,
     DRAWN,
@@ -29,14 +26,17 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, around
 from udkjax.scene.drawing.mistakes import joint_names, where
 from udkjax.scene.drawing.pin_forms import AbstractPin, Pin, norm, pin_entries, places_of
-from udkjax.scene.drivers import Driver
-from udkjax.scene.element_setup import name_elements
-from udkjax.scene.forces import ForceElement
-from udkjax.scene.joints import Joint, Revolute
+from udkjax.scene.elements.bodies import GROUND, Body
+from udkjax.scene.elements.drivers import Driver
+from udkjax.scene.elements.forces import ForceElement
+from udkjax.scene.elements.joints import Joint, Revolute
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import ElementGroups
-from udkjax.scene.schema import table_of
-from udkjax.scene.sources import AbstractDrawing, Drawn, Follows, is_number
+from udkjax.scene.numbers.description import drawing_table
+from udkjax.scene.numbers.number_fields import ElementGroups
+from udkjax.scene.numbers.sources import AbstractDrawing, Drawn, Follows, is_number
+from udkjax.scene.tables.checks import SceneEntry, SceneError
+from udkjax.scene.tables.element_setup import name_elements
+from udkjax.scene.tables.schema import table_of
 from udkjax.wording import abbreviate, quote, suggestion
 
 

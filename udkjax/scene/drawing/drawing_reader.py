@@ -7,8 +7,6 @@ import numpy as np
 
 from udkjax.annotations import TomlTable
 from udkjax.arrays import by_numpy, is_traced
-from udkjax.scene.bodies import GROUND, Body, Frame
-from udkjax.scene.checks import SceneEntry, check_table, gravity_mistakes, name_mistake
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_friction import PinFriction
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, ScrewPair, Slide
@@ -17,11 +15,13 @@ from udkjax.scene.drawing.link import Link, with_concrete_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, pin_mistakes, shape_mistakes, where
 from udkjax.scene.drawing.pin_forms import AbstractPin, PointArray, lowest_of_stack, places_of
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
-from udkjax.scene.drivers import Driver
-from udkjax.scene.element_setup import as_leaves
-from udkjax.scene.forces import ForceElement
-from udkjax.scene.joints import Coupling, Joint, Revolute
-from udkjax.scene.schema import build
+from udkjax.scene.elements.bodies import GROUND, Body, Frame
+from udkjax.scene.elements.drivers import Driver
+from udkjax.scene.elements.forces import ForceElement
+from udkjax.scene.elements.joints import Coupling, Joint, Revolute
+from udkjax.scene.tables.checks import SceneEntry, check_table, gravity_mistakes, name_mistake
+from udkjax.scene.tables.element_setup import as_leaves
+from udkjax.scene.tables.schema import build
 from udkjax.wording import abbreviate, quote, suggestion
 
 SECTIONS: Mapping[str, type[DrawnElement]] = {

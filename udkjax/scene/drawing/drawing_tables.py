@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.scene.checks import SceneEntry, SceneError
 from udkjax.scene.drawing.drawing import Drawing
 from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, read_drawing, units_of_element
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.pin_forms import pin_entries
 from udkjax.scene.mechanism_tables import check_classes, check_known, head_mistakes, key_lines, read_section, type_key
-from udkjax.scene.schema import table_of
+from udkjax.scene.tables.checks import SceneEntry, SceneError
+from udkjax.scene.tables.schema import table_of
 from udkjax.wording import abbreviate, suggestion
 
 LISTS = tuple(section for section in DRAWN if section != "pin")  # sections of tables in double brackets

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
-from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, Placement, pair_mistakes
-from udkjax.scene.drivers import Driver, Motion, Polynomial, Sine, Spline
-from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, given_names, given_number, given_or_none
-from udkjax.scene.forces import Force, Spring, Torque, TorsionSpring
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.drivers import Driver, Motion, Polynomial, Sine, Spline
+from udkjax.scene.elements.fields import LINK, NOT_NEGATIVE, PIN, SLIDE, given_names, given_number, given_or_none
+from udkjax.scene.elements.forces import Force, Spring, Torque, TorsionSpring
 from udkjax.wording import quote
 
 

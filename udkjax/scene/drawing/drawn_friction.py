@@ -6,10 +6,10 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.scene.drawing.placement import DrawnElement, Parts, PinLayout, pair_mistakes
-from udkjax.scene.fields import LINK, NOT_NEGATIVE, PIN, POSITIVE, SLIDE, SLOT, given_names, given_or_none
-from udkjax.scene.friction import SLIDING_SPEED, Friction
-from udkjax.scene.joints import Prismatic, Revolute, Slot
-from udkjax.scene.schema import table_of
+from udkjax.scene.elements.fields import LINK, NOT_NEGATIVE, PIN, POSITIVE, SLIDE, SLOT, given_names, given_or_none
+from udkjax.scene.elements.friction import SLIDING_SPEED, Friction
+from udkjax.scene.elements.joints import Prismatic, Revolute, Slot
+from udkjax.scene.tables.schema import table_of
 from udkjax.wording import quote
 
 

@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
-from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.pin_forms import norm
 from udkjax.scene.drawing.placement import (
     DrawnElement,
@@ -20,9 +19,10 @@ from udkjax.scene.drawing.placement import (
     line_mistakes,
     pair_mistakes,
 )
-from udkjax.scene.fields import LINK, PIN, POSITIVE, SLIDE, given_direction, given_names, given_number, given_or_none
-from udkjax.scene.joints import Cam, Gear, Prismatic, Screw, Slot
-from udkjax.scene.profiles import AbstractProfile, LawProfile, SwingProfile, as_profile
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.fields import LINK, PIN, POSITIVE, SLIDE, given_direction, given_names, given_number, given_or_none
+from udkjax.scene.elements.joints import Cam, Gear, Prismatic, Screw, Slot
+from udkjax.scene.elements.profiles import AbstractProfile, LawProfile, SwingProfile, as_profile
 from udkjax.wording import quote
 
 

@@ -11,10 +11,10 @@ from jax.core import Tracer
 
 from udkjax.annotations import TomlTable
 from udkjax.printing import format_number
-from udkjax.scene.fields import vector_as_angle
-from udkjax.scene.profiles import AbstractProfile, profile_class
-from udkjax.scene.schema import CLASSES_BY_TYPE, keys, table_of, type_name
-from udkjax.scene.units import FOLLOWS, conversion_factor, field_unit, read_quantity, unit_sizes
+from udkjax.scene.elements.fields import vector_as_angle
+from udkjax.scene.elements.profiles import AbstractProfile, profile_class
+from udkjax.scene.numbers.units import FOLLOWS, conversion_factor, field_unit, read_quantity, unit_sizes
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.wording import abbreviate, quote, suggestion
 
 # Quantities whose units a file may choose, with their SI units, the default.

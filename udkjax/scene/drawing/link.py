@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.printing import PrintsLine
-from udkjax.scene.bodies import Body, Frame
 from udkjax.scene.drawing.pin_forms import Places, PointArray
-from udkjax.scene.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, given_names, given_or_none
+from udkjax.scene.elements.bodies import Body, Frame
+from udkjax.scene.elements.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, given_names, given_or_none
 
 
 class Shape(NamedTuple):

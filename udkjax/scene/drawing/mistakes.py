@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from udkjax.arrays import is_traced
-from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.link import Link, twice_area, with_concrete_numbers
@@ -20,6 +19,7 @@ from udkjax.scene.drawing.pin_forms import (
     reference_mistakes,
 )
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.wording import quote
 
 DrawnGroups = Mapping[str, Mapping[str, Any]]  # elements by section and name

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 from udkjax.arrays import ROUNDING, array_namespace, by_numpy
 from udkjax.printing import PrintsLine
-from udkjax.scene.checks import SceneEntry
-from udkjax.scene.fields import PIN, POSITIVE, given_names, given_number, given_or_none
-from udkjax.scene.schema import table_of
+from udkjax.scene.elements.fields import PIN, POSITIVE, given_names, given_number, given_or_none
+from udkjax.scene.tables.checks import SceneEntry
+from udkjax.scene.tables.schema import table_of
 from udkjax.wording import quote
 
 PointArray = Float[Array, "n 2"] | np.ndarray

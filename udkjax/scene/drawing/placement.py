@@ -9,12 +9,12 @@ from jaxtyping import Array, Float
 from udkjax.annotations import Number
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.printing import PrintsLine
-from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame
 from udkjax.scene.drawing.link import DrawnBody, Link
 from udkjax.scene.drawing.pin_forms import PointArray, norm
-from udkjax.scene.drivers import Driver
-from udkjax.scene.forces import ForceElement
-from udkjax.scene.joints import Joint
+from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME, Frame
+from udkjax.scene.elements.drivers import Driver
+from udkjax.scene.elements.forces import ForceElement
+from udkjax.scene.elements.joints import Joint
 from udkjax.wording import quote
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.annotations import Numbers
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.forces import Spring, Torque
-from udkjax.scene.joints import Revolute
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.forces import Spring, Torque
+from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.library.posed_bodies import bodies_on_pose, unit_vector, with_concrete_numbers
 from udkjax.scene.mechanism import Mechanism
 

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.arrays import array_namespace
-from udkjax.scene.bodies import GROUND
 from udkjax.scene.drawing.drawing import Drawing
 from udkjax.scene.drawing.drawn_forces import Motor
 from udkjax.scene.drawing.drawn_joints import PinInSlot, Slide
 from udkjax.scene.drawing.link import Link
-from udkjax.scene.forces import Spring
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.forces import Spring
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,

@@ -7,10 +7,10 @@ from jaxtyping import ArrayLike
 
 from udkjax.annotations import Numbers
 from udkjax.arrays import array_namespace
-from udkjax.scene.bodies import GROUND, GROUND_FRAME, Frame, between
-from udkjax.scene.drivers import Driver, Sine
-from udkjax.scene.forces import Spring
-from udkjax.scene.joints import Revolute
+from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME, Frame, between
+from udkjax.scene.elements.drivers import Driver, Sine
+from udkjax.scene.elements.forces import Spring
+from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.library.posed_bodies import (
     apex,
     as_array,

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.joints import Revolute, Slot
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Revolute, Slot
 from udkjax.scene.library.posed_bodies import (
     bodies_on_pose,
     gravity_vector,

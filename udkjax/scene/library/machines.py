@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import ArrayLike
 
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.joints import Gear, Joint, Revolute
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Gear, Joint, Revolute
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.annotations import Numbers
-from udkjax.scene.bodies import GROUND, Body
-from udkjax.scene.drivers import Driver, Sine
-from udkjax.scene.joints import Distance, Revolute
+from udkjax.scene.elements.bodies import GROUND, Body
+from udkjax.scene.elements.drivers import Driver, Sine
+from udkjax.scene.elements.joints import Distance, Revolute
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     bodies_on_pose,

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from udkjax.arrays import array_namespace, number
 from udkjax.programs.deferred import deferred_if_traced
 from udkjax.scene.arguments import bind_arguments
-from udkjax.scene.bodies import Body
+from udkjax.scene.elements.bodies import Body
 from udkjax.scene.mechanism import Mechanism
 
 ORIGINS = ((0.0, 0.0), (0.0, 0.0))  # the centres of mass of two bodies, as points of a joint

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.scene.forces import Force, ForceElement, Spring, Torque, TorsionSpring
-from udkjax.scene.friction import Friction
+from udkjax.scene.elements.forces import Force, ForceElement, Spring, Torque, TorsionSpring
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
 from udkjax.scene.mjcf.model_settings import merge_parts

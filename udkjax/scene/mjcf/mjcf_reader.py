@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from udkjax.scene.bodies import GROUND, GROUND_FRAME, Body
-from udkjax.scene.checks import SceneError
-from udkjax.scene.joints import Angle, Distance, Gear, Joint, Prismatic, Revolute, Slot
+from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME, Body
+from udkjax.scene.elements.joints import Angle, Distance, Gear, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import is_xml
 from udkjax.scene.mjcf.body_tree import BodyTree, TreeJoint, unique_name
@@ -21,6 +20,7 @@ from udkjax.scene.mjcf.model_settings import ModelSettings, merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, PlaneModel, PlaneMotion, contact_pairs, plane_of
 from udkjax.scene.mjcf.vocabulary import unknown_parts
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import abbreviate, suggestion
 
 INITIAL = "initial"  # the keyframe with velocities and controls that `mjcf_text` writes

@@ -10,13 +10,12 @@ from jaxtyping import Array
 
 from udkjax.annotations import Number
 from udkjax.scene.arguments import checked
-from udkjax.scene.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
-from udkjax.scene.forces import Spring, Torque, TorsionSpring
-from udkjax.scene.friction import Friction
-from udkjax.scene.held import Held
-from udkjax.scene.joints import (
+from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
+from udkjax.scene.elements.forces import Spring, Torque, TorsionSpring
+from udkjax.scene.elements.friction import Friction
+from udkjax.scene.elements.held import Held
+from udkjax.scene.elements.joints import (
     Angle,
     Constraint,
     Coupling,
@@ -37,6 +36,7 @@ from udkjax.scene.mjcf.mjcf_reader import INITIAL, OPEN_LOOP
 from udkjax.scene.reshaping import attachments
 from udkjax.scene.spanning_tree import spanning_tree
 from udkjax.scene.suspicions import body_sizes
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
 IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # joints that no equality can express come first

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.scene.bodies import GROUND
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mjcf.body_tree import BodyTree, TreeGeom, TreeJoint, unique_name
 from udkjax.scene.mjcf.geom_masses import sum_masses
 from udkjax.scene.mjcf.model_settings import merge_parts

@@ -6,7 +6,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from udkjax.scene.checks import SceneError
+from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import abbreviate, quote, suggestion
 
 MOST_INCLUDED = 100_000  # elements of included files, each counted as often as it is included, 0.5 s of reading

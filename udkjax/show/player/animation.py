@@ -9,20 +9,21 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.annotations import JsonObject, Numbers
-from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.extras import WRITERS, require
-from udkjax.integrate.events.conditions import Gap
-from udkjax.integrate.events.event import ExpandsToEvents, expand_events
+from udkjax.integrate.events.law.conditions import Gap
+from udkjax.integrate.events.law.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.named_arguments import require_history
 from udkjax.show.player import pictures
-from udkjax.show.player.drawn_systems import PlacesBodies, drawn_system
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
-from udkjax.show.player.marks import BodyPoints
-from udkjax.show.player.measure_curves import Measures, ShownMotion
+from udkjax.show.player.marks.drawn_systems import PlacesBodies, drawn_system
+from udkjax.show.player.marks.marks import BodyPoints
+from udkjax.show.player.marks.measure_curves import Measures, ShownMotion
+from udkjax.show.player.marks.sketch import ForceArrow, TracedPath
 from udkjax.show.player.page import frame, page
 from udkjax.show.player.picture_labels import PictureLabels, labels_of
 from udkjax.show.player.player_data import (
@@ -36,7 +37,6 @@ from udkjax.show.player.player_data import (
     run_record,
     stuck_at,
 )
-from udkjax.show.player.sketch import ForceArrow, TracedPath
 
 if TYPE_CHECKING:
     from udkjax.show.player.widget import PlayerWidget

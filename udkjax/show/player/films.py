@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from udkjax.extras import OptionalImport
+from udkjax.show.player.marks.sketch import THEMES, Circle, Line, Text
 from udkjax.show.player.pictures import Posed, sketches
-from udkjax.show.player.sketch import THEMES, Circle, Line, Text
 
 with OptionalImport():
     from PIL import Image, ImageDraw, ImageFont

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations.analysis import analyse
-from udkjax.integrate.events.event import ExpandsToEvents, expand_events
+from udkjax.equations.rows.analysis import analyse
+from udkjax.integrate.events.law.event import ExpandsToEvents, expand_events
 from udkjax.integrate.portable import portable_engine, unknown_friction
-from udkjax.native.base.program import UnsupportedError
-from udkjax.positions.assembly import close
+from udkjax.native.language.program import UnsupportedError
+from udkjax.positions.assembling.assembly import close
 from udkjax.requirements import ArgumentError
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.live_parameters import Live, Slider, in_sections, names_in, sliders_of
-from udkjax.show.player.measure_curves import ShownMotion
+from udkjax.show.player.marks.measure_curves import ShownMotion
+from udkjax.show.player.marks.symbol_updates import symbol_updates
 from udkjax.show.player.player_data import MOST_INSTANTS
-from udkjax.show.player.symbol_updates import symbol_updates
 
 TOLERANCE = 1e-8  # rtol and atol of a run that does not record its tolerances: the defaults of `simulate`
 SAME_STATE = 1e-6  # tolerance (characteristic lengths or rad, per characteristic time) for an initial state to be the scene's

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations.analysis import analyse
+from udkjax.equations.rows.analysis import analyse
 from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import parameters_of
-from udkjax.scene.units import conversion_factor, units_of
+from udkjax.scene.numbers.number_fields import parameters_of
+from udkjax.scene.numbers.units import conversion_factor, units_of
 
 # Names of parameters or of their entries, alone or with the ranges of their sliders; True: all parameters.
 Live = bool | Sequence[str] | Mapping[str, tuple[float, float] | None]

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.scene.mechanism import Mechanism
-from udkjax.show.player.mark_kinds import MarkKind
-from udkjax.show.player.marks import Mark
-from udkjax.show.player.sketch import Line, Sketch, Text
+from udkjax.show.player.marks.mark_kinds import MarkKind
+from udkjax.show.player.marks.marks import Mark
+from udkjax.show.player.marks.sketch import Line, Sketch, Text
 
 T = TypeVar("T")
 Anchor = tuple[int, float, float]  # a place of a body, by its index; -1 is the ground

@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from udkjax.annotations import JsonObject
 from udkjax.extras import OptionalImport
-from udkjax.show.player.mark_kinds import MarkKind
+from udkjax.show.player.marks.mark_kinds import MarkKind
+from udkjax.show.player.marks.sketch import THEMES, Circle, ForceArrow, Line, Sketch, Text, TracedPath, View, view_of
 from udkjax.show.player.picture_labels import PictureLabels, Placing
-from udkjax.show.player.sketch import THEMES, Circle, ForceArrow, Line, Sketch, Text, TracedPath, View, view_of
 
 DXF_LAYERS: dict[str, str] = {
     MarkKind.PIN: "joints",

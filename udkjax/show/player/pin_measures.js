@@ -1,4 +1,4 @@
-// Measures of pins (udkjax/show/player/pin_measures.py): the speed of an anchor, or the acute angle at the second of three.
+// Measures of pins (udkjax/show/player/marks/pin_measures.py): the speed of an anchor, or the acute angle at the second of three.
 
 import {place} from "./motion.js";
 

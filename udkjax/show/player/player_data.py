@@ -30,24 +30,18 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.annotations import JsonObject, Numbers
-from udkjax.equations.analysis import analyse
-from udkjax.integrate.events.conditions import Gap
+from udkjax.equations.rows.analysis import analyse
+from udkjax.integrate.events.law.conditions import Gap
 from udkjax.integrate.solution import Result
-from udkjax.positions.channels import locate
+from udkjax.positions.assembling.channels import locate
 from udkjax.scene.mechanism import Mechanism
-from udkjax.show.player.mark_kinds import MarkKind
-from udkjax.show.player.mark_places import body_points, to_ground
-from udkjax.show.player.marks import BodyPoints, marks
-from udkjax.show.player.measure_curves import (
-    Measures,
-    ShownMotion,
-    measures_of,
-    reaction_arrows,
-    sticking_spans,
-)
+from udkjax.show.player.marks.mark_kinds import MarkKind
+from udkjax.show.player.marks.mark_places import body_points, to_ground
+from udkjax.show.player.marks.marks import BodyPoints, marks
+from udkjax.show.player.marks.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows, sticking_spans
+from udkjax.show.player.marks.sketch import POINT, ForceArrow, TracedPath, view_of
+from udkjax.show.player.marks.symbols import symbols_of
 from udkjax.show.player.packing import floats, pack, unpack
-from udkjax.show.player.sketch import POINT, ForceArrow, TracedPath, view_of
-from udkjax.show.player.symbols import symbols_of
 
 Record = JsonObject
 Traces = Sequence[str | tuple[str, Numbers]]  # joints, bodies, or points of bodies

@@ -8,10 +8,10 @@ import numpy as np
 
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result
-from udkjax.scene.checks import SceneError
 from udkjax.scene.files import loads
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mjcf import MjcfWarning
+from udkjax.scene.tables.checks import SceneError
 
 with OptionalImport():
     import xarray

@@ -1,4 +1,4 @@
-// Updates of symbols when numbers of the scene change (udkjax/show/player/symbol_updates.py).
+// Updates of symbols when numbers of the scene change (udkjax/show/player/marks/symbol_updates.py).
 
 /** Updates the symbols, marks and traces of a run from the numbers of the scene. */
 export class SymbolUpdater {

@@ -1,4 +1,4 @@
-// Symbols (udkjax/show/player/symbols.py): lines and circles in frames that move with bodies.
+// Symbols (udkjax/show/player/marks/symbols.py): lines and circles in frames that move with bodies.
 
 import {angleOf, clamp} from "./motion.js";
 import {Painter, mix} from "./painter.js";

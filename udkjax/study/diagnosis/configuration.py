@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from udkjax.equations.analysis import analyse
-from udkjax.equations.dense_rows import KinematicRows
-from udkjax.equations.position_closure import CLOSURE, close_position, is_closed
-from udkjax.equations.position_rows import PositionRows
-from udkjax.equations.redundancy import kinematic_rows
-from udkjax.equations.scene_programs import scene_programs
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.rows.dense_rows import KinematicRows
+from udkjax.equations.rows.position_closure import CLOSURE, close_position, is_closed
+from udkjax.equations.rows.position_rows import PositionRows
+from udkjax.equations.rows.redundancy import kinematic_rows
 from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:

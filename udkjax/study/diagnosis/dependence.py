@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.equations import determinacy
-from udkjax.equations.position_rows import PositionRows
+from udkjax.equations.rows.position_rows import PositionRows
 from udkjax.pinv.row_spaces import null_space
 from udkjax.study.diagnosis.configuration import Configuration
 

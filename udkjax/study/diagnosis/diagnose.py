@@ -5,16 +5,16 @@ from typing import Any, overload
 import numpy as np
 
 from udkjax.equations import determinacy
-from udkjax.equations.analysis import hold_pins
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.position_closure import is_closed
-from udkjax.equations.textbook import prepare
+from udkjax.equations.rows.analysis import hold_pins
+from udkjax.equations.rows.position_closure import is_closed
+from udkjax.equations.states.textbook import prepare
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
-from udkjax.positions.assembly import Closure, State, close, require_closed
-from udkjax.positions.channels import StateHistory
+from udkjax.positions.assembling.assembly import Closure, State, close, require_closed
+from udkjax.positions.assembling.channels import StateHistory
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
-from udkjax.scene.joints import Revolute, Weld
+from udkjax.scene.elements.joints import Revolute, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.clearance import clearance
 from udkjax.study.diagnosis.configuration import Configuration, JointForces, RankedPositions

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.equations.dense_rows import KinematicRows
+from udkjax.equations.rows.dense_rows import KinematicRows
 from udkjax.pinv.row_spaces import null_space
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.joints import Constraint
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions, singular_values
 from udkjax.study.diagnosis.dependence import DEPENDS, Dependency, stress_of

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import SceneError
-from udkjax.scene.joints import Angle, Constraint, Prismatic, Revolute, Slot, Weld
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Angle, Constraint, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.equations.textbook import TextbookEquations
+from udkjax.equations.states.textbook import TextbookEquations
 
 
 class JointFriction(NamedTuple):

@@ -6,10 +6,10 @@ import jax
 import numpy as np
 
 from udkjax.equations import determinacy
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.position_rows import PositionRows
-from udkjax.positions.assembly import State, close, require_closed
-from udkjax.positions.channels import StateHistory
+from udkjax.equations.rows.position_rows import PositionRows
+from udkjax.equations.systems.general import ConstrainedSystem
+from udkjax.positions.assembling.assembly import State, close, require_closed
+from udkjax.positions.assembling.channels import StateHistory
 from udkjax.printing import PrintedTable, html_table
 from udkjax.study.diagnosis.configuration import N_NEIGHBOURS, NEIGHBOUR_STEP, SMALLEST_MOVE, Configuration, count_rank
 from udkjax.study.diagnosis.dependence import dependencies_at

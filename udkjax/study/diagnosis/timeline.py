@@ -15,13 +15,13 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.interpolate import BPoly
 
 from udkjax.equations import determinacy
-from udkjax.equations.analysis import Analysis
-from udkjax.equations.quantities import equations_of
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.states.quantities import equations_of
 from udkjax.integrate import simulate
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD
-from udkjax.positions.assembly import State
-from udkjax.positions.channels import StateHistory
+from udkjax.positions.assembling.assembly import State
+from udkjax.positions.assembling.channels import StateHistory
 from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.quantities import StudyModel, analysis_of

@@ -12,10 +12,18 @@ from udkjax.integrate.solution import CAUSES, Result
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
-from udkjax.study.identify.estimate import Estimate
-from udkjax.study.identify.fit_problem import FitProblem, Strategy, build_problem
-from udkjax.study.identify.least_squares import CostHistory, Fit
-from udkjax.study.identify.optimizer import (
+from udkjax.study.identify.answers.estimate import Estimate
+from udkjax.study.identify.answers.uncertainty import UnknownValues, estimate_uncertainty
+from udkjax.study.identify.problem.fit_problem import FitProblem, Strategy, build_problem
+from udkjax.study.identify.problem.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
+from udkjax.study.identify.problem.parameters import ParametersLike
+from udkjax.study.identify.problem.prediction import LOOSE_TOL, TIGHT_TOL, TolerancePair
+from udkjax.study.identify.problem.residuals import Residuals, reduce_groups, residual_vector
+from udkjax.study.identify.problem.row_statistics import hat_bands, residuals_of_others
+from udkjax.study.identify.records.record_reader import Data
+from udkjax.study.identify.records.records import Estimated, IdentificationError, Noise, Start
+from udkjax.study.identify.search.least_squares import CostHistory, Fit
+from udkjax.study.identify.search.optimizer import (
     Loss,
     Minimizer,
     Optimizer,
@@ -25,15 +33,7 @@ from udkjax.study.identify.optimizer import (
     squares,
     weighted_residuals,
 )
-from udkjax.study.identify.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
-from udkjax.study.identify.parameters import ParametersLike
-from udkjax.study.identify.prediction import LOOSE_TOL, TIGHT_TOL, TolerancePair
-from udkjax.study.identify.record_reader import Data
-from udkjax.study.identify.records import Estimated, IdentificationError, Noise, Start
-from udkjax.study.identify.residuals import Residuals, reduce_groups, residual_vector
-from udkjax.study.identify.row_statistics import hat_bands, residuals_of_others
-from udkjax.study.identify.search import N_STARTS, SearchResult, search
-from udkjax.study.identify.uncertainty import UnknownValues, estimate_uncertainty
+from udkjax.study.identify.search.search import N_STARTS, SearchResult, search
 from udkjax.study.noise import Whiteness, whiteness_of
 from udkjax.study.quantities import StudyModel
 

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.annotations import Numbers
-from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.pinv import Auto, Dense, Elimination, OneOf
-from udkjax.positions.assembly import State
+from udkjax.positions.assembling.assembly import State
 from udkjax.requirements import ArgumentTypeError, describe, require_count
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.choices import Choice

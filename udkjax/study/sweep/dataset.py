@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Int, PyTree
 
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
-from udkjax.scene.bodies import COORDINATES
+from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.units import units_of
+from udkjax.scene.numbers.units import units_of
 from udkjax.study.quantities import body_names
 from udkjax.study.sweep.axes import AxisColumn, Dimension
 from udkjax.study.sweep.dimensions import NUMBERS_OF, RENAMED, SweepError

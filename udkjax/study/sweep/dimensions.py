@@ -10,16 +10,16 @@ from typing import Any, TypeAlias, cast
 import jax
 import numpy as np
 
-from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.simulate import simulate
 from udkjax.pinv import Auto
-from udkjax.positions.assembly import State
+from udkjax.positions.assembling.assembly import State
 from udkjax.requirements import describe
 from udkjax.scene.arguments import argument_problems
-from udkjax.scene.checks import Mistakes, SceneError
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.number_fields import parameters_of, split_index
-from udkjax.scene.units import NUMBERS, units_of
+from udkjax.scene.numbers.number_fields import parameters_of, split_index
+from udkjax.scene.numbers.units import NUMBERS, units_of
+from udkjax.scene.tables.checks import Mistakes, SceneError
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import (
     CHOICES,

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution, scene_text, versions
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.quantities import StudyModel, body_names

@@ -11,8 +11,8 @@ from scipy import stats
 
 from udkjax.annotations import TomlTable
 from udkjax.extras import OptionalImport
-from udkjax.scene.checks import Mistakes
 from udkjax.scene.mechanism_tables import parse_toml
+from udkjax.scene.tables.checks import Mistakes
 from udkjax.study.choices import CHOICES, Choice, choice
 from udkjax.study.quantities import InitialAngle, Length, Scaled, Setter
 from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, Sobol, SweepDesign, Values, Zipped

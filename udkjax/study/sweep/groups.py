@@ -17,15 +17,15 @@ from jaxtyping import Array, Int, PyTree
 
 from udkjax.arrays import number
 from udkjax.devices import default_devices
-from udkjax.equations.analysis import analyse
-from udkjax.equations.general import ConstrainedSystem
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solvers import has_method
 from udkjax.pinv import Auto, Elimination
-from udkjax.positions.assembly import Closure, State, close
+from udkjax.positions.assembling.assembly import Closure, State, close
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.units import NUMBERS
+from udkjax.scene.numbers.units import NUMBERS
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Outputs, Program
 from udkjax.study.quantities import StudyModel, analysis_of, parameter_value
 from udkjax.study.sweep.dimensions import NUMBERS_OF, refuse_untraceable, uses_number

@@ -13,12 +13,12 @@ from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.quantities import energy, equations_of, violation
-from udkjax.equations.textbook import prepare
+from udkjax.equations.states.quantities import energy, equations_of, violation
+from udkjax.equations.states.textbook import prepare
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
-from udkjax.positions.channels import Channel, channel_of
+from udkjax.positions.assembling.channels import Channel, channel_of
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.channel_values import measure as evaluate_channels
 from udkjax.study.quantities import StudyModel

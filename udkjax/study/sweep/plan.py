@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Int, PyTree
 
 from udkjax.annotations import Numbers
-from udkjax.equations.analysis import analyse
-from udkjax.equations.general import ConstrainedSystem
-from udkjax.equations.udwadia_kalaba import Baumgarte
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.simulate import simulate
 from udkjax.requirements import require_output_times
 from udkjax.scene.arguments import argument_problems

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from udkjax.positions.drive import Drive, only_driver
-from udkjax.positions.free_numbers import FreeNumbers
+from udkjax.positions.following.drive import Drive, only_driver
+from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.requirements import require_number
 from udkjax.scene.arguments import checked
-from udkjax.scene.checks import SceneError
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.complete.balls import ComplexBall
 from udkjax.synthesis.complete.complete_designs import CompleteDesigns, OtherSolution
 from udkjax.synthesis.complete.drawn_four_bar import DrawnFourBar, read_four_bar

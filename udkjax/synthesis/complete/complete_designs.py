@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.positions.drive import Drive
+from udkjax.positions.following.drive import Drive
 from udkjax.printing import PrintedTable, PrintsTable
-from udkjax.scene.checks import SceneError
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.found_mechanism import FoundMechanism
 
 NEARLY_REAL = 1e-4  # relative to the extent; singular ends are at best accurate to the square root of the rounding error

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.positions.coordinates import element_of
-from udkjax.positions.drive import Drive
-from udkjax.scene.bodies import GROUND
-from udkjax.scene.checks import SceneError
+from udkjax.positions.assembling.coordinates import element_of
+from udkjax.positions.following.drive import Drive
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.complete.four_bars import FourBars
 from udkjax.wording import quote
 

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from udkjax.expressions import Graph, ScalarProgram
-from udkjax.expressions.complex_scalars import ComplexScalar, solve_complex
-from udkjax.expressions.selection import absolute
+from udkjax.expressions.scalars.complex_scalars import ComplexScalar, solve_complex
+from udkjax.expressions.scalars.selection import absolute
 from udkjax.synthesis.complete.balls import LONG, Ball
 
 ArrayOrBall = Any  # arrays or balls

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.positions.position_batch import PositionBatch
+from udkjax.positions.following.position_batch import PositionBatch
 from udkjax.scene.drawing import Drawing
 from udkjax.synthesis.complete.four_bars import Classification, FourBars
 

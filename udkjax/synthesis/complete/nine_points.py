@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from udkjax.positions.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
+from udkjax.positions.following.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
 from udkjax.synthesis.complete.balls import LONG, Ball
 from udkjax.synthesis.complete.certificate import Certificate, certify
 from udkjax.synthesis.complete.dyads import JOINTS, POINTS, UNKNOWNS, Displacements, four_bar_system, newton_and_tangent

@@ -1,0 +1,53 @@
+"""Mistakes in events are named."""
+
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false
+# All of these runs have events; wrong arguments are meant.
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import udkjax as udk
+from tests.integrate.events.event_scenes import PENDULUM, TS
+
+
+@pytest.mark.parametrize(
+    ("events", "message"),
+    [
+        (udk.JointLimit("B", lower=0.0), 'no joint named "B"'),
+        (udk.JointLimit("A"), "give `lower` or `upper`"),
+        (udk.JointLimit("A", lower=np.nan), 'limit "A": lower must be a finite number, not nan'),
+        (udk.JointLimit("A", upper=np.inf), 'limit "A": upper must be a finite number, not inf'),
+        (udk.JointLimit("A", lower=[0, 1]), 'limit "A": lower must be one number'),
+        (udk.JointLimit("A", lower=1, upper=0.5), 'limit "A": lower = 1 must not be above upper = 0.5'),
+        (udk.JointLimit("A", lower=0, restitution=np.nan), 'event "A.lower": the restitution must be a finite number, not nan'),
+        (udk.Contact("link", point=[np.nan, 0]), r'contact "link on ground": point\[0\] is nan'),
+        (udk.Contact("link", point=[0, 0, 9]), r"point must be two numbers, x and y, not an array of the shape \(3,\)"),
+        (udk.Contact("link", through=[0, np.inf]), r"through\[1\] is inf"),
+        (udk.Contact("link", normal=[0, 1, 5]), "normal must be two numbers"),
+        (udk.Contact("link", normal=[0, 0]), "normal must not be zero"),
+        (udk.Contact("link", point="here"), 'contact "link on ground": point must be real numbers, not "here"'),
+        (udk.Contact("link", restitution=[0.5, 0.5]), "the restitution must be one number"),
+        (udk.Contact("link", name=3), "Contact: name must be a string, not 3"),
+        (udk.Event(lambda t, at: at["link"].x, direction=1.5), 'event "event1": the direction must be -1, 0 or 1, not 1.5'),
+        (udk.Event(lambda t, at: at["link"].x, udk.Release(7)), "the name of Release must be a string, not 7"),
+        (udk.Event(lambda t, at: at["link"].x, udk.Lock(None)), "the joint of Lock must be a string, not None"),
+        (udk.Event(lambda t, at: at["link"].x, udk.Attach("weld", "w")), "the joint of Attach must be a joint"),
+        (
+            udk.Event(lambda t, at: at["link"].x, udk.Attach(udk.Weld(("ground", "link"), [[0, np.nan], [0, 0]]), "w")),
+            r"the joint of Attach\[0, 1\] is nan: it must be finite",
+        ),
+        (udk.Contact("lnik"), 'no body named "lnik"; did you mean "link"'),
+        (udk.Event(lambda t, at: at["lnik"].x), 'event "event1": no body named "lnik"; did you mean "link"'),
+        (udk.Event(lambda t, at: at["link"].omega, udk.Impact(0.5)), "must depend on positions alone"),
+        (udk.Event(lambda t, at: at["link"].x, udk.Impact(0.5), 1), "its condition falls to zero, and not where direction=1"),
+        (udk.Event(lambda t, at: at["link"].x, udk.Impact(1.5)), "restitution must be from 0 to 1, not 1.5"),
+        (udk.Event(lambda t, at: at["link"].x, udk.Release("C")), 'no joint or driver named "C"'),
+        (udk.Event(lambda t, at: jnp.ones(2)), r"must return one number, not an array of shape \(2,\)"),
+        ([udk.Contact("link"), udk.Contact("link")], "two events have this name"),
+        ([], "the list is empty"),
+        ([1.0], r"events\[0\]: must be an Event"),
+    ],
+)
+def test_mistakes_are_named(events, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        udk.simulate(PENDULUM, TS, events=events)

@@ -1,0 +1,121 @@
+"""User-defined pseudoinverses, formulations, stabilizations, integrators and step sizes."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import udkjax as udk
+from experiments.parts.atlas_own import BraunGoldfarb, HalfImplicit
+from tests.integrate.systems.own_systems import G, pendulum
+
+RATE = np.sqrt(G / 0.6)  # of the conical pendulum 0.6 m below its pivot
+START = udk.State([0.8, 0.0, -0.6], [0.0, 0.8 * RATE, 0.0])
+TS = np.linspace(0.0, 1.0, 3)
+EXACT = np.stack([0.8 * np.cos(RATE * TS), 0.8 * np.sin(RATE * TS), 0 * TS - 0.6], 1)
+
+
+class BenIsrael(udk.MatrixPseudoinverse):
+    """D^+ by Newton's iteration X <- X (2 I - D X), at any rank."""
+
+    def matrix(self, D):
+        X = D.T / (jnp.abs(D).sum(0).max() * jnp.abs(D).sum(1).max())
+        X = jax.lax.fori_loop(0, 40, lambda _, X: 2 * X - X @ D @ X, X)
+        return X @ D @ X  # without rounding errors outside the range, which the iteration doubles
+
+
+def test_a_pseudoinverse():
+    """Penrose's conditions, the rank and the derivative at a matrix of rank two."""
+    D = np.random.default_rng(0).normal(size=(4, 2)) @ np.random.default_rng(1).normal(size=(2, 5))
+    method = BenIsrael()
+    assert_allclose(method(D), np.linalg.pinv(D), atol=1e-10)
+    assert int(method.rank(D)) == 2
+    b, change = np.arange(4.0), np.random.default_rng(2).normal(size=(4, 5)) @ np.linalg.pinv(D) @ D
+    change = D @ np.linalg.pinv(D) @ change  # keeps the rank
+    slope = jax.jvp(lambda D: method.solve(D, b).x, (jnp.asarray(D),), (jnp.asarray(change),))[1]
+    reference = jax.jvp(lambda D: udk.SVD().solve(D, b).x, (jnp.asarray(D),), (jnp.asarray(change),))[1]
+    assert_allclose(slope, reference, atol=1e-9)
+
+
+class ThreeTimes(udk.PointwiseFormulation):
+    """Accelerations by block elimination, for independent rows."""
+
+    def solve(self, M, F, A, c):
+        mobility = jnp.linalg.solve(M, A.T)
+        free = jnp.linalg.solve(M, F)
+        return free + mobility @ jnp.linalg.solve(A @ mobility, c - A @ free)
+
+
+class Radial(udk.Stabilization):
+    """Scales positions to the sphere, and removes the radial velocity: for the pendulum alone."""
+
+    length: jax.Array
+
+    def end_of_step(self, at):
+        q = self.length * at.q / jnp.linalg.norm(at.q)
+        return q, at.v - q * (q @ at.v) / self.length**2
+
+
+def run(**choices: Any) -> udk.Solution:
+    settings: Any = {"rtol": 1e-7, "atol": 1e-7} | choices
+    return udk.simulate(pendulum(), TS, START, **settings)
+
+
+CONSTANT = {"stepsize_controller": diffrax.ConstantStepSize()}
+
+
+@pytest.mark.parametrize(
+    ("choices", "error", "gap"),
+    [
+        pytest.param({"stabilization": BraunGoldfarb()}, 1e-6, 1e-6, id="rates"),
+        pytest.param({"stabilization": Radial(jnp.array(1.0))}, 1e-5, 1e-6, id="end of step", marks=pytest.mark.slow),
+        pytest.param({"method": BenIsrael()}, 1e-6, 1e-14, id="pseudoinverse", marks=pytest.mark.slow),
+        pytest.param({"formulation": ThreeTimes()}, 1e-6, 1e-14, id="formulation", marks=pytest.mark.slow),
+        pytest.param({"solver": diffrax.Dopri5(), "dt0": 0.01, **CONSTANT}, 1e-8, 1e-14, id="constant", marks=pytest.mark.slow),
+        pytest.param(
+            {"stepsize_controller": diffrax.PIDController(1e-8, 1e-8)}, 1e-6, 1e-14, id="controller", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_runs(choices, error, gap):
+    """The exact conical motion, and the length of the rod."""
+    found = run(**choices)
+    assert found.settings["engine"].startswith("diffrax")
+    assert_allclose(found.q, EXACT, atol=error)
+    assert_allclose(udk.violation(pendulum(), found), 0.0, atol=gap)
+
+
+@pytest.mark.slow
+def test_an_integrator_of_first_order():
+    errors = [np.abs(run(solver=HalfImplicit(), dt0=h, **CONSTANT).q - EXACT).max() for h in (4e-3, 2e-3)]
+    assert_allclose(errors[0] / errors[1], 2.0, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_derivatives_and_batches_of_a_stabilization():
+    """By a number of the stabilization, against differences, and in a batch; a mechanism takes it as well."""
+    ends = lambda length: run(stabilization=Radial(length), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.02).q[-1]  # noqa: E731
+    slope, h = jax.jit(jax.jacfwd(ends))(1.0), 1e-5
+    assert_allclose(slope, (ends(jnp.array(1.0 + h)) - ends(jnp.array(1.0 - h))) / (2 * h), atol=1e-6)
+    assert_allclose(jax.jit(jax.vmap(ends))(jnp.array([0.99, 1.0]))[1], ends(jnp.array(1.0)), atol=1e-12)
+    linkage = udk.library.parallelogram()
+    stabilized = udk.simulate(linkage, TS, stabilization=BraunGoldfarb())
+    assert_allclose(stabilized.q, udk.simulate(linkage, TS).q, atol=1e-6)
+
+
+def test_mistakes():
+    with pytest.raises(ValueError, match="constant steps need their length"):
+        run(**CONSTANT)
+    with pytest.raises(ValueError, match="constant steps, stepsize_controller"):
+        run(solver=HalfImplicit())
+    with pytest.raises(ValueError, match='engine="native" cannot: it does not know BraunGoldfarb'):
+        run(stabilization=BraunGoldfarb(), engine="native")
+    stop = udk.Event(lambda t, q, v: q[0], udk.Stop())
+    with pytest.raises(ValueError, match="not a stabilization of your own"):
+        run(stabilization=BraunGoldfarb(), events=stop)
+    assert eqx.is_array(Radial(jnp.array(1.0)).length)

@@ -1,0 +1,162 @@
+"""Set-valued friction at a single state, on arrays: which joints stick, and the forces of all.
+
+A joint i slides at the speed s_i = A_i(q) v, and its friction f_i acts on the bodies as A_i^T f_i. While it sticks, f_i is a
+multiplier, that of the row A_i a = -(d A_i / dt) v, in addition to those of the constraints:
+
+    M a + Psi_q^T lambda = F + G(lambda) + sum of A_i^T f_i over joints that stick.
+
+G is the friction of joints that slide, by the Newton's method of rubbing.py. A joint is at rest if its speed is zero, up to
+rounding errors in units of the scene; which of the joints at rest stick follows from the law (stick_or_slip.py), or is known from
+a run. Where joints lock each other, the forces of least norm among those that the law allows count.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from udkjax.annotations import Time, Vector
+from udkjax.complementarity.stick_or_slip import AT_REST, FrictionModes, JointsAtRest, Response
+from udkjax.equations.friction import rubbing
+from udkjax.equations.friction.compliance import sharing
+from udkjax.equations.friction.directed_friction import DirectedFriction, DirectedMechanism
+from udkjax.equations.laws import udwadia_kalaba as uk
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.programs.scales import Scales
+from udkjax.equations.terms import constraints, loads
+from udkjax.pinv import Pseudoinverse
+from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
+
+
+class StickingLoads(NamedTuple):
+    """The multipliers of a mechanism some of whose joints stick, and its friction."""
+
+    multipliers: Float[Array, "m"]
+    friction: Float[Array, "n"]  # loads of all friction without the constant torques, which `loads.force` includes
+    by_name: dict[str, Float[Array, "n"]]  # loads of each friction
+
+
+class StickingState(eqx.Module):
+    """A mechanism with set-valued friction at one state.
+
+    Args:
+        mechanism: The scene.
+        method: The pseudoinverse.
+        baumgarte: Gains of Baumgarte stabilization; None: no stabilization.
+        w: Weights of the rows (m,).
+        scales: Scales of the scene.
+        soft: Compliances of the rows (m,); None: loads of least norm.
+        sticking: The joints that are known to stick, in the order of the forces; None: those at rest that the law holds.
+    """
+
+    mechanism: Mechanism
+    method: Pseudoinverse
+    baumgarte: Baumgarte | None
+    w: Float[Array, "m"]
+    scales: Scales
+    soft: Float[Array, "m"] | None
+    sticking: Bool[Array, "F"] | None
+
+    def loads(self, t: Time, q: Vector, v: Vector) -> StickingLoads:
+        """Return the multipliers and the friction at a state; NaN where friction admits no motion."""
+        modes, failed = self.modes(t, q, v)
+        found, _ = self._respond(DirectedFriction.put_in(self.mechanism), modes, t, q, v)
+        return jax.tree.map(lambda x: jnp.where(failed, jnp.nan, x), found)
+
+    def modes(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
+        """Return the modes of the joints, without derivatives, and whether none obey the law."""
+        return stop_gradients(self)._decide(*stop_gradients((t, q, v)))
+
+    def _decide(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
+        directed = DirectedFriction.put_in(self.mechanism)
+        unit, (speed, A, _) = directed.units(self.scales.length), self._rows(directed, q, v)
+        sticking = jnp.zeros(len(unit), bool) if self.sticking is None else self.sticking
+        rest = sticking | (jnp.abs(speed) <= AT_REST.closed * unit * self.scales.rate)
+        D, root = uk.D(self.mechanism, t, q, self.w), uk.inverse_sqrt_mass(self.mechanism)
+        plus = uk.pseudoinverse(self.method, D)
+        u = jax.vmap(lambda row: row - plus @ (D @ row))(root * A)
+        mobility, accelerations = jnp.sum((root * A) ** 2, axis=1), unit * self.scales.rate**2
+        rest = rest & jnp.all(jnp.isfinite(u))
+        none = jnp.zeros_like(rest)
+        joints = JointsAtRest.of(rest, jnp.sign(speed), u @ u.T, mobility, sticking, none, accelerations, jnp)
+        respond = lambda modes: self._respond(directed, modes, t, q, v)[1]  # noqa: E731
+        found, failed, _ = joints.decide(respond, jnp.zeros(len(unit)), none, none, jnp)
+        if self.sticking is None:
+            return found, failed
+        known = FrictionModes(sticking, jnp.where(rest, 0.0, joints.sliding), none, none)
+        return jax.tree.map(lambda x, y: jnp.where(failed, x, y), known, found), jnp.asarray(False)
+
+    def _respond(
+        self, directed: DirectedMechanism, modes: FrictionModes, t: Time, q: Vector, v: Vector
+    ) -> tuple[StickingLoads, Response]:
+        """Return the loads in given modes, and the motion of the joints."""
+        mechanism = directed.with_sides(modes.sides(jnp))
+        _, A, rate = self._rows(directed, q, v)
+        length = self.scales.length
+        held = jnp.where(modes.locked, length / directed.units(length), 0.0)  # weights as in `Scales`
+        root, rows, w = uk.inverse_sqrt_mass(mechanism), len(self.w), jnp.concatenate([self.w, held])
+        D = w[:, None] * jnp.concatenate([constraints.psi_q(mechanism, t, q), A]) * root
+        plus, share = uk.pseudoinverse(self.method, D), sharing(D, self.soft, w)
+
+        def b(friction: Array) -> Array:
+            of_locks = -rate - A @ uk.a_F(mechanism, t, q, v, friction)
+            return w * jnp.concatenate([uk.b(mechanism, t, q, v, self.baumgarte, None, friction), of_locks])
+
+        def multipliers(friction: Array) -> Array:
+            return share(-w * (plus.T @ (plus @ b(friction))))
+
+        found = rubbing.settle(multipliers, mechanism, t, q, v)
+        friction = rubbing.rubbing_loads(mechanism, t, q, v, found)
+        a = uk.a_F(mechanism, t, q, v, friction) + root * (plus @ b(friction))
+        total = loads.force(mechanism, t, q, v) + friction - A.T @ found[rows:]
+        limits, of_locks = self._limits(directed, found), found[rows:]
+        response = Response(A @ a + rate, limits - of_locks, limits + of_locks)
+        by_name = rubbing.loads_of_friction(mechanism, t, q, v, found)
+        for (_, k), row, multiplier in zip(directed.joints, A, of_locks, strict=True):
+            by_name[mechanism.force_names[k]] = by_name[mechanism.force_names[k]] - row * multiplier
+        return StickingLoads(found[:rows], total - loads.force(self.mechanism, t, q, v), by_name), response
+
+    def _limits(self, directed: DirectedMechanism, multipliers: Float[Array, "k"]) -> Float[Array, "F"]:
+        """Return the largest forces by which the joints stick."""
+        owners = [name for name, _ in constraints.row_names(self.mechanism)]
+        found = []
+        for name, k in directed.joints:
+            friction: Any = self.mechanism._forces[k]
+            own = [multipliers[row] for row, owner in enumerate(owners) if owner == name]
+            found.append(friction.largest_force(self.mechanism.joints[name], own))
+        return jnp.stack([jnp.asarray(x, float) for x in found])
+
+    def _rows(
+        self, directed: DirectedMechanism, q: Vector, v: Vector
+    ) -> tuple[Float[Array, "F"], Float[Array, "F n"], Float[Array, "F"]]:
+        """Return the speeds of the joints, A, and (d A / dt) v."""
+        speeds = directed.sliding_speeds
+        s, rate = jax.jvp(lambda q: speeds(q, v), (q,), (v,))
+        return s, jax.jacfwd(speeds, 1)(q, v), rate
+
+
+def sticking_joints(mechanism: Mechanism) -> tuple[str, ...]:
+    """Return the joints with set-valued friction, in the order of the forces."""
+    return tuple(name for name, _ in DirectedFriction.put_in(mechanism).joints)
+
+
+def known_sticking(mechanism: Any, solution: Any) -> Bool[Array, "T F"] | None:
+    """Return which joints stick in a run, if this is known.
+
+    Args:
+        mechanism: The scene.
+        solution: A `Solution`, or other states over time.
+
+    Returns:
+        A mask of the joints with set-valued friction, in the order of the forces; None: it is not known, or there are none.
+    """
+    sticking = getattr(solution, "sticking", None)
+    if not sticking or not isinstance(mechanism, Mechanism):
+        return None
+    names = sticking_joints(mechanism)
+    if not names or not set(names) <= set(sticking):  # only contacts stick, or it is a run of another mechanism
+        return None
+    return jnp.stack([jnp.asarray(sticking[name]) for name in names], axis=-1)

@@ -1,0 +1,195 @@
+"""The interface of equations of motion: the functions that an integrator calls."""
+
+from abc import abstractmethod
+from types import SimpleNamespace
+from typing import ClassVar, NamedTuple, Protocol, Self, TypeAlias
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from udkjax.annotations import Time, Vector
+from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.programs.scales import Scales
+
+
+class PseudoinverseOperator(Protocol):
+    """A pseudoinverse as an operator: its products `D_plus @ b` and `D_plus.T @ x`, and its rank."""
+
+    @property
+    def T(self) -> "PseudoinverseOperator": ...
+
+    @property
+    def rank(self) -> Int[Array, ""]: ...
+
+    def __matmul__(self, b: Array) -> Array: ...
+
+
+class HasStates(Protocol):
+    """Times and states, such as those of a `Solution`."""
+
+    @property
+    def ts(self) -> Float[ArrayLike, "T"]:
+        """Times (s)."""
+        ...
+
+    @property
+    def q(self) -> Float[ArrayLike, "T bodies 3"]:
+        """Coordinates (m, rad)."""
+        ...
+
+    @property
+    def v(self) -> Float[ArrayLike, "T bodies 3"]:
+        """Velocities (m/s, rad/s)."""
+        ...
+
+
+HistoryLike: TypeAlias = HasStates | SimpleNamespace  # anything with these attributes
+
+
+class TangentPart(NamedTuple):
+    """The parts of small changes of q and v within the constraint manifold."""
+
+    dq: Vector
+    dv: Vector
+
+
+class AbstractSystem(eqx.Module):
+    """The equations of motion of one system. Coordinates and velocities are flat vectors (n,)."""
+
+    @property
+    @abstractmethod
+    def constrained(self) -> bool:
+        """True if there are any constraints."""
+
+    @property
+    def programs(self) -> RunPrograms | None:
+        """The programs of the equations for machine code; None if there are none."""
+        return None
+
+    @property
+    def programs_of_rows(self) -> RunPrograms | None:
+        """The programs that find independent rows, among all of them."""
+        return None
+
+    def size(self, dq: Vector) -> Float[Array, ""]:
+        """Return the largest component of a change of coordinates, relative to the system's units, which are 1 by default."""
+        return jnp.max(jnp.abs(dq), initial=0.0)
+
+    def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
+        """Return the largest violation of any row of Psi, relative to the system's units, which are 1 by default."""
+        return jnp.max(jnp.abs(psi), initial=0.0)
+
+    @abstractmethod
+    def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
+        """Return the accelerations a."""
+
+    @abstractmethod
+    def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
+        """Return the multipliers lambda of all rows, of minimum norm."""
+
+    @abstractmethod
+    def matrices(
+        self, t: Time, q: Vector, v: Vector
+    ) -> tuple[Float[Array, "n n"], Vector, Float[Array, "m n"], Float[Array, "m"]]:
+        """Return M, F, A and c of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
+
+    @abstractmethod
+    def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """Return q and v to the constraint manifold."""
+
+    def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
+        """Return the parts of small changes of q and v that a projection at q preserves; by default the changes themselves."""
+        return TangentPart(dq, dv)
+
+    @abstractmethod
+    def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m"], Float[Array, "k"]]:
+        """Return Psi and the velocity residuals of all rows."""
+
+    @abstractmethod
+    def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
+        """Return whether all terms of the equations are finite."""
+
+    # The members below are for formulations that integrate only some of the coordinates. By default all are integrated.
+
+    solves_constraints: ClassVar[bool] = False  # True: dependent coordinates are solved for, so every state is projected
+
+    def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
+        """Return the time derivatives of q and v that are integrated."""
+        return v, self.accelerations(t, q, v)
+
+    def fix_partition(self, t: Time, q: Vector, v: Vector) -> Self:
+        """Return the same system with the partition of coordinates at this state, which stays fixed for one step."""
+        return self
+
+    @property
+    def independent(self) -> Bool[Array, "2n"] | None:
+        """The coordinates and velocities that are integrated and under error control; None: all."""
+        return None
+
+
+class ConstrainedRows(AbstractSystem):
+    """A system whose rows of positions and of velocities are known, for formulations that solve them."""
+
+    @property
+    @abstractmethod
+    def stabilized(self) -> bool:
+        """True if Baumgarte's stabilization terms are included."""
+
+    @property
+    @abstractmethod
+    def restricts_velocities(self) -> bool:
+        """True if there are rows that restrict velocities alone: nonholonomic ones."""
+
+    @property
+    @abstractmethod
+    def row_weights(self) -> Float[Array, "m"]:
+        """The weights that make rows comparable."""
+
+    @property
+    @abstractmethod
+    def rank_tol(self) -> Float[Array, ""]:
+        """The default threshold of dependence among rows."""
+
+    @abstractmethod
+    def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """Return D and Psi of all rows of positions, weighted, and the units of coordinates: M^(-1/2) if M is diagonal."""
+
+    @abstractmethod
+    def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
+        """Return the same of all rows of velocities, with their residuals."""
+
+
+class MechanismSystem(ConstrainedRows):
+    """The equations of motion of a mechanism; coordinates and velocities are x, y, angle of each body in turn."""
+
+    scales: eqx.AbstractVar[Scales]
+
+    def size(self, dq: Vector) -> Float[Array, ""]:
+        """Return the largest component of a change of coordinates: lengths per characteristic length, angles in rad."""
+        return self.scales.size(dq)
+
+    def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
+        """Return the largest violation of any row of Psi, each divided by the row's scale."""
+        return self.scales.violation(psi)
+
+    @property
+    @abstractmethod
+    def row_names(self) -> list[tuple[str, int]]:
+        """The constraint that each row of Psi belongs to, and the row's index within it."""
+
+    @abstractmethod
+    def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Kinetic and potential energy (J)."""
+
+    @abstractmethod
+    def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
+        """Return Psi_q of all rows."""
+
+    @abstractmethod
+    def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
+        """Return D^+ by the method, Psi, both with weighted rows, and M^(-1/2)."""
+
+    @abstractmethod
+    def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
+        """Return D^+ by the method, Psi_dot, both with weighted rows, and M^(-1/2)."""

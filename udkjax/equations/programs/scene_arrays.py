@@ -1,0 +1,161 @@
+"""The programs of a scene on arrays, without machine code: by NumPy, without compilation, or by JAX."""
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from operator import attrgetter
+from typing import Any, Generic, NamedTuple
+
+import numpy as np
+
+from udkjax.annotations import AnyArray, Time
+from udkjax.arrays import ArrayLibrary
+from udkjax.equations.programs.scene_programs import ScenePrograms, scene_programs
+from udkjax.equations.terms.rest_program import CURVATURE
+from udkjax.equations.terms.structure import concrete_numbers
+from udkjax.expressions.loops.array_loops import ArrayLoops
+from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.scene.mechanism import Mechanism
+
+RESULTS = {  # arrays that callers of a program need
+    "psi": ("psi",),
+    "psi_q": ("psi_q",),
+    "geometry": ("psi", "psi_dot", "psi_q"),
+    "equation_terms": ("terms",),
+    "energy": ("energy",),
+    "newton_q_and_distance": ("q1", "psi", "distance"),
+}
+
+
+class SceneArrays(Generic[AnyArray]):
+    """Psi, Psi_dot, Psi_q and loads of a mechanism at a state, or by NumPy at many: t (T,), q and v (n, T), results (..., T).
+
+    Args:
+        programs: The programs of the mechanism's scene.
+        numbers: All numbers of the scene and the gains.
+        xp: NumPy or jax.numpy.
+    """
+
+    def __init__(self, programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary):
+        self.programs, self.numbers, self._xp = programs, numbers, xp
+        self._constants = constants_of(programs, numbers, xp)
+        self._evaluators = dict[str, _Evaluator]()
+
+    def _evaluator(self, name: str) -> "_Evaluator":
+        if name not in self._evaluators:
+            self._evaluators[name] = _evaluator(self.programs, name, self._xp)
+        return self._evaluators[name]
+
+    @cached_property
+    def _constant_list(self) -> list[float]:
+        return self._constants.tolist()
+
+    def psi(self, t: Time, q: AnyArray) -> AnyArray:
+        """Return Psi (m,)."""
+        return self._run("psi", t, q, q)["psi"]
+
+    def geometry(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+        """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q in the order of `ScenePrograms.psi_q_entries`."""
+        arrays = self._run("geometry", t, q, v)
+        return arrays["psi"], arrays["psi_dot"], self._entries(arrays)
+
+    def jacobian(self, t: Time, q: AnyArray) -> AnyArray:
+        """Return the entries of Psi_q in the order of `ScenePrograms.psi_q_entries`."""
+        return self._entries(self._run("psi_q", t, q, q))
+
+    def _entries(self, arrays: Mapping[str, AnyArray]) -> AnyArray:
+        _, _, places, factors = self.programs.psi_q_entries
+        return (arrays["psi_q"][places].T * factors).T
+
+    def loads(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+        """Return a_F (n,), and b (m,)."""
+        terms = self._run("equation_terms", t, q, v)["terms"]
+        return terms[: self.programs.coordinate_count], terms[self.programs.coordinate_count :]
+
+    def energy(self, t: Time, q: AnyArray, v: AnyArray) -> AnyArray:
+        """Return the kinetic and the potential energy (2,)."""
+        return self._run("energy", t, q, v)["energy"]
+
+    def element_loads(self, t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
+        """Return the entries of the loads of force elements and of their derivatives, as `RestProgram.places` orders them."""
+        return self._run("at_rest.loads", t, q, v)
+
+    def curvature(self, t: Time, q: AnyArray, multipliers: AnyArray) -> AnyArray:
+        """Return the entries of (lambda^T Psi)_qq, as `RestProgram.places` orders them."""
+        found = self._run("at_rest.curvature", t, q, q, multipliers=multipliers)
+        return found[CURVATURE] if CURVATURE in found else self._xp.zeros(0)
+
+    def newton_step(self, t: Time, q: AnyArray) -> tuple[AnyArray, AnyArray, float] | None:
+        """Return q (n,) after a Newton step to Psi = 0 by elimination, Psi (m,) at q, and the distance from dependent rows.
+
+        The step is the smallest in the metric of M. It is computed on Python's floats; None if that is not possible.
+        """
+        found = self._run_on_floats("newton_q_and_distance", t, q, q, {}, often=True)
+        return None if found is None else (found["q1"], found["psi"], float(found["distance"][0]))
+
+    def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
+        """Run a program whose loops have independent iterations."""
+        xp = self._xp
+        many = q.shape[1:]
+        if not many and xp is np and (found := self._run_on_floats(name, t, q, v, given)) is not None:
+            return found
+        evaluate, sizes, _ = self._evaluator(name)
+        blank = {x: xp.zeros((size, *many)) for x, size in sizes.items()}
+        constants = self._constants[:, None] if many else self._constants
+        state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}
+        return evaluate(blank | state | given)
+
+    def _run_on_floats(
+        self, name: str, t: Any, q: AnyArray, v: AnyArray, given: Mapping[str, AnyArray], often: bool = False
+    ) -> dict[str, AnyArray] | None:
+        """Run a program at one state on Python's floats, and return its results alone; None if that is not possible."""
+        evaluate, sizes, results = self._evaluator(name)
+        needed = evaluate.needed
+        lists: dict[str, Any] = {x: [0.0] * size for x, size in sizes.items() if needed is None or x in needed or x in results}
+        lists |= {"constants": self._constant_list, "t": [float(t)], "q": q.tolist(), "v": v.tolist()}
+        if given:
+            lists |= {x: value.tolist() for x, value in given.items()}
+        return {x: self._xp.array(lists[x]) for x in results} if evaluate.on_lists(lists, often) else None
+
+
+def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndarray]]:
+    """Return the arrays of a mechanism with concrete numbers as a function of time (s), on which sampled numbers depend."""
+    if mechanism.samples:
+        return lambda t: _arrays_at(mechanism, t)
+    fixed = _fixed_arrays(mechanism)
+    return lambda t: fixed
+
+
+@cached_by_identity
+def _fixed_arrays(mechanism: Mechanism) -> SceneArrays[np.ndarray]:
+    return _arrays_at(mechanism, 0.0)
+
+
+def _arrays_at(mechanism: Mechanism, t: Time) -> SceneArrays[np.ndarray]:
+    return SceneArrays(scene_programs(mechanism), concrete_numbers(mechanism, t), np)
+
+
+def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
+    """Return the constants of the loops from the numbers of a scene and the gains."""
+    evaluate, *_ = _evaluator(programs, "prologue", xp)
+    arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(programs.constants))}
+    return evaluate(arrays)["constants"]
+
+
+class _Evaluator(NamedTuple):
+    """A program as a function of its arrays."""
+
+    loops: ArrayLoops
+    blank: dict[str, int]  # the lengths of the arrays that it begins with zeros
+    results: tuple[str, ...]  # the arrays that it writes for its callers
+
+
+@cached_by_identity
+def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> _Evaluator:
+    """Return a program as a function of its arrays."""
+    program, p = attrgetter(name)(programs), programs
+    at_rest = p.at_rest.sizes if name.startswith("at_rest.") else {}
+    sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count, "energy": 2} | at_rest
+    sizes |= {"q1": p.coordinate_count, "distance": 1}
+    results = RESULTS.get(name) or tuple(x for x in at_rest if x in program.written)
+    blank = {x: size for x, size in sizes.items() if x in program.arrays | set(results)}
+    return _Evaluator(ArrayLoops(program, xp, results or None), blank, results)

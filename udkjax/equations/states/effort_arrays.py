@@ -1,0 +1,171 @@
+"""Efforts of drivers for a prescribed motion at many times, by NumPy on the scene's programs.
+
+The equations are those of study/inverse_dynamics.py.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike
+
+from udkjax.annotations import NumericArray
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.states.state_arrays import StateArrays, by_numpy, state_arrays
+from udkjax.equations.terms.scale_program import RANK_TOL
+from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.scene.mechanism import Mechanism
+
+# Efforts (T, k), rates of their coordinates (T, k), unbalanced parts of the loads (T,).
+EffortArrays: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]
+Slopes: TypeAlias = Callable[[np.ndarray], np.ndarray]
+CLEARLY = 0.1  # rank tolerance over the rank tolerance at which rows would count as dependent, for which a bound is known
+
+
+@np.errstate(all="ignore")  # states that are not finite have no efforts
+def efforts_by_numpy(
+    mechanism: Mechanism, slopes: Slopes, analysis: Analysis, weights: ArrayLike, ts: ArrayLike, motion: Sequence[ArrayLike]
+) -> EffortArrays | None:
+    """Return efforts along coordinates, the rates of these, and the unbalanced part of the loads; None if numbers are traced.
+
+    Args:
+        mechanism: the mechanism without its drivers.
+        slopes: the derivatives C (T, k, n) of the coordinates by q, as a function of q (T, n).
+        analysis: the analysis of the mechanism.
+        weights: weight of each squared effort.
+        ts: times (T,).
+        motion: q, v and a, each (T, bodies, 3).
+
+    Returns:
+        Efforts (T, k), rates (T, k) and unbalanced parts (T,).
+    """
+    if not by_numpy(mechanism, (analysis.scales, weights, ts, motion)):
+        return None
+    equations, w, times = state_arrays(mechanism), np.asarray(weights, float), np.asarray(ts, float)
+    states = [np.asarray(x, float).reshape(len(times), -1) for x in motion]
+    pieces = equations.pieces(len(times))
+    columns = [_efforts_at(equations, slopes, analysis, w, *[x[p] for x in (times, *states)]) for p in pieces]
+    efforts, rates, unbalanced = columns[0] if len(columns) == 1 else map(np.concatenate, zip(*columns, strict=True))
+    return efforts, rates, unbalanced
+
+
+class _Units(NamedTuple):
+    """Weights of rows and units, by NumPy."""
+
+    weights: np.ndarray  # (m,)
+    coordinates: np.ndarray  # (n,)
+    inertial_load: float  # of the characteristic motion (N m)
+    independent: np.ndarray | None  # indices of the rows of joints that are not redundant; None if unknown
+    redundant: np.ndarray
+
+
+@cached_by_identity
+def _units_of(analysis: Analysis) -> _Units:
+    scales = jax.tree.map(np.asarray, analysis.scales)
+    load = float(scales.mass * (scales.length * scales.rate) ** 2)
+    independent = None if analysis.redundant_rows is None else np.array(analysis.independent_rows, int)
+    redundant = np.array(analysis.redundant_rows or (), int)
+    weights = scales.length / np.asarray(analysis.row_units)
+    return _Units(weights, np.asarray(analysis.coordinate_units), load, independent, redundant)
+
+
+def _efforts_at(
+    equations: StateArrays, slopes: Slopes, analysis: Analysis, w: np.ndarray, t: np.ndarray, *motion: np.ndarray
+) -> EffortArrays:
+    q, v, a = motion
+    scale = _units_of(analysis)
+    units, share = scale.coordinates, 1 / np.sqrt(w)
+    rows, C, (force, sizes) = equations.jacobian(t, q), slopes(q), equations.force_and_sizes(t, q, v)
+    J = rows * (scale.weights[:, None] * units)
+    missing = units * (equations.mass * a - force)
+    rates = (C @ v[:, :, None])[:, :, 0]
+    reached = np.isfinite(rows).all((1, 2)) & np.isfinite(C).all((1, 2)) & np.isfinite(missing).all(1)
+    # Relative to the single terms, since their sum may be a rounding error.
+    size = np.maximum((units * (equations.mass * np.abs(a) + sizes)).max(1), scale.inertial_load)
+    pull = C * (share[:, None] * units)
+    if not reached.all():
+        J, pull, missing = (np.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0) for x in (J, pull, missing))
+        rates, size = np.where(reached[:, None], rates, np.nan), np.where(reached, size, np.nan)
+    f, unbalanced, regular = _regular_efforts(scale, J, pull, missing)
+    if not regular.all():
+        k = ~regular
+        f[k], unbalanced[k], determined = _any_efforts(analysis, J[k], pull[k], missing[k], v[k] / units)
+        f[k] = np.where((determined & reached[k])[:, None], f[k], np.nan)
+    return share * f, rates, unbalanced / np.where(size == 0, 1.0, size)
+
+
+_Found: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _regular_efforts(scale: _Units, J: np.ndarray, pull: np.ndarray, missing: np.ndarray) -> _Found:
+    """Return efforts (T, k), unbalanced loads (T,), and a mask of the times for which they are right.
+
+    Where the independent rows of joints and the drivers' rows are as many as the coordinates, and clearly independent,
+    A^T (mu, f) = M a - F has one solution. The rank of J is then that of the independent rows: with A (P N) = 1, the columns of N
+    span their null space, on which the redundant rows vanish.
+    """
+    T, k = pull.shape[:2]
+    if scale.independent is None or len(scale.independent) + k != J.shape[2]:
+        return np.zeros((T, k)), np.zeros(T), np.zeros(T, bool)
+    A = np.concatenate([J[:, scale.independent], pull], axis=1)
+    joints, drivers = _length(J), _length(pull)
+    factor = np.where(joints * drivers > 0, joints, 1.0) / np.where(joints * drivers > 0, drivers, 1.0)  # makes both comparable
+    A[:, len(scale.independent) :] *= factor[:, None, None]
+    try:
+        inverse = np.linalg.inv(A)
+    except np.linalg.LinAlgError:  # at some time
+        inverse = np.linalg.inv(np.where((np.linalg.slogdet(A)[0] == 0)[:, None, None], np.eye(A.shape[1]), A))
+    regular = (_length(A) * _length(inverse) * RANK_TOL < CLEARLY) & (drivers > 0)
+    if len(scale.redundant):
+        null_space = inverse[:, :, len(scale.independent) :]
+        off = _length(J[:, scale.redundant] @ null_space) * _length(A)
+        regular &= off < CLEARLY * RANK_TOL * joints
+    z = (missing[:, None] @ inverse)[:, 0]
+    unbalanced = np.abs(missing - (z[:, None] @ A)[:, 0]).max(1)
+    return factor[:, None] * z[:, len(scale.independent) :], unbalanced, regular
+
+
+def _length(A: np.ndarray) -> np.ndarray:
+    """Return the Frobenius norms of matrices (T, m, n)."""
+    entries = A.reshape(len(A), 1, A.shape[1] * A.shape[2])
+    return np.sqrt((entries @ entries.transpose(0, 2, 1))[:, 0, 0])
+
+
+def _any_efforts(analysis: Analysis, J: np.ndarray, pull: np.ndarray, missing: np.ndarray, u: np.ndarray) -> _Found:
+    """Return efforts (T, k), unbalanced loads (T,), and whether they are determined, for any number of rows and of any rank."""
+    held, rank = _row_space(J)
+    determined, known_rank = np.ones(len(J), bool), analysis.rank
+    if known_rank is not None:  # otherwise the number of degrees of freedom is unknown
+        deficient = rank < known_rank
+        speed = np.linalg.norm(u, axis=1)
+        determined = ~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0))
+
+    def free(x: np.ndarray) -> np.ndarray:
+        """Return the part of columns (T, n, k) that the joints do not hold: in deficient positions, along the motion."""
+        result = x - held.transpose(0, 2, 1) @ (held @ x)
+        if known_rank is not None and deficient.any():
+            along = np.where(speed > 0, u.T / speed, 0.0).T[deficient, :, None]
+            result[deficient] = along @ (along.transpose(0, 2, 1) @ x[deficient])
+        return result
+
+    columns = pull.transpose(0, 2, 1)
+    required = free(missing[:, :, None])
+    V, U, inverse = _decompose(free(columns))
+    f = V.transpose(0, 2, 1) @ (inverse[:, :, None] * (U.transpose(0, 2, 1) @ required))
+    return f[:, :, 0], np.abs(required - free(columns @ f)).max((1, 2)), determined
+
+
+def _row_space(J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return orthonormal rows (T, k, n) that span those of matrices (T, m, n), zero beyond the rank, and the rank (T,)."""
+    if not J.shape[1]:
+        return np.zeros((len(J), 0, J.shape[2])), np.zeros(len(J), int)
+    vt, _, inverse = _decompose(J)
+    return np.where(inverse[:, :, None] > 0, vt, 0.0), np.count_nonzero(inverse, axis=1)
+
+
+def _decompose(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return V^T, U and 1/sigma of matrices (T, m, n), zero where sigma is zero up to rounding."""
+    u, sigma, vt = np.linalg.svd(A, full_matrices=False)
+    counts = sigma > RANK_TOL * sigma[:, :1]
+    return vt, u, np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)

@@ -1,0 +1,300 @@
+"""Quantities of a motion: accelerations, multipliers, energies and violations of the constraints."""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple, TypeVar, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from udkjax.annotations import NumberLike, Vector
+from udkjax.equations.friction.sticking_state import known_sticking
+from udkjax.equations.laws.abstract_system import AbstractSystem, HistoryLike, MechanismSystem
+from udkjax.equations.laws.formulations import Formulation
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.states.state_arrays import by_numpy, history_of, state_arrays
+from udkjax.equations.states.textbook import TextbookEquations, prepare
+from udkjax.equations.systems.general import ConstrainedSystem, GeneralEquations, prepare_general
+from udkjax.equations.systems.traced_system import TracedSystem
+from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.printing import prints_table, units
+from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import at_each, defined
+from udkjax.scene.arguments import checked
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.friction import Friction
+from udkjax.scene.mechanism import Mechanism
+
+Result = TypeVar("Result")
+
+
+@prints_table
+class Energy(NamedTuple):
+    """Energies (J) at each time; the potential energy is that of gravity, zero at the origin, and of force elements."""
+
+    kinetic: Float[Array, "T"]
+    potential: Float[Array, "T"]
+
+    _units = units(kinetic="J", potential="J")
+
+    @property
+    def total(self) -> Float[Array, "T"]:
+        return self.kinetic + self.potential
+
+
+def equations_of(
+    system: Mechanism | ConstrainedSystem | TracedSystem,
+    method: Pseudoinverse | None = None,
+    baumgarte: Baumgarte | None = None,
+    formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
+) -> AbstractSystem:
+    """Prepare the equations of motion of a mechanism or a system, by the Udwadia-Kalaba equation or another formulation.
+
+    Args:
+        system: The mechanism, or the `ConstrainedSystem`.
+        method: The pseudoinverse; by default `Auto`.
+        baumgarte: Gains of Baumgarte stabilization; None: no stabilization.
+        formulation: Another formulation; None: the Udwadia-Kalaba equation.
+        analysis: The mechanism's `Analysis`; by default computed here.
+
+    Returns:
+        The equations, ready to be evaluated at states (n,).
+    """
+    if isinstance(system, Mechanism):
+        equations: AbstractSystem = prepare(system, method, baumgarte, analysis)
+    else:
+        equations = prepare_general(system, method, baumgarte)
+    return equations if formulation is None else formulation.formulate(equations)
+
+
+@overload
+def accelerations(
+    mechanism: Mechanism | ConstrainedSystem,
+    t: NumberLike,
+    q: Float[ArrayLike, "bodies 3"],
+    v: Float[ArrayLike, "bodies 3"],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    multipliers: Literal[False] = False,
+    formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
+) -> Float[Array, "bodies 3"]: ...
+
+
+@overload
+def accelerations(
+    mechanism: Mechanism | ConstrainedSystem,
+    t: NumberLike,
+    q: Float[ArrayLike, "bodies 3"],
+    v: Float[ArrayLike, "bodies 3"],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    *,
+    multipliers: Literal[True],
+    formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
+) -> tuple[Float[Array, "bodies 3"], Float[Array, "m"]]: ...
+
+
+@checked
+def accelerations(
+    mechanism: Mechanism | ConstrainedSystem,
+    t: NumberLike,
+    q: Float[ArrayLike, "bodies 3"],
+    v: Float[ArrayLike, "bodies 3"],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
+    multipliers: bool = False,
+    formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
+) -> Float[Array, "bodies 3"] | tuple[Float[Array, "bodies 3"], Float[Array, "m"]]:
+    """Return a = a_F + M^(-1/2) D^+ b, and on request lambda = -(D^+)^T D^+ b. The state need not be closed.
+
+    A joint with set-valued friction whose speed is zero, up to 1e-9 of the scene's own speeds, sticks if the law allows it: its
+    friction is the force that holds it. Else it begins to slide.
+
+    Args:
+        mechanism: The mechanism, or a `ConstrainedSystem`.
+        t: Time (s).
+        q: Coordinates (m, rad), (bodies, 3); for a `ConstrainedSystem`, q, v and a are (n,).
+        v: Velocities (m/s, rad/s), in the shape of q.
+        method: The pseudoinverse; by default `Auto`, which is `SVD` here.
+        stabilization: `Baumgarte`, or None.
+        multipliers: Whether to return lambda as well.
+        formulation: Another formulation, which computes a but not lambda; None: the Udwadia-Kalaba equation.
+        analysis: The mechanism's `Analysis`; by default computed here.
+
+    Returns:
+        a (m/s^2, rad/s^2) in the shape of q; with `multipliers` also lambda (m,) in N and N m, in the order of the rows, with
+        the sign of M a + Psi_q^T lambda = F, and of minimum norm where constraints are redundant.
+    """
+    if isinstance(mechanism, Mechanism):
+        analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
+        if formulation is None and by_numpy(mechanism, (t, q, v, analysis, stabilization), method):
+            one_q, one_v = (np.reshape(np.asarray(x, float), (1, -1)) for x in (q, v))
+            time = np.reshape(np.asarray(t, float), 1)
+            found = state_arrays(mechanism).solve(time, one_q, one_v, analysis, method, stabilization)
+            a = found.a.reshape(np.shape(q))
+            return jax.device_put((a, found.multipliers[0]) if multipliers else a)
+    t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
+    system = mechanism.traced(q.size) if isinstance(mechanism, ConstrainedSystem) else mechanism
+    return _accelerations(system, analysis, t, q, v, method, stabilization, formulation, multipliers)
+
+
+@checked
+def violation(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> Float[Array, "T m"]:
+    """Return Psi at each time of a solution.
+
+    Args:
+        mechanism: The mechanism, or a `ConstrainedSystem`.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+
+    Returns:
+        Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers. For a `ConstrainedSystem` the
+        rows of Psi, then those of phi.
+    """
+    if isinstance(mechanism, Mechanism) and by_numpy(mechanism, (solution.ts, solution.q)):
+        ts, q = history_of(solution)[:2]
+        return jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
+    return _evaluate_along(mechanism, solution, _psi if isinstance(mechanism, Mechanism) else _residuals)
+
+
+@checked
+def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> Energy:
+    """Return T = v^T M v / 2 and V at each time of a solution.
+
+    Args:
+        mechanism: The mechanism, or a `ConstrainedSystem`, whose V is its potential, zero without one.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+
+    Returns:
+        The `Energy`, kinetic and potential (T,), in J.
+    """
+    if isinstance(mechanism, Mechanism) and by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
+        return Energy(*jax.device_put([*state_arrays(mechanism.without_origin).energy(*history_of(solution)).T]))
+    return _evaluate_along(mechanism, solution, _energy)
+
+
+@checked
+def efforts(
+    mechanism: Mechanism, solution: HistoryLike, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+) -> dict[str, Float[Array, "T"]]:
+    """Return the effort of each driver, which acts on the driver's second body along the driven coordinate: -lambda of its row.
+
+    Args:
+        mechanism: The scene.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+        method: The pseudoinverse; by default `SVD`. A redundant driver gets its share of the minimum-norm multipliers.
+        stabilization: The run's `Baumgarte`, to include its terms.
+
+    Returns:
+        For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are NaN.
+    """
+    if not mechanism.driver_names:
+        return {}
+    analysis, method = analyse(mechanism), SVD() if method is None else method
+    if by_numpy(mechanism, (solution.ts, solution.q, solution.v, analysis, stabilization), method):
+        arrays, (ts, q, v) = state_arrays(mechanism.without_origin), history_of(solution)
+        pieces = [arrays.solve(ts[p], q[p], v[p], analysis, method, stabilization) for p in arrays.pieces(len(ts))]
+        multipliers = jax.device_put(np.concatenate([piece.multipliers for piece in pieces]))
+    else:
+        ts, q, v = (jnp.asarray(x) for x in (solution.ts, solution.q, solution.v))
+        sticking = known_sticking(mechanism, solution)
+        multipliers = _multipliers(mechanism.without_origin, analysis, ts, q, v, sticking, method, stabilization)
+    rows = {owner: k for k, (owner, _) in enumerate(analysis.row_names)}
+    return {name: -multipliers[:, rows[name]] for name in mechanism.driver_names}
+
+
+@checked
+def friction_loads(
+    mechanism: Mechanism, solution: HistoryLike, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+    """Return the load of each friction on the bodies of its joint: `friction_loads(mech, sol)["rub"]["link1"]`.
+
+    A joint that sticks carries the force that keeps it at rest. With gravity, all other force elements and `reactions`, these
+    loads are the mass times the accelerations of a body.
+
+    Args:
+        mechanism: The scene.
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3). A `Solution` tells which joints stick; else
+            those do that are at rest, as the law says.
+        method: The pseudoinverse; by default `SVD`.
+        stabilization: The run's `Baumgarte`, to include its terms.
+
+    Returns:
+        For each friction and each body of its joint the load (T, 3) about the centre of mass: force x, force y (N) and torque
+        (N m).
+    """
+    frictions = {name: force for name, force in mechanism.forces.items() if isinstance(force, Friction)}
+    if not frictions:
+        return {}
+    ts, q, v = (jnp.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
+    given = analyse(mechanism), ts, q, v, known_sticking(mechanism, solution), SVD() if method is None else method
+    by_name, names = _friction_loads(mechanism.without_origin, *given, stabilization), mechanism.body_names
+    bodies = {name: [b for b in dict.fromkeys(mechanism.frames_of(force)) if b != GROUND] for name, force in frictions.items()}
+    return {name: {b: by_name[name][:, names.index(b)] for b in bodies[name]} for name in frictions}
+
+
+# Top-level functions, so that compiled programs are reused by later calls.
+
+
+@deferred
+@defined
+def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation, multipliers):
+    equations, flat = equations_of(mechanism, method, baumgarte, formulation, analysis), (q.ravel(), v.ravel())
+    if multipliers and isinstance(equations, TextbookEquations):
+        a, found = equations.motion(t, *flat)
+        return a.reshape(q.shape), found
+    a = equations.accelerations(t, *flat).reshape(q.shape)
+    return (a, equations.multipliers(t, *flat)) if multipliers else a
+
+
+@deferred
+def _multipliers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
+    def of_state(equations, t, q, v, sticking):
+        found = equations.known_to_stick(sticking).multipliers(t, q.ravel(), v.ravel())
+        return jnp.where(jnp.all(jnp.isfinite(q) & jnp.isfinite(v)), found, jnp.nan)
+
+    return at_each(of_state, prepare(mechanism, method, baumgarte, analysis), ts, q, v, sticking)
+
+
+@deferred
+def _friction_loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
+    equations = prepare(mechanism, method, baumgarte, analysis)
+
+    def of_state(equations, t, q, v, sticking):
+        found = equations.known_to_stick(sticking).friction_loads(t, q.ravel(), v.ravel())
+        return {name: load.reshape(q.shape) for name, load in found.items()}
+
+    return at_each(of_state, equations, ts, q, v, sticking)
+
+
+def _psi(equations: AbstractSystem, t: Array, q: Vector, v: Vector) -> Array:
+    return equations.violation(t, q, v)[0]
+
+
+def _residuals(equations: GeneralEquations, t: Array, q: Vector, v: Vector) -> Array:
+    return equations.residuals(t, q, v)
+
+
+def _energy(equations: MechanismSystem | GeneralEquations, t: Array, q: Vector, v: Vector) -> Energy:
+    return Energy(*equations.energy(t, q, v))
+
+
+def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike, quantity: Callable[..., Result]) -> Result:
+    analysis = None
+    if isinstance(mechanism, Mechanism):
+        analysis, mechanism = analyse(mechanism), mechanism.without_origin
+    else:
+        mechanism = mechanism.traced(np.shape(solution.q)[-1])
+    return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity)
+
+
+@deferred
+def _evaluate(mechanism, analysis, ts, q, v, quantity):
+    equations = equations_of(mechanism, SVD(), analysis=analysis)
+    ts, q, v = jnp.asarray(ts), jnp.asarray(q).reshape(len(ts), -1), jnp.asarray(v).reshape(len(ts), -1)
+    return at_each(quantity, equations, ts, q, v)

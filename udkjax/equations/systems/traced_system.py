@@ -1,0 +1,309 @@
+"""The functions of a `ConstrainedSystem`, traced: expressions of the state and of numbers, which are kept apart.
+
+The numbers are the float arrays among the leaves of the system, and those that its functions hold in their closures, concrete or
+traced. The functions are read into a graph of scalars, with the terms of the equations,
+
+    Psi, Psi_q, Psi_dot, gamma          of `constraint`, as for the joints of a mechanism (elements.py)
+    phi, phi_v, -(phi_q v + phi_t)      of `velocity_constraint`
+    M, F
+
+Two systems whose graphs are equal share their programs, whatever their numbers are.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from udkjax.annotations import Time, Vector
+from udkjax.equations.terms.elements import choose_shorter, gamma_by_entries
+from udkjax.expressions import Differential, Graph, Scalar, may_have_kinks, trace
+from udkjax.expressions.algebra.differential import SparseRow
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
+from udkjax.requirements import ArgumentError
+
+FUNCTIONS = {"mass": "q", "force": "tqv", "constraint": "tq", "velocity_constraint": "tqv", "potential": "tq"}  # and arguments
+MOST_NUMBERS = 20_000  # more, as of a table, would be copied to the memory of every lane
+
+
+def load(system: Any, t: Time, q: Vector, v: Vector) -> Vector:
+    """Return F: the force of a system, if it has one, minus the slope of its potential."""
+    total = jnp.zeros_like(q) if system.force is None else jnp.asarray(system.force(t, q, v))
+    return total if system.potential is None else total - jax.grad(system.potential, 1)(t, q)
+
+
+class SystemFunctions:
+    """The functions of a system on arrays and on scalars; two of them are equal if their graphs are.
+
+    Attributes:
+        n: The number of coordinates.
+        graph: The graph of all scalars; its inputs are of the groups parameter, time, position and velocity.
+        numbers: The scalars of each array of numbers.
+        mass: M by rows, without zeros.
+        force: F.
+        psi, psi_q, psi_dot, gamma: the rows of `constraint`.
+        phi, phi_v, bend: the rows of `velocity_constraint`; phi_v a = bend.
+    """
+
+    def __init__(self, functions: dict[str, Any], numbers: Sequence[Any], is_fixed: Sequence[bool], n: int):
+        self._functions, self.n = functions, n
+        self.number_count = sum(int(np.size(x)) for x in numbers)
+        self.shapes = tuple((np.shape(x), np.dtype(x.dtype)) for x in numbers)
+        graph = self.graph = Graph(np.float64)
+        self.numbers = [self._inputs(k, x, fixed) for k, (x, fixed) in enumerate(zip(numbers, is_fixed, strict=True))]
+        self.t = graph.input("t", "time")
+        self.q = [graph.input(("q", i), "position") for i in range(n)]
+        self.v = [graph.input(("v", i), "velocity") for i in range(n)]
+        shapes = {"t": (), "q": (n,), "v": (n,), "dt": (), "dq": (n,)}
+        self._examples = {name: jax.ShapeDtypeStruct(shape, np.float64) for name, shape in shapes.items()}
+        self._read_terms()
+        wanted = [*self.force, *self.psi, *self.psi_dot, *self.gamma, *self.phi, *self.bend]
+        wanted += [s for rows in (self.mass, self.psi_q, self.phi_v) for row in rows for s in row.values()]
+        places = tuple((tuple(row), len(row)) for rows in (self.mass, self.psi_q, self.phi_v) for row in rows)
+        self._key = n, len(self.psi), len(self.phi), places, tuple((s.index, s.sign) for s in wanted), graph.key, self.shapes
+        self._hash = hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SystemFunctions) and (self is other or self._key == other._key)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @property
+    def row_counts(self) -> tuple[int, int]:
+        """The numbers of rows of Psi and of phi."""
+        return len(self.psi), len(self.phi)
+
+    @property
+    def text(self) -> str:
+        """The functions as text, without their numbers."""
+        parts = [f"{name} {constants} {closed.jaxpr}" for name, (closed, constants, _) in self._functions.items()]
+        return "\n".join(parts)
+
+    def has(self, name: str) -> bool:
+        """Return whether the system has a function."""
+        return name in self._functions
+
+    @property
+    def other_terms(self) -> dict[str, list[Scalar]]:
+        """The terms of all functions but the loads, by the names of the functions."""
+        rows = {"mass": self.mass, "constraint": self.psi_q, "velocity_constraint": self.phi_v}
+        further = {"mass": [], "constraint": [*self.psi, *self.psi_dot, *self.gamma], "velocity_constraint": self.phi + self.bend}
+        return {name: [*further[name], *(s for row in parts for s in row.values())] for name, parts in rows.items()}
+
+    @cached_property
+    def may_have_kinks(self) -> bool:
+        """True if a function contains an operation that may have jumps or kinks."""
+        return may_have_kinks(self.graph, [*self.force, *(s for terms in self.other_terms.values() for s in terms)])
+
+    @staticmethod
+    def moving(breaks: bool) -> tuple[str, ...]:
+        """Return the groups of inputs that change along a motion; with breakpoints in time nothing else happens at a time."""
+        return ("position", "velocity") if breaks else ("position", "velocity", "time")
+
+    def with_force(self, force: Callable[..., Array], count: int) -> "SystemFunctions":
+        """Return the functions with `force(numbers, t, q, v)` as all loads, where `count` further numbers are the last array."""
+        known = [np.array([s.constant is None for s in x.flat], dtype).reshape(shape) for x, (shape, dtype) in self._arrays]
+        known.append(np.ones(count))
+        structs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in known]
+        state = [self._examples[x] for x in FUNCTIONS["force"]]
+        closed = jax.make_jaxpr(lambda *given: force(given[: len(known)], *given[len(known) :]))(*structs, *state)
+        constants = [(None, x) for x in closed.consts]
+        others = {name: x for name, x in self._functions.items() if name not in ("force", "potential")}
+        whole = closed.replace(consts=[None] * len(constants)), constants, list(range(len(known)))
+        return SystemFunctions(others | {"force": whole}, known, [True] * len(known), self.n)
+
+    @property
+    def _arrays(self) -> list[tuple[np.ndarray, tuple[Any, Any]]]:
+        return list(zip(self.numbers, self.shapes, strict=True))
+
+    def call(self, name: str, numbers: Sequence[Any], *arguments: Any) -> Array:
+        """Return the value of a function on arrays."""
+        closed, constants, leaves = self._functions[name]
+        program = closed.replace(consts=[x if k is None else numbers[k] for k, x in constants])
+        return jax.extend.core.jaxpr_as_fun(program)(*(numbers[k] for k in leaves), *arguments)[0]
+
+    def _inputs(self, k: int, x: Any, fixed: bool) -> np.ndarray:
+        """Return the scalars of an array; zeros of an array that cannot change otherwise are zeros by structure."""
+        scalars, values = np.empty(np.shape(x), object), np.asarray(x) if fixed else None
+        for index in np.ndindex(*np.shape(x)):
+            zero = values is not None and values[index] == 0
+            scalars[index] = self.graph.constant(0.0) if zero else self.graph.input((k, index), "parameter", x.dtype)
+        return scalars
+
+    def _read(self, function: Callable, *arguments: str, **given: Any) -> list[np.ndarray]:
+        """Read a function of the numbers and of t, q, v, dt and dq into the graph."""
+        structs = [jax.ShapeDtypeStruct(*x) for x in self.shapes]
+        state = {"t": self.t, "q": self.q, "v": self.v, **given}
+        scalars = [np.asarray(state[x], object) for x in arguments]
+        return trace(function, structs, *(self._examples[x] for x in arguments))(self.graph, self.numbers, *scalars)
+
+    def _read_terms(self):
+        graph, n, zero = self.graph, self.n, self.graph.constant(0.0)
+        one, dq = graph.constant(1.0), [graph.input(("dq", i), "direction") for i in range(n)]
+        (mass,) = self._read(partial(self.call, "mass"), "q")
+        self.mass = [{i: s for i, s in enumerate(row) if not s.is_zero} for row in mass]
+        (force,) = self._read(lambda numbers, *state: load(TracedSystem(numbers, self), *state), "t", "q", "v")
+        self.force = list(force.flat)
+        self.psi, self.psi_dot, self.gamma, self.phi, self.bend = [], [], [], [], []
+        self.psi_q, self.phi_v = [], []
+        if self.has("constraint"):
+            along = lambda numbers, t, q, dt, dq: jax.jvp(  # noqa: E731
+                lambda t, q: self.call("constraint", numbers, t, q), (t, q), (dt, dq)
+            )
+            twice = lambda numbers, t, q, dt, dq: jax.jvp(  # noqa: E731
+                lambda t, q: along(numbers, t, q, dt, dq)[1], (t, q), (dt, dq)
+            )[1]
+            names = "t", "q", "dt", "dq"
+            value, rate = self._read(along, *names, dt=one, dq=self.v)
+            _, change = self._read(along, *names, dt=zero, dq=dq)
+            (acceleration,) = self._read(twice, *names, dt=one, dq=self.v)
+            self.psi, self.psi_dot, self.psi_q = list(value.flat), list(rate.flat), self._rows(change, dq)
+            bend = list(acceleration.flat)
+            if not any("time" in s.node.depends for s in self.psi):
+                bend = choose_shorter(graph, self.psi_q, bend, gamma_by_entries(graph, self.psi_q, self.q, self.v))
+            self.gamma = [-s for s in bend]
+        if self.has("velocity_constraint"):
+            function = partial(self.call, "velocity_constraint")
+            by_v = lambda numbers, t, q, v, dq: jax.jvp(lambda v: function(numbers, t, q, v), (v,), (dq,))  # noqa: E731
+            by_state = lambda numbers, t, q, v: jax.jvp(  # noqa: E731
+                lambda t, q: function(numbers, t, q, v), (t, q), (jnp.ones_like(t), v)
+            )[1]
+            value, change = self._read(by_v, "t", "q", "v", "dq", dq=dq)
+            (bend,) = self._read(by_state, "t", "q", "v")
+            self.phi, self.phi_v, self.bend = list(value.flat), self._rows(change, dq), [-s for s in bend.flat]
+
+    def _rows(self, change: np.ndarray, dq: list[Scalar]) -> list[SparseRow]:
+        """Return the coefficients of changes that are linear in dq, by rows."""
+        column = {s.index: i for i, s in enumerate(dq)}
+        differential = Differential(self.graph, change.flat, dq)
+        rows = [{column[k]: s for k, s in differential.row(x).items() if k in column} for x in change.flat]
+        return [dict(sorted(row.items())) for row in rows]
+
+
+class TracedSystem(eqx.Module):
+    """A `ConstrainedSystem` of traced functions: `numbers` are the leaves on which all of them depend.
+
+    It has what runs ask of a mechanism: no number of it is sampled, so it is the same at any time.
+    """
+
+    numbers: list[Array]
+    functions: SystemFunctions = eqx.field(static=True)
+    row_labels: tuple[str, ...] = eqx.field(static=True, default=())  # of Psi, then of phi
+    breakpoints: Float[Array, "k"] | None = None
+    samples: dict[Any, Any] = eqx.field(static=True, default_factory=dict)
+
+    def mass(self, q: Vector) -> Float[Array, "n n"]:
+        return self.functions.call("mass", self.numbers, q)
+
+    @property
+    def force(self) -> Callable[[Time, Vector, Vector], Array] | None:
+        return self._function("force")
+
+    @property
+    def constraint(self) -> Callable[[Time, Vector], Array] | None:
+        return self._function("constraint")
+
+    @property
+    def velocity_constraint(self) -> Callable[[Time, Vector, Vector], Array] | None:
+        return self._function("velocity_constraint")
+
+    @property
+    def potential(self) -> Callable[[Time, Vector], Array] | None:
+        return self._function("potential")
+
+    def _function(self, name: str) -> Callable[..., Array] | None:
+        return partial(self.functions.call, name, self.numbers) if self.functions.has(name) else None
+
+    def with_functions(self, functions: SystemFunctions, more: Array) -> "TracedSystem":
+        """Return the system with functions of its numbers and of one further array."""
+        return TracedSystem([*self.numbers, more], functions, self.row_labels, self.breakpoints)
+
+    @property
+    def without_origin(self) -> "TracedSystem":
+        return self
+
+    def at(self, t: Time) -> "TracedSystem":
+        del t
+        return self
+
+    def with_samples(self, samples: dict[Any, Any]) -> "TracedSystem":
+        del samples
+        return self
+
+    @property
+    def is_concrete(self) -> bool:
+        """True if no number is traced."""
+        return is_concrete(self)
+
+
+@cached_by_identity
+def trace_system(system: Any, n: int) -> TracedSystem:
+    """Trace the functions of a `ConstrainedSystem` of n coordinates.
+
+    Raises:
+        ArgumentError: a function returns an array of another shape than `ConstrainedSystem` says.
+    """
+    given = {name: getattr(system, name) for name in FUNCTIONS if getattr(system, name) is not None}
+    leaves, others = eqx.partition(given, eqx.is_inexact_array)
+    listed, tree = jax.tree.flatten(leaves)
+    numbers: list[Any] = []
+    indices: dict[int, int] = {}  # of each array among the numbers, by its identity
+
+    def place(x: Any) -> int:
+        if id(x) not in indices:
+            indices[id(x)] = len(numbers)
+            numbers.append(x)
+        return indices[id(x)]
+
+    of_leaves = [place(x) for x in listed]
+    count, functions, labels = len(numbers), {}, {}
+    examples = {x: jax.ShapeDtypeStruct(() if x == "t" else (n,), float) for x in "tqv"}
+    for name in given:
+
+        def function(*arrays: Any, name: str = name) -> Array:
+            own: Any = eqx.combine(jax.tree.unflatten(tree, arrays[: len(listed)]), others)
+            value = own[name](*arrays[len(listed) :])
+            labels[name] = labels_of_rows(name, value)
+            return _checked(name, jnp.asarray(joined_rows(value), float), n)
+
+        closed = jax.make_jaxpr(function)(*listed, *(examples[x] for x in FUNCTIONS[name]))
+        is_number = [isinstance(x, Tracer) or eqx.is_inexact_array_like(x) for x in closed.consts]
+        constants = [(place(x), None) if yes else (None, x) for x, yes in zip(closed.consts, is_number, strict=True)]
+        functions[name] = closed.replace(consts=[None] * len(constants)), constants, of_leaves
+    is_fixed = [k >= count and not isinstance(x, Tracer) for k, x in enumerate(numbers)]
+    of_rows = tuple(label for name in ("constraint", "velocity_constraint") for label in labels.get(name, ()))
+    return TracedSystem(numbers, SystemFunctions(functions, numbers, is_fixed, n), of_rows, system.breakpoints)
+
+
+def joined_rows(value: Any) -> Any:
+    """Return the rows of a constraint as one vector, if they are given by name."""
+    if not isinstance(value, Mapping):
+        return value
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x, float)) for x in value.values()])
+
+
+def labels_of_rows(name: str, value: Any) -> list[str]:
+    """Return the labels of the rows of a constraint: their names, or its own with an index."""
+    if not isinstance(value, Mapping):
+        return [f"{name}[{k}]" for k in range(np.size(value))]
+    parts = [(label, np.size(x)) for label, x in value.items()]
+    return [str(label) if count == 1 else f"{label}[{k}]" for label, count in parts for k in range(count)]
+
+
+def _checked(name: str, value: Array, n: int) -> Array:
+    """Return the value of a function in the shape that it must have."""
+    if name in ("constraint", "velocity_constraint"):
+        value = jnp.atleast_1d(value)
+    wanted = {"mass": (n, n), "force": (n,), "potential": ()}.get(name)
+    if (wanted is not None and value.shape != wanted) or (wanted is None and value.ndim > 1):
+        shape = "a vector" if wanted is None else f"the shape {wanted}" if wanted else "a number"
+        raise ArgumentError(f"{name} must return {shape} for {n} coordinates, not an array of shape {value.shape}")
+    return value

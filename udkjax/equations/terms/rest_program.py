@@ -1,0 +1,121 @@
+"""The programs of a scene at rest: loads of force elements, their derivatives, and the curvature of constraints under load.
+
+    K = -F_q + (lambda^T Psi)_qq,        C = -F_v.
+
+An element writes the nonzero entries of its own blocks of these matrices. Where they belong in the whole matrices is known when
+the scene is built, so that statics needs neither traces nor compilation.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.equations.terms.scene_layout import BODIES, BODY_COORDINATES, ROW, ConstraintGroup, ElementGroup
+from udkjax.equations.terms.scene_terms import ProgramParts, SceneTerms
+from udkjax.expressions import KernelWriter, LoopProgram, Scalar, tangents
+
+LOADS, STIFFNESS, DAMPING, CURVATURE = "loads at rest", "stiffness", "damping", "curvature"
+
+
+class EntryPlaces(NamedTuple):
+    """The rows and columns of the entries that elements write to an array."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+
+
+class RestProgram(NamedTuple):
+    """Programs of a scene at rest.
+
+    `loads` computes the loads of force elements, from t, q and v, and their negative derivatives by q and v; `curvature` the
+    second derivatives of lambda^T Psi, from the array `multipliers` of all rows.
+    """
+
+    loads: LoopProgram
+    curvature: LoopProgram
+    places: dict[str, EntryPlaces]  # of the entries in each array
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The sizes of the arrays."""
+        return {name: len(place.rows) for name, place in self.places.items()}
+
+
+class _Entries:
+    """The places of an array that grows by the entries of each element."""
+
+    def __init__(self):
+        self._rows, self._columns, self.size = [np.zeros(0, int)], [np.zeros(0, int)], 0
+
+    def add(self, group: ElementGroup, places: Sequence[tuple[int, int]]) -> np.ndarray:
+        """Add entries at (row, column) of each element's own block; return where each element's entries begin."""
+        start = self.size + len(places) * np.arange(len(group.table))
+        coordinates = [group.table[:, BODIES + 3 * (k // 3) + BODY_COORDINATES] + k % 3 for k in range(group.coordinates)]
+        for target, k in ((self._rows, 0), (self._columns, 1)):
+            ordered = [coordinates[place[k]] for place in places]
+            target.append(np.stack(ordered, 1).ravel() if ordered else np.zeros(0, int))
+        self.size += len(places) * len(group.table)
+        return start
+
+    def places(self) -> EntryPlaces:
+        return EntryPlaces(np.concatenate(self._rows), np.concatenate(self._columns))
+
+
+def write_rest_program(terms: SceneTerms) -> RestProgram:
+    """Return the programs of a scene at rest."""
+    entries = {name: _Entries() for name in (LOADS, STIFFNESS, DAMPING, CURVATURE)}
+    loads = [*([terms.sincos()] if terms.layout.forces else []), *_write_loads(terms, entries)]
+    curvature = [terms.sincos(), *_write_curvature(terms, entries[CURVATURE])]
+    return RestProgram(LoopProgram(loads), LoopProgram(curvature), {name: x.places() for name, x in entries.items()})
+
+
+def _write_loads(terms: SceneTerms, entries: dict[str, _Entries]) -> ProgramParts:
+    for group in terms.layout.forces:
+        programs = group.programs
+        loads = programs.outputs["loads"]
+        blocks = {LOADS: {(k, k): s for k, s in enumerate(loads) if not s.is_zero}}
+        blocks |= {name: _derivatives(loads, variables) for name, variables in ((STIFFNESS, programs.q), (DAMPING, programs.v))}
+        blocks = {name: {place: s if name == LOADS else -s for place, s in block.items()} for name, block in blocks.items()}
+        starts = [entries[name].add(group, list(block)) for name, block in blocks.items()]
+        base = group.table.shape[1]
+
+        def write(w: KernelWriter, blocks: dict = blocks, base: int = base):
+            for column, (name, block) in enumerate(blocks.items(), base):
+                for k, s in enumerate(block.values()):
+                    w.write(s, name, column, k)
+
+        loop = terms.over_group(LOADS, group, write)
+        yield loop._replace(table=np.column_stack([group.table, *starts]))
+
+
+def _write_curvature(terms: SceneTerms, entries: _Entries) -> ProgramParts:
+    for group in terms.layout.constraints:
+        base = group.table.shape[1]
+        graph, pull = group.programs.graph, [group.programs.graph.constant(0.0)] * group.coordinates
+        multipliers = [graph.input(("multiplier", row), "multiplier") for row in range(group.programs.row_count)]
+        for index, entry in enumerate(group.programs.outputs["psi_q"]):
+            row, k = divmod(index, group.coordinates)
+            pull[k] = pull[k] + multipliers[row] * entry
+        block = _derivatives(pull, group.programs.q)
+
+        def write(w: KernelWriter, group: ConstraintGroup = group, block: dict = block, base: int = base, given=multipliers):
+            for row, s in enumerate(given):
+                w.bind(s, "multipliers", ROW, row)
+            for k, s in enumerate(block.values()):
+                w.write(s, CURVATURE, base, k)
+
+        start = entries.add(group, list(block))
+        if block:
+            loop = terms.over_group(CURVATURE, group, write)
+            yield loop._replace(table=np.column_stack([group.table, start]))
+
+
+def _derivatives(outputs: Sequence[Scalar], variables: Iterable[Scalar]) -> dict[tuple[int, int], Scalar]:
+    """Return the derivatives that are not zero, by the indices of output and variable."""
+    graph, found = outputs[0].graph, {}
+    for k, variable in enumerate(variables):
+        for i, s in enumerate(tangents(graph, outputs, {variable: graph.constant(1.0)})):
+            if not s.is_zero:
+                found[i, k] = s
+    return found

@@ -1,0 +1,194 @@
+"""Loop programs as functions of arrays, without machine code: by NumPy, without compilation, or by JAX."""
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from udkjax.expressions.loops.float_loops import FloatLoops, LaidOutPart, Lists
+from udkjax.expressions.loops.loop_program import ADD, ALL, MAXIMUM, SET, Address, KernelLoop, LoopProgram, Reset
+from udkjax.expressions.scalars.scalar_program import ScalarProgram
+
+_BY_ARRAYS = {ADD: np.add, MAXIMUM: np.maximum, ALL: np.minimum}
+_NEUTRAL = {ADD: 0.0, MAXIMUM: -math.inf, ALL: math.inf}
+_NOT_USED = np.zeros(1)  # value of an input that a program does not use
+MAX_UPDATES = 8  # number of updates of one place that JAX unrolls; more become a loop
+
+
+class ArrayLoops:
+    """A loop program as a function of its arrays, by NumPy or JAX; no row of a loop may read a number that another row writes.
+
+    The indices of all numbers are computed once, for all calls. By NumPy, arrays may have a second axis of many states, or of
+    length one if they are the same for all.
+
+    Args:
+        program: the program.
+        xp: NumPy or jax.numpy.
+        results: the arrays whose numbers are needed after a run, for functions that compute no others; None: all.
+    """
+
+    def __init__(self, program: LoopProgram, xp: ModuleType, results: Collection[str] | None = None):
+        self._parts, self._xp = list(map(_lay_out, program.parts)), xp
+        self._written = {name for part in self._parts for name, *_ in part.outputs}
+        self._read = {name for part in self._parts for name, _ in part.inputs if name}
+        self._on_floats = FloatLoops(self._parts, results) if xp is np and FloatLoops.support(self._parts) else None
+
+    @property
+    def needed(self) -> Collection[str] | None:
+        """The names of the lists that `on_lists` needs; None: all."""
+        return self._on_floats and self._on_floats.needed
+
+    def on_lists(self, lists: Lists, often: bool = False) -> bool:
+        """Change the lists of the numbers of arrays by a run at one state; return False if that is not possible.
+
+        It is not if loops have many rows, or a number is not finite; the lists are then of no more use. Rows may read what
+        earlier rows have written. The function that takes a third of the time is generated at once if the runs are `often`.
+        """
+        if self._on_floats is None:
+            return False
+        if often and not self._on_floats.is_written:
+            self._on_floats.write(lists.keys())
+        try:
+            self._on_floats(lists)
+        except (ArithmeticError, ValueError):
+            return False
+        return True
+
+    def __call__(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the arrays after a run of the program; the given arrays do not change."""
+        if self._xp is jnp:
+            results = dict(arrays)
+            for part in self._parts:
+                _run_by_jax(part, results)
+            return results
+        if self._on_floats:
+            run = self._run_at_many if any(np.ndim(x) > 1 for x in arrays.values()) else self._run_on_floats
+            try:
+                if (found := run(arrays, self._on_floats)) is not None:
+                    return found
+            except (ArithmeticError, ValueError):  # a number is not finite
+                pass
+        results = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
+        for part in self._parts:
+            _run_by_numpy(part, results)
+        return results
+
+    def _run_on_floats(self, arrays: Mapping[str, Any], run: FloatLoops) -> dict[str, np.ndarray]:
+        involved = self._written | self._read
+        lists = {name: np.asarray(x, float).tolist() for name, x in arrays.items() if name in involved}
+        run(lists)
+        return {name: np.array(lists[name], float) if name in self._written else x for name, x in arrays.items()}
+
+    def _run_at_many(self, arrays: Mapping[str, Any], loops: FloatLoops) -> dict[str, np.ndarray] | None:
+        """Run on lists of arrays, which have one number for each state; None if that is not worth writing a function."""
+        involved = {name: np.asarray(x, float) for name, x in arrays.items() if name in self._written | self._read}
+        run, count = loops.of_many(involved.keys()), max((x.shape[1] for x in involved.values()), default=1)
+        if run is None:
+            return None
+        # A number that is the same for all states is a float, with which NumPy computes faster.
+        lists: dict[str, list[Any]] = {
+            name: x[:, 0].tolist() if x.shape[1] == 1 else list(np.ascontiguousarray(x)) for name, x in involved.items()
+        }
+        with np.errstate(all="ignore"):
+            run(lists)
+        results = dict(arrays)
+        for name in self._written & lists.keys():
+            results[name] = table = np.empty((len(lists[name]), count))
+            for row, x in zip(table, lists[name], strict=True):
+                row[...] = x
+        return results
+
+
+def _lay_out(part: KernelLoop | Reset) -> LaidOutPart:
+    if isinstance(part, Reset):
+        return LaidOutPart(part.value, [], [(part.array, slice(part.start, part.start + part.count), SET)], part.count)
+    kernel, table = part.kernel, part.table
+
+    def places(address: Address) -> np.ndarray:
+        return address.offset + (np.zeros(len(table), int) if address.base is None else table[:, address.base])
+
+    used = [kernel.program.uses(s) for s in kernel.program.inputs]
+    inputs = [(part.array(x.array) if is_used else "", places(x)) for x, is_used in zip(kernel.inputs, used, strict=True)]
+    outputs = [(part.array(x.array), places(x), x.update) for x in kernel.outputs] if len(table) else []
+    return LaidOutPart(kernel.program, inputs, outputs, len(table))
+
+
+def _run_by_numpy(part: LaidOutPart, arrays: dict[str, np.ndarray]) -> None:
+    if not part.outputs:
+        return
+    results: Any = [part.run]
+    if isinstance(part.run, ScalarProgram):
+        results = part.run.by_numpy([arrays[name][places] if name else _NOT_USED for name, places in part.inputs])
+    for x, (name, places, update) in zip(results, part.outputs, strict=True):
+        target = arrays[name]
+        if update == SET:
+            target[places] = x
+        elif target.ndim == 1:
+            _BY_ARRAYS[update].at(target, places, x)
+        else:  # row by row: `at` is slow with a second axis
+            for k, row in zip(places, np.broadcast_to(x, (part.count, *np.shape(x)[1:])), strict=True):
+                target[k] = _BY_ARRAYS[update](target[k], row)
+
+
+def _run_by_jax(part: LaidOutPart, arrays: dict[str, Array]) -> None:
+    """Run a part, with one operation for all reads from an array and one for all writes: XLA compiles each for milliseconds."""
+    if not isinstance(part.run, ScalarProgram):
+        for name, places, _ in part.outputs:
+            x = arrays[name]
+            arrays[name] = jnp.concatenate([x[: places.start], jnp.full(part.count, part.run), x[places.stop :]])
+        return
+    if not part.outputs:
+        return
+    values: list = [np.zeros(part.count)] * len(part.inputs)
+    for (name,), group in _group(part.inputs, 1).items():
+        if name:
+            rows = _take(arrays[name], np.stack([places for _, (_, places) in group]))
+            for (k, _), row in zip(group, rows, strict=True):
+                values[k] = row
+    run: Callable = jax.vmap(part.run) if values else part.run.by_numpy
+    results = run(values)
+    for (name, update), group in _group([(name, update, places) for name, places, update in part.outputs], 2).items():
+        new = jnp.concatenate([jnp.broadcast_to(results[k], part.count) for k, _ in group])
+        arrays[name] = _put(arrays[name], np.concatenate([places for _, (*_, places) in group]), new, update)
+
+
+def _group(items: Sequence[tuple], heads: int) -> dict[tuple, list[tuple[int, tuple]]]:
+    """Group items, with their indices, by their first entries."""
+    groups: dict[tuple, list[tuple[int, tuple]]] = {}
+    for k, item in enumerate(items):
+        groups.setdefault(item[:heads], []).append((k, item))
+    return groups
+
+
+def _take(x: jax.Array, places: np.ndarray) -> jax.Array:
+    flat = places.ravel()
+    if np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
+        return x[flat[0] : flat[0] + flat.size].reshape(places.shape)
+    return x.at[places].get(mode="promise_in_bounds")
+
+
+def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.Array:
+    """Return an array with some places updated: by a gather, since XLA compiles a scatter into a loop."""
+    order = np.argsort(places, kind="stable")
+    first = np.searchsorted(places[order], places[order])
+    earlier = np.empty(len(places), int)
+    earlier[order] = np.arange(len(places)) - first  # number of earlier updates of the same place
+    if earlier.max() >= MAX_UPDATES:
+        selected = x.at[places]
+        write = {SET: selected.set, ADD: selected.add, MAXIMUM: selected.max, ALL: selected.min}[update]
+        return write(new, mode="promise_in_bounds")
+    padded = jnp.append(new, _NEUTRAL.get(update, 0.0))
+    for k in range(earlier.max() + 1):
+        source = np.full(len(x), len(places))
+        source[places[earlier == k]] = np.flatnonzero(earlier == k)
+        updates, is_updated = _take(padded, source), source < len(places)
+        if update == SET:
+            x = updates if is_updated.all() else jnp.where(is_updated, updates, x)
+        else:
+            x = getattr(jnp, _BY_ARRAYS[update].__name__)(x, updates)
+    return x

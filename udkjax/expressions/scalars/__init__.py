@@ -1,0 +1,1 @@
+"""Graphs of scalars, and programs that evaluate only the nodes that their outputs need."""

@@ -1,0 +1,141 @@
+"""Jumps: the changes of velocities, phase, added joints and held contacts at the instant of an event.
+
+The action of the event is applied first. The complementarity of all closed contacts is then solved (`impacts`), since every event
+except `Log` and `Stop` can push or lift them. Their positions follow (`closing`).
+"""
+
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from udkjax.complementarity.stick_or_slip import FrictionModes
+from udkjax.integrate.events.instant.closing import Gaps, close_contacts
+from udkjax.integrate.events.instant.impacts import (
+    ATTACHABLE,
+    OPEN,
+    ContactChanges,
+    hit_contacts,
+    rows_of_directions,
+    rows_of_system,
+)
+from udkjax.integrate.events.instant.runs import MemberIndices, RunState, take
+from udkjax.integrate.events.instant.sticking import settle_friction
+from udkjax.integrate.events.instant.system import StateValues, System
+from udkjax.integrate.events.law.crossings import NO_EVENT, ConditionValues
+from udkjax.integrate.solution import Result
+from udkjax.transforms.gradients import stop_gradients
+
+
+class JumpResult(NamedTuple):
+    """The states of members after an event."""
+
+    state: RunState
+    contacts: ContactChanges | None  # None if no event is an impact
+    code: Int[Any, "b"]  # not successful if constraints block an impact, an attached joint is open, or friction has no solution
+
+
+def apply_event(
+    system: System,
+    members: MemberIndices,
+    k: Int[Any, "b"],
+    before: RunState,
+    values: ConditionValues,
+    state_values: StateValues,
+    closed: Int[Any, "b E"] | None = None,
+    modes: FrictionModes | None = None,
+) -> JumpResult:
+    """Apply the action of event k of each member, or, if k >= E, release the contact of event k - E.
+
+    Args:
+        system: the system.
+        members: the members.
+        k: indices of the events.
+        before: their states before the event.
+        values: the conditions in these states.
+        state_values: derivatives of the conditions, and directions of impulses.
+        closed: the states of the contacts that take part, OPEN, TOUCHES or SLOW; None: not known yet.
+        modes: the modes of joints with set-valued friction after the event; None: not known yet.
+    """
+    found, gaps = _apply_event(system, members, k, before, values, state_values, closed)
+    if system.plan.sticking:
+        found = _settle_friction(system, members, k, found, modes)
+    return found if gaps is None else found._replace(state=found.state._replace(q=close_contacts(system, gaps, found.state)))
+
+
+def _settle_friction(
+    system: System, members: MemberIndices, k: Int[Any, "b"], found: JumpResult, modes: FrictionModes | None
+) -> JumpResult:
+    """Return the states after events with the modes of all joints that may stick."""
+    plan, xp, contacts = system.plan, system.xp, found.contacts
+    stopped = xp.where(xp.asarray(plan.slides)[k % plan.count], k, NO_EVENT)
+    resting = None if contacts is None else contacts.rests
+    state, code = settle_friction(system, members, found.state, stopped, modes, resting)
+    if contacts is not None:
+        contacts = contacts._replace(held=xp.where(plan.impacts, plan.held(state.phase, xp), contacts.held))
+    return JumpResult(state, contacts, xp.where(found.code == Result.successful, code, found.code))
+
+
+def _apply_event(
+    system: System,
+    members: MemberIndices,
+    k: Int[Any, "b"],
+    before: RunState,
+    values: ConditionValues,
+    state_values: StateValues,
+    closed: Int[Any, "b E"] | None,
+) -> tuple[JumpResult, Gaps | None]:
+    """Apply events, except the decisions of joints with set-valued friction; return the contacts, too, if any are closed."""
+    plan, xp = system.plan, system.xp
+    releases, e = k >= plan.count, k % plan.count
+    t, q, v, phase, joints = before
+    if plan.kinks.any():
+        joints = system.with_sides(members, joints, system.turned(members, k, before))
+    after = xp.where(releases[:, None], phase, plan.after(phase, e, xp))
+    blocked, adds = xp.zeros_like(releases), ~releases & xp.asarray(plan.adds)[e]
+    if plan.adds.any() and (xp is not np or adds.any()):
+        joints = system.add_joints(members, adds[:, None] & (e[:, None] == np.array(plan.added_by)), q, joints)
+        # The new velocities satisfy the phase without its contacts at rest, since these contacts may open.
+        q1, _ = system.project(members, RunState(t, q, v, after, joints))
+        _, v1 = system.project(members, RunState(t, q1, v, plan.free(after), joints), is_free=True)
+        moved = xp.abs(q1 - q) / take(system.coordinates, members)
+        moved = moved if xp is np else stop_gradients(moved)
+        blocked = adds & (xp.max(moved, axis=-1) > ATTACHABLE)
+        q, v = (xp.where(adds[:, None], x, y) for x, y in ((q1, q), (v1, v)))
+    acts = ((releases | xp.asarray(plan.changes)[e]) & ~xp.asarray(plan.slides)[e])[:, None]
+    state = RunState(t, q, v, after, joints)
+    if not plan.impacts.any() or (xp is np and not acts.any()):
+        return JumpResult(state, None, _code(blocked, xp)), None
+
+    free, held = state._replace(phase=plan.free(after)), plan.held(phase, xp)
+    is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
+    state_values = state_values if is_evaluated else system.look(members, free, is_free=True)
+    if plan.of_system:
+        rows = rows_of_system(state_values.by_q, state_values.directions, state_values.mobilities)
+    else:
+        normals = xp.where(plan.slides[:, None], state_values.by_v, state_values.by_q)
+        rows = rows_of_directions(normals, state_values.directions, take(system.inverse_mass, members))
+    rate = xp.where(plan.slides, state_values.g, state_values.rate)  # of contacts with friction, also along their lines
+
+    def second_rates(v: Any) -> Any:
+        after = state._replace(v=v, phase=plan.without_contacts(state.phase))
+        return system.look(members, after if xp is np else stop_gradients(after), is_free=not plan.sticking).rate_2
+
+    hit = hit_contacts(system.contacts(members), k, v, held, values, rows, rate, second_rates, closed, xp)
+    contacts = hit._replace(
+        closed=xp.where(acts, hit.closed, OPEN),
+        hits=hit.hits & acts,
+        held=xp.where(acts, hit.held, held),
+        rests=xp.where(acts, hit.rests, held & plan.impacts),
+        ends=hit.ends & acts,
+    )
+    phase = plan.with_contacts(free.phase, contacts.held, xp)
+    code = _code(blocked | (acts[:, 0] & hit.blocked), xp)
+    result = JumpResult(state._replace(v=xp.where(acts, hit.v, v), phase=phase), contacts, code)
+    may_push = plan.adds.any() or (plan.held_at_rest.any() and plan.impacts.sum() > 1)
+    return result, Gaps(rows, state_values.g, values.scale, plan.impacts & rows.free & acts) if may_push else None
+
+
+def _code(blocked: Bool[Any, "b"], xp: ModuleType) -> Int[Any, "b"]:
+    return xp.where(blocked, int(Result.event_impossible), int(Result.successful))

@@ -1,0 +1,245 @@
+"""Phases: the sets of constraints that hold one after another, as events release or add some and contacts come to rest.
+
+A phase is a mask of the *switches*: the constraints that events release or add, and the contacts that are held at rest. A run
+begins with the mechanism of the scene. All other phases share one mechanism with all switches. Its numbers switch the constraints
+on and off (switched.py), so no phase needs its own equations or code.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool
+
+from udkjax.annotations import Number
+from udkjax.arrays import is_traced, number
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.integrate.events.law.conditions import BodyCondition, Frames, frames_of
+from udkjax.integrate.events.law.event import Event
+from udkjax.integrate.events.law.kinks import HeldElement, has_sides, sides_in
+from udkjax.integrate.events.law.sticking_joints import StickingJoint, friction_of, line_of, lock_of
+from udkjax.integrate.events.law.switched import switch, switched, with_switched_friction
+from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME_AT_REST
+from udkjax.scene.elements.joints import Constraint, Joint
+from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote, suggestion
+
+Added = tuple[Any, ...]  # the joints that events add, with their current numbers, and the sides of comparisons
+SCENE, SWITCHED = 0, 1  # the mechanisms of a run
+
+
+class Switches(NamedTuple):
+    """The switches, C, what the events, E, do to them, and the rows of Psi with all switches, m; hashable."""
+
+    names: tuple[str, ...] = ()  # their constraints in the mechanism with all switches
+    first: tuple[bool, ...] = ()  # the phase in which a run begins: constraints of the scene are on, all others are off
+    removed: tuple[tuple[bool, ...], ...] = ()  # (E, C)
+    added: tuple[tuple[bool, ...], ...] = ()  # (E, C)
+    contacts: tuple[int, ...] = ()  # the switch that holds the contact, or the joint that may stick, of an event; -1: none
+    rows: tuple[int, ...] = ()  # the row of Psi of that switch; -1: none
+    joint_rows: tuple[tuple[int, ...], ...] = ()  # the rows of the joint that this switch locks; empty: it locks none
+    switch_of_row: tuple[int, ...] = ()  # -1: a row of the scene that no event changes
+    redundant: tuple[bool, ...] = ()  # rows of the scene that depend on others while all constraints of the scene hold
+
+    def on(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m m"]:
+        """Return a mask of the rows of Psi that hold in a phase."""
+        switch = np.array(self.switch_of_row, int)
+        return (switch < 0) | phase[..., np.maximum(switch, 0)]
+
+    def independent(self, phase: Bool[Any, "*m C"], xp: ModuleType) -> Bool[Any, "*m m"]:
+        """Return a mask of the rows of Psi that may be independent in a phase."""
+        is_whole = xp.all(phase | ~np.array(self.first, bool), axis=-1, keepdims=True)
+        return self.on(phase) & ~(np.array(self.redundant, bool) & is_whole)
+
+
+class Phases(eqx.Module):
+    """The mechanism of the scene, and the one with all switches if there are any; their analyses, and the switches."""
+
+    mechanisms: tuple[Any, ...]  # mechanisms, or one traced system
+    analyses: tuple[Analysis | None, ...]
+    added: tuple[Joint, ...]  # joints of `Attach` and `Lock`, and of sticking, without the numbers that depend on the state
+    added_by: tuple[tuple[int, str], ...] = eqx.field(static=True)  # for each added joint its event and its switch
+    switches: Switches = eqx.field(static=True)
+    held: tuple[HeldElement, ...] = eqx.field(static=True, default=())  # the forces with held sides
+    sticking: tuple[StickingJoint, ...] = eqx.field(static=True, default=())  # the joints that may stick
+
+    @property
+    def sided(self) -> tuple[StickingJoint | HeldElement, ...]:
+        """All forces with sides, in the order of the sides."""
+        return (*self.sticking, *self.held)
+
+    def mechanism(self, which: int, phase: Bool[Array, "C"], added: Added) -> Any:
+        """Return the mechanism of a phase, with the joints that events have added and the sides of its comparisons.
+
+        Args:
+            which: SCENE, in the phase in which a run begins, or SWITCHED.
+            phase: the phase.
+            added: the joints and the sides.
+        """
+        mechanism, (*joints, sides) = self.mechanisms[which], added
+        for sided in self.sided:
+            if has_sides(mechanism, sided.force):
+                at = partial(sides_in, force=sided.force)
+                mechanism = eqx.tree_at(at, mechanism, sides[sided.sides])
+        if which == SCENE:
+            return mechanism
+        for (_, name), joint in zip(self.added_by, joints, strict=True):
+            index = mechanism.joint_names.index(name)
+            mechanism = eqx.tree_at(lambda m, index=index: m._joints[index], mechanism, switched(joint))
+        return switch(mechanism, self.switches.names, list(jnp.asarray(phase, float)))
+
+    def first_added(self) -> tuple[Joint, ...]:
+        """Return the joints that events add, as they would be at the initial guess."""
+        return tuple(self.joint_at(k, self.mechanisms[SCENE].q0.ravel()) for k in range(len(self.added)))
+
+    def with_kinks(self, model: Any, held: tuple[HeldElement, ...], count: int) -> "Phases":
+        """Return the phases with the loads of a model some of which are held, and with events at `count` kinks."""
+        switches, none = self.switches, (False,) * len(self.switches.names)
+        more = {name: (*getattr(switches, name), *[none] * count) for name in ("removed", "added")}
+        more |= {name: (*getattr(switches, name), *[-1] * count) for name in ("contacts", "rows")}
+        more |= {"joint_rows": (*switches.joint_rows, *[()] * count)}
+        found = replace(self, held=held, switches=switches._replace(**more))
+        if not isinstance(model, Mechanism):
+            return replace(found, mechanisms=(model,))
+        places = [x.force for x in held if x.force is not None]
+        forces = [model._forces[k] for _ in self.mechanisms for k in places]
+        return eqx.tree_at(lambda p: [m._forces[k] for m in p.mechanisms for k in places], found, forces)
+
+    def joint_at(self, k: int, q: Array) -> Joint:
+        """Return the k-th joint that events add, added at q."""
+        joint, frames = self.added[k], frames_of(self.mechanisms[SCENE].body_names, q)
+        return jax.tree.map(number, joint.complete(*(frames[name] for name in joint.frame_names)))
+
+
+class _Switch(NamedTuple):
+    """A constraint that events switch on or off."""
+
+    name: str  # in the mechanism with all switches
+    public: str  # the name by which events release it; "" for contacts
+    constraint: Constraint
+    event: int  # the event that adds it, or whose contact or joint it holds; -1: it is a constraint of the scene
+    locks: str = ""  # the joint that it locks
+
+
+def phases_of(
+    mechanism: Any, events: Sequence[Event], analysis: Analysis | None, sticking: tuple[StickingJoint, ...] = ()
+) -> Phases:
+    """Return the phases of a mechanism, or of a system, with events. A system has one phase."""
+    E = len(events)
+    switches = _switches(mechanism, events, sticking) if isinstance(mechanism, Mechanism) else []
+    if not switches:
+        none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E, joint_rows=((),) * E)
+        return Phases((mechanism.without_origin,), (analysis,), (), (), none)
+    assert isinstance(mechanism, Mechanism)
+    assert analysis is not None  # a mechanism has one
+    whole = _with(mechanism, switches, events)
+    # A joint that an event adds may depend on others.
+    adds_any = any(x.public and x.event >= 0 for x in switches)
+    with_all = analysis.with_rows_of(whole, only_switched=analysis.redundant_rows == () and not adds_any)
+    row_names, names = [name for name, _ in with_all.row_names], [x.name for x in switches]
+    contacts = {x.event: k for k, x in enumerate(switches) if not x.public}
+    locks = [(event, k) for k, x in enumerate(switches) if x.locks for event in (x.event, x.event + 1)]
+    contacts, locked = contacts | dict(locks), {event: switches[k].locks for event, k in locks}
+    table = Switches(
+        names=tuple(names),
+        first=tuple(x.event < 0 for x in switches),
+        removed=tuple(tuple(x.public != "" and x.public in _names_removed(mechanism, e) for x in switches) for e in events),
+        added=tuple(tuple(x.public != "" and x.event == k for x in switches) for k in range(E)),
+        contacts=tuple(contacts.get(k, -1) for k in range(E)),
+        rows=tuple(row_names.index(names[contacts[k]]) if k in contacts else -1 for k in range(E)),
+        joint_rows=tuple(tuple(r for r, name in enumerate(row_names) if name == locked.get(k)) for k in range(E)),
+        switch_of_row=tuple(names.index(name) if name in names else -1 for name in row_names),
+        redundant=tuple(row in analysis.redundant for row in with_all.row_names),
+    )
+    added = [x for x in switches if (x.public and x.event >= 0) or x.locks]
+    mechanisms = mechanism.without_origin, whole
+    joints: Any = tuple(x.constraint for x in added)
+    added_by = tuple((x.event, x.name) for x in added)
+    return Phases(mechanisms, (analysis, with_all), joints, added_by, table, sticking=sticking)
+
+
+def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:
+    """Return the names of the constraints that an event removes; an added joint replaces another one of its name."""
+    addition = event.action.addition(mechanism, f"event {quote(event.name)}")
+    return event.action.removed | ({addition[0]} if addition else frozenset())
+
+
+def _switches(mechanism: Mechanism, events: Sequence[Event], sticking: Sequence[StickingJoint]) -> list[_Switch]:
+    """Return the switches: constraints of the scene, joints that events add, contacts, joints that stick.
+
+    Raises `ValueError` for unknown names.
+    """
+    additions = [(k, e.action.addition(mechanism, f"event {quote(e.name)}")) for k, e in enumerate(events)]
+    added = [(k, *found) for k, found in additions if found is not None]
+    known, released = [*mechanism.constraints, *(name for _, name, _ in added)], set()
+    for event in events:
+        for name in sorted(event.action.removed.difference(known)):
+            raise ValueError(f"event {quote(event.name)}: no joint or driver named {quote(name)}{suggestion(name, known)}")
+        released |= event.action.removed
+    for k, name, _ in added:
+        if name in mechanism.constraints and name not in released:
+            cure = "attach the joint under another name, or release this one before"
+            raise ValueError(f"event {quote(events[k].name)}: {quote(name)} is in the scene already; {cure}")
+    found = [_Switch(name, name, x, -1) for name, x in mechanism.constraints.items() if name in released]
+    taken = set(mechanism.constraints)
+
+    def unique(name: str) -> str:
+        name = next(x for x in (name, *(f"{name} {k}" for k in range(2, len(events) + 3))) if x not in taken)
+        taken.add(name)
+        return name
+
+    found += [_Switch(unique(name), name, joint, k) for k, name, joint in added]
+    contacts = [(k, e) for k, e in enumerate(events) if e.action.rest == "hold"]
+    rubbing = {x.contact: line_of(events[x.contact]) for x in sticking if x.contact >= 0}
+    lines = {k: _Switch(unique(f"{e.name}.contact"), "", rubbing.get(k) or HeldContact.of(e, mechanism), k) for k, e in contacts}
+    found += lines.values()
+    joints = {
+        x: (lines[x.contact].name, rubbing[x.contact]) if x.contact >= 0 else (x.name, mechanism.joints[x.name]) for x in sticking
+    }
+    return found + [_Switch(unique(f"{x.name}.stick"), "", lock_of(j), x.event, name) for x, (name, j) in joints.items()]
+
+
+def _with(mechanism: Mechanism, switches: Sequence[_Switch], events: Sequence[Event]) -> Mechanism:
+    """Return the mechanism with all switches, switched on, and the friction of contacts."""
+    of_scene: dict[str, Any] = {x.name: switched(x.constraint) for x in switches if x.event < 0}
+    others: dict[str, Any] = {x.name: x.constraint for x in switches if x.event >= 0}
+    is_concrete = mechanism.is_concrete and not is_traced(list(others.values()))
+    with jax.ensure_compile_time_eval() if is_concrete else nullcontext():  # numbers taken from the guess stay concrete
+        joints, drivers = (
+            {k: of_scene.get(k, x) for k, x in elements.items()} for elements in (mechanism.joints, mechanism.drivers)
+        )
+        forces = with_switched_friction(dict(mechanism.forces), list(of_scene))
+        for x in switches:
+            if not x.public and not x.locks and events[x.event].action.friction is not None:
+                name = next(y for k in range(len(forces) + 1) if (y := f"{x.name} friction{' ' * k}") not in forces)
+                forces[name] = friction_of(events[x.event], x.name)
+        whole = Mechanism(mechanism.bodies, joints | others, drivers, forces, mechanism.gravity, mechanism.name).without_origin
+        completed = [switched(whole.joints[name]) for name in others]
+        return eqx.tree_at(lambda m: [m._joints[m.joint_names.index(name)] for name in others], whole, completed)
+
+
+class HeldContact(Joint):
+    """A contact at rest: its condition stays zero. 1 row, in the condition's unit."""
+
+    labels: tuple[str, ...] = eqx.field(static=True)  # the names by which the condition knows the bodies
+    condition: Callable[[Number, Frames], ArrayLike]
+
+    @classmethod
+    def of(cls, event: Event, mechanism: Mechanism) -> "HeldContact":
+        """Return the contact of an event; its bodies are all, or those in the attribute `bodies` of the condition."""
+        condition, bodies = event.condition, getattr(event.condition, "bodies", mechanism.body_names)
+        if not isinstance(condition, BodyCondition):
+            return cls(bodies=bodies, labels=tuple(bodies), condition=condition)
+        # Contacts that differ in their bodies alone share their programs.
+        labels = tuple(str(k) for k in range(len(bodies)))
+        return cls(bodies=bodies, labels=labels, condition=condition.of_bodies(labels))
+
+    def residual(self, t, *frames):
+        return [self.condition(t, {GROUND: GROUND_FRAME_AT_REST, **dict(zip(self.labels, frames, strict=True))})]

@@ -1,0 +1,110 @@
+"""Constraints that events switch on and off, and friction that goes with its joint.
+
+A switched element has one more number, `active`: one, or zero, which makes its rows of Psi, or its loads, vanish. All sets of
+constraints that events can leave behind are thus one mechanism with different numbers, and share its equations and its code.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.arrays import make_module, number
+from udkjax.scene.elements.forces import Wrench
+from udkjax.scene.elements.friction import Friction
+from udkjax.scene.elements.joints import Constraint
+from udkjax.scene.elements.rolling import RollingJoint
+from udkjax.scene.mechanism import Mechanism
+
+AnyConstraint = TypeVar("AnyConstraint", bound=Constraint)
+
+
+def switched(constraint: AnyConstraint) -> AnyConstraint:
+    """Return a constraint with the number `active`, switched on."""
+    return make_module(_switched(type(constraint)), **vars(constraint), active=number(1.0))
+
+
+@cache
+def _switched(cls: type) -> Any:
+    """Return the subclass of a class of constraints whose elements have the number `active`."""
+
+    class Switched(cls):
+        active: Float[Array, ""] = eqx.field(default=1.0)
+
+        def residual(self, t, *frames):
+            # Not a product: what is off may be undefined.
+            return [jnp.where(self.active > 0.5, row, 0.0) for row in super().residual(t, *frames)]
+
+    if not issubclass(cls, RollingJoint):
+        return Switched
+
+    class SwitchedRolling(Switched):
+        def residual(self, t, *frames):
+            return RollingJoint.residual(self, t, *frames)  # zero by structure
+
+        def rates(self, t, *frames):
+            return [jnp.where(self.active > 0.5, row, 0.0) for row in super().rates(t, *frames)]
+
+    return SwitchedRolling
+
+
+@cache
+def _switched_friction(cls: type) -> Any:
+    """Return the subclass of a class of friction that is off without its joint."""
+
+    class SwitchedFriction(cls):
+        active: Float[Array, ""] = eqx.field(default=1.0)
+
+        def loads(self, t, *frames):
+            loads = super().loads(t, *frames)
+            return None if loads is None else [self._switched(load) for load in loads]
+
+        def rubbing_loads(self, joint, multipliers, t, *frames):
+            return [self._switched(load) for load in super().rubbing_loads(joint, multipliers, t, *frames)]
+
+        def _switched(self, load: Wrench) -> Wrench:
+            x, y, torque = load
+            return self.active * x, self.active * y, self.active * torque
+
+    return SwitchedFriction
+
+
+def with_switched_friction(forces: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return force elements, with friction of the joints `names` switched on with them."""
+    result = {}
+    for name, force in forces.items():
+        is_switched = isinstance(force, Friction) and force.joint in names
+        result[name] = force
+        if is_switched:
+            result[name] = make_module(_switched_friction(type(force)), **vars(force), active=number(1.0))
+    return result
+
+
+def switch(mechanism: Mechanism, names: Sequence[str], active: Sequence[Any]) -> Mechanism:
+    """Return the mechanism with other numbers `active` of its switched constraints, by name, and of their friction."""
+
+    def numbers(m: Mechanism) -> list[Any]:
+        return [element.active for _, element in _switched_elements(m, names)]
+
+    new = dict(zip(names, active, strict=True))
+    return eqx.tree_at(numbers, mechanism, [new[name] for name, _ in _switched_elements(mechanism, names)])
+
+
+def _switched_elements(mechanism: Mechanism, names: Sequence[str]) -> list[tuple[str, Any]]:
+    constraints, forces = mechanism.constraints, mechanism._forces
+    return [(name, constraints[name]) for name in names] + [
+        (f.joint, f) for f in forces if isinstance(f, Friction) and hasattr(f, "active")
+    ]
+
+
+def places_of_switches(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    """Return the places of all `active` among the numbers of a mechanism, each with the index of its constraint in `names`."""
+    zeros = jax.tree.map(lambda x: np.zeros(np.shape(x)), mechanism)
+    marked = switch(zeros, names, [np.asarray(k + 1.0) for k in range(len(names))])
+    numbers = np.concatenate([np.ravel(x) for x in jax.tree.leaves(marked)])
+    return tuple((int(place), int(numbers[place]) - 1) for place in np.flatnonzero(numbers))

@@ -1,0 +1,332 @@
+"""Machine code of the phases of runs with events, for batches: integration to the next crossing, evaluation at single states."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from udkjax.integrate.compiled_mechanism import CompiledMechanism
+from udkjax.integrate.events.instant.runs import RunState
+from udkjax.integrate.events.instant.system import StateValues
+from udkjax.integrate.events.law.event_plan import EventPlan
+from udkjax.integrate.events.law.kinks import KinkPlaces, places_of_sides
+from udkjax.integrate.events.law.phases import SWITCHED, Phases, Switches
+from udkjax.integrate.events.law.switched import places_of_switches
+from udkjax.integrate.events.run.added_joints import AddedJoint, places_of_joints
+from udkjax.integrate.events.run.passed_events import NumberPlaces, PassedEvents, passed_events
+from udkjax.integrate.native_engine import integrator_output, marking, run_inputs
+from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
+from udkjax.native.primitive import MemberCalls
+from udkjax.native.runs import RunWatched
+from udkjax.native.watching.conditions import Conditions
+from udkjax.scene.mechanism import Mechanism
+
+INPUTS = RunWatched.input_names
+STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # the inputs of a run that are times and initial state
+PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a phase, followed by its samples if it has any
+ALL = np.ones(1, bool)  # of one member
+
+
+class PhasePlan(NamedTuple):
+    """The operations of the phases of one mechanism; hashable."""
+
+    run: RunWatched
+    states: EvaluateEvents
+    marking: MarkRows | None  # marks independent rows; None if this is not needed
+    projected: bool
+    project: StateOperation | None  # projects to the joints that events add; None without any
+    joints: tuple[tuple[int, ...], ...]  # places of the numbers of each such joint, then of the sides of comparisons
+    active: tuple[tuple[int, int], ...]  # places of the numbers that switch constraints on, each with the index of the switch
+    sides_of_events: tuple[tuple[int, int], ...]  # places of sides among the numbers of events, with the index of the side
+
+    @property
+    def number_count(self) -> int:
+        """The number of numbers of the conditions."""
+        return 0 if self.run.conditions is None else self.run.conditions.number_count
+
+    @property
+    def force_count(self) -> int:
+        """The number of watched forces."""
+        return 0 if self.run.conditions is None else self.run.conditions.force_count
+
+    @property
+    def count(self) -> int:
+        """The number of arrays of the phases."""
+        return len(PARTS) + bool(self.run.sampled)
+
+
+def phase_plan(
+    which: int,
+    plan: EventPlan,
+    phases: Phases,
+    compiled: CompiledMechanism,
+    conditions: Conditions,
+    added: Sequence[AddedJoint],
+    of_kinks: KinkPlaces,
+) -> PhasePlan:
+    """Return the operations of the phases of the mechanism `which`, SCENE or SWITCHED.
+
+    Args:
+        which: the mechanism.
+        plan: the events.
+        phases: all phases.
+        compiled: the mechanism, compiled.
+        conditions: conditions of all events, with forces.
+        added: the joints that events add.
+        of_kinks: the places of kinks among the numbers of events.
+    """
+    run, names, active = compiled.plan.operation, [name for _, name in phases.added_by], ()
+    assert run is not None  # checked by the caller
+    mechanism, joints = compiled.samples.stand_in(compiled.textbook.mechanism), [()] * len(added)
+    directed = tuple(int(k) for k in (*np.flatnonzero(plan.impacts), *plan.forwards))  # with directions of impulses
+    without = replace(conditions, forces=None, force_key="")
+    has_forces = any(which == SWITCHED or x.contact < 0 for x in phases.sticking)
+    if which == SWITCHED:
+        active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, names)
+    sides = places_of_sides(mechanism, phases.sided) if phases.sided else ()
+    watched = conditions if which == SWITCHED else without  # nothing is held that could let go
+    first_mark = run.code.marks.start if run.code.marks_rows else -1
+    places = NumberPlaces(sides, joints, active, first_mark)
+    return PhasePlan(
+        run=run.watching(watched, **passed_events(plan, phases, watched, of_kinks, added, places)),
+        states=run.accelerations.of_events(conditions if has_forces else without, directed),
+        marking=_marking(compiled.textbook) if run.code.marks_rows and not run.code.weighs_rows else None,
+        projected=compiled.plan.projected,
+        project=run.accelerations.projection if added else None,
+        joints=(*joints, sides),
+        active=active,
+        sides_of_events=of_kinks.sides,
+    )
+
+
+def _marking(textbook: Any) -> MarkRows:
+    """Return the operation that marks independent rows among those that numbers mark as possible."""
+    model = textbook.mechanism
+    return marking(model.at(0.0)) if isinstance(model, Mechanism) else MarkRows(textbook.programs_of_marked_rows)
+
+
+def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
+    """Return the arrays of a phase, with a leading axis for members."""
+    if plan.marking is not None:
+        problem = replace(problem, marks=np.ones(plan.run.code.row_count))
+    inputs = run_inputs(problem, plan.run, xp)
+    tol = problem.textbook.scales.rank_tol**2 if plan.marking is not None else 0.0
+    return [
+        *inputs[: STATE.start],
+        *inputs[STATE.stop : len(INPUTS)],
+        xp.reshape(xp.asarray(tol, float), (1, 1)),
+        *inputs[len(INPUTS) :],
+    ]
+
+
+class StretchEnd(NamedTuple):
+    """The ends of runs, at a crossing or elsewhere, and their outputs; integers are stored as floats."""
+
+    q: Float[np.ndarray, "b T n"]  # at the requested times
+    v: Float[np.ndarray, "b T n"]
+    violation: Float[np.ndarray, "b T"]
+    info: Float[np.ndarray, "b K"]  # `RunStates.info_names`, and the last state of the integrator
+    event: Float[np.ndarray, "b"]  # index of the watched quantity that crosses; -1: none
+    t: Float[np.ndarray, "b"]  # the end (s); no event happens before
+    worst: Float[np.ndarray, "b"]  # largest violation at a node
+    sides: Float[np.ndarray, "b C"]
+    q_end: Float[np.ndarray, "b n"]  # at t
+    v_end: Float[np.ndarray, "b n"]
+    passed: PassedEvents | None  # None if runs pass no events
+
+
+class PhaseCode:
+    """The machine code of the phases of one mechanism, with the numbers of all members of a batch.
+
+    Args:
+        plan: the operations of the phases.
+        switches: the switches of the phases.
+        arrays: arrays from `phase_arrays`, for one member or for all.
+        event_numbers: the numbers of all events.
+        inverse_mass: one over the mass of each coordinate.
+        joints: the numbers of the joints that events have added, then all sides, for all members; changed in place.
+        widths: the number of those of each joint, then of sides.
+    """
+
+    def __init__(
+        self,
+        plan: PhasePlan,
+        switches: Switches,
+        arrays: Sequence[np.ndarray],
+        event_numbers: np.ndarray,
+        inverse_mass: np.ndarray,
+        joints: Float[np.ndarray, "B K"],
+        widths: Sequence[int],
+    ):
+        self.plan, (self._numbers, self._settings, self._rows, self._breaks, self._tol, *self._samples) = plan, arrays
+        names = plan.run.all_settings
+        self._of_states = self._settings[:, [names.index(name) for name in plan.states.all_settings]]
+        self._of_marking = [] if plan.marking is None else [names.index(name) for name in plan.marking.all_settings]
+        self._event_numbers, self._joints = event_numbers, joints
+        rows = max(len(event_numbers), len(inverse_mass))
+        self._numbers_of_states = np.concatenate([_spread(x, rows) for x in (event_numbers, inverse_mass)], axis=1)
+        assert plan.states.conditions is not None  # this code has conditions
+        n, E = inverse_mass.shape[1], plan.states.conditions.own_count
+        self._places, start = [], 0
+        for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues` before directions
+            self._places.append((slice(start, start + math.prod(shape)), shape))
+            start += math.prod(shape)
+        self._switches, self._holds = switches, np.array(switches.rows, int) >= 0
+        places = np.concatenate([np.array(x or [-1] * width, int) for x, width in zip(plan.joints, widths, strict=True)])
+        self._columns, self._first_side = np.flatnonzero(places >= 0), joints.shape[1] - widths[-1]
+        self._places_of_joints = places[self._columns]
+        self._of_switches = np.array(plan.active, int).reshape(-1, 2).T
+        self._run, self._evaluate = MemberCalls(plan.run), MemberCalls(plan.states).at_states
+        self._mark_rows, self._project = (x and MemberCalls(x).at_states for x in (plan.marking, plan.project))
+        self._seen: tuple[bytes, ...] = ()  # the states that were evaluated last, and their values
+        self._values: StateValues | None = None
+        self._marks: dict[bytes, np.ndarray] = {}  # by the phase, of all members; NaN: not known yet
+        self._no_marks = np.full((len(joints), plan.run.code.row_count), np.nan)
+
+    def atol(self, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "#b 1"]:
+        """Return the absolute tolerance of members, in units of the scene."""
+        return _of(self._settings, members)[:, [self.plan.run.all_settings.index("atol")]]
+
+    def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray) -> StretchEnd:
+        """Run members over times (b, T) to the first crossing; `watch` describes the conditions, with room for their numbers."""
+        _, q, v, *_ = state
+        conditions = self.plan.run.conditions
+        assert conditions is not None  # this code has conditions
+        numbers = self._with_marks(members, state)
+        further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
+        watch[:, : conditions.number_count] = _of(self._event_numbers, members)
+        self._put_sides(watch, members)
+        inputs = numbers, ts, q, v, *further, watch
+        qs, vs, violation, info, crossing, *record = self._run(*inputs, times=ts.shape[1])
+        last_side, n = Conditions.head + conditions.count, q.shape[1]
+        (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
+        q_end, v_end = crossing[:, last_side : last_side + n], crossing[:, last_side + n :]
+        passing = self.plan.run.passing
+        passed = None if passing is None else PassedEvents.of(record[0], passing, n)
+        return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, passed)
+
+    def flow(self, member: int, ts: Float[np.ndarray, "T"], state: RunState) -> IntegratorOutput:
+        """Integrate a member over times, whatever its conditions; its state has a leading axis of length one."""
+        members, run = np.array([member]), MemberCalls(self.plan.run.unwatched)
+        further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
+        return integrator_output(run(self._with_marks(members, state), ts[None], state.q, state.v, *further, times=len(ts)))
+
+    def breakpoints(self, member: int) -> Float[np.ndarray, "k"]:
+        """Return the times (s) at which the motion of a member is not smooth."""
+        return self._breaks[member if len(self._breaks) > 1 else 0]
+
+    def setting(self, name: str, member: int) -> float:
+        """Return a setting of a member."""
+        return self._settings[member if len(self._settings) > 1 else 0, self.plan.run.all_settings.index(name)]
+
+    def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:
+        """Evaluate the conditions of members at states."""
+        t, q, v, *_ = state
+        operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
+        assert conditions is not None  # this code has conditions
+        numbers = self._with_samples(members, t, self._with_marks(members, state))
+        given = tuple([x.tobytes() for x in (members, t, q, v, numbers)])
+        if self._values is not None and given == self._seen:
+            return self._values
+        further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
+        inputs = numbers, np.stack([t, t], axis=1), q, v, *further
+        of_states = _of(self._numbers_of_states, members)
+        if self.plan.sides_of_events:
+            of_states = _spread(of_states, b).copy()
+            self._put_sides(of_states, members)
+        (results,) = self._evaluate(*inputs, of_states)
+        results = results.copy()
+        values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
+        directions, mobilities = np.zeros((2, b, conditions.own_count, n))
+        start, end = self._places[-1][0].stop, results.shape[1] - (conditions.force_count + (conditions.forces is not None))
+        if operation.directed:
+            found = results[:, start:end].reshape(b, -1, len(operation.directed), n)
+            for array, x in zip((directions, mobilities), found.swapaxes(0, 1), strict=False):
+                array[:, list(operation.directed)] = x
+        forces = np.ones((b, conditions.own_count))
+        if conditions.force_count:
+            forces[:, self._holds] = results[:, end:-1]
+        safe = results[:, -1] > 0.5 if conditions.force_count else np.ones(b, bool)
+        self._seen, self._values = given, StateValues._make([*values, directions, mobilities, forces, safe])
+        return self._values
+
+    def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities of members, projected to the constraints of their phases."""
+        t, q, v, *_ = state
+        n = q.shape[1]
+        assert self._project is not None  # events add joints
+        further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
+        numbers = self._with_samples(members, t, self._with_marks(members, state))
+        (results,) = self._project(numbers, np.stack([t, t], axis=1), q, v, *further)
+        return results[:, :n].copy(), results[:, n:].copy()
+
+    def _put_sides(self, numbers: np.ndarray, members: Int[np.ndarray, "b"]):
+        """Put the sides of comparisons into the numbers of events."""
+        for place, side in self.plan.sides_of_events:
+            numbers[:, place] = self._joints[members, self._first_side + side]
+
+    def _numbers_of(self, members: Int[np.ndarray, "b"], phase: Bool[np.ndarray, "b C"]) -> np.ndarray:
+        """Return the numbers of members in their phases, with those of the joints that events have added."""
+        numbers = np.empty((len(members), self._numbers.shape[1]))
+        numbers[:] = _of(self._numbers, members)
+        numbers[:, self._places_of_joints] = self._joints[members[:, None], self._columns]
+        places, switches = self._of_switches
+        numbers[:, places] = phase[:, switches]
+        return numbers
+
+    def _with_samples(self, members: Int[np.ndarray, "b"], t: Float[np.ndarray, "b"], numbers: np.ndarray) -> np.ndarray:
+        """Return the numbers of members with the samples of their times; a run takes all samples instead."""
+        if not self._samples:
+            return numbers
+        numbers, b = _spread(numbers, len(t)).copy(), len(t)
+        row = np.sum(_of(self._breaks, members) <= t[:, None], axis=1)
+        numbers[:, list(self.plan.run.sampled)] = _spread(_of(self._samples[0], members), b)[np.arange(b), row]
+        return numbers
+
+    def _with_marks(self, members: Int[np.ndarray, "b"], state: RunState) -> np.ndarray:
+        """Return the numbers of members, with marks of independent rows, determined where each member enters its phase first."""
+        numbers = self._numbers_of(members, state.phase)
+        if self.plan.marking is None:
+            return numbers
+        is_one = len(members) == 1
+        for phase in state.phase if is_one else np.unique(state.phase, axis=0):
+            marks, here = self._marks.get(phase.tobytes()), ALL if is_one else (state.phase == phase).all(axis=1)
+            if marks is None:
+                marks = self._marks[phase.tobytes()] = self._no_marks.copy()
+            unknown = here & np.isnan(marks[members, 0])  # all marks of a member become known together
+            if unknown.any():
+                found = self._mark(members[unknown], numbers[unknown], state.where(unknown))
+                marks[members[unknown]] = found
+            numbers[here, self.plan.run.code.marks] = marks[members[here]]
+        return numbers
+
+    def _mark(self, members: Int[np.ndarray, "b"], numbers: np.ndarray, state: RunState) -> np.ndarray:
+        """Return the marks of independent rows of members at their states."""
+        marking, (t, q, v, phase, _), m = self.plan.marking, state, self.plan.run.code.row_count
+        assert marking is not None and self._mark_rows is not None  # checked by the caller
+        numbers = self._with_samples(members, t, numbers)
+        scene_numbers, tol = numbers[:, : marking.code.marks.start], _spread(_of(self._tol, members), len(numbers))
+        among = np.ones((len(numbers), m))
+        if self.plan.active:
+            among = self._switches.independent(phase, np).astype(float)
+        inputs = np.concatenate([scene_numbers, among, tol, np.zeros((len(numbers), 1))], axis=1), np.stack([t, t], axis=1), q, v
+        further = _of(self._settings, members)[:, self._of_marking], _of(self._rows, members), np.zeros((1, 0))
+        (marks,) = self._mark_rows(*inputs, *further)
+        if not self.plan.run.code.shares_by_marks:
+            return marks * among
+        return np.where(marks * among > 0, 1.0, -1.0) * (self._switches.on(phase) if self.plan.active else 1.0)
+
+
+def _of(x: np.ndarray, members: Int[np.ndarray, "b"]) -> np.ndarray:
+    """Return the rows of members, or the single row that all share."""
+    return x if len(x) == 1 else x[members]
+
+
+def _spread(x: np.ndarray, count: int) -> np.ndarray:
+    return np.broadcast_to(x, (count, *x.shape[1:]))

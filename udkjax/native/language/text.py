@@ -1,0 +1,83 @@
+"""The text of a module from its functions, and the functions outside that it calls."""
+
+import re
+from collections.abc import Collection, Iterable, Sequence
+
+from udkjax.native.language.ir import Function
+
+ALLOCATION = ("declare ptr @malloc(i64)", "declare void @free(ptr)")
+# Intrinsics that LLVM writes as instructions for each target
+INSTRUCTIONS = frozenset(
+    (
+        "fmuladd",
+        "sqrt",
+        "fabs",
+        "copysign",
+        "floor",
+        "ceil",
+        "trunc",
+        "roundeven",
+        "fptosi",
+        "fptoui",
+        "maximum",
+        "minimum",
+        "vector",
+    )
+)
+
+
+def with_evaluated(functions: Iterable[Function]) -> list[Function]:
+    """Return functions, and the functions that they evaluate."""
+    functions, evaluated = list(functions), {}
+    for f in functions:
+        evaluated |= f.evaluated
+    return [*functions, *(evaluated[name] for name in sorted(evaluated))]
+
+
+def text_of_module(
+    functions: Iterable[Function],
+    globals: Sequence[str] = (),
+    declared: Sequence[str] = (),
+    local: Collection[str] | None = None,
+    shared: Sequence[Function] = (),
+) -> str:
+    """Return the text of a module of functions, and of the functions that they evaluate.
+
+    Args:
+        functions: The functions.
+        globals: Definitions of constants, one line each.
+        declared: Declarations in addition to those of the functions.
+        local: For the thread of a GPU, the names of the arguments that point to its own memory (`Function.text`).
+        shared: For the thread of a GPU, functions of pointers to any memory.
+    """
+    functions = list(functions)
+    others = with_evaluated([*functions, *shared])[len(functions) :]
+    heads = sorted({*declared}.union(*(f.declared for f in (*functions, *others))))
+    texts = [*(f.text(local) for f in functions), *(f.text(None if local is None else ()) for f in others)]
+    return "\n".join([*heads, *globals, *texts])
+
+
+def apart(names: Iterable[str]) -> str:
+    """Return the line of a module that names functions which are compiled apart from others (machine.py)."""
+    return f"; apart {' '.join(sorted(names))}"
+
+
+def named_apart(text: str) -> frozenset[str]:
+    """Return the names of such functions, from the text of a module."""
+    found = re.search(r"^; apart (.*)$", text, re.MULTILINE)
+    return frozenset(found[1].split()) if found else frozenset()
+
+
+def external_functions(declarations: str) -> frozenset[str]:
+    """Return the names of functions outside a module, from its text or its declarations; instructions are not functions.
+
+    In the engine's modules only functions of memory management are external (malloc, free, realloc). Whoever compiles a
+    module for a target without a C library must supply them, or refuse the module.
+    """
+    declared = re.findall(r"^declare [^@\n]*@([\w.]+)", declarations, re.MULTILINE)
+    return frozenset(name for name in declared if not _is_instruction(name))
+
+
+def _is_instruction(name: str) -> bool:
+    library, _, rest = name.partition(".")
+    return library == "llvm" and rest.split(".")[0] in INSTRUCTIONS

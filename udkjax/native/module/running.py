@@ -1,0 +1,213 @@
+"""The run of the members of a module: `run` for the threads of a processor, `run_member` for a thread of a GPU."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+from udkjax.native.code import interrupts
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.language.loops import LoopWriter
+from udkjax.native.language.text import ALLOCATION, apart, text_of_module
+from udkjax.native.module import leaving
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.memory import Memory, ThreadCode
+
+Repeat = Callable[[Callable[[], Value], Callable[[], None]], None]  # repeats a step while a condition holds: (goes_on, step)
+
+
+class Running(Memory):
+    """A module that runs members in lanes.
+
+    Lanes load members by the function `begin(work, call, lane, member)`, and `step_all` takes them a step further and finishes
+    them.
+    """
+
+    ways: tuple[str, ...] = ()  # prefixes of the inputs of each tangent of a group, in forward mode
+    group = 1  # directions of a tangent
+    tangents_begin: int | None = None
+    """Where the memory of directions begins, relative to `work`; None if it is a block of its own."""
+
+    functions: list[Function]
+    apart: set[str]
+    """The names of functions that are compiled apart from others, since only this module has them."""
+    loops: LoopWriter
+    is_interruptible = True
+    """True if Ctrl-C ends runs: on a page, which has no signals, it cannot."""
+
+    def text(self) -> str:
+        """LLVM's text of the whole module."""
+        self.write_functions()
+        self._write_run()
+        pointers = [*(leaving.GLOBALS if self.plan.leaves else []), *([interrupts.GLOBAL] if self._has_signals else [])]
+        text = text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION)
+        has_both = self.plan.leaves or self.plan.stiff is not None
+        return f"{apart(self.apart | leaving.DIFFERENT)}\n{text}" if has_both else text
+
+    def thread_code(self) -> ThreadCode:
+        self.write_functions()
+        self._write_run_member()
+        programs, kernels = self.loops.parts
+        return ThreadCode([*self.functions, *programs], kernels, self.loops.globals, self._memory_size)
+
+    @abstractmethod
+    def write_functions(self):
+        """Write all functions but `run`."""
+
+    def present(self, f: Function, s: Lane) -> Value:
+        """Return which lanes have a member."""
+        return s.active > 0.5
+
+    @abstractmethod
+    def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Take one step in all lanes, and finish completed members."""
+
+    def member_of(self, f: Function, thread: Value) -> Value:
+        """Return the index of the member of a thread of a GPU."""
+        return thread
+
+    def write_member(self, f: Function, s: Lane, repeat: Repeat):
+        """Take the member of a thread of a GPU through all its steps."""
+        repeat(lambda: f.any_of(self.present(f, s)), lambda: self.step_all(f, s, lambda: None))
+
+    def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
+        """Fill the lanes of completed members with the next members."""
+        fill()
+
+    def release(self, f: Function, s: Lane):
+        """Hook: frees the memory of the members in lanes when they leave the module."""
+
+    def begin_memory(self, f: Function):
+        """Store the numbers that all members share, once per run, in zeroed memory."""
+        for begin in self.begins:
+            begin(f)
+
+    @property
+    def _has_signals(self) -> bool:
+        return self.is_interruptible and self.plan.steps
+
+    @property
+    def _memory_size(self) -> int:
+        """The count of numbers in the memory of a run."""
+        return self.places.size * self.plan.width + 2 * self.plan.vector
+
+    def _clear_memory(self, f: Function):
+        """Clear the memory at `work`, and store what all members share, and numbers with which lanes that stay empty compute."""
+        work, width = f.given["work"], self.plan.width
+        s = Lane(f, self.places)
+        start, end = (place * width for place in self.unused)
+        for first, count in ((0, start), (end, self._memory_size - end)):
+            with f.each(count) as i:
+                f.store(0.0, work, i + first)
+        f.store(f.given["call"], work, self.start("call", "work"), base=POINTER)
+        self.begin_memory(f)
+        for name in ("length", "omega", "rtol", "atol", "smallest"):
+            setattr(s, name, f.const(1.0, DOUBLE, width))
+        with f.each(-(-self.n // max(self.plan.vector // width, 1)) * max(self.plan.vector // width, 1)) as i:
+            for name in ("scale q", "scale v"):
+                self.put_entry(f, name, i, 1.0)
+
+    def _write_run(self):
+        """Write `run(call)`: run all members; or `resume(call, members)` (leaving.py), and `run`, which calls it."""
+        plan, width = self.plan, self.plan.width
+        resumes = plan.stiff is not None
+        arguments = [(POINTER, x) for x in ("call", *(["members"] if resumes else []))]
+        f = Function(leaving.RESUME if resumes else "run", arguments, width)
+        self.functions.append(f)
+        call = f.given["call"]
+        if plan.leaves:
+            leaving.go_on_if_loaded(f)
+        block, work = self.allocate(f, f.const(self._memory_size, INT))
+        f.given["work"], s = work, Lane(f, self.places)
+        self._clear_memory(f)
+        blocks = [block, *self.allocate_tangents(f, block)]
+        members, following = self.field(f, "members"), self.field(f, "next", POINTER)
+
+        def take() -> Value:
+            # Threads share the index of the next member.
+            return f.op(f"atomicrmw add ptr {following.name}, i64 1 seq_cst", INT)
+
+        def begin(k: Value, member: Value):
+            with f.if_(member < members):
+                f.call("begin", work, call, k, member)
+
+        def fill():
+            with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
+                begin(k, take())
+
+        if resumes:
+            with f.each(width) as k:
+                member = f.variable(f.load(f.given["members"], k, base=INT), INT, 1)
+                with f.if_(member.value < 0):
+                    member.value = take()
+                begin(k, member.value)
+        else:
+            fill()
+
+        def leaves() -> Value:
+            return f.any_of(self.present(f, s) & (s.stiff > 0.5))
+
+        interruption = interrupts.Interruption(f) if self._has_signals else None
+
+        with f.while_(lambda: f.any_of(self.present(f, s)) & ~leaves() if plan.leaves else f.any_of(self.present(f, s))):
+            if interruption:
+                with f.if_(interruption.has_come()):
+                    s.max_steps = f.const(-1.0, DOUBLE, width)
+            self.step_all(f, s, fill)
+        left = leaving.members_in_lanes(self, f, s, self.present(f, s)) if plan.leaves else None
+        is_left = leaves() if plan.leaves else None
+        if left is not None:
+            self.release(f, s)
+        for block in blocks:
+            f.line(f"call void @free(ptr {block.name})")
+        if left is not None and is_left is not None:
+            with f.if_(is_left):
+                leaving.go_on(self, f, left)
+        if resumes:
+            run = Function("run", [(POINTER, "call")], width)
+            leaving.write_run(run)
+            self.functions.append(run)
+
+    def _write_run_member(self):
+        """Write `run_member(call, work, thread)`: run the member of a thread in the memory at `work`.
+
+        A thread of a GPU calls it, together with the other threads of its block: `meet(goes_on)` waits for them before each
+        step, and returns whether one of them goes on, so that all run the same instructions at the same time.
+        """
+        f = Function("run_member", [(POINTER, "call"), (POINTER, "work"), (INT, "thread")], self.plan.width)
+        self.functions.append(f)
+        call, work, s = f.given["call"], f.given["work"], Lane(f, self.places)
+        member = self.member_of(f, f.given["thread"])
+        self._clear_memory(f)
+        with f.if_(member < self.field(f, "members")):
+            f.call("begin", work, call, f.const(0, INT), member)
+
+        def together(goes_on: Callable[[], Value], step: Callable[[], None]):
+            with f.while_(lambda: f.op(f"call i1 @meet(i1 {goes_on().name})", BOOL)), f.if_(goes_on()):
+                step()
+
+        self.write_member(f, s, together)
+
+    # --- memory of directions
+
+    def groups(self, f: Function) -> Value:
+        """Return the number of groups of directions."""
+        return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
+
+    def first_tangent(self, f: Function) -> Value:
+        """Return the address of the memory of the first direction."""
+        work = f.given["work"]
+        if self.tangents_begin is not None:
+            return f.at(work, self.tangents_begin)
+        return f.load(work, self.start("tangents", "work"), base=POINTER)
+
+    def allocate_tangents(self, f: Function, block: Value) -> list[Value]:
+        """Allocate memory for all directions, and store its address in `work`; return the blocks to free.
+
+        Without memory, `block` is freed, and the function returns (`allocate`)."""
+        if not self.ways:
+            return []
+        size = self.groups(f) * (len(self.ways) * self.tangents.size * self.tangents.width)
+        tangent_block, start = self.allocate(f, size, [block])
+        with f.each(size) as i:
+            f.store(0.0, start, i)
+        f.store(start, f.given["work"], self.start("tangents", "work"), base=POINTER)
+        return [tangent_block]

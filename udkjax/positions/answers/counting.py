@@ -1,0 +1,129 @@
+"""Values of a driver as a course counts them: the angle of a crank as drawn, from the x axis, in the units of the drawing."""
+
+import math
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.arrays import ROUNDING
+from udkjax.positions.assembling.coordinates import Coordinate, element_of
+from udkjax.printing import format_number
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
+
+FULL_TURN = 2.0 * math.pi
+
+
+class Count(NamedTuple):
+    """The count of a driver's values: the shown number is (value + offset) / size.
+
+    Attributes:
+        offset: added to the driver's value (rad, m).
+        size: the shown unit in rad or m.
+        unit: the shown unit.
+        words: the counted quantity and its zero.
+        units: the units of the drawing, for texts and plain numbers.
+    """
+
+    offset: float
+    size: float
+    unit: str
+    words: str
+    units: Units
+
+    @property
+    def is_angle(self) -> bool:
+        """True if the driver is an angle."""
+        return self.unit == "deg"
+
+    @property
+    def rate_unit(self) -> str:
+        """The SI unit of the driver's rate."""
+        return "rad/s" if self.is_angle else "m/s"
+
+    def shown(self, value: float) -> float:
+        """Return a driver's value (rad, m) as it is counted, in the shown unit."""
+        return (float(value) + self.offset) / self.size
+
+    def text(self, value: float) -> str:
+        """Return a driver's value (rad, m) as text, as it is counted."""
+        return f"{self.number(value)} {self.unit}"
+
+    def number(self, value: float) -> str:
+        """Return a driver's value (rad, m) as text without its unit, as it is counted."""
+        return format_number(self.shown(value), scale=360.0 if self.is_angle else 0.0)
+
+    def within_turn(self, value: float) -> str:
+        """Return a driver's value (rad, m) as text; an angle from 0 to 360 degrees."""
+        whole = math.floor((value + self.offset) / FULL_TURN + ROUNDING) if self.is_angle else 0
+        return self.text(value - FULL_TURN * whole)
+
+    def read(self, given: object, name: str) -> float:
+        """Return the driver's value (rad, m) of a counted number, in the unit of the drawing, or text with its unit.
+
+        Raises:
+            SceneError: it is not a number, or the unit does not fit; the message begins with `name`.
+        """
+        return read_number(given, "rad" if self.is_angle else "m", name, self.units) - self.offset
+
+
+def read_number(given: object, unit: str, name: str, units: Units) -> float:
+    """Return a number in an SI unit, from a number in the unit of the drawing or a text with its unit."""
+    problems: list[str] = []
+    with suppress(ValueError):  # a text with a unit
+        given = float(given) if isinstance(given, str) else given
+    found = units.convert(name, given, unit, problems)
+    if problems or not isinstance(found, int | float | np.number):
+        raise SceneError(problems or [f"{name}: must be a number, or a text with a number and its unit"])
+    return float(found)
+
+
+def direction_text(vector: np.ndarray) -> str:
+    """Return the direction of a vector as text, an angle from the x axis."""
+    return format_number(math.degrees(math.atan2(vector[1], vector[0])), "deg", 360.0)
+
+
+def units_of_drawing(mechanism: Mechanism) -> Units:
+    """Return the units in which a mechanism was drawn; SI units and radians without a drawing."""
+    return Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
+
+
+def count_of(mechanism: Mechanism, driver: str | Coordinate) -> Count:
+    """Return the count of the values of a driver or coordinate; numbers of the mechanism are concrete.
+
+    The angle of a drawn link on the ground is that of the line from its pin on the ground to its first other pin; the angles of
+    other links are those of their bodies. Lengths are in the unit of the drawing, coordinates of slides from the drawn position.
+    """
+    units, element = units_of_drawing(mechanism), element_of(mechanism, driver)
+    first, second = element.bodies
+    if element.coordinate != "angle":
+        motors = mechanism.drawing.groups["motor"] if isinstance(mechanism.drawing, Drawing) else {}
+        motor = motors.get(driver) if isinstance(driver, str) else None
+        if motor is not None:
+            words = "the distance " + "-".join(motor.between) if motor.between else f"the way of {second} from the drawn position"
+        else:
+            what = "the distance" if element.coordinate == "distance" else f"the displacement along {element.coordinate}"
+            words = f"{what} of {second} from {first}"
+        return Count(0.0, units.size("m"), units.shown("m"), words, units)
+    size = math.pi / 180
+    if first != GROUND or not isinstance(mechanism.drawing, Drawing) or second not in mechanism.drawing.links:
+        of = f"the angle of {second}" if first == GROUND else f"the angle of {second} from {first}"
+        return Count(0.0, size, "deg", of, units)
+    drawing = mechanism.drawing
+    pins, places = drawing.links[second].pins, {name: np.asarray(place) for name, place in drawing.pins.items()}
+    if len(pins) < 2:
+        return Count(0.0, size, "deg", f"the angle of {second}, from the drawn position", units)
+    start = next((pin for pin in pins if pin in drawing.ground), pins[0])
+    end = next(pin for pin in pins if pin != start)
+    drawn, of_frame = places[end] - places[start], places[pins[1]] - places[pins[0]]
+    offset = math.atan2(of_frame[0] * drawn[1] - of_frame[1] * drawn[0], of_frame @ drawn)
+    return Count(offset, size, "deg", f"the angle of {start}-{end} from the x axis", units)
+
+
+def nearest_turn(value: float, start: float) -> float:
+    """Return the angle (rad) that differs from `value` by whole turns and is nearest to `start`."""
+    return value - FULL_TURN * round((value - start) / FULL_TURN)

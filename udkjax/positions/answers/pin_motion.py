@@ -1,0 +1,210 @@
+"""Positions, velocities and accelerations of all pins and links of a mechanism, as the tables of a course."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.annotations import NumberLike
+from udkjax.arrays import by_numpy, library_for
+from udkjax.positions.answers.counting import Count, count_of, nearest_turn, read_number
+from udkjax.positions.assembling.channels import pins_of, point_of_pin
+from udkjax.positions.assembling.coordinates import value_of
+from udkjax.positions.following.drive import Drive, constant_speed, only_driver
+from udkjax.positions.following.kinematics import Kinematics, kinematics
+from udkjax.printing import PRINTED_AS_ZERO, PrintedTable, PrintsTable, fields_table, format_number, has_numbers, units
+from udkjax.scene.arguments import checked
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Revolute
+from udkjax.scene.mechanism import Mechanism
+
+TableRows = Sequence[Sequence[float]] | np.ndarray  # of a table, (T, columns)
+
+
+class PinMotion(PrintsTable):
+    """Motion of the pins and links of a mechanism over values of its driver; NaN at values that are not reached.
+
+    Attributes:
+        values: values of the driver (T,), in rad or m.
+        pins: by name, x and y of the position (m), velocity (m/s) and acceleration (m/s^2): (T, 3, 2).
+        links: by name, angle (rad), angular velocity (rad/s) and angular acceleration (rad/s^2): (T, 3).
+        rate: the rate of the driver (T,), in rad/s or m/s.
+        count: the zero and the units in which values are shown; None: SI units.
+    """
+
+    values: Float[Array, "T"]
+    pins: dict[str, Float[Array, "T 3 2"]]
+    links: dict[str, Float[Array, "T 3"]]
+    rate: Float[Array, "T"]
+    count: Count | None = eqx.field(static=True, default=None)
+
+    _units = units(pins="m, m/s, m/s²", links="rad, rad/s, rad/s²")
+
+    def _table(self) -> PrintedTable:
+        if self.count is None or np.ndim(self.values) != 1 or not has_numbers((self.values, self.pins, self.links)):
+            return fields_table(self, self._units, "motion of pins and links")
+        pins, links = self.tables()
+        width = len(pins.heads) - len(links.heads)
+        below = [[*row, *[""] * width] for row in ([""] * len(links.heads), links.heads, *links.rows)]
+        return PrintedTable(pins.title, [*pins.rows, *below], pins.heads)
+
+    def tables(self) -> list[PrintedTable]:
+        """Return the tables of pins and of links, in the units of the drawing, at one value or by the driver's values.
+
+        Raises:
+            ValueError: `count` is None.
+        """
+        count = self.count
+        if count is None:
+            raise ValueError("count is None: the units of the tables are not known; use udk.motion_at")
+        unit = count.units.shown("m")
+        heads = ["pin", f"x ({unit})", f"y ({unit})", f"v ({unit}/s)", "at (deg)", f"a ({unit}/s²)", "at (deg)"]
+        links = ["link", "angle (deg)", "omega (rad/s)", "alpha (rad/s²)", *(["torque ratio"] if count.is_angle else [])]
+        scale = np.array([180 / np.pi, 1.0, 1.0])
+        motions = {name: np.asarray(motion) / count.units.size("m") for name, motion in self.pins.items()}
+        least = [PRINTED_AS_ZERO * max([0.0, *(float(np.nanmax(np.abs(x[:, k]))) for x in motions.values())]) for k in range(3)]
+        pin_rows = {name: [_pin_row(x, least) for x in motion] for name, motion in motions.items()}
+        link_rows: dict[str, np.ndarray] = {name: np.asarray(motion) * scale for name, motion in self.links.items()}
+        if len(self.values) == 1:  # over several values, angles are continuous
+            for rows in link_rows.values():
+                rows[:, 0] = 180.0 - (180.0 - rows[:, 0]) % 360.0
+        if count.is_angle:  # torque out for one of the driver: power in is power out
+            ratios = {name: _ratio(np.asarray(self.rate), np.asarray(motion)[:, 1]) for name, motion in self.links.items()}
+            link_rows = {name: np.column_stack([rows, ratios[name]]) for name, rows in link_rows.items()}
+        return [self._rows(count, self.title(), heads, pin_rows), self._rows(count, "", links, link_rows)]
+
+    def title(self) -> str:
+        """Return as text where the driver is, from which zero it counts, and how fast it moves."""
+        count = self.count
+        assert count is not None
+        ends = [count.text(float(x)) for x in (self.values[0], self.values[-1])]
+        at = f"at {ends[0]}" if len(self.values) == 1 else f"from {ends[0]} to {ends[1]}"
+        return f"{at}, {count.words}; {rate_text(float(self.rate[0]), count)}"
+
+    def _rows(self, count: Count, title: str, heads: list[str], rows: Mapping[str, TableRows]) -> PrintedTable:
+        """Return a table with a row for each name and value; the driver's values are a column if there are several."""
+        many = len(self.values) > 1
+        sizes = np.abs(np.array([row for motion in rows.values() for row in motion]).reshape(-1, len(heads) - 1))
+        largest = np.max(sizes, axis=0, initial=0.0, where=np.isfinite(sizes))
+        scales = [360.0 if "deg" in head else 0.0 if "ratio" in head else x for head, x in zip(heads[1:], largest, strict=True)]
+        cells = [
+            [name, *([count.number(value)] if many else []), *map(_cell, row, scales)]
+            for name, motion in rows.items()
+            for value, row in zip(np.asarray(self.values), motion, strict=True)
+        ]
+        return PrintedTable(title, cells, [heads[0], *([f"driver ({count.unit})"] if many else []), *heads[1:]])
+
+
+def _pin_row(motion: Float[np.ndarray, "3 2"], least: Sequence[float]) -> list[float]:
+    """Return x and y of a pin, and size and direction (deg) of its velocity and acceleration; less than `least` is rounding."""
+    place, *vectors = np.where(np.abs(motion) > np.reshape(least, (3, 1)), motion, np.where(np.isnan(motion), np.nan, 0.0))
+    sizes = [[float(np.hypot(*vector)), float(np.degrees(np.arctan2(vector[1], vector[0])))] for vector in vectors]
+    return [*place.tolist(), *sizes[0], *sizes[1]]
+
+
+def _ratio(rate: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Return the rates of a driver and a link as a ratio, infinite where the link stands still."""
+    still = np.abs(omega) <= PRINTED_AS_ZERO * np.abs(rate)
+    return np.where(still, np.inf, rate / np.where(still, 1.0, omega))
+
+
+def _cell(x: float, scale: float) -> str:
+    return format_number(x, scale=scale)
+
+
+def rate_text(rate: float, count: Count) -> str:
+    """Return the rate of a driver as text."""
+    if count.is_angle:
+        return f"at {format_number(rate, 'rad/s')} ({format_number(rate * 30 / np.pi, 'rpm')})"
+    return f"at {format_number(rate / count.size, count.unit)}/s"
+
+
+@checked
+def pin_motion(mechanism: Mechanism, motion: Kinematics) -> PinMotion:
+    """Return position, velocity and acceleration of each moving pin, and angle, angular velocity and acceleration of each link.
+
+    With the arm r from the centre of a link, v = v_c + omega x r and a = a_c + alpha x r - omega^2 r. A drawn link's angle is
+    that of the direction from its first pin to its second. Differentiable like the `Kinematics`.
+
+    Args:
+        mechanism: the mechanism.
+        motion: its kinematics.
+
+    Returns:
+        A `PinMotion`.
+    """
+    fixed = [name for name, joint in mechanism.joints.items() if isinstance(joint, Revolute) and GROUND in joint.bodies]
+    named = pins_of(mechanism) if mechanism.drawing is None else list(mechanism.drawing.pins)  # a drawn slide has its link's pin
+    places = {name: point_of_pin(mechanism, name) for name in named if name not in fixed}
+    pins = {name: _point_motion(motion, *place) for name, place in places.items() if place[0] != GROUND}
+    parts = [by_numpy(x) for x in (motion.q, motion.v, motion.a)]
+    xp = library_for(parts)
+    links = {name: xp.stack([x[:, k, 2] for x in parts], 1) for k, name in enumerate(motion.bodies)}
+    return PinMotion(motion.values, pins, links, motion.rate)
+
+
+def of_kinematics(mechanism: Mechanism, motion: Kinematics, count: Count) -> PinMotion:
+    """Return the motion of pins and links, shown as values are counted."""
+    return dataclasses.replace(pin_motion(mechanism, motion), count=count)
+
+
+def _point_motion(motion: Kinematics, body: str, local: Array) -> Float[Array, "T 3 2"]:
+    """Return position, velocity and acceleration of a point in the frame of a body."""
+    q, v, a, (px, py) = (by_numpy(x) for x in (motion.q, motion.v, motion.a, local))
+    xp = library_for((q, v, a, px))
+    k = motion.bodies.index(body)
+    (x, y, angle), (vx, vy, omega), (ax, ay, alpha) = (xp.moveaxis(z[:, k], -1, 0) for z in (q, v, a))
+    c, s = xp.cos(angle), xp.sin(angle)
+    rx, ry = c * px - s * py, s * px + c * py
+    rows = [[x + rx, y + ry], [vx - omega * ry, vy + omega * rx]]
+    rows.append([ax - alpha * ry - omega**2 * rx, ay + alpha * rx - omega**2 * ry])
+    return xp.stack([xp.stack(row, -1) for row in rows], 1)
+
+
+@checked
+def motion_at(
+    mechanism: Mechanism,
+    at: NumberLike | str | Sequence[float | str],
+    driver: Drive = None,
+    rate: NumberLike | str | None = None,
+    acceleration: NumberLike | str = 0.0,
+    held: Mapping[str, NumberLike] | None = None,
+) -> PinMotion:
+    """Return the motion of all pins and links where a course asks for it: `udk.motion_at(mech, "60 deg", rate="600 rpm")`.
+
+    Angles are those of the drawing: the angle of a crank is that of the line from its pin on the ground to its other pin,
+    from the x axis.
+
+    Args:
+        mechanism: a mechanism of one degree of freedom once its drivers hold; its numbers are not traced.
+        at: one or several values of the driver, in the unit of the drawing (SI without a drawing), or texts with units.
+        driver: a driver or coordinate, as for `kinematics`; by default the only driver.
+        rate: its rate, in the unit of the drawing or as text, "60 rpm"; by default that of a motor at constant speed, or 1
+            rad/s or m/s.
+        acceleration: its acceleration, in rad/s^2 or m/s^2, or as text.
+        held: values that other drivers or coordinates hold, as for `kinematics`.
+
+    Returns:
+        A `PinMotion`, which prints as a table.
+
+    Raises:
+        SceneError: there is no such driver, positions do not follow from it, or a value cannot be read.
+    """
+    driver = only_driver(mechanism) if driver is None else driver
+    count = count_of(mechanism, driver)
+    given = list(at) if isinstance(at, list | tuple) else np.atleast_1d(at).tolist()
+    values = np.array([count.read(value, "at") for value in given])
+    if len(values) == 1 and count.is_angle:
+        values[0] = nearest_turn(values[0], float(value_of(mechanism, driver)(mechanism.q0)))
+    unit = count.rate_unit
+    rate = usual_rate(mechanism, driver) if rate is None else read_number(rate, unit, "rate", count.units)
+    second = 0.0 if acceleration == 0.0 else read_number(acceleration, f"{unit}2", "acceleration", count.units)
+    motion = kinematics(mechanism, driver, values, rate=rate, acceleration=second, held=held)
+    return of_kinematics(mechanism, motion, count)
+
+
+def usual_rate(mechanism: Mechanism, driver: Drive) -> float:
+    """Return the constant speed of a driver (rad/s, m/s), or one unit per second."""
+    return (constant_speed(mechanism, driver) if isinstance(driver, str) else 0.0) or 1.0

@@ -1,0 +1,161 @@
+"""Places over the values of a driver where an angle or a displacement turns back, to rounding."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.positions.assembling.coordinates import Coordinate, value_of
+from udkjax.positions.following.continuation import Reached
+from udkjax.positions.following.kinematics import FULL_TURN, Kinematics, kinematics, travel
+from udkjax.scene.mechanism import Mechanism
+
+GRID = 721  # values of a driver over its range: half a degree apart over a turn
+SHIFT = 0.4142  # of a step: linkages are drawn in dead points, which shall lie within the range
+STILL = 1e-9  # relative to the fastest: slower is rounding
+NEWTON_STEPS = 5  # from a secant of the grid to rounding
+SECANTS = 7  # the same without the derivative, by secants that keep the zero between them
+
+
+Item = TypeVar("Item")
+
+
+class Combination(NamedTuple):
+    """A combination of the coordinates of bodies, such as the angle of a body, or its displacement along a line.
+
+    Attributes:
+        weights: of the coordinates x, y (m) and angle (rad) of each body, (bodies, 3).
+    """
+
+    weights: Float[np.ndarray, "bodies 3"]
+
+    def of(self, coordinates: Float[np.ndarray, "T bodies 3"]) -> Float[np.ndarray, "T"]:
+        """Return the combination of coordinates, or of their first or second derivatives."""
+        return np.einsum("tbc,bc->t", coordinates, self.weights)
+
+
+class TurningPoint(NamedTuple):
+    """A value (rad, m) of the driver, the combination there, and whether it stands still around the value."""
+
+    value: float
+    height: float
+    dwells: bool
+
+
+class Cycle:
+    """The positions of a mechanism over the whole range of its driver, and its derivatives by the driver's value.
+
+    Args:
+        mechanism: a mechanism with concrete numbers.
+        driver: its driver or coordinate.
+
+    Attributes:
+        turns: whether the range is a whole turn, without limits.
+        values: the values (T,) in rad or m.
+        q, dq, ddq: the coordinates (T, bodies, 3) and their derivatives.
+        ends: values of the driver, and coordinates, at its toggles.
+    """
+
+    def __init__(self, mechanism: Mechanism, driver: str | Coordinate):
+        self._given = mechanism, driver
+        limits = travel(mechanism, driver)
+        lower, upper = float(limits.lower), float(limits.upper)
+        start = float(value_of(mechanism, driver)(mechanism.q0))
+        self.turns = limits.unit == "rad" and not np.isfinite([lower, upper]).any()
+        self.ends = [(v, np.asarray(q)) for v, q in ((lower, limits.lower_q), (upper, limits.upper_q)) if np.isfinite(v)]
+        self.is_known = self.turns or len(self.ends) == 2
+        if self.turns:
+            values = start + SHIFT * FULL_TURN / (GRID - 1) + np.linspace(0.0, FULL_TURN, GRID)
+        else:  # closer towards the toggles, where positions change with the root of the distance
+            shares = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, GRID) / GRID)
+            values = lower + (upper - lower) * shares
+        self.values, self.q, self.dq, self.ddq = self._parts(self.at(values)) if self.is_known else (np.zeros(0),) * 4
+
+    def at(self, values: np.ndarray) -> Kinematics:
+        """Return the kinematics at increasing values, at a rate of one."""
+        return kinematics(*self._given, values)
+
+    @staticmethod
+    def _parts(motion: Kinematics) -> tuple[np.ndarray, ...]:
+        good = np.isin(np.asarray(motion.status), [Reached.closed])
+        return tuple(np.asarray(x)[good] for x in (motion.values, motion.q, motion.v, motion.a))
+
+    def turning_points(self, measured: Sequence[Combination]) -> list[list[TurningPoint]]:
+        """Return the places where each combination turns back, in the order of the driver's values."""
+        found = [(k, i) for k, one in enumerate(measured) for i in _sign_changes(one.of(self.dq))]
+        if not found:
+            return [[] for _ in measured]
+        which, index = np.array(found).T
+        slopes = np.stack([one.of(self.dq) for one in measured])
+        low, high = self.values[index], self.values[index + 1]
+        first, last = slopes[which, index], slopes[which, index + 1]
+        value = low - first * (high - low) / (last - first)
+        height, dwells = np.zeros(len(value)), np.zeros(len(value), bool)
+        largest = STILL * np.max(np.abs(slopes), axis=1)[which]
+        for _ in range(NEWTON_STEPS):
+            order = np.argsort(value)
+            motion = self.at(value[order])
+            parts = [np.empty((len(value), *np.shape(motion.q)[1:])) for _ in range(3)]
+            for part, x in zip(parts, (motion.q, motion.v, motion.a), strict=True):
+                part[order] = np.asarray(x)
+            rows = [[measured[k].of(x[i : i + 1])[0] for i, k in enumerate(which)] for x in parts]
+            height, slope, curvature = np.array(rows)
+            dwells = (np.abs(slope) <= largest) & (np.abs(curvature) <= largest)
+            steps = np.divide(slope, curvature, out=np.zeros_like(slope), where=~dwells)
+            value = np.clip(value - steps, low, high)
+        points = [TurningPoint(float(v), float(h), bool(d)) for v, h, d in zip(value, height, dwells, strict=True)]
+        return _by_number(zip(which, points, strict=True), len(measured))
+
+    def speed_extremes(self, measured: Sequence[Combination]) -> list[list[tuple[float, float]]]:
+        """Return the values of the driver, in order, at which the rate of each combination by it is extreme, with these rates.
+
+        At these the second derivative is zero; it is found by the secants of Illinois, which also find places where it jumps. A
+        combination that moves in proportion to the driver has none.
+        """
+        curves = [one.of(self.ddq) for one in measured]
+        sizes = [np.max(np.abs(one.of(self.dq)), initial=0.0) for one in measured]
+        found = [(k, i) for k, (x, size) in enumerate(zip(curves, sizes, strict=True)) for i in _sign_changes(x, size)]
+        if not found:
+            return [[] for _ in measured]
+        which, index = np.array(found).T
+        ends, heights = self.values[np.stack([index, index + 1])], np.stack(curves)[which, np.stack([index, index + 1])]
+        value, rate, kept = ends[0], np.zeros(len(found)), np.full(len(found), -1)
+        for _ in range(SECANTS):
+            value = ends[0] - heights[0] * (ends[1] - ends[0]) / (heights[1] - heights[0])
+            order = np.argsort(value)
+            motion, back = self.at(value[order]), np.argsort(order)
+            rate, height = (
+                np.array([measured[k].of(np.asarray(x)[i : i + 1])[0] for i, k in zip(back, which, strict=True)])
+                for x in (motion.v, motion.a)
+            )
+            side = np.where(height * heights[0] > 0, 0, 1)  # the end that the new place replaces
+            everyone = np.arange(len(found))
+            heights[1 - side, everyone] *= np.where(side == kept, 0.5, 1.0)
+            ends[side, everyone], heights[side, everyone], kept = value, height, side
+            if np.all(heights[0] == heights[1]):
+                break
+        pairs = zip(which, value.tolist(), rate.tolist(), strict=True)
+        return _by_number(((k, (v, r)) for k, v, r in pairs), len(measured))
+
+    def heights(self, one: Combination, turning: Sequence[TurningPoint]) -> np.ndarray:
+        """Return the values of a combination among which are its least and its largest."""
+        at_ends = [one.of(q[None])[0] for _, q in self.ends]
+        inner = [] if turning else one.of(self.q[[0, -1]]).tolist()
+        return np.array([point.height for point in turning] + at_ends + inner)
+
+
+def _by_number(pairs: Iterable[tuple[int, Item]], count: int) -> list[list[Item]]:
+    lists: list[list[Item]] = [[] for _ in range(count)]
+    for k, item in pairs:
+        lists[k].append(item)
+    return lists
+
+
+def _sign_changes(slopes: np.ndarray, size: float = 0.0) -> list[int]:
+    """Return the indices before changes of sign. Errors of rounding, of slopes or of another size, have none; a dwell has one."""
+    signs = np.sign(slopes)
+    signs[np.abs(slopes) <= STILL * max(size, np.max(np.abs(slopes), initial=0.0))] = 0.0
+    last = np.maximum.accumulate(np.where(signs != 0.0, np.arange(len(signs)), 0))
+    signs = signs[last]
+    return np.flatnonzero(signs[:-1] * signs[1:] < 0.0).tolist()

@@ -1,0 +1,199 @@
+"""Closure of a mechanism as a function of its numbers, by machine code or JAX, with derivatives of any order."""
+
+import operator
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from udkjax.annotations import Number, Time
+from udkjax.equations.programs.scales import Scales
+from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.rows.position_closure import CLOSURE, Assembly, close_position, damped_step
+from udkjax.equations.states.textbook import TextbookEquations, prepare
+from udkjax.pinv import SVD
+from udkjax.positions.assembling import native_closing
+from udkjax.programs.undefined import defined_along
+from udkjax.scene.elements.drivers import Motion
+from udkjax.scene.mechanism import Mechanism
+from udkjax.transforms.gradients import stop_gradients
+from udkjax.transforms.linear_map import DifferentiableFunction, Linear
+from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_numbers
+
+Closed = Assembly[Array]
+NativeGuess = tuple[Mechanism, Scales, Array, Array, Array]  # mechanism, scales, t, q, v
+
+
+class MotionFrom(Motion):
+    """A motion law shifted in time by `start` (s): machine code has derivatives with respect to `start`, as to any number."""
+
+    motion: Motion
+    start: Number
+
+    def __call__(self, t):
+        return self.motion(self.start + t)
+
+
+def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
+    """Return a mechanism whose drivers have, at time zero, the values that they had at time t."""
+    if not mechanism.drivers:
+        return mechanism
+    motions = lambda x: [driver.motion for driver in x.drivers.values()]  # noqa: E731
+    return eqx.tree_at(motions, mechanism, [MotionFrom(motion, t) for motion in motions(mechanism)])
+
+
+class TracedRows(NamedTuple):
+    """The `Rows` of a mechanism with traced numbers, by its equations of motion."""
+
+    equations: TextbookEquations
+
+    @property
+    def scales(self) -> Scales:
+        return self.equations.scales
+
+    def residual(self, t: Time, q: Array) -> Array:
+        return self.equations.violation(t, q, q)[0] / self.scales.rows
+
+    def correction(self, t: Time, q: Array) -> Array:
+        plus, psi, root = self.equations.linearized_position(t, q)
+        return -root * (plus @ psi)
+
+    def assemble(self, close: Callable[["TracedRows", Time, Array], Array], t: Time, q: Array, v: Array) -> Assembly[Array]:
+        """Return q closed by `close`, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
+        if not self.equations.constrained:
+            return q, v, *self.equations.violation(t, q, v), 0
+        q, rank = close(self, t, q), 0
+        for _ in range(CLOSURE.velocities):
+            plus, residual, root = self.equations.linearized_velocity(t, q, v)
+            v, rank = v - root * (plus @ residual), plus.rank
+        return q, v, *self.equations.violation(t, q, v), rank
+
+
+def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
+    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D."""
+    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assemble(_close_position, t, q, v)
+
+
+def close_by_machine_code(
+    mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
+) -> Closed:
+    """Return the results of `close_by_jax`, by machine code."""
+    guess, inputs = split_numbers((_with_fixed_loads(mechanism), analysis, t, q, v))
+    return _close_by_code(AssemblyFunction(guess), inputs)
+
+
+def _with_fixed_loads(mechanism: Mechanism) -> Mechanism:
+    """Return the mechanism without derivatives with respect to its loads, on which a closed state does not depend.
+
+    Derivatives with respect to these alone then need no machine code for closing.
+    """
+    loads = lambda m: [m.gravity, *m.forces.values()]  # noqa: E731
+    return eqx.tree_at(loads, mechanism, stop_gradients(loads(mechanism)))
+
+
+class AssemblyFunction(DifferentiableFunction):
+    """q and v of a closed state as a function of the numbers of a guess: a mechanism, its analysis, and t, q and v."""
+
+    guess: TreeOfNumbers
+
+    @property
+    def orders(self) -> int:
+        return 2 if self._has_second else 1
+
+    @property
+    def _has_second(self) -> bool:
+        """True if machine code has second derivatives, for which no rows may contradict each other off the manifold."""
+        return self.guess.rest[1].redundant_rows == ()
+
+    def __call__(self, inputs: list[Array]) -> list[Array]:
+        return list(close_by_jax(*self.guess(inputs))[:2])
+
+    def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
+        *_, q, v = self.guess(inputs)
+        return [q.shape, v.shape]
+
+    def forward(self, inputs: list[Array], has_tangent: Mask, tangents: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(inputs, has_tangent)
+        if guess is None:
+            return super().forward(inputs, has_tangent, tangents, run)
+        change = self.guess.changes(has_tangent, tangents)
+        return list(native_closing.close_jvp(guess, _native_inputs(which), _native_inputs(change)))
+
+    def backward(self, inputs: list[Array], has_tangent: Mask, cotangents: list[Array], run: PyTree) -> list[Array]:
+        guess, which = self._native(inputs, has_tangent)
+        if guess is None:
+            return super().backward(inputs, has_tangent, cotangents, run)
+        found = native_closing.close_vjp(guess, _native_inputs(which), *cotangents)
+        pairs = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in (_native_inputs(which), found)), strict=True)
+        return [bar for m, bar in pairs if m is True]
+
+    def twice(
+        self, inputs: list[Array], active: Mask, tangents: list[Array], others: Mask, other_tangents: list[Array]
+    ) -> list[Array]:
+        guess, which = self._native(inputs, tuple(map(operator.or_, active, others)))
+        if guess is None or not self._has_second:
+            return super().twice(inputs, active, tangents, others, other_tangents)
+        changes = (
+            (_native_inputs(self.guess.marks(mask)), _native_inputs(self.guess.changes(mask, dxs)))
+            for mask, dxs in ((active, tangents), (others, other_tangents))
+        )
+        return list(native_closing.second_derivative(guess, _native_inputs(which), *changes))
+
+    def _native(self, inputs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
+        """Return the arguments of machine code and the inputs with tangents; None if machine code lacks these derivatives."""
+        which = self.guess.marks(has_tangent)
+        mechanism, analysis, t, q, v = self.guess(inputs)
+        others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
+        if others or not native_closing.can_close(mechanism):
+            return None, None
+        return (mechanism, analysis.scales, t, q, v), which
+
+
+def _native_inputs(tree: PyTree) -> PyTree:
+    """Return the mechanism, q and v of a guess: the inputs along which machine code has derivatives."""
+    mechanism, _, _, q, v = tree
+    return mechanism, q, v
+
+
+@eqx.filter_custom_jvp
+def _close_by_code(function: AssemblyFunction, inputs: list[Array]) -> Closed:
+    mechanism, analysis, t, q, v = function.guess(inputs)
+    return native_closing.close(mechanism, analysis.scales, t, q, v)
+
+
+@_close_by_code.def_jvp
+def _(primals, tangents):
+    function, inputs = primals
+    found = _close_by_code(function, inputs)
+    has_tangent = tuple(dx is not None for dx in tangents[1])
+    if not any(has_tangent):
+        return found, (None,) * len(found)
+    linear = Linear(function=function, inputs=inputs, run=(), active=has_tangent)
+    return found, (*defined_along(linear.applied, select(tangents[1], has_tangent), found[:2]), None, None, None)
+
+
+@jax.custom_jvp
+def _close_position(rows: TracedRows, t: Array, q: Array) -> Array:
+    return close_position(rows, t, q)
+
+
+def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
+    """Take the steps of `_close_position` in a loop of fixed length, for reverse mode.
+
+    Even steps that no longer lower the residual are taken: at a closed state they only project the tangent to the manifold.
+    """
+
+    def body(q, _):
+        following, better = damped_step(rows, t, q)
+        return jnp.where(better, following, q + rows.correction(t, q)), None
+
+    return jax.lax.scan(body, q, None, length=CLOSURE.steps)[0]
+
+
+@_close_position.defjvp
+def _(primals, tangents):
+    _, tangent = jax.jvp(_close_position_plain, primals, tangents)
+    return _close_position(*primals), tangent

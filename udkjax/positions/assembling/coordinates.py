@@ -1,0 +1,175 @@
+"""Coordinates that can be driven, by the name of a driver, by the name of a channel, or as objects."""
+
+from collections.abc import Callable, Container, Sequence
+from typing import Any, Literal, cast, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from udkjax.annotations import Numbers
+from udkjax.arrays import is_traced, number, number_called
+from udkjax.positions.assembling.channels import channel_of, point_of_pin
+from udkjax.printing import PrintsLine
+from udkjax.requirements import ArgumentTypeError, describe, require_choice
+from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME, Frame
+from udkjax.scene.elements.drivers import Driver, Motion, Polynomial, effort_unit
+from udkjax.scene.elements.fields import names
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
+from udkjax.wording import quote, suggestion
+
+CoordinateName = Literal["angle", "x", "y", "distance"]
+DRIVEN = get_args(CoordinateName)
+
+
+def _names_of_bodies(value: Any) -> tuple[str, ...]:
+    try:
+        return names(value)
+    except TypeError:
+        raise ArgumentTypeError(f"bodies must be a name, or a list of names, {describe(value)}") from None
+
+
+class Coordinate(PrintsLine):
+    """A coordinate of body 2 relative to body 1 that can be driven, like that of a `Driver`.
+
+    `angle`: theta2 - theta1 (rad), including whole turns; `x`, `y`: point 2 minus point 1 in body 1's frame (m); `distance` (m).
+
+    Args:
+        bodies: the names of two bodies, or "ground".
+        coordinate: "angle", "x", "y" or "distance".
+        points: one point of each body, in its frame (m); by default the origins.
+        axis: for x and y: the direction of x in body 1's frame (rad); by default that of the frame.
+    """
+
+    bodies: tuple[str, ...] = eqx.field(static=True, converter=_names_of_bodies)
+    coordinate: CoordinateName = eqx.field(static=True, default="angle")
+    points: Float[Array, "2 2"] | None = eqx.field(converter=number_called("points", optional=True), default=None)
+    axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
+
+    def __check_init__(self):
+        require_choice("coordinate", self.coordinate, DRIVEN)
+
+    @classmethod
+    def of(cls, driver: Driver) -> "Coordinate":
+        """Return the coordinate that a driver prescribes."""
+        return cls(driver.bodies, driver.coordinate, driver.points, driver.axis)
+
+    def driver(self, motion: Motion) -> Driver:
+        """Return the driver that prescribes this coordinate."""
+        return Driver(self.bodies, self.coordinate, motion, self.points, self.axis)
+
+    @property
+    def effort_unit(self) -> str:
+        """The unit of the effort along the coordinate."""
+        return effort_unit(self.coordinate)
+
+
+def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Array], Array]:
+    """Return the value (rad, m) of a coordinate as a function of q (bodies, 3)."""
+    element = element_of(mechanism, coordinate)
+    places = [None if b == GROUND else mechanism.body_names.index(b) for b in element.bodies]
+
+    def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
+        rows: Any = q if isinstance(q, Tracer) else np.asarray(q)  # JAX would compile a program to take a row
+        return coordinate_value(element, *(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
+
+    return value
+
+
+def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
+    """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
+    driver = element.driver(constant_motion(0.0)).complete()
+    if is_traced((driver, frames)):
+        return jnp.asarray(driver.residual(0.0, *frames)[0])
+    return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
+
+
+def slopes_of(elements: Sequence[Coordinate], body_names: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the derivatives C (T, k, n) of coordinates by q, as a function of q (T, n), by NumPy.
+
+    With p the vectors from the origins of the bodies to their points, n the direction of the coordinate, and d from point 1 to
+    point 2, it changes by n . (dx2 + p2' dtheta2 - dx1 - p1' dtheta1), where ' is a quarter turn. If n turns with body 1, it
+    changes by n' . d dtheta1, too.
+    """
+    places = [[None if body == GROUND else body_names.index(body) for body in element.bodies] for element in elements]
+
+    def slopes(q: np.ndarray) -> np.ndarray:
+        C = np.zeros((len(q), len(elements), q.shape[1]))
+        for k, (element, bodies) in enumerate(zip(elements, places, strict=True)):
+            for sign, body, values in zip((-1, 1), bodies, _slopes(element, bodies, q), strict=True):
+                if body is not None:
+                    C[:, k, 3 * body : 3 * body + 3] = sign * values
+        return C
+
+    return slopes
+
+
+def _slopes(element: Coordinate, bodies: Sequence[int | None], q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (T, 3) of a coordinate by the coordinates of body 2, and minus those by body 1's."""
+    if element.coordinate == "angle":
+        return np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
+    poses = [np.zeros((len(q), 3)) if k is None else q[:, 3 * k : 3 * k + 3] for k in bodies]
+    points = [0j, 0j] if element.points is None else [complex(x, y) for x, y in np.asarray(element.points).tolist()]
+    p1, p2 = (point * np.exp(1j * pose[:, 2]) for point, pose in zip(points, poses, strict=True))
+    o1, o2 = (pose[:, 0] + 1j * pose[:, 1] for pose in poses)
+    d = o2 + p2 - o1 - p1
+    if element.coordinate == "distance":
+        n, turns = d / np.abs(d), 0.0
+    else:
+        axis = 0.0 if element.axis is None else float(element.axis)
+        n = np.exp(1j * (poses[0][:, 2] + axis)) * (1.0 if element.coordinate == "x" else 1j)
+        turns = (np.conj(1j * n) * d).real
+    first, second = (np.stack([n.real, n.imag, (np.conj(n) * 1j * p).real - more], -1) for p, more in ((p1, turns), (p2, 0.0)))
+    return first, second
+
+
+def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
+    """Return a coordinate by the name of its driver, or by its name. Raises `SceneError`."""
+    return named_element(mechanism, driver)[1]
+
+
+def named_element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coordinate]:
+    """Return the name of a driver and its coordinate; a new name for a coordinate without a driver. Raises `SceneError`."""
+    if isinstance(driver, str) and driver in mechanism.drivers:
+        return driver, Coordinate.of(mechanism.drivers[driver])
+    element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
+    return choose_name("value", mechanism.constraints), element
+
+
+def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
+    """Return the coordinate of a channel's name: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, or a distance.
+
+    Raises `SceneError`.
+    """
+    try:
+        channel = channel_of(mechanism, text)
+    except ValueError as problem:
+        drivers = ", ".join(map(quote, mechanism.driver_names)) or "none"
+        cure = suggestion(text, mechanism.driver_names) or f"; drivers: {drivers}; coordinates: body.NAME.angle, joint.NAME.angle"
+        raise SceneError([f"{quote(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
+    if channel.quantity not in DRIVEN:
+        raise SceneError([f"{quote(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
+    kind = cast(CoordinateName, channel.quantity)
+    with jax.ensure_compile_time_eval():
+        if len(channel.bodies) == 2 and (kind == "angle" or channel.points):
+            return Coordinate(channel.bodies, kind, channel.points or None)
+        if channel.owner:
+            body, point = point_of_pin(mechanism, channel.owner)
+            return Coordinate((GROUND, body), kind, [(0.0, 0.0), point])
+        return Coordinate((GROUND, *channel.bodies), kind, [(0.0, 0.0), *channel.points])
+
+
+def choose_name(name: str, taken: Container[str]) -> str:
+    """Return a free name: `name` with as many primes as needed."""
+    while name in taken:
+        name += "'"
+    return name
+
+
+def constant_motion(value: Numbers) -> Polynomial:
+    """Return the motion law that holds a value (rad, m)."""
+    return Polynomial(jnp.stack([value]) if isinstance(value, Tracer) else np.reshape(value, 1))

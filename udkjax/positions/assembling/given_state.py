@@ -1,0 +1,127 @@
+"""Mechanisms and systems in which named coordinates and velocities have given values, for `assemble`.
+
+A given coordinate is a constant driver, or a row of Psi; a given velocity is a driver that moves on, or a row of phi. Positions
+are closed first, with the coordinates alone, so that a coordinate may be given without its velocity.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.annotations import NumberLike
+from udkjax.arrays import number
+from udkjax.equations.systems.general import ConstrainedSystem
+from udkjax.positions.assembling.channels import RATES, channel_of
+from udkjax.positions.assembling.coordinates import Coordinate, coordinate_of, value_of
+from udkjax.printing import format_number
+from udkjax.requirements import ArgumentError, describe, require_text
+from udkjax.scene.elements.bodies import COORDINATES
+from udkjax.scene.elements.drivers import Polynomial
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
+from udkjax.wording import quote
+
+GivenValues: TypeAlias = Mapping[str, NumberLike]
+_COORDINATE_OF: dict[str, str] = dict(zip(RATES, COORDINATES, strict=True))  # vx: x, ...
+
+
+class GivenState:
+    """The given values of a model, by name, as conditions on its position and on its velocity.
+
+    Args:
+        model: A mechanism, or a `ConstrainedSystem`.
+        given: Values by name: `body.link1.angle`, `joint.A.omega`, `q[0]`, `v[0]`.
+
+    Raises:
+        ArgumentError: a name is unknown, or of another quantity; or a value is not a number.
+    """
+
+    def __init__(self, model: Mechanism | ConstrainedSystem, given: GivenValues):
+        if not isinstance(given, Mapping):
+            raise ArgumentError(f"given must map names to values, such as {{'q[0]': 1.0}}, {describe(given)}")
+        for name in given:
+            require_text("given: a name", name)
+        self.model = model
+        self.values = {name: _value_called(name, value) for name, value in given.items()}
+        parse = self._entry if isinstance(model, ConstrainedSystem) else self._coordinate
+        self.parsed = {name: parse(name) for name in given}
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} = {format_number(float(value))}" for name, value in self.values.items())
+
+    def at_position(self) -> Any:
+        """Return the model whose position has the given coordinates; the model itself if there are none."""
+        known = {name: where for name, (is_rate, where) in self.parsed.items() if not is_rate}
+        if not known:
+            return self.model
+        if isinstance(self.model, ConstrainedSystem):
+            return _with_entries(self.model, {name: (k, self.values[name]) for name, k in known.items()})
+        return _with_drivers(self.model, {name: (c, [self.values[name]]) for name, c in known.items()})
+
+    def at_velocity(self, t: NumberLike, q: Array) -> Any:
+        """Return the model whose velocity at time t (s) and position q has the given ones; the model itself if there are none."""
+        known = {name: where for name, (is_rate, where) in self.parsed.items() if is_rate}
+        if not known:
+            return self.model
+        if isinstance(self.model, ConstrainedSystem):
+            return _with_entries(self.model, {name: (k, self.values[name]) for name, k in known.items()}, rates=True)
+        laws = {}
+        for name, coordinate in known.items():
+            rate = self.values[name]
+            laws[name] = coordinate, [value_of(self.model, coordinate)(q) - rate * t, rate]
+        return _with_drivers(self.model, laws)
+
+    def _entry(self, name: str) -> tuple[bool, Any]:
+        try:
+            channel = channel_of(self.model, name)
+        except ValueError as problem:
+            raise ArgumentError(f"given: {problem}") from None
+        return channel.owner == "v", int(channel.quantity)
+
+    def _coordinate(self, name: str) -> tuple[bool, Any]:
+        owner, _, last = name.strip().rpartition(".")
+        assert isinstance(self.model, Mechanism)
+        try:
+            coordinate = coordinate_of(self.model, f"{owner}.{_COORDINATE_OF.get(last, last)}")
+        except SceneError as error:
+            problem = error.problems[0].partition(": ")[2] or error.problems[0]
+            cure = "give coordinates such as body.NAME.angle or joint.NAME.angle, and velocities such as body.NAME.omega"
+            raise ArgumentError(f"given: {quote(name)} is neither a coordinate nor a velocity ({problem}); {cure}") from None
+        return last in RATES, coordinate
+
+
+def _value_called(name: str, value: Any) -> Float[Array, ""]:
+    try:
+        found = number(value)
+    except (TypeError, ValueError):
+        found = None
+    if found is None or np.shape(found) != ():
+        raise ArgumentError(f"given[{quote(name)}] must be a number, {describe(value)}")
+    return found
+
+
+def _with_drivers(mechanism: Mechanism, laws: Mapping[str, tuple[Coordinate, list[Any]]]) -> Mechanism:
+    """Return a mechanism with further drivers by the names of the coordinates, whose motions are polynomials."""
+    more = {
+        f"given {name}": coordinate.driver(Polynomial(jnp.stack(coefficients))).complete()
+        for name, (coordinate, coefficients) in laws.items()
+    }
+    return mechanism.with_drivers({**mechanism.drivers, **more})
+
+
+def _with_entries(system: ConstrainedSystem, entries: Mapping[str, tuple[int, Array]], rates: bool = False) -> ConstrainedSystem:
+    """Return a system with further rows, that entries of q, or of v, have given values."""
+    places, values = np.array([k for k, _ in entries.values()]), jnp.stack([value for _, value in entries.values()])
+    old = system.velocity_constraint if rates else system.constraint
+
+    def rows(*state: Any) -> Any:
+        own, more = {} if old is None else old(*state), state[-1][places] - values
+        if isinstance(own, Mapping):
+            return {**own, "given": more}
+        return jnp.concatenate([jnp.atleast_1d(jnp.asarray(own)), more])
+
+    return replace(system, **{"velocity_constraint" if rates else "constraint": rows})

@@ -1,0 +1,72 @@
+"""Closing of a user-defined system: Psi = 0 by damped Gauss-Newton steps, then Psi_dot = 0 and phi = 0.
+
+A closed state is differentiated through a last Newton step, at which all residuals vanish: first derivatives with respect to the
+numbers of the system are exact, those with respect to the guess are those of a projection.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from udkjax.annotations import Time, Vector
+from udkjax.equations.rows.position_closure import CLOSURE, close_position
+from udkjax.equations.states.quantities import equations_of
+from udkjax.pinv import SVD
+from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import defined
+from udkjax.transforms.gradients import stop_gradients
+
+
+class SystemRows(NamedTuple):
+    """The `Rows` of a user-defined system."""
+
+    equations: Any
+
+    @property
+    def scales(self) -> Any:
+        return self.equations.scales
+
+    def residual(self, t: Time, q: Array) -> Array:
+        return self.equations.violation(t, q, jnp.zeros_like(q))[0]
+
+    def correction(self, t: Time, q: Array) -> Array:
+        return self.equations.correct_position(t, q) - q
+
+
+class ClosedSystem(NamedTuple):
+    """A closed state with its residuals, and the rank of (Psi_q; phi_v) M^(-1/2)."""
+
+    q: Vector
+    v: Vector
+    psi: Float[Array, "m"]
+    rates: Float[Array, "k"]  # Psi_dot and phi
+    rank: Int[Array, ""]
+    scales: Any
+
+
+@deferred
+@defined
+def close_system(system: Any, t: Array, q: Vector, v: Vector) -> ClosedSystem:
+    """Close a state of a system.
+
+    Args:
+        system: The system, of traced functions.
+        t: Time (s).
+        q: Coordinates (n,) from which to start.
+        v: Velocities (n,).
+
+    Returns:
+        The closed state, with its residuals; they exceed `CLOSURE.tol` if no closed state is near.
+    """
+    equations: Any = equations_of(system, SVD())
+    fixed, at, start = stop_gradients((equations, t, q))
+    closed = close_position(SystemRows(fixed), at, start) if system.constraint is not None else start
+    corrected = equations.correct_position(t, stop_gradients(closed) + q - start)
+    closed = stop_gradients(closed) + corrected - stop_gradients(corrected)
+    velocity = v
+    for _ in range(CLOSURE.velocities + 1):
+        velocity = equations.correct_velocity(t, closed, velocity)
+    psi, rates = equations.violation(t, closed, velocity)
+    rank = stop_gradients(equations.rank(closed, equations.jacobian(t, closed, velocity)))
+    return ClosedSystem(closed, velocity, psi, rates, rank, fixed.scales)

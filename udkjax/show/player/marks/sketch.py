@@ -1,0 +1,192 @@
+"""Marks of a pose as lines and circles in pixels, with y downwards, for an SVG, a DXF or the frame of a film.
+
+These are the same symbols (symbols.py) as in the player, with the same colours and proportions.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.show.player.marks.mark_places import to_ground
+from udkjax.show.player.marks.marks import Mark
+from udkjax.show.player.marks.symbols import Symbol, symbols_of
+
+THEMES: dict[str, dict[str, Any]] = {
+    "light": {
+        "back": "#ffffff", "ink": "#1b2430", "soft": "#5a6676", "grid": "#edf0f4", "accent": "#0067b0", "tint": 0.74,
+        "force": "#b3261e",
+        "bodies": ["#0072b2", "#d55e00", "#009e73", "#c2559a", "#3a9bdc", "#b87a00", "#6b5bb5"],
+    },
+    "dark": {
+        "back": "#11161d", "ink": "#e7ecf3", "soft": "#9aa7b8", "grid": "#1c232d", "accent": "#5cb3f2", "tint": 0.68,
+        "force": "#ff8a80",
+        "bodies": ["#4fb0ec", "#ff9055", "#3fcfa4", "#ea9fcb", "#93d2f6", "#f0bb4a", "#ab9cf2"],
+    },
+}  # fmt: skip
+POINT = 420.0  # shorter side (px) of a picture in which the unit of symbols is one pixel
+MARGIN = 44.0  # margin of a picture (px)
+ARROW, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols; the longest arrow relative to this one
+HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # head and width in units of symbols; half of the head's angle (rad)
+NOT_UNIQUE_TINT = 0.5  # fraction of the background colour mixed into the colour of a force
+STUCK = 8.0, 3.5  # radius and width, in units of symbols, of the ring around a joint that sticks
+PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the background colour mixed into the colour of a body
+
+
+class TracedPath(NamedTuple):
+    """The path of a point (n, 2) of a body, in metres."""
+
+    body: int
+    points: Float[np.ndarray, "n 2"]
+
+
+class ForceArrow(NamedTuple):
+    """A force on a point (m) of a body: x and y relative to the usual force, and whether it is unique."""
+
+    body: int
+    at: tuple[float, float]
+    force: tuple[float, float]
+    unique: bool
+
+
+class View(NamedTuple):
+    """Maps metres to pixels, (x + scale X, y - scale Y), in a picture of width x height px; `pt` is the unit of symbols (px)."""
+
+    scale: float
+    x: float
+    y: float
+    width: int
+    height: int
+    pt: float
+
+
+class Line(NamedTuple):
+    """A line through points, open or closed, filled or not; its width is zero if only its fill is drawn."""
+
+    layer: str
+    points: np.ndarray
+    width: float = 0.0
+    stroke: str = ""
+    fill: str = ""
+    closed: bool = False
+
+
+class Text(NamedTuple):
+    """A line of text about its middle (px), turned anticlockwise by an angle (deg)."""
+
+    layer: str
+    place: np.ndarray
+    words: str
+    size: float
+    colour: str
+    angle: float = 0.0
+
+
+class Circle(NamedTuple):
+    """A circle."""
+
+    layer: str
+    centre: np.ndarray
+    radius: float
+    width: float = 0.0
+    stroke: str = ""
+    fill: str = ""
+
+
+def view_of(bounds: Sequence[float], width: int, times: int = 1, has_arrows: bool = False) -> View:
+    """Return the view of a picture that contains `bounds` (left, bottom, right, top, in m), enlarged by `times`.
+
+    With `has_arrows` the margin has room for the arrow of the usual force.
+    """
+    left, bottom, right, top = bounds
+    margin = min(MARGIN + ARROW, 0.24 * width) if has_arrows else min(MARGIN, 0.12 * width)
+    height = int(np.clip((width - 2 * margin) / (right - left) * (top - bottom) + 2 * margin, 0.25 * width, 1.25 * width))
+    scale = times * min((width - 2 * margin) / (right - left), (height - 2 * margin) / (top - bottom))
+    pt = times * float(np.clip(min(width, height) / POINT, 0.75, 1.5))
+    wide, high = times * width, times * height
+    return View(scale, wide / 2 - scale * (left + right) / 2, high / 2 + scale * (bottom + top) / 2, wide, high, pt)
+
+
+def mix(first: str, second: str, t: float) -> str:
+    """Return a mixture of two colours, from the first (t = 0) to the second (t = 1)."""
+    channels = [[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in (first, second)]
+    return "#" + "".join(f"{round(a * (1 - t) + b * t):02x}" for a, b in zip(*channels, strict=True))
+
+
+class Sketch:
+    """The paths and symbols of a mechanism's marks at one pose, from back to front."""
+
+    def __init__(
+        self,
+        marks: Sequence[Mark],
+        pose: Float[np.ndarray, "bodies 3"],
+        view: View,
+        theme: str = "light",
+        paths: Sequence[TracedPath] = (),
+        arrows: Sequence[ForceArrow] = (),
+        stuck: Sequence[Sequence[float]] = (),
+    ):
+        self.pose, self.view, self.theme = pose, view, THEMES[theme]
+        symbols = symbols_of(marks, view.pt / view.scale)
+        self.shapes: list[Line | Circle | Text] = [*map(self._path, paths), *map(self._shape, symbols)]
+        for body, x, y in stuck:
+            ring = self.anchor(body, x, y), STUCK[0] * view.pt, STUCK[1] * view.pt, self.theme["force"]
+            self.shapes.append(Circle("sticking", *ring))
+        for arrow in arrows:
+            self.shapes += self._arrow(arrow)
+
+    def _path(self, path: TracedPath) -> Line:
+        points = np.array([self.view.x, self.view.y]) + self.view.scale * path.points * [1, -1]
+        colour = mix(self._colour(f"edge:{path.body}"), self.theme["back"], PATH_TINT)
+        return Line("path", points, PATH_WIDTH * self.view.pt, colour)
+
+    def _arrow(self, arrow: ForceArrow) -> list[Line]:
+        """Return the shaft and the head of an arrow; empty if it is too short to be seen."""
+        force, pt = np.array(arrow.force), self.view.pt
+        size = float(np.hypot(*force))
+        length = ARROW * pt * min(size, LONGEST_ARROW)
+        if length <= HEAD * pt:
+            return []
+        direction, start = force / size * [1, -1], self.anchor(arrow.body, *arrow.at)
+        tip, side = start + length * direction, np.array([-direction[1], direction[0]])
+        back = tip - HEAD * pt * np.cos(HEAD_ANGLE) * direction
+        colour = mix(self.theme["force"], self.theme["back"], 0.0 if arrow.unique else NOT_UNIQUE_TINT)
+        wing = HEAD * pt * np.sin(HEAD_ANGLE) * side
+        shaft = Line("reaction", np.array([start, back]), ARROW_WIDTH * pt, colour)
+        return [shaft, Line("reaction", np.array([tip, back + wing, back - wing]), fill=colour, closed=True)]
+
+    def _shape(self, symbol: Symbol) -> Line | Circle:
+        look = symbol["width"] * self.view.pt, self._colour(symbol["stroke"]), self._colour(symbol["fill"])
+        origin, axis, scale = self._frame(symbol["frame"])
+        if "radius" in symbol:
+            metres, units, least = symbol["radius"]
+            radius = max(self.view.scale * metres + self.view.pt * units, self.view.pt * least)
+            return Circle(symbol["layer"], origin, radius, *look)
+        points = np.array(symbol["points"], float)
+        local = scale * points[:, :2] + (self.view.pt * points[:, 2:] if points.shape[1] > 2 else 0.0)
+        return Line(symbol["layer"], origin + local @ np.array([axis * [1, -1], -axis[::-1]]), *look, symbol["closed"])
+
+    def _frame(self, frame: list) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the origin of a frame (px), the cosine and sine of the angle of its x axis, and its unit of length (px)."""
+        if len(frame) == 2:
+            start, end = (self.anchor(*anchor) for anchor in frame)
+            axis = (end - start) * [1, -1]
+            length = float(np.hypot(*axis))
+            return start, axis / (length or 1.0), length
+        body, x, y, angle, turns = frame
+        angle += self.pose[body][2] if turns and body >= 0 else 0.0
+        return self.anchor(body, x, y), np.array([np.cos(angle), np.sin(angle)]), self.view.scale
+
+    def anchor(self, body: float, x: float, y: float) -> np.ndarray:
+        """Return the place (px) of a point (m) of a body."""
+        place = to_ground((x, y), (np.zeros(3) if body < 0 else self.pose[int(body)])[None])[0]
+        return np.array([self.view.x, self.view.y]) + self.view.scale * place * [1, -1]
+
+    def _colour(self, name: str) -> str:
+        kind, _, body = name.partition(":")
+        if not body:
+            return self.theme[name] if name else ""
+        edge = self.theme["soft"] if int(body) < 0 else self.theme["bodies"][int(body) % len(self.theme["bodies"])]
+        tint = mix(edge, self.theme["back"], self.theme["tint"])
+        return {"edge": edge, "tint": tint, "spoke": mix(edge, tint, 0.25)}[kind]

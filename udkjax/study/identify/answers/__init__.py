@@ -1,0 +1,1 @@
+"""Answers of an identification: the estimate, its uncertainty, checks of gradients, and the design of further experiments."""

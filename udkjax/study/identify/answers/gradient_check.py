@@ -1,0 +1,385 @@
+"""Check of the derivatives that identification uses against finite differences.
+
+With y(z) the values predicted with the unknowns z, J d is compared with differences of y along directions d: each unknown by
+itself, and some random combinations of all, unless directions are given. Second derivatives of y along d are compared with
+differences of J d. Each evaluation closes the mechanism again. The integration error of J is estimated by its change at another
+tolerance. The floor up to which J d and differences can agree is the sum of this error and the errors of differences, noise and
+truncation (see `differences`), at the step where these are smallest. It does not depend on the discrepancy: if the discrepancy
+exceeds the floor, the derivative is wrong, or does not exist.
+
+Along a chaotic motion even the smallest step leads to an entirely different motion, which cannot be compared. Steps are
+therefore excluded if h J d exceeds the values of a channel and the channel changes.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from udkjax.integrate.solution import CAUSES, Result
+from udkjax.printing import PrintedTable, html_table, text_table
+from udkjax.requirements import concrete_only
+from udkjax.scene.arguments import checked
+from udkjax.scene.mechanism import Mechanism
+from udkjax.study.differences import DIFFERENCE_STEPS, Differences, DifferenceSums, best_steps, leave_out_far_steps
+from udkjax.study.identify.problem import prediction
+from udkjax.study.identify.problem.directions import Directions, given_directions, usual_directions
+from udkjax.study.identify.problem.fit_problem import FitProblem, build_problem
+from udkjax.study.identify.problem.parameters import ParametersLike
+from udkjax.study.identify.problem.prediction import TIGHT_TOL, TolerancePair
+from udkjax.study.identify.problem.residuals import Residuals
+from udkjax.study.identify.problem.windows import BLOCK_BYTES
+from udkjax.study.identify.records.record_reader import Data
+from udkjax.study.identify.records.records import IdentificationError, label_prefixes
+from udkjax.wording import join_names
+
+AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
+# Steps with floors up to this factor above the smallest are used as well. Truncation is estimated from the next finer step, whose
+# noise is four times as large, so smaller truncation errors are unknown.
+ALIKE = 4.5
+USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which agreement is meaningful
+OTHER_TOL = 0.01, 10.0  # tolerances, relative to the given one, to estimate errors; the second is used if runs fail at the first
+SMALLEST_TOL = 1e-14  # below this, the step controller responds to rounding errors
+
+
+# The numbers (R,) of rows, the values (B, R) predicted with B sets of unknowns, and how their runs ended (B,).
+_Values: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class DisagreementPlace(NamedTuple):
+    """The time (s) at which a derivative and its difference (channel units per unit of z) disagree most."""
+
+    record: int
+    channel: str
+    time: float
+    derivative: float
+    difference: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GradientCheck:
+    """A comparison of derivatives with finite differences, in D directions of z and S series (a channel of a record each).
+
+    All sizes are root mean squares over the times of a series, in the channel's units per unit of z; NaN if runs failed. `print`
+    shows the series with the worst agreement for each direction.
+
+    Attributes:
+        title: the name of the mechanism.
+        names: names of the directions.
+        directions: the directions, of unit length.
+        series: record and channel of each series; `labels` are their names in messages, `units` the channels' units.
+        steps: steps of the differences.
+        discrepancy: discrepancy between derivatives and differences, by step.
+        noise, truncation: errors of the differences, by step.
+        derivative_error: errors of the derivatives.
+        size: root mean squares of the derivatives.
+        places: times of the worst disagreement (D, S).
+        tol: tolerances of the integration.
+        other_tol: tolerances at which errors were estimated.
+        order: 1 for derivatives, 2 for second derivatives along the directions, compared with differences of derivatives.
+    """
+
+    title: str
+    names: tuple[str, ...]
+    directions: Float[np.ndarray, "D K"]
+    series: tuple[tuple[int, str], ...]
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    steps: Float[np.ndarray, "H"]
+    discrepancy: Float[np.ndarray, "D S H"]
+    noise: Float[np.ndarray, "D S H"]
+    truncation: Float[np.ndarray, "D S H"]
+    derivative_error: Float[np.ndarray, "D S"]
+    size: Float[np.ndarray, "D S"]
+    places: tuple[tuple[DisagreementPlace, ...], ...]
+    tol: TolerancePair
+    other_tol: TolerancePair
+    order: int = 1
+
+    @property
+    def ok(self) -> bool:
+        """True if derivatives and differences agree in all directions and series."""
+        return bool(self.agrees.all())
+
+    @property
+    def agrees(self) -> Bool[np.ndarray, "D S"]:
+        """True for each direction and series if the discrepancy is at most `AGREEMENT` floors."""
+        return self.ratio <= AGREEMENT
+
+    @cached_property
+    def best(self) -> Int[np.ndarray, "D S"]:
+        """Index of the step with the most accurate differences; -1 if all failed."""
+        return best_steps(self.noise + self.truncation)
+
+    def at_best(self, values: Float[np.ndarray, "D S H"]) -> Float[np.ndarray, "D S"]:
+        """Return the values at the best step."""
+        best_values = np.take_along_axis(values, np.maximum(self.best, 0)[..., None], -1)[..., 0]
+        return np.where(self.best < 0, np.nan, best_values)
+
+    @property
+    def step(self) -> Float[np.ndarray, "D S"]:
+        """The step with the most accurate differences."""
+        return self.at_best(np.broadcast_to(self.steps, self.noise.shape))
+
+    @property
+    def floor(self) -> Float[np.ndarray, "D S"]:
+        """The discrepancy that errors explain: noise, truncation, and the error of the derivative."""
+        return self.at_best(self.noise + self.truncation) + self.derivative_error
+
+    @property
+    def ratio(self) -> Float[np.ndarray, "D S"]:
+        """The least ratio of the discrepancy to the floor, of the steps that are about as accurate as the best; NaN if unknown.
+
+        A derivative that is wrong is wrong at all of these steps, while a difference may be off at one of them.
+        """
+        floors = self.noise + self.truncation + self.derivative_error[..., None]
+        alike = floors <= ALIKE * self.floor[..., None]
+        ratios = np.where(self.discrepancy == 0.0, 0.0, self.discrepancy / np.where(floors == 0.0, np.finfo(float).tiny, floors))
+        least = np.min(np.where(alike & ~np.isnan(ratios), ratios, np.inf), -1)
+        return np.where(np.isinf(least), self.at_best(ratios), least)
+
+    @property
+    def worst(self) -> Int[np.ndarray, "D"]:
+        """Index of the series with the worst agreement, for each direction."""
+        return np.nan_to_num(self.ratio, nan=np.inf).argmax(1)
+
+    @property
+    def message(self) -> str:
+        """Remarks on the check, one sentence per line."""
+        kind = "second derivatives" if self.order == 2 else "derivatives"
+        return "\n".join(_sentences(self)) or f"{kind} agree with finite differences, to within the errors of both"
+
+    def __str__(self) -> str:
+        return text_table(table := _table(self), len(table.rows))
+
+    def _repr_html_(self) -> str:
+        return html_table(_table(self))
+
+    def __repr__(self) -> str:
+        return f"GradientCheck(ok={self.ok}, {len(self.names)} directions, {len(self.series)} series)"
+
+
+@checked
+@concrete_only()
+def check_gradients(
+    mechanism: Mechanism,
+    data: Data,
+    parameters: ParametersLike,
+    *,
+    tol: float = TIGHT_TOL,
+    ignore: Sequence[str] = (),
+    seed: int = 0,
+    order: Literal[1, 2] = 1,
+    directions: Directions | None = None,
+    **settings: Any,
+) -> GradientCheck:
+    """Compare the derivatives that `identify` uses with finite differences, at the first guess of the parameters.
+
+    The directions are each unknown by itself, so that each entry of the Jacobian is compared, and some random combinations; in
+    each direction, the mechanism is closed and simulated forty times. Of second order, the second derivative of the predicted
+    values along each direction is compared with differences of the first one: d^T H d with the Hessian H of each value. Memory
+    holds a block of rows of the Jacobian, however long the records are. For the same check at an estimate, see
+    `Estimate.check_gradients`.
+
+    Args:
+        mechanism: mechanism with the first guesses.
+        data: records, as for `identify`; only times, names of channels and initial states are used.
+        parameters: parameters, as for `identify`.
+        tol: tolerance of the integration, relative and absolute.
+        ignore: columns of tables that are not read.
+        seed: seed of the random directions.
+        order: 1 for first derivatives, 2 for second ones.
+        directions: other directions by name, each the changes of unknowns by their names, in the units of these; other unknowns
+            do not change. The sizes of directions do not matter.
+        settings: further arguments of `simulate`.
+
+    Returns:
+        The comparison; `ok` is True if all derivatives agree, and `print` shows a table.
+
+    Raises:
+        IdentificationError: as for `identify`, the motion cannot be simulated to its end, or a direction names no unknown, or
+            changes none.
+    """
+    problem, tol = build_problem(mechanism, data, parameters, settings, ignore=ignore, seed=seed), float(tol)
+    return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed, order, directions)
+
+
+def compare_gradients(
+    problem: FitProblem,
+    z: Float[np.ndarray, "K"],
+    tol: TolerancePair,
+    seed: int = 0,
+    order: int = 1,
+    directions: Directions | None = None,
+) -> GradientCheck:
+    """Compare the derivatives of a problem at z with finite differences, at given tolerances of the integration."""
+    names, d = usual_directions(problem, seed) if directions is None else given_directions(problem, z, directions)
+    tol = _completed_tol(problem, z, [tol])
+    smaller, larger = ((max(factor * tol[0], SMALLEST_TOL), max(factor * tol[1], SMALLEST_TOL)) for factor in OTHER_TOL)
+    tols = tol, _completed_tol(problem, z, [smaller, larger] if smaller[0] < tol[0] and smaller[1] < tol[1] else [larger])
+    series, errors, found = problem.series(), [], list[Differences]()
+    together = max(1, int(BLOCK_BYTES // (8 * len(tols) * len(problem.index))))
+    for first in range(0, len(d), together):
+        some = d[first : first + together]
+        for along, slopes in zip(some, (_slopes if order == 1 else _curvatures)(problem, z, some, tols), strict=True):
+            found.append(_compare(problem, z, along, slopes[0], tols, series, order))
+            errors.append([np.sqrt(np.mean((slopes[0, rows] - slopes[1, rows]) ** 2)) for rows in series])
+    keys = [(int(problem.index[p[0], 0]), problem.channels[problem.index[p[0], 2]]) for p in series]
+    return GradientCheck(
+        title=problem.mechanism.name or "mechanism",
+        names=names,
+        directions=d,
+        series=tuple((k, channel.name) for k, channel in keys),
+        labels=tuple(label_prefixes(problem.records)[k] + channel.name for k, channel in keys),
+        units=tuple(channel.units for _, channel in keys),
+        steps=found[0].steps,
+        discrepancy=np.stack([f.discrepancy.T for f in found]),
+        noise=np.stack([f.noise.T for f in found]),
+        truncation=np.stack([f.truncation.T for f in found]),
+        derivative_error=np.array(errors),
+        size=np.stack([f.derivative_size for f in found]),
+        places=tuple(_places(problem, f) for f in found),
+        tol=tol,
+        other_tol=tols[1],
+        order=order,
+    )
+
+
+def _completed_tol(problem: FitProblem, z: Float[np.ndarray, "K"], tols: Sequence[TolerancePair]) -> TolerancePair:
+    """Return the first of the tolerances at which all runs are completed."""
+    code = Result.successful
+    for tol in tols:
+        found = [(int(block.code[0]), np.isfinite(block.r[0]).all()) for block in problem.row_blocks(z[None], tol)]
+        code = Result(max(code for code, _ in found))
+        if code == Result.successful and all(finite for _, finite in found):
+            return tol
+    cause = "some channels are NaN" if code == Result.successful else CAUSES[code]
+    raise IdentificationError([f"there are no derivatives to check: {cause}"])
+
+
+def _slopes(
+    problem: FitProblem, z: Float[np.ndarray, "K"], directions: Float[np.ndarray, "D K"], tols: Sequence[TolerancePair]
+) -> Float[np.ndarray, "D tols R"]:
+    """Return J d for some directions, at each of the tolerances, in the units of channels."""
+    slopes = np.zeros((len(directions), len(tols), len(problem.index)))
+    for k, tol in enumerate(tols):
+        for block in problem.row_blocks(z[None], tol):
+            rows = block.row_numbers[block.row_numbers < len(problem.index)]
+            slopes[:, k, rows] = directions @ (problem.sigma[rows, None] * block.J[0, : len(rows)]).T
+    return slopes
+
+
+def _curvatures(
+    problem: FitProblem, z: Float[np.ndarray, "K"], directions: Float[np.ndarray, "D K"], tols: Sequence[TolerancePair]
+) -> Float[np.ndarray, "D tols R"]:
+    """Return the second derivatives of the predicted values along some directions, in the units of channels."""
+    return np.stack([[problem.second_derivatives(z, d, tol) for tol in tols] for d in directions])
+
+
+def _compare(
+    problem: FitProblem,
+    z: Float[np.ndarray, "K"],
+    d: Float[np.ndarray, "K"],
+    slopes: Float[np.ndarray, "R"],
+    tols: Sequence[TolerancePair],
+    series: Sequence[np.ndarray],
+    order: int,
+) -> Differences:
+    """Compare derivatives along a direction with differences, in blocks of rows."""
+    along = d if order == 2 else None
+    series_of = np.full(len(problem.index), -1)
+    series_of[np.concatenate(series)] = np.repeat(np.arange(len(series)), [len(rows) for rows in series])
+    points = z + np.concatenate([DIFFERENCE_STEPS, -DIFFERENCE_STEPS])[:, None] * d
+    # Batches small enough to be computed one by one, since a program with vector lanes would have to be compiled.
+    most = min(problem.sets_together, max(1, (prediction.FEWEST_IN_LANES - 1) // len(problem.columns)))
+    size = max(n for n in range(1, len(points) + 1) if len(points) % n == 0 and n <= most)
+    batches = [points[k : k + size] for k in range(0, len(points), size)]
+    sums, failed = DifferenceSums(len(series)), np.zeros((len(tols), len(points)), bool)
+    for blocks in zip(*(_values(problem, batch, tol, along) for tol in tols for batch in batches), strict=True):
+        rows = blocks[0][0]
+        used = series_of[rows] >= 0
+        y, code = (np.concatenate(x).reshape(len(tols), len(points), -1) for x in list(zip(*blocks, strict=True))[1:])
+        failed |= (code != Result.successful).any(2)
+        y = y[:, :, used].reshape(len(tols), 2, len(DIFFERENCE_STEPS), -1).swapaxes(1, 2)
+        sums.add(y[0], y[0] - y[1], series_of[rows[used]], slopes[rows[used]], rows[used])
+    return leave_out_far_steps(sums.differences(failed.any(0).reshape(2, -1).T))
+
+
+def _values(
+    problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair, along: Float[np.ndarray, "K"] | None
+) -> Iterator[_Values]:
+    """Iterate over blocks of rows: their numbers, the predicted values of channels in their units, and how runs ended.
+
+    If a direction is given, the derivatives along it take the place of the values. Derivatives, which are computed in any case,
+    are dropped at once: several such iterators are suspended together.
+    """
+
+    def values(block: Residuals) -> _Values:
+        rows = block.row_numbers[block.row_numbers < len(problem.index)]
+        if along is not None:
+            return rows, (block.J[:, : len(rows)] @ along) * problem.sigma[rows], block.code
+        return rows, block.r[:, : len(rows)] * problem.sigma[rows] + problem.measured[rows], block.code
+
+    return map(values, problem.row_blocks(z, tol))
+
+
+def _places(problem: FitProblem, computed: Differences) -> tuple[DisagreementPlace, ...]:
+    best, places = best_steps((computed.noise + computed.truncation).T), []
+    for row, derivative, difference in np.take_along_axis(computed.worst, best[None, :, None], 0)[0].tolist():
+        record, time, channel = problem.index[int(row)]
+        where = int(record), problem.channel_names[channel], float(problem.ts[record, time])
+        places.append(DisagreementPlace(*where, derivative, difference))
+    return tuple(places)
+
+
+# --- text
+
+
+def _sentences(check: GradientCheck) -> list[str]:
+    directions: dict[str, list[str]] = {}
+    for d, (name, s) in enumerate(zip(check.names, check.worst, strict=True)):
+        if sentence := _sentence(check, d, s):
+            directions.setdefault(sentence, []).append(name)
+    count = len(check.names)
+    return [f"{'all directions' if len(names) == count > 1 else join_names(names)}: {text}" for text, names in directions.items()]
+
+
+def _sentence(check: GradientCheck, d: int, s: int) -> str:
+    """Return a sentence about a problem in a direction and a series; empty if there is no problem."""
+    floor, size = check.floor[d, s], check.size[d, s]
+    if np.isnan(check.noise[d, s]).all():
+        return "cannot be compared, since runs with nearby values fail"
+    if check.best[d, s] < 0:
+        return "cannot be compared, since differences do not converge: the motion jumps, or is too sensitive"
+    if not check.agrees[d, s]:
+        place, times = check.places[d][s], check.ratio[d, s]
+        of = f" of {check.labels[s]}" if len(check.series) > 1 else ""
+        kind = "second derivative" if check.order == 2 else "derivative"
+        values = f"the {kind} is {place.derivative:.6g}, by differences {place.difference:.6g}"
+        remark = f": {times:.2g} times the discrepancy that the errors of both explain" if np.isfinite(times) else ""
+        return f"at t = {place.time:.6g} s{of} {values}{remark}"
+    if floor > size:
+        return f"the derivative is smaller than the accuracy of differences, {floor:.1g} {check.units[s]}".rstrip()
+    if floor > USEFUL_PRECISION * size:
+        return f"differences are accurate to {floor / size:.0%} only; a smaller tolerance makes them more accurate"
+    return ""
+
+
+def _table(check: GradientCheck) -> PrintedTable:
+    several = len(check.series) > 1
+    where = ["worst in"] if several else []
+    cells, heads = [], ("direction", *where, "size", "differs by", "noise", "truncation", "its error", "step", "")
+    errors = [check.at_best(x) for x in (check.discrepancy, check.noise, check.truncation)]
+    for d, (name, s) in enumerate(zip(check.names, check.worst, strict=True)):
+        size = check.size[d, s]
+        scale = np.fmax(size, errors[0][d, s]) or 1.0  # a zero derivative differs by the whole difference
+        relative = [f"{values[d, s] / scale:.1e}" for values in (*errors, check.derivative_error)]
+        verdict = "agrees" if check.agrees[d, s] else "unknown" if check.best[d, s] < 0 else "DIFFERS"
+        where = [check.labels[s]] if several else []
+        cells.append((name, *where, f"{size:.3g} {check.units[s]}".rstrip(), *relative, f"{check.step[d, s]:.0e}", verdict))
+    kind = "second derivatives" if check.order == 2 else "derivatives"
+    title = f"{check.title}: {kind} against finite differences, at a tolerance of {check.tol[0]:.1g}"
+    return PrintedTable(title, cells, heads, check.message.splitlines())

@@ -1,0 +1,48 @@
+"""Directions along which derivatives are compared with differences: vectors of unit length in the space of all unknowns."""
+
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.study.identify.problem.fit_problem import FitProblem
+from udkjax.study.identify.records.records import IdentificationError
+from udkjax.wording import quote, suggestion
+
+RANDOM_DIRECTIONS = 3  # number of directions in which all unknowns change
+Directions: TypeAlias = Mapping[str, Mapping[str, float]]  # changes of unknowns by name, by the name of the direction
+
+
+def usual_directions(problem: FitProblem, seed: int) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
+    """Return each unknown by itself, and some random combinations of all."""
+    names = problem.all_names[: problem.K - problem.constrained]
+    random = np.random.default_rng(int(seed)).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
+    directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
+    return (*names, *(f"random direction {k + 1}" for k in range(len(random)))), directions
+
+
+def given_directions(
+    problem: FitProblem, z: Float[np.ndarray, "K"], given: Directions
+) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
+    """Return directions of unit length from changes of unknowns in their units, by names."""
+    P, problems = len(problem.unknowns.names), []
+    per_unit = np.ones(problem.K)  # dz over the change of an unknown
+    per_unit[:P] = 1 / problem.unknowns.dx_dz(z[:P])
+    directions = np.zeros((len(given), problem.K))
+    for row, (name, changes) in zip(directions, given.items(), strict=True):
+        unknown = [key for key in changes if key not in problem.all_names]
+        problems += [f"directions: {quote(name)}: no unknown {quote(key)}{suggestion(key, problem.all_names)}" for key in unknown]
+        for key in changes.keys() - set(unknown):
+            k = problem.all_names.index(key)
+            row[k] = float(changes[key]) * per_unit[k]
+        size = np.linalg.norm(row)
+        if not unknown and not (np.isfinite(size) and size > 0):
+            problems.append(f"directions: {quote(name)} must change an unknown by a finite number")
+        else:
+            row /= size or 1.0
+    if not given:
+        problems.append("directions: there are none")
+    if problems:
+        raise IdentificationError(problems)
+    return tuple(given), directions
