@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from functools import partial
 from types import MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
@@ -96,6 +97,11 @@ def _unpacked(words: Float[Array, "N"], kinds: Sequence[tuple[tuple[int, ...], n
         jax.lax.bitcast_convert_type(part, np.int64 if kind == np.bool_ else kind).astype(kind).reshape(shape)
         for part, (shape, kind) in parts
     ]
+
+
+def fractions(text: str) -> Float[np.ndarray, "n"]:
+    """Return numbers that are written as fractions with spaces between them, such as "1/6 4/15 1"."""
+    return np.array([float(Fraction(x)) for x in text.split()])
 
 
 def make_module(cls: type[Module], **fields: Any) -> Module:

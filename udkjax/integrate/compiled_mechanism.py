@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations.laws.abstract_system import AbstractSystem
-from udkjax.equations.laws.formulations import Formulation, WrappedSystem
+from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.rows.analysis import Analysis
@@ -100,7 +100,7 @@ class CompiledMechanism:
     @cached_property
     def textbook(self) -> Any:
         """The equations, without the formulation that may contain them."""
-        return textbook_of(self.equations)
+        return self.equations.textbook
 
 
 def compile_mechanism(
@@ -133,7 +133,7 @@ def compile_mechanism(
         why = _reason_for_diffrax(equations, solver, adjoint, meter, stepper)
     if not why:
         operation = _run_operation(equations, solver, projected, breakpoints)
-        textbook = textbook_of(equations)
+        textbook = equations.textbook
         most_rank = len(textbook.scales.rows) - len(textbook.redundant or ())
         rows = most_rank if eliminates(textbook.method) else len(textbook.scales.rows)
         why = _reason_for_programs(operation.code)
@@ -187,14 +187,14 @@ def _reason_for_diffrax(
         return f"{type(solver).__name__} is not a Runge-Kutta method with one tableau, explicit or singly diagonally implicit"
     if equations.solves_constraints and not is_explicit(solver):
         return f"it partitions coordinates with explicit methods only, and {type(solver).__name__} is implicit"
-    if equations.solves_constraints and rolling_joints(getattr(textbook_of(equations), "mechanism", None)):
+    if equations.solves_constraints and rolling_joints(getattr(equations.textbook, "mechanism", None)):
         return "it does not partition the coordinates of mechanisms with rolling joints"
     return _reason_for_equations(equations)
 
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
     """Return why machine code cannot evaluate such equations, whatever the scene; empty if it can."""
-    plain, formulation = textbook_of(equations), formulation_of(equations)
+    plain, formulation = equations.textbook, formulation_of(equations)
     if plain.programs is None and jax.config.jax_enable_x64:
         return f"it does not know {type(plain).__name__}"
     if isinstance(plain, TextbookEquations) and plain.rubs:
@@ -224,11 +224,6 @@ def _reason_for_programs(code: RunPrograms) -> str:
     return f"{code.owner} uses {missing}, which is not arithmetic on numbers" if missing else ""
 
 
-def textbook_of(equations: AbstractSystem) -> Any:
-    """Return the equations of a mechanism or a user-defined system, without the formulation that may contain them."""
-    return equations.equations if isinstance(equations, WrappedSystem) else equations
-
-
 def formulation_of(equations: AbstractSystem) -> Formulation | None:
     """Return the formulation that contains equations; None for the Udwadia-Kalaba equation."""
     return getattr(equations, "formulation", None)  # a field of the equations that formulations wrap
@@ -240,7 +235,7 @@ def eliminates(method: Pseudoinverse) -> bool:
 
 
 def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, breakpoints: Float[Array, "k"] | None) -> RunStates:
-    textbook = textbook_of(equations)
+    textbook = equations.textbook
     mechanism = textbook.mechanism
     return RunStates(
         code=textbook.programs,
@@ -255,13 +250,13 @@ def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, brea
 
 def _method_code(equations: AbstractSystem) -> MethodCode:
     """Return the machine code of the method and the formulation of equations."""
-    return MethodCode.of(textbook_of(equations).method, formulation_of(equations))
+    return MethodCode.of(equations.textbook.method, formulation_of(equations))
 
 
 def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
     """Return the operation that evaluates equations at single states; None if there is no machine code for them."""
     if not equations.constrained or equations.solves_constraints or _reason_for_equations(equations):
         return None
-    inner = textbook_of(equations)
+    inner = equations.textbook
     operation = Accelerate(inner.programs, *_method_code(equations))
     return None if _reason_for_programs(operation.code) else operation

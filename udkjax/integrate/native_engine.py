@@ -13,7 +13,7 @@ from jaxtyping import Array
 from udkjax.equations.laws.abstract_system import AbstractSystem
 from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.terms.structure import numbers_as_vector
-from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, formulation_of, textbook_of
+from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, formulation_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.module.steps import Status
 from udkjax.native.operations import MarkRows
@@ -179,7 +179,7 @@ class SceneInputs(NamedTuple):
 
 def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
     """Return the inputs that follow from equations; `mechanism` has the numbers, without samples or at a given time."""
-    textbook = textbook_of(equations)
+    textbook = equations.textbook
     method: Any = textbook.method
     rank_tol = method.rank_tol
     # Derivatives of all methods are computed by elimination, whose thresholds are relative.

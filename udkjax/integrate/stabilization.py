@@ -73,10 +73,7 @@ class ConstraintState(eqx.Module):
         rows = A[:count]
         if not len(rows):
             return jnp.zeros_like(self.q)
-        inner: Any = self.equations
-        while isinstance(inner, WrappedSystem):
-            inner = inner.equations
-        scales = getattr(inner, "scales", None)
+        scales = getattr(self.equations.textbook, "scales", None)
         weights = jnp.ones(len(rows)) if scales is None or len(scales.rows) < len(rows) else scales.weights[: len(rows)]
         tol = RANK_TOL if scales is None else scales.rank_tol
         L = jnp.linalg.cholesky(M)

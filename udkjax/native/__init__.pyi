@@ -17,7 +17,6 @@ from udkjax.native.module.steps import SMALLEST_STEP as SMALLEST_STEP
 from udkjax.native.module.steps import Status as Status
 from udkjax.native.module.tableau import DOPRI8 as DOPRI8
 from udkjax.native.module.tableau import Method as Method
-from udkjax.native.module.tableau import row as row
 from udkjax.native.operations import Accelerate as Accelerate
 from udkjax.native.operations import EvaluateEvents as EvaluateEvents
 from udkjax.native.operations import MarkRows as MarkRows

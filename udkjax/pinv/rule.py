@@ -5,7 +5,6 @@ order, forward or reverse, follow from these. No factorization is ever different
 """
 
 from abc import abstractmethod
-from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.arrays import number_called
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.printing import PrintsLine
 from udkjax.programs.varying_axes import result_type
@@ -44,18 +44,7 @@ class LeastSquaresSolution(NamedTuple):
     rank: Int[Array, ""]
 
 
-def number(value: NumberLike | None) -> Float[Array, ""] | None:
-    """Convert a number to an array leaf: a Python float as a field would be static and recompile for each new value."""
-    dtype = jnp.result_type(float)
-    if isinstance(value, float | int | np.number):
-        value = np.asarray(value, dtype)  # JAX would compile a program to convert it
-    context = nullcontext() if isinstance(value, jax.core.Tracer) else jax.ensure_compile_time_eval()  # concrete also in a trace
-    try:
-        with context:
-            return None if value is None else jnp.asarray(value, dtype=dtype)
-    except (TypeError, ValueError):
-        what = "a string" if isinstance(value, str) else f"an object of type {type(value).__name__}"
-        raise TypeError(f"a threshold (rank_tol, or branch_tol of Auto) must be one number or None, not {what}") from None
+number = number_called("a threshold (rank_tol, or branch_tol of Auto)", optional=True)
 
 
 class Pseudoinverse(PrintsLine):

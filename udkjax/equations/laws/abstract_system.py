@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from types import SimpleNamespace
-from typing import ClassVar, NamedTuple, Protocol, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -61,6 +61,11 @@ class AbstractSystem(eqx.Module):
     @abstractmethod
     def constrained(self) -> bool:
         """True if there are any constraints."""
+
+    @property
+    def textbook(self) -> Any:
+        """The equations of the mechanism or user-defined system itself, without what wraps them."""
+        return self
 
     @property
     def programs(self) -> RunPrograms | None:

@@ -9,6 +9,7 @@ assumptions, and some of them fail.
 """
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -161,6 +162,10 @@ class WrappedSystem(AbstractSystem):
     """
 
     equations: eqx.AbstractVar[AbstractSystem]
+
+    @property
+    def textbook(self) -> Any:
+        return self.equations.textbook
 
     def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         return self.equations.multipliers(t, q, v)

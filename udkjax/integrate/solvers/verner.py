@@ -9,21 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from udkjax.native.module.tableau import row
+from udkjax.arrays import fractions
 
 TABLEAU = diffrax.ButcherTableau(
-    c=row("1/6 4/15 2/3 5/6 1 1/15 1"),
+    c=fractions("1/6 4/15 2/3 5/6 1 1/15 1"),
     a_lower=(
-        row("1/6"),
-        row("4/75 16/75"),
-        row("5/6 -8/3 5/2"),
-        row("-165/64 55/6 -425/64 85/96"),
-        row("12/5 -8 4015/612 -11/36 88/255"),
-        row("-8263/15000 124/75 -643/680 -81/250 2484/10625 0"),
-        row("3501/1720 -300/43 297275/52632 -319/2322 24068/84065 0 3850/26703"),
+        fractions("1/6"),
+        fractions("4/75 16/75"),
+        fractions("5/6 -8/3 5/2"),
+        fractions("-165/64 55/6 -425/64 85/96"),
+        fractions("12/5 -8 4015/612 -11/36 88/255"),
+        fractions("-8263/15000 124/75 -643/680 -81/250 2484/10625 0"),
+        fractions("3501/1720 -300/43 297275/52632 -319/2322 24068/84065 0 3850/26703"),
     ),
-    b_sol=row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616"),
-    b_error=row("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616") - row("13/160 0 2375/5984 5/16 12/85 3/44 0 0"),
+    b_sol=fractions("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616"),
+    b_error=fractions("3/40 0 875/2244 23/72 264/1955 0 125/11592 43/616") - fractions("13/160 0 2375/5984 5/16 12/85 3/44 0 0"),
 )
 
 # Column m: coefficients of s^(m + 1). Among the weights b(s) of the eight stages that meet the conditions of order 4 at every s,
