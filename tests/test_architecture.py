@@ -1,5 +1,6 @@
 """The plan in the documentation shows the existing folders and imports."""
 
+import ast
 import importlib
 import sys
 from pathlib import Path
@@ -61,3 +62,37 @@ def test_of_a_circle_the_arrow_of_fewest_imports_points_up(tmp_path):
     )
     assert architecture.up(found.arrows("folder")) == [("scene", "equations")]
     assert found.floors == {"scene": 0, "equations": 1}
+
+
+# Rooms that import each other: the interface of a folder beside what it is made of.
+CIRCLES = (
+    "integrate integrate/causes integrate/events integrate/events/instant integrate/events/run",
+    "native native/gpu native/host",
+    "native/language native/language/elementary",
+    "scene scene/drawing scene/mjcf",
+    "study study/diagnosis",
+    "synthesis synthesis/complete",
+)
+MOST_MODULES = 16  # of a room, as many as one can keep in mind with what each is for
+LARGER = {"cli": 21}  # one module for each command
+
+
+def test_rooms_have_an_order(house):
+    found = [one for one in architecture.circles(house.arrows("room")) if len(one) > 1]
+    assert {frozenset(one) for one in found} <= {frozenset(names.split()) for names in CIRCLES}
+
+
+def test_rooms_are_small():
+    root = ROOT / "udkjax"
+    count = {
+        folder.relative_to(root).as_posix(): sum(file.name != "__init__.py" for file in folder.glob("*.py"))
+        for folder in root.rglob("*")
+        if folder.is_dir()
+    }
+    assert {name: n for name, n in count.items() if n > LARGER.get(name, MOST_MODULES)} == {}
+    assert LARGER.keys() <= count.keys()
+
+
+def test_rooms_say_what_lives_there():
+    texts = {folder: folder / "__init__.py" for folder in (ROOT / "udkjax").rglob("*") if any(folder.glob("*.py"))}
+    assert [folder for folder, file in texts.items() if not ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))] == []
