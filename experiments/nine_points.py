@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 
 from experiments.common import described, panels, tracked
 from experiments.parts.nine_point_monodromy import check, complex_numbers, loops, random_four_bar
-from udkjax.positions.following.path_tracking import ACCEPTED
 from udkjax.show.plots import COLOURS
 from udkjax.synthesis.complete.dyads import JOINTS, POINTS
 from udkjax.synthesis.complete.nine_points import CLASSES, CLOSE, STARTS, distinct, find_real_classes, start_solutions, tracker
+from udkjax.synthesis.complete.path_tracking import ACCEPTED
 
 SEEDS = 3
 SETS = 60  # of nine points, each coordinate normal

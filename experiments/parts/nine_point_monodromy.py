@@ -11,9 +11,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from udkjax.positions.following.path_tracking import ACCEPTED
 from udkjax.synthesis.complete.dyads import JOINTS, POINTS
 from udkjax.synthesis.complete.nine_points import CLASSES, CLOSE, class_keys, distinct, tracker, turns_of
+from udkjax.synthesis.complete.path_tracking import ACCEPTED
 
 
 def random_four_bar(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -84,12 +84,6 @@ from udkjax.positions.following.kinematics import Travel as Travel
 from udkjax.positions.following.kinematics import kinematics as kinematics
 from udkjax.positions.following.kinematics import motion_in_time as motion_in_time
 from udkjax.positions.following.kinematics import travel as travel
-from udkjax.positions.following.path_tracking import ACCEPTED as ACCEPTED
-from udkjax.positions.following.path_tracking import INFINITE as INFINITE
-from udkjax.positions.following.path_tracking import LOST as LOST
-from udkjax.positions.following.path_tracking import SINGULAR as SINGULAR
-from udkjax.positions.following.path_tracking import PathTracker as PathTracker
-from udkjax.positions.following.path_tracking import Precision as Precision
 from udkjax.positions.following.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.following.position_batch import PositionBatch as PositionBatch
 from udkjax.positions.following.position_batch import compile_programs as compile_programs

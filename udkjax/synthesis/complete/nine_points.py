@@ -16,11 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from udkjax.positions.following.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
 from udkjax.synthesis.complete.balls import LONG, Ball
 from udkjax.synthesis.complete.certificate import Certificate, certify
 from udkjax.synthesis.complete.dyads import JOINTS, POINTS, UNKNOWNS, Displacements, four_bar_system, newton_and_tangent
 from udkjax.synthesis.complete.four_bars import certainly_different
+from udkjax.synthesis.complete.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
 
 CLASSES = 1442
 STARTS = Path(__file__).with_name("nine_points.npz")
