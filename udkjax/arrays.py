@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import mlir
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import Numbers
@@ -130,7 +131,8 @@ def solve_each(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 class QuickMethods(eqx.Module):
     """A module whose methods are looked up in the same time however many numbers it has.
 
-    The methods are trees, as those of every Equinox module, but made without the check that visits all leaves each time.
+    Its methods are trees, as those of every Equinox module, so that `jax.jit(module.method)` traces its numbers; Equinox makes
+    them with a check that visits all leaves each time.
     """
 
     if not TYPE_CHECKING:
@@ -138,20 +140,13 @@ class QuickMethods(eqx.Module):
         def __getattribute__(self, name: str, /) -> Any:
             found = object.__getattribute__(self, name)
             if type(found) is MethodType and found.__self__ is self and not name.startswith("__"):
-                described = {key: getattr(found, key) for key in _DESCRIPTION if hasattr(found, key)}
-                method = object.__new__(_METHOD)
-                vars(method).update(described, __func__=found.__func__, __self__=self)
+                method = Partial(function := found.__func__, self)
+                vars(method).update({key: getattr(function, key) for key in _DESCRIPTION})
                 return method
             return found
 
 
-class _WithMethod(eqx.Module):
-    def method(self) -> None:
-        """Have the type of methods of Equinox modules, which is not public."""
-
-
-_METHOD: type[Any] = type(_WithMethod().method)
-_DESCRIPTION = tuple(vars(_WithMethod().method).keys() - {"__func__", "__self__"})  # as of `functools.wraps`
+_DESCRIPTION = "__doc__", "__name__", "__qualname__", "__module__"
 
 
 _FLOAT64, _FLOAT32 = np.dtype(np.float64), np.dtype(np.float32)
