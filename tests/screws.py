@@ -1,17 +1,18 @@
 """Screws and wedges with friction, and the only motion that their equations allow, by enumeration of the signs of all loads."""
 
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 import udkjax as udk
 
 G = 9.81
+Law = Literal["smooth", "set-valued"]
 GUIDES = ("turn", "guide", "thread")
 
 
-def screw(law: str = "set-valued", mass: float = 1.0, angle: float = 0.1, speed: float = 0.0, **more: Any) -> udk.Mechanism:
+def screw(law: Law = "set-valued", mass: float = 1.0, angle: float = 0.1, speed: float = 0.0, **more: Any) -> udk.Mechanism:
     """Return a screw that slides along x below a nut of 100 kg, which it lifts by a thread: a wedge.
 
     Args:

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from functools import cached_property
 from itertools import combinations
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,15 @@ STEP = 1e-4  # of differences, relative to a number
 
 class WrongError(Exception):
     """Two ways to one number differ."""
+
+
+class Accelerated(NamedTuple):
+    """A motion with its accelerations."""
+
+    ts: jax.Array
+    q: jax.Array
+    v: jax.Array
+    a: jax.Array
 
 
 class Case:
@@ -42,10 +50,10 @@ class Case:
         return self.run if self.events is None else udk.simulate(self.model, TS, self.state, **EXACT)
 
     @cached_property
-    def accelerated(self) -> SimpleNamespace:
+    def accelerated(self) -> Accelerated:
         """The run without events, with its accelerations."""
         a = [udk.accelerations(self.model, *at) for at in zip(TS, self.alone.q, self.alone.v, strict=True)]
-        return SimpleNamespace(ts=TS, q=self.alone.q, v=self.alone.v, a=np.stack(a).reshape(np.shape(self.alone.q)))
+        return Accelerated(jnp.asarray(TS), self.alone.q, self.alone.v, jnp.stack(a).reshape(self.alone.q.shape))
 
     @cached_property
     def reached(self) -> int:
@@ -212,8 +220,8 @@ def transformed(function: Function, tol: float = 1e-7, slope_tol: float = 1e-4) 
             agree([y[k] for y in found], eager[k], "eager calls (jit, vmap)", tol)
         wanted = [(b - a) / (2 * STEP) for a, b in zip(*eager[2:], strict=True)]
         # A relative change of 1 for a relative change of 1 is the scale of derivatives: less is rounding of the differences.
-        relative = [[1.0 + y / s for y, s in zip(ys, sizes, strict=True)] for ys in ([y[0] for y in slopes], wanted)]
-        agree(*relative, "differences (jvp)", slope_tol)
+        forward = [1.0 + y[0] / s for y, s in zip(slopes, sizes, strict=True)]
+        agree(forward, [1.0 + y / s for y, s in zip(wanted, sizes, strict=True)], "differences (jvp)", slope_tol)
         agree(jax.grad(total)(0.0), jax.jvp(total, (0.0,), (1.0,))[1], "forward mode (grad)", 1e-6)
         return "eager calls and differences"
 

@@ -125,8 +125,8 @@ def characteristics(case: Case) -> str:
     if not found.turns:
         agree(sorted(found.limits), sorted(ends), "travel", 1e-6)
     other = udk.characteristics(case.twin[0], case.driver)
-    wanted = [[x.extent for x in y.outputs.values()] + [y.turns, *y.ratios.values()] for y in (found, other)]
-    return agree(*wanted, f"travel, {case.twin[1]}", 1e-6)
+    numbers, wanted = ([x.extent for x in y.outputs.values()] + [y.turns, *y.ratios.values()] for y in (found, other))
+    return agree(numbers, wanted, f"travel, {case.twin[1]}", 1e-6)
 
 
 def instant_centres(case: Case) -> str:

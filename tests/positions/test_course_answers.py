@@ -123,7 +123,9 @@ def test_speeds_of_a_whitworth_quick_return_are_extreme_above_and_below_its_pin(
     slots = [{"pin": "A", "along": ["C", "A"], "on": "lever"}]
     mech = udk.Drawing(pins, links, ["O", "C"], slots=slots, motors=[{"pin": "O", "speed": 1.0}]).mechanism()
     found = udk.characteristics(mech)
-    slow, fast = found.outputs["lever"].speed_ratios
+    ratios = found.outputs["lever"].speed_ratios
+    assert ratios is not None
+    slow, fast = ratios
     assert_allclose([slow.ratio, fast.ratio], [r / (r + e), r / (r - e)], rtol=1e-12)
     assert_allclose(np.sin([slow.at[0], fast.at[0]]), [1.0, -1.0], rtol=1e-12)
     assert found.lines()["speed ratio of lever"] == "0.666667 at 90 deg to 2 at 270 deg"
@@ -136,7 +138,9 @@ def test_speed_of_a_slide_in_the_units_of_the_drawing():
     slots = [{"pin": "A", "direction": 90, "on": "yoke"}]
     given = {"slides": [{"link": "yoke", "direction": 0}], "slots": slots, "motors": [{"pin": "O", "speed": "60 rpm"}]}
     found = udk.characteristics(udk.Drawing(pins, links, ["O"], **given, units=MM).mechanism())
-    least, most = found.outputs["yoke"].speed_ratios
+    ratios = found.outputs["yoke"].speed_ratios
+    assert ratios is not None
+    least, most = ratios
     assert_allclose([least.ratio, most.ratio], [-0.05, 0.05], rtol=1e-12)
     assert_allclose(np.cos([*least.at, *most.at]), np.zeros(2), atol=1e-12)
     assert found.lines()["speed ratio of yoke"] == "-50 mm/rad at 90 deg to 50 mm/rad at 270 deg"

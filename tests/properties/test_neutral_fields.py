@@ -4,6 +4,8 @@ Compiled programs and results are found again by the form of a scene. If a key f
 such scenes would get the program of the first.
 """
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -28,17 +30,20 @@ def driven(**more):
     return udk.Mechanism(SLIDE, {"slide": joint}, {"drive": driver})
 
 
+def rubbing(**more: Any):
+    return udk.Friction("top", coefficient=0.2, radius=0.02, **more)
+
+
 def joined(joint):
     return udk.Mechanism(BODY | {"b": udk.Body(1.0, 0.1, [1.0, 0.5])}, PIN | {"j": joint})
 
 
-RUBS = {"joint": "top", "coefficient": 0.2, "radius": 0.02}
 # Without the field, with it, and its name.
 PAIRS = {
     "Spring.damping": lambda x: forced(udk.Spring(ENDS, POINTS, 50.0, 0.5, *x)),
     "TorsionSpring.damping": lambda x: forced(udk.TorsionSpring(ENDS, 5.0, *x)),
-    "Friction.static_coefficient": lambda x: forced(udk.Friction(**RUBS, **({"static_coefficient": 0.2} if x else {}))),
-    "Friction.viscous": lambda x: forced(udk.Friction(**RUBS, **({"viscous": 0.0} if x else {}))),
+    "Friction.static_coefficient": lambda x: forced(rubbing(**({"static_coefficient": 0.2} if x else {}))),
+    "Friction.viscous": lambda x: forced(rubbing(**({"viscous": 0.0} if x else {}))),
     "Driver.axis": lambda x: driven(**({"axis": 0.0} if x else {})),
     "Driver.points": lambda x: driven(points=[[0.0, 0.0], [0.0, 0.0]] if x else None),
     "Prismatic.angle": lambda x: joined(udk.Prismatic(["a", "b"], [[0.5, 0.5], [0.0, 0.0]], 0.7, *x)),
@@ -75,7 +80,7 @@ def test_a_neutral_field_changes_nothing(name):
 @pytest.mark.parametrize("order", [1, -1])
 def test_laws_of_friction_are_identified_one_after_the_other(order):
     """The laws have different numbers of `Friction`, and the fits the same unknown."""
-    laws = [forced(udk.Friction("top", torque=0.1, velocity=0.1)), forced(udk.Friction(**RUBS))]
+    laws = [forced(udk.Friction("top", torque=0.1, velocity=0.1)), forced(rubbing())]
     for mech in laws[::order]:
         run = udk.simulate(mech, TS, rtol=1e-10, atol=1e-10)
         data = {"time": TS, "body.a.angle": np.asarray(run.q)[:, 0, 2]}

@@ -6,6 +6,7 @@ program is repeated with the direction it found, from many guesses.
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.optimize import linprog
 import udkjax as udk
 
 ROUNDS = 40
+Vector = np.ndarray | tuple[np.ndarray, np.ndarray]  # columns of a force's components; of one component, with their factors
 
 
 class FreeBodies:
@@ -24,7 +26,7 @@ class FreeBodies:
         self.pose = {n: (np.asarray(b.position, float), float(b.angle)) for n, b in mechanism.bodies.items()}
         self.pose["ground"] = (np.zeros(2), 0.0)
         self.columns: list[np.ndarray] = []
-        self.limits: list[tuple[int, float, float, list[np.ndarray]]] = []  # friction: column, constant, factor, vectors
+        self.limits: list[tuple[int, float, float, Sequence[Vector]]] = []  # friction: column, constant, factor, vectors
         self.joint_columns: dict[str, Any] = {}
         for name, joint in mechanism.joints.items():
             self._joint(name, joint)
@@ -48,6 +50,7 @@ class FreeBodies:
                 point = self._place(force.body, np.asarray(force.point, float))
                 self.loads[3 * k : 3 * k + 3] += self._wrench(point, np.asarray(force.vector, float))
             elif isinstance(force, udk.Torque):
+                assert not isinstance(force.value, udk.Held)
                 self.loads += self._pair(force.bodies, np.zeros(2), np.zeros(2), float(force.value))
 
     def _place(self, body: str, point: np.ndarray) -> np.ndarray:

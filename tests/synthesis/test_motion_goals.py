@@ -129,7 +129,9 @@ def test_limits_and_speeds_of_goal_files_have_units():
         return goal_file._read_motion(0, udk.library.four_bar(), given, Units({"length": "mm"}), problems)
 
     found = read(kind="torque", most="2 N mm", least="1 N mm", speed="60 rpm")
-    np.testing.assert_allclose([found.most, found.least, found.speed], [2e-3, 1e-3, 2 * np.pi], rtol=1e-12)
-    np.testing.assert_allclose(read(kind="load", joint="A", most="3 kN").most, 3e3)
+    assert found is not None
+    assert (found.most, found.least, found.speed) == pytest.approx((2e-3, 1e-3, 2 * np.pi), rel=1e-12, abs=0.0)
+    force = read(kind="load", joint="A", most="3 kN")
+    assert force is not None and force.most == pytest.approx(3e3, rel=1e-12, abs=0.0)
     assert problems == []
     assert read(kind="torque", most="2 kg", speed="60 rpm") is None and "motion[0].most" in problems[0]

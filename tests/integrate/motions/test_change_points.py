@@ -37,8 +37,11 @@ def test_derivatives_pass_a_change_point_with_friction_by_load(sticks):
 
     def angle(x, size):
         other = {"sticks": udk.Friction("B1", coefficient=0.05, radius=0.3 * size[2], law="set-valued")} if sticks else {}
-        mech = parallelogram(*size[:4], 0.1 * x[0], **other).with_parameters({"body.coupler.mass": 0.7 * x[1]})
-        return udk.simulate(mech, jnp.array([0.0, 0.5, 1.0]) * size[4], rtol=1e-9, atol=1e-9, throw=False).q[-1, 0, 2]
+        length, spacing, radius, speed, end = size
+        mech = parallelogram(length, spacing, radius, speed, 0.1 * x[0], **other).with_parameters(
+            {"body.coupler.mass": 0.7 * x[1]}
+        )
+        return udk.simulate(mech, jnp.array([0.0, 0.5, 1.0]) * end, rtol=1e-9, atol=1e-9, throw=False).q[-1, 0, 2]
 
     one, step = jnp.ones(2), 1e-2
     shifts = jnp.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])

@@ -287,12 +287,15 @@ def test_references_are_followed_and_pins_are_compared_in_few_steps(monkeypatch)
             asked.append(1)
             return super().references
 
-    pins = {f"p{k}": CountedPin(f"p{k - 1}", 1.0, 0.1) for k in range(count, 0, -1)} | {"p0": pin_forms.Pin([0.0, 0.0])}
+    def pin(x: float) -> pin_forms.Pin:
+        return pin_forms.Pin(position=[x, 0.0])
+
+    pins = {f"p{k}": CountedPin(from_=f"p{k - 1}", length=1.0, angle=0.1) for k in range(count, 0, -1)} | {"p0": pin(0.0)}
     monkeypatch.setattr(np.linalg, "norm", lambda *given, **choices: asked.append(1) or norm(*given, **choices))
     assert pin_forms.in_order(pins) == [f"p{k}" for k in range(count + 1)]
-    row = {f"p{k}": pin_forms.Pin([float(k), 0.0]) for k in range(count)}
+    row = {f"p{k}": pin(float(k)) for k in range(count)}
     assert list(shape_mistakes(row, {})) == []
     assert len(asked) < 5 * count
-    found = list(shape_mistakes(row | {"far": pin_forms.Pin([1e6, 0.0]), "on": pin_forms.Pin([7.0 + 1e-7, 0.0])}, {}))
+    found = list(shape_mistakes(row | {"far": pin(1e6), "on": pin(7.0 + 1e-7)}, {}))
     assert ["pins.on: is at the same place as pin" in x for x in found] == [True, False]
     assert "pins.far: is 1e+06 m away from the other pins, which are within 399 m of each other" in found[1]

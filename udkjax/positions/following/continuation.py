@@ -102,9 +102,9 @@ _START, _LANDS, _TOGGLE, _VALUE = -1, -2, -3, -4
 
 def follow(
     curve: AbstractCurve,
-    s: Float[Array, ""],
-    q: Float[Array, "n"],
-    values: Float[Array, "T"],
+    s: Float[Array | np.ndarray, ""],
+    q: Float[Array | np.ndarray, "n"],
+    values: Float[Array | np.ndarray, "T"],
     points: Points,
     first: int | Int[Array, ""],
 ) -> Points:
@@ -120,9 +120,9 @@ def follow(
 
 def _follow(
     curve: AbstractCurve,
-    s: Float[Array, ""],
-    q: Float[Array, "n"],
-    values: Float[Array, "T"],
+    s: Float[Array | np.ndarray, ""],
+    q: Float[Array | np.ndarray, "n"],
+    values: Float[Array | np.ndarray, "T"],
     points: Points,
     first: int | Int[Array, ""],
 ) -> Points:

@@ -65,7 +65,7 @@ class Driven(NamedTuple):
         """The unit of s."""
         return "rad" if self.is_angle else "m" if self.name else "s"
 
-    def value(self, q: Float[Array, "n"] | Float[Array, "bodies 3"]) -> Float[Array, ""]:
+    def value(self, q: Float[Array | np.ndarray, "n"] | Float[Array | np.ndarray, "bodies 3"]) -> Float[Array, ""]:
         """Return the value of the coordinate (rad, m) in a position, by NumPy if all numbers are concrete."""
         if is_traced((self.mechanism, q)):
             return constraints.psi(self.mechanism, 0.0, q)[self.row]

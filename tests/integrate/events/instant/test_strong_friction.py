@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
-from tests.screws import GUIDES, accelerations, numbers_of, random_screw, screw
+from tests.screws import GUIDES, Law, accelerations, numbers_of, random_screw, screw
 
 SPAN = 1e-2
 # A nut of 981 N, a thread of 3.64 degrees and a coefficient of 0.15: of less than 0.54 kg, the screw cannot be lowered at rest.
@@ -21,7 +21,7 @@ def lifted(mass: float) -> dict[str, float]:
     return LIGHT | {"mass": mass, "push": 981.0 * np.tan(LIGHT["angle"] + np.arctan(LIGHT["thread"])) + 10.0}
 
 
-def speeds_of_screws(law: str, screws: list[dict[str, float]], speeds: np.ndarray) -> tuple[np.ndarray, ...]:
+def speeds_of_screws(law: Law, screws: list[dict[str, float]], speeds: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the last speeds and the codes of runs of screws, and their accelerations at the start."""
     scene = screw(law)
 
@@ -35,7 +35,7 @@ def speeds_of_screws(law: str, screws: list[dict[str, float]], speeds: np.ndarra
     return tuple(map(np.asarray, jax.jit(jax.vmap(run))(numbers_of(screws), speeds)))
 
 
-def check_screws(law: str, count: int) -> None:
+def check_screws(law: Law, count: int) -> None:
     random = np.random.default_rng(0)
     screws = [random_screw(random) for _ in range(count)]
     speeds = 10.0 * np.sign(random.uniform(-1, 1, count))
@@ -176,7 +176,7 @@ def test_a_redundant_linkage_goes_on_while_its_loads_of_least_norm_exist(law):
     scene = parallelogram(law)
     inertia, start = float(scene.bodies["bar"].inertia), [np.deg2rad(3.0), -7.2]
     ts = np.linspace(0.0, 5.5e-3, 4)
-    rate = lambda _, y: [y[1], acceleration_of_cranks(*y, inertia)]  # noqa: E731
+    rate = lambda _, y: [y[1], acceleration_of_cranks(y[0], y[1], inertia)]  # noqa: E731
     known = solve_ivp(rate, (ts[0], ts[-1]), start, "RK45", ts, rtol=1e-7, atol=1e-9).y
     run = udk.simulate(scene, ts, near_the_line(*start))
     assert np.rad2deg(known[0, -1]) < 0.75
