@@ -460,6 +460,30 @@ def test_a_joint_that_a_driver_holds_at_rest_sticks(engine):
     assert not turning.sticking["S"].any() and not turning.sticking["B"].any()  # at 0.5 s the slide turns round
 
 
+class SlowStart(udk.Motion):
+    """Begins to move with t^3; at its breakpoint the speed still counts as zero along a run, but no longer in a state."""
+
+    def __call__(self, t):
+        return t**3
+
+    @property
+    def breakpoints(self):
+        return [1e-5]
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_a_joint_that_a_driver_moves_slowly_slips_after_a_breakpoint(engine):
+    """A window that ends while the speed is still within the tolerance does not take the event away."""
+    slide = block(0.0, coefficient=0.3)
+    at_origin = [[0.0, 0.0], [0.0, 0.0]]
+    slide = udk.Mechanism(
+        slide.bodies, slide.joints, {"motor": udk.Driver(["ground", "block"], "x", SlowStart(), at_origin)}, slide.forces
+    )
+    run = udk.simulate(slide, [0.0, 0.05, 0.1], engine=engine)
+    assert run.sticking["S"].tolist() == [True, False, False]
+    assert [run.events.names[int(k)] for k in run.events.index] == ["S slips"]
+
+
 def test_joints_that_drivers_hold_stick_in_lanes():
     @jax.jit
     @jax.vmap

@@ -54,8 +54,9 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     watched, sign = plan.watched(state.phase, carried, xp)[:, :E], xp.sign(values.h).astype(int)
     is_late = size * take(system.rate, members)[:, None] <= RESOLUTION.late * state_values.rate * sides[:, :E]
     has_crossed = crosses(plan.both_directions[:E], sides[:, :E], sign)
-    keeps = watched & (has_crossed | is_late) & (event >= 0)[:, None] & ~plan.slides
-    known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale) & ~keeps
+    keeps = watched & (has_crossed | is_late) & (event >= 0)[:, None]
+    # The side of a joint's speed is that of its direction, until its event: it is zero below a larger bound (`zero_of`).
+    known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale) & ~keeps & ~plan.slides
     after = xp.where(known, sign, sides[:, :E])
     code = xp.where(take(runs.totals, members)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
     unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
