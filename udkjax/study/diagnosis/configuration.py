@@ -56,7 +56,7 @@ class Configuration:
     @property
     def largest(self) -> float:
         """The largest singular value."""
-        return float(self.sigma[0])
+        return float(np.max(self.sigma, initial=0.0))
 
     @cached_property
     def _vectors(self) -> tuple[np.ndarray, np.ndarray]:
