@@ -106,7 +106,7 @@ def _with_rule(function: Callable[..., list[Array]]) -> Callable[..., list[Array
     call = jax.custom_jvp(function)
 
     def derivative(xs: Sequence[Array], dxs: Sequence[Any]) -> tuple[list[Array], list[Array]]:
-        moves = [not isinstance(dx, SymbolicZero) and np.result_type(dx) != jax.dtypes.float0 for dx in dxs]
+        moves = [not isinstance(dx, SymbolicZero) and getattr(dx, "dtype", None) != jax.dtypes.float0 for dx in dxs]
         moving, changes = ([x for x, m in zip(part, moves, strict=True) if m] for part in (xs, dxs))
 
         def along(*moved: Array) -> list[Array]:
