@@ -1,4 +1,4 @@
 """Rows of Psi: how many are independent, which are redundant, and the loop that closes a mechanism.
 
-Every question about rank is answered here, with the thresholds of this folder and no others.
+Questions about the rank of positions belong here; the units of rows come from `balance`, and the default tolerance from `terms`.
 """

@@ -207,14 +207,15 @@ def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
         found = _rows_of(mechanism, kind)
         scales = _with_rank_tol(mechanism, concrete_scales(mechanism), found)
         names, count = _row_names(mechanism), 3 * len(mechanism.body_names)
-        known: dict[str, Any] = {
-            "coordinates": count,
-            "row_names": names,
-            "redundant_rows": found.redundant,
-            "only_switched": False,
-        }
-        known["balance"] = found.balance
-        return make_module(Analysis, scales=scales, **known)
+        return make_module(
+            Analysis,
+            scales=scales,
+            coordinates=count,
+            row_names=names,
+            redundant_rows=found.redundant,
+            balance=found.balance,
+            only_switched=False,
+        )
 
 
 def _with_rank_tol(mechanism: Mechanism, scales: Scales, found: FoundRows) -> Scales:

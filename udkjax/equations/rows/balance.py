@@ -29,10 +29,14 @@ from udkjax.scene.mechanism import Mechanism
 # Factors are powers of ten, so that small changes of numbers do not change them; if all are within a decade of each other, which
 # no threshold of a rank notices, they are one.
 LEAST_SPREAD = 2
-RANDOM_POSITIONS = 2
-SAME = 1e-6  # relative difference of coefficients that do not depend on positions
-ANCHOR = 1e-9  # weight that ends the freedom to multiply all rows and divide all columns of a part of the scene
-MANY_UNKNOWNS = 400  # above this number, sparse matrices are used
+RANDOM_POSITIONS = 2  # within L and one radian of the guess: a coefficient that is small there and at the guess is small anywhere
+# Relative difference of coefficients that do not depend on positions: far above rounding errors of angles of any usual size, and
+# far below what a radian changes.
+SAME = 1e-6
+# Weight that ends the freedom to multiply all rows and divide all columns of a part of the scene; the weights of coefficients are
+# at most one.
+ANCHOR = 1e-9
+MANY_UNKNOWNS = 400  # rows and groups above which sparse matrices are used
 
 
 class BalancedUnits(NamedTuple):
