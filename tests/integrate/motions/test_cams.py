@@ -119,3 +119,31 @@ def test_a_condition_costs_no_step_at_the_end_of_a_piece():
     assert int(with_event.stats["steps"]) == int(without.stats["steps"])
     assert int(with_event.stats["projections"]) < 2 * int(without.stats["projections"])
     np.testing.assert_array_equal(with_event.q, without.q)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.1, 0.3])
+def test_a_stiff_damper_lets_a_body_slide_along_a_cam(shift):
+    """A body whose turning is damped ever more slides along a cam as one that may not turn, from a knot and from between two.
+
+    States and stages at a knot are on either side by rounding and by errors below the tolerance, which must not end steps.
+    Explicit steps that are far too long lead from any state to other pieces.
+    """
+    angles = 2 * np.pi * np.arange(7) / 7
+    body = udk.Body(2.7, 0.09, position=[0.85, 0.0])
+    cam = udk.Cam(["ground", "a"], [[0, 0], [-0.3, 0]], udk.Profile(angles + shift, 0.5 + 0.05 * np.cos(2 * angles)))
+    spring = udk.TorsionSpring(["ground", "a"], stiffness=5.0, damping=1.0)
+    scene = udk.Mechanism({"a": body}, {"cam": cam}, forces={"spring": spring})
+    start = udk.assemble(scene)
+    held = udk.Mechanism(
+        {"a": body}, {"cam": cam}, {"hold": udk.Driver(["ground", "a"], "angle", udk.Polynomial([start.q[0, 2]]))}
+    )
+    wanted = udk.simulate(held, [0.0, 1.0], start, rtol=1e-10, atol=1e-10).q[-1]
+
+    def error(damping, tol):
+        damped = scene.with_parameters({"force.spring.damping": damping})
+        run = udk.simulate(damped, [0.0, 1.0], start, rtol=tol, atol=tol, throw=False)
+        return jnp.where(run.result == 0, abs(run.q[-1] - wanted).max(), jnp.nan)
+
+    dampings, tolerances = np.logspace(6, 10, 5), np.logspace(-4, -9, 6)
+    errors = jax.jit(jax.vmap(jax.vmap(error, (None, 0)), (0, None)))(dampings, tolerances)
+    assert (errors < 10 / dampings[:, None] + 200 * tolerances).all()  # the angle changes in proportion to 1 / damping

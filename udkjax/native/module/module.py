@@ -16,7 +16,7 @@ from udkjax.native.module.tableau import Method
 
 # Rarely called functions: once per run, near singular configurations, where a piece may end, or once in an implicit step.
 COLD = (
-    "leave",
+    "end_piece",
     "along_motion",
     "jump",
     "finish_members",

@@ -61,7 +61,7 @@ def write_decide(module: Module):
     tried = where(stepping, s.tried + 1.0, s.tried)
     if module.pieces:
         s.again = where(stepping, yes, 0.0)
-        f.call("leave", f.given["work"])
+        f.call("end_piece", f.given["work"])
         repeats = s.again > 0.5
     accept = stepping & (error < 1.0) & ~shortens & ~repeats
     stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
@@ -76,6 +76,9 @@ def write_decide(module: Module):
     with f.if_(f.any_of(begun)):
         s.behind = where(begun, first_step(module, f, s), s.behind)
     h = s.behind
+    if module.plan.breaks:
+        h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
+        h = where(begun & (tried > 0.0), s.h * RESTART_FACTOR, h)
     code = where(stepping & (h < s.smallest), f.const(Status.STEP_TOO_SMALL, DOUBLE, f.width), s.code)
     is_over = code.is_(float(Status.RUNNING)) & stepping & (tried >= s.max_steps)
     code = where(is_over, where(s.max_steps < 0.0, f.const(Status.INTERRUPTED, DOUBLE, f.width), Status.STEP_LIMIT), code)
@@ -86,8 +89,6 @@ def write_decide(module: Module):
     code = where((lost > 0.0) & goes_on, lost, code)
     s.where(accept & stepped, rate=rate)
     if module.plan.breaks:
-        h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
-        h = where(begun & (tried > 0.0), s.h * RESTART_FACTOR, h)
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)

@@ -5,20 +5,21 @@ from collections.abc import Callable
 import numpy as np
 
 from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, HALVINGS, NEAR_END, TRIES
+from udkjax.native.module.steps import AIM_ACROSS, AIM_BEFORE, AIM_BEYOND, EDGE, FACTORS, HALVINGS, NEAR_END, TRIES
 from udkjax.native.run.runge_kutta import stage_state
 
 
-def write_leave(module: Module):
-    """Write `leave`: decide in lanes of `again` whether a step that ends in another piece is accepted or repeated.
+def write_end_piece(module: Module):
+    """Write `end_piece`: decide in lanes of `again` whether a step that ends in another piece is accepted or repeated.
 
     Such a step is repeated to end just before the end of the piece. A tiny step then crosses the end, and the run begins anew:
     the accelerations of all points of an interpolation must belong to one piece. So must those of all stages of a step, since
     their derivatives jump: a step that ends in its piece, but has a stage near its end in another, is repeated to end earlier.
     Only a jump that follows from constraints may remain if states are projected, which makes their derivatives right.
     """
-    f, s = module.function("leave")
+    f, s = module.function("end_piece")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
 
     def find_pieces(time: Value, state: Callable[[Value], tuple[Value, Value]]):
@@ -48,7 +49,9 @@ def write_leave(module: Module):
             strays = strays | moved()
     find_pieces(s.t1, lambda r: (module.vector(f, "corrected q", r), module.vector(f, "result v", r)))
     stepping, step = s.again > 0.5, s.t1 - s.point3_t
-    can_leave = stepping & (s.begin < 0.5) & f.is_finite(s.error)
+    # The polynomial of a step is no motion where its error is so large that the controller shortens it as far as it may.
+    is_motion = s.error < FACTORS.shrink**-module.method.order
+    can_leave = stepping & (s.begin < 0.5) & is_motion & moves_by_tolerance(module, f, s)
     leaves = can_leave & moved()
     s.share, s.low = yes, f.const(0.0, DOUBLE, f.width)
     with f.if_(f.any_of(leaves)), f.each(HALVINGS):
@@ -83,6 +86,27 @@ def write_leave(module: Module):
     tries = where(repeats, s.tries + 1.0, where(is_accurate, 0.0, s.tries))
     s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)
     s.again = where(repeats, yes, 0.0)
+
+
+def moves_by_tolerance(module: Module, f: Function, s: Lane) -> Value:
+    """Return whether the state changes by more than its tolerance in a step from the latest point to `corrected q`, `result v`.
+
+    At an end of a piece, derivatives of accelerations jump. What this adds to a step that begins and ends so close to it is less
+    than its error may be. A mechanism at rest there would step to and fro across the end by rounding errors for ever.
+    """
+    rtol = module.broadcast(f, s.rtol)
+    changes = [("point3 q", "corrected q", "scale q")]
+    if module.code.has_piecewise_loads:
+        changes.append(("point3 v", "result v", "scale v"))
+
+    def ratios(r: Value) -> list[Value]:
+        sizes = []
+        for start, end, scale in changes:
+            y0, y1 = module.vector(f, start, r), module.vector(f, end, r)
+            sizes.append(f.abs(y1 - y0) / f.fma(rtol, f.max(f.abs(y0), f.abs(y1)), module.vector(f, scale, r)))
+        return sizes
+
+    return module.largest(f, ratios) > 1.0
 
 
 def interpolate_step(module: Module, f: Function, share: Value, step: Value, r: Value) -> tuple[Value, Value]:

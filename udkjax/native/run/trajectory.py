@@ -34,7 +34,7 @@ from udkjax.native.run.dense_output import write_between, write_differences, wri
 from udkjax.native.run.fallback import write_fallback
 from udkjax.native.run.formulations import FORMULATE
 from udkjax.native.run.members import write_begin, write_finish
-from udkjax.native.run.pieces import write_leave
+from udkjax.native.run.pieces import write_end_piece
 from udkjax.native.run.runge_kutta import write_attempt
 from udkjax.native.run.stage_equations import StageEquations
 
@@ -108,7 +108,7 @@ class Trajectory(Module):
             self._write_stage_equations()
         write_attempt(self)
         if self.pieces:
-            write_leave(self)
+            write_end_piece(self)
         write_decide(self)
         write_differences(self)
         write_between(self)
