@@ -27,6 +27,7 @@ from udkjax.equations.programs.unrolled import UnrolledProgram as UnrolledProgra
 from udkjax.equations.rows import determinacy as determinacy
 from udkjax.equations.rows.analysis import Analysis as Analysis
 from udkjax.equations.rows.analysis import analyse as analyse
+from udkjax.equations.rows.analysis import analysis_of as analysis_of
 from udkjax.equations.rows.analysis import hold_pins as hold_pins
 from udkjax.equations.rows.dense_rows import DenseRows as DenseRows
 from udkjax.equations.rows.dense_rows import DenseTerms as DenseTerms

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.arrays import float_type, is_traced, is_within_jit, make_module, number, stored
 from udkjax.devices import on_host
-from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.rows.analysis import Analysis, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
@@ -79,11 +79,11 @@ def step(
     values, others = _checked_inputs(mechanism, inputs), {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     moved: Any = mechanism.traced(np.size(state.q)) if isinstance(mechanism, ConstrainedSystem) else mechanism
     if not is_concrete(moved, analysis) or is_traced((state.q, state.v, values, others)):
-        analysis, has_fixed_times = analysis or _analysis_of(moved), not is_traced((t, dt))
+        analysis, has_fixed_times = analysis or analysis_of(moved), not is_traced((t, dt))
         if is_within_jit():
             return _advance(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
         values, others = ({name: number(x) for name, x in given.items()} for given in (values, others))
-        moved = _reduced(moved, tuple(values))
+        moved = moved.without_origin_beside(tuple(values))
         return _advance_at_once(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
     run = _steps_of(moved, analysis, *values).program(moved, values, np.shape(state.q), max_steps, engine)
     q, v = run(state, values, others)
@@ -138,11 +138,6 @@ def _advance(
 _advance_at_once = deferred(_advance)
 
 
-def _analysis_of(mechanism: Any) -> Analysis | None:
-    """Return the analysis of a mechanism; a user-defined system has none."""
-    return analyse(mechanism) if isinstance(mechanism, Mechanism) else None
-
-
 class _Steps:
     """The intervals of a concrete mechanism: its numbers as one array, and its programs for the forms of inputs met so far.
 
@@ -178,12 +173,7 @@ class _Steps:
 @cached_by_identity
 def _steps_of(mechanism: Any, analysis: Analysis | None, *names: str) -> _Steps:
     """Return the intervals of a mechanism with inputs of these names, cached for all of its steps."""
-    return _Steps(_reduced(mechanism, names), analysis or _analysis_of(mechanism))
-
-
-def _reduced(mechanism: Any, names: Sequence[str]) -> Any:
-    """Return a model without numbers that are not needed, also if those of these names change."""
-    return mechanism.without_origin_beside(names) if isinstance(mechanism, Mechanism) else mechanism.without_origin
+    return _Steps(mechanism.without_origin_beside(names), analysis or analysis_of(mechanism))
 
 
 @lru_cache(maxsize=64)

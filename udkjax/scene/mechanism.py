@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 from weakref import WeakValueDictionary
 
 import equinox as eqx
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.annotations import NumberLike, Numbers
+from udkjax.annotations import NumberLike, Numbers, NumericArray
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, without_derivatives
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.programs.control_flow import ConvertsItself
@@ -23,12 +23,14 @@ from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.held import Held, row_at, row_size, sampled_fields, with_row
 from udkjax.scene.elements.joints import Constraint, Joint
+from udkjax.scene.model import Model
 from udkjax.scene.numbers.description import mechanism_table
 from udkjax.scene.numbers.direct_numbers import DirectNumbers
 from udkjax.scene.numbers.mechanism_fields import fields_of
 from udkjax.scene.numbers.number_fields import (
     SECTIONS,
     ElementGroups,
+    NumberField,
     parameters_in,
     parameters_of,
     parameters_of_drawing,
@@ -53,7 +55,7 @@ Element = TypeVar("Element", bound=eqx.Module)
 Module = TypeVar("Module", bound=eqx.Module)
 
 
-class Mechanism(PrintsTable, ConvertsItself):
+class Mechanism(PrintsTable, Model, ConvertsItself):
     """Bodies, joints, drivers and force elements by name, and gravity.
 
     It is only data; `udkjax.analyse` finds its properties, such as redundant rows. All independent numbers are leaves of the
@@ -73,8 +75,10 @@ class Mechanism(PrintsTable, ConvertsItself):
         origin: for internal use: the concrete mechanism from which one with traced numbers was made.
     """
 
+    has_bodies: ClassVar[bool] = True
+
     name: str = eqx.field(static=True)
-    body_names: tuple[str, ...] = eqx.field(static=True)
+    body_names: tuple[str, ...] = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
     joint_names: tuple[str, ...] = eqx.field(static=True)
     driver_names: tuple[str, ...] = eqx.field(static=True)
     force_names: tuple[str, ...] = eqx.field(static=True)
@@ -299,6 +303,28 @@ class Mechanism(PrintsTable, ConvertsItself):
         return mechanism_table(self, self.frames_of)
 
     _shapes = _table  # the table marks traced numbers
+
+    @property
+    def coordinate_count(self) -> int:
+        return 3 * len(self.body_names)
+
+    @property
+    def may_have_kinks(self) -> bool:
+        return any(force.may_have_kinks for force in self._forces)
+
+    def state_shape(self, state: object = None) -> tuple[int, ...]:
+        del state
+        return len(self.body_names), 3
+
+    def with_guess(self, q: NumericArray, v: NumericArray) -> "Mechanism":
+        values: dict[str, NumericArray] = {}
+        for k, body in enumerate(self.body_names):
+            values |= {f"body.{body}.position": q[k, :2], f"body.{body}.angle": q[k, 2]}
+            values |= {f"body.{body}.velocity": v[k, :2], f"body.{body}.angular_velocity": v[k, 2]}
+        return self.with_parameters(values)
+
+    def number_fields(self) -> Mapping[str, NumberField]:
+        return parameters_of(self)
 
     def parameters(self) -> dict[str, Array]:
         """Return all numbers of the scene by name, such as `body.link1.mass`, except absent ones, such as an optional damping.

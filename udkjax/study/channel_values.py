@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Numbers
 from udkjax.equations.rows.analysis import Analysis, analyse
-from udkjax.equations.states.textbook import TextbookEquations, prepare
+from udkjax.equations.states.quantities import equations_of
+from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.channels import (
@@ -160,7 +161,7 @@ class _Motion:
     @cached_property
     def dynamics(self) -> _Dynamics:
         """The solution of the equations of motion, computed only if a channel needs it."""
-        equations = prepare(self.mechanism, SVD(), None, self.analysis)
+        equations = equations_of(self.mechanism, SVD(), analysis=self.analysis)
 
         def at(t, q, v, sticking):
             a, multipliers = equations.known_to_stick(sticking).motion(t, q.ravel(), v.ravel())

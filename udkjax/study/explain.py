@@ -15,7 +15,7 @@ from udkjax.equations import constraints, determinacy
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import Analysis, analyse
-from udkjax.equations.states.textbook import prepare
+from udkjax.equations.states.quantities import equations_of
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.programs.deferred import deferred
@@ -62,7 +62,7 @@ def explain(
     s = {name: np.asarray(value) for name, value in symbols.items()}
     rank, null_rows = int(s.pop("rank")), s.pop("null_rows")
     marks = joint_friction(
-        prepare(mechanism, SVD(), analysis=analysis), t, q, null_rows * np.asarray(analysis.scales.rows)[:, None]
+        equations_of(mechanism, SVD(), analysis=analysis), t, q, null_rows * np.asarray(analysis.scales.rows)[:, None]
     )
     names = {f.joint: name for name, f in mechanism.forces.items() if isinstance(f, Friction) and f.rubs}
     return Explanation(
@@ -89,7 +89,7 @@ def _symbols(
     mechanism: Mechanism, analysis: Analysis, t: Array, q: Array, v: Array, baumgarte: Baumgarte | None, tol: ArrayLike
 ) -> dict[str, Any]:
     w, method = analysis.scales.weights, SVD(rank_tol=tol)
-    equations = prepare(mechanism, method, baumgarte, analysis)
+    equations = equations_of(mechanism, method, baumgarte, analysis=analysis)
     M, F, psi_q, required = equations.matrices(t, q, v)
     a, multipliers = equations.motion(t, q, v)
     rows, columns = psi_q.shape

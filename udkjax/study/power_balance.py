@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 from udkjax.equations import constraints, loads
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import analyse
-from udkjax.equations.states.textbook import TextbookEquations, prepare
+from udkjax.equations.states.quantities import equations_of
+from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.printing import PrintedTable, format_number, prints_table, units
@@ -117,7 +118,7 @@ def power_balance(
 
 @deferred
 def _powers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
-    equations = prepare(mechanism, method, baumgarte, analysis)
+    equations = equations_of(mechanism, method, baumgarte, analysis=analysis)
 
     def one(at, t, q, v, sticking):
         equations, mechanism = at

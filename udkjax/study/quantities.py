@@ -5,19 +5,17 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
-from udkjax.annotations import NumberLike, NumericArray
-from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.annotations import NumberLike
 from udkjax.equations.states.quantities import equations_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
 from udkjax.programs.deferred import deferred
 from udkjax.programs.undefined import defined
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.number_fields import parameters_of, split_index
+from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.reshaping import with_angle, with_length
 
 StudyModel: TypeAlias = Mechanism | ConstrainedSystem  # the models of studies
@@ -60,38 +58,9 @@ class Scaled:
 
 def parameter_value(mechanism: StudyModel, name: str) -> Array:
     """Return the value of an existing parameter, or of an entry (`joint.A.points[1][0]`)."""
-    known = parameters_of(mechanism)
+    known = mechanism.number_fields()
     owner, index = split_index(name, known)
     return jnp.asarray(known[owner].value)[index]
-
-
-def analysis_of(model: StudyModel) -> Analysis | None:
-    """Return the analysis of a mechanism; a user-defined system has none."""
-    return analyse(model) if isinstance(model, Mechanism) else None
-
-
-def state_shape(model: StudyModel, state: object = None) -> tuple[int, ...]:
-    """Return the shape of coordinates: (bodies, 3), or (n,) of a system, by its guess or a state."""
-    if isinstance(model, Mechanism):
-        return len(model.body_names), 3
-    q = model.q0 if state is None else getattr(getattr(state, "state", state), "q", None)
-    return () if q is None else np.shape(q)
-
-
-def body_names(model: StudyModel) -> tuple[str, ...]:
-    """Return the names of the bodies of a mechanism; a user-defined system has none."""
-    return model.body_names if isinstance(model, Mechanism) else ()
-
-
-def with_guess(model: Any, q: NumericArray, v: NumericArray) -> Any:
-    """Return a mechanism, or a system with a guess, with another initial guess."""
-    if not isinstance(model, Mechanism):
-        return model.with_parameters({"q0": q, "v0": v})
-    values: dict[str, NumericArray] = {}
-    for k, body in enumerate(model.body_names):
-        values |= {f"body.{body}.position": q[k, :2], f"body.{body}.angle": q[k, 2]}
-        values |= {f"body.{body}.velocity": v[k, :2], f"body.{body}.angular_velocity": v[k, 2]}
-    return model.with_parameters(values)
 
 
 @deferred

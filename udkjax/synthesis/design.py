@@ -14,7 +14,6 @@ from udkjax.requirements import require_count, require_number
 from udkjax.scene.arguments import checked
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.number_fields import parameters_of
 from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import Designs
@@ -201,7 +200,7 @@ def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[Motion
 def _all_pins(mechanism: Mechanism) -> list[str]:
     if mechanism.drawing is None:
         raise SceneError(["free: name the free numbers; only a drawing has a default, all pins"], mechanism.name)
-    numbers = {name: x for name, x in parameters_of(mechanism).items() if x.section == "pin" and x.value is not None}
+    numbers = {name: x for name, x in mechanism.number_fields().items() if x.section == "pin" and x.value is not None}
     return [name for name, x in numbers.items() if x.path[-1] not in ("velocity", "along")]
 
 

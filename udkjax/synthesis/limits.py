@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 from udkjax.expressions import Differential, Graph, ScalarProgram, trace
 from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.number_fields import must_be_positive, parameters_of, split_index
+from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote, suggestion
 
@@ -47,7 +47,7 @@ def read_bounds(
     """
     low, high = np.full(free.count, -np.inf), np.full(free.count, np.inf)
     centre, extent = 0.5 * (places.min(0) + places.max(0)), max(float(np.max(np.ptp(places, axis=0))), 1e-12)
-    known = parameters_of(free.mechanism)
+    known = free.mechanism.number_fields()
     problems = [f"bounds: {quote(key)} is not free{suggestion(key, free.names)}" for key in given if key not in free.names]
     first, last = np.empty(free.count), np.empty(free.count)
     for key, value, a, b in zip(free.names, free.values, free.starts, free.starts[1:], strict=False):
@@ -61,7 +61,7 @@ def read_bounds(
         else:
             ends = np.stack([np.ravel(value) / DEFAULT_FACTOR, np.ravel(value) * DEFAULT_FACTOR])
             first[a:b], last[a:b] = ends.min(0), ends.max(0)
-        if must_be_positive(free.mechanism, key):
+        if free.mechanism.must_be_positive(key):
             low[a:b] = np.finfo(float).tiny
         if key in given:
             try:

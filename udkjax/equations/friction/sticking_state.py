@@ -154,7 +154,7 @@ def known_sticking(mechanism: Any, solution: Any) -> Bool[Array, "T F"] | None:
         A mask of the joints with set-valued friction, in the order of the forces; None: it is not known, or there are none.
     """
     sticking = getattr(solution, "sticking", None)
-    if not sticking or not isinstance(mechanism, Mechanism):
+    if not sticking or not mechanism.has_bodies:
         return None
     names = sticking_joints(mechanism)
     if not names or not set(names) <= set(sticking):  # only contacts stick, or it is a run of another mechanism

@@ -136,6 +136,18 @@ class AbstractSystem(eqx.Module):
 class ConstrainedRows(AbstractSystem):
     """A system whose rows of positions and of velocities are known, for formulations that solve them."""
 
+    def residuals(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
+        """Return Psi of all rows, then phi if there is one."""
+        return self.violation(t, q, v)[0]
+
+    @abstractmethod
+    def jacobian(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m n"]:
+        """Return the coefficients of accelerations in all rows: Psi_q, or (Psi_q; phi_v)."""
+
+    @abstractmethod
+    def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Kinetic and potential energy (J)."""
+
     @property
     @abstractmethod
     def stabilized(self) -> bool:
@@ -182,14 +194,6 @@ class MechanismSystem(ConstrainedRows):
     @abstractmethod
     def row_names(self) -> list[tuple[str, int]]:
         """The constraint that each row of Psi belongs to, and the row's index within it."""
-
-    @abstractmethod
-    def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Kinetic and potential energy (J)."""
-
-    @abstractmethod
-    def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
-        """Return Psi_q of all rows."""
 
     @abstractmethod
     def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:

@@ -36,6 +36,7 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbe
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.model import RunModel
 
 # Rank tolerance, relative to the smallest nonzero singular value of a generic position, where gears make it small. As in a scene
 # without gears, it is then about a hundredth of the usual values.
@@ -166,6 +167,11 @@ def analyse(mechanism: Mechanism) -> Analysis:
         count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
         return Analysis(traced_scales(mechanism), count, names, *_rows_of_concrete_geometry(mechanism))
     return _analyse_concrete(mechanism)
+
+
+def analysis_of(model: RunModel) -> Analysis | None:
+    """Return the analysis of a mechanism; a model without bodies has none: its coordinates and rows are of order one."""
+    return analyse(model) if isinstance(model, Mechanism) else None
 
 
 @cached_by_identity

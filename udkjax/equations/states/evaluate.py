@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from udkjax.annotations import NumberLike
+from udkjax.annotations import NumberLike, Time, Vector
 from udkjax.equations.rows import determinacy
 from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.states.quantities import equations_of
 from udkjax.equations.states.state_arrays import StateArrays, by_numpy, state_arrays
-from udkjax.equations.systems.general import ConstrainedSystem, singular_values_of_rows
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.equations.terms import constraints, loads
 from udkjax.equations.terms.constraints import BodyArray
 from udkjax.programs.deferred import deferred
@@ -59,7 +60,7 @@ def compiled(function: Callable[Arguments, Result], numeric: Callable[..., Any] 
             given = {name: _for_numpy(name, value) for name, value in bound.arguments.items() if name != "mechanism"}
             return jax.device_put(numeric(state_arrays(mechanism.without_origin), **given))
         for name, value in arguments.items():
-            if not isinstance(value, Mechanism | Analysis):
+            if name not in ("mechanism", "analysis"):
                 arguments[name] = jnp.asarray(value, jnp.result_type(float))  # Python numbers would be static
         return program(*bound.args, **bound.kwargs)
 
@@ -114,7 +115,12 @@ def singular_values(
     if isinstance(mechanism, Mechanism):
         return _singular_values(mechanism, t, q, analysis)
     t, q = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q))
-    return singular_values_of_rows(mechanism.traced(q.size), t, q, jnp.zeros_like(q) if v is None else jnp.asarray(v, q.dtype))
+    return _values_of_rows(mechanism.traced(q.size), t, q, jnp.zeros_like(q) if v is None else jnp.asarray(v, q.dtype))
+
+
+@deferred
+def _values_of_rows(model: Any, t: Time, q: Vector, v: Vector) -> Float[Array, "k"]:
+    return jnp.linalg.svd(equations_of(model).jacobian(t, q, v), compute_uv=False)
 
 
 uniqueness = compiled(determinacy.uniqueness, _uniqueness)

@@ -10,14 +10,13 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import NumberLike, Vector
 from udkjax.equations.friction.sticking_state import known_sticking
-from udkjax.equations.laws.abstract_system import AbstractSystem, HistoryLike, MechanismSystem
+from udkjax.equations.laws.abstract_system import AbstractSystem, ConstrainedRows, HistoryLike
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.rows.analysis import Analysis, analyse, analysis_of
 from udkjax.equations.states.state_arrays import by_numpy, history_of, state_arrays
 from udkjax.equations.states.textbook import TextbookEquations, prepare
 from udkjax.equations.systems.general import ConstrainedSystem, GeneralEquations, prepare_general
-from udkjax.equations.systems.traced_system import TracedSystem
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
@@ -26,6 +25,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.model import Model, RunModel
 
 Result = TypeVar("Result")
 
@@ -44,8 +44,38 @@ class Energy(NamedTuple):
         return self.kinetic + self.potential
 
 
+@overload
 def equations_of(
-    system: Mechanism | ConstrainedSystem | TracedSystem,
+    system: Mechanism,
+    method: Pseudoinverse | None = None,
+    baumgarte: Baumgarte | None = None,
+    formulation: None = None,
+    analysis: Analysis | None = None,
+) -> TextbookEquations: ...
+
+
+@overload
+def equations_of(
+    system: RunModel,
+    method: Pseudoinverse | None = None,
+    baumgarte: Baumgarte | None = None,
+    formulation: None = None,
+    analysis: Analysis | None = None,
+) -> TextbookEquations | GeneralEquations: ...
+
+
+@overload
+def equations_of(
+    system: RunModel,
+    method: Pseudoinverse | None = None,
+    baumgarte: Baumgarte | None = None,
+    formulation: Formulation | None = None,
+    analysis: Analysis | None = None,
+) -> AbstractSystem: ...
+
+
+def equations_of(
+    system: RunModel,
     method: Pseudoinverse | None = None,
     baumgarte: Baumgarte | None = None,
     formulation: Formulation | None = None,
@@ -131,17 +161,14 @@ def accelerations(
         a (m/s^2, rad/s^2) in the shape of q; with `multipliers` also lambda (m,) in N and N m, in the order of the rows, with
         the sign of M a + Psi_q^T lambda = F, and of minimum norm where constraints are redundant.
     """
-    if isinstance(mechanism, Mechanism):
-        analysis, mechanism = analyse(mechanism) if analysis is None else analysis, mechanism.without_origin
-        if formulation is None and by_numpy(mechanism, (t, q, v, analysis, stabilization), method):
-            one_q, one_v = (np.reshape(np.asarray(x, float), (1, -1)) for x in (q, v))
-            time = np.reshape(np.asarray(t, float), 1)
-            found = state_arrays(mechanism).solve(time, one_q, one_v, analysis, method, stabilization)
-            a = found.a.reshape(np.shape(q))
-            return jax.device_put((a, found.multipliers[0]) if multipliers else a)
+    analysis, model = analysis_of(mechanism) if analysis is None else analysis, mechanism.without_origin
+    if analysis is not None and formulation is None and by_numpy(model, (t, q, v, analysis, stabilization), method):
+        one_q, one_v = (np.reshape(np.asarray(x, float), (1, -1)) for x in (q, v))
+        found = state_arrays(model).solve(np.reshape(np.asarray(t, float), 1), one_q, one_v, analysis, method, stabilization)
+        a = found.a.reshape(np.shape(q))
+        return jax.device_put((a, found.multipliers[0]) if multipliers else a)
     t, q, v = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
-    system = mechanism.traced(q.size) if isinstance(mechanism, ConstrainedSystem) else mechanism
-    return _accelerations(system, analysis, t, q, v, method, stabilization, formulation, multipliers)
+    return _accelerations(model.traced(q.size), analysis, t, q, v, method, stabilization, formulation, multipliers)
 
 
 @checked
@@ -156,10 +183,10 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -
         Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers. For a `ConstrainedSystem` the
         rows of Psi, then those of phi.
     """
-    if isinstance(mechanism, Mechanism) and by_numpy(mechanism, (solution.ts, solution.q)):
+    if by_numpy(mechanism, (solution.ts, solution.q)):
         ts, q = history_of(solution)[:2]
         return jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
-    return _evaluate_along(mechanism, solution, _psi if isinstance(mechanism, Mechanism) else _residuals)
+    return _evaluate_along(mechanism, solution, _residuals)
 
 
 @checked
@@ -173,7 +200,7 @@ def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> E
     Returns:
         The `Energy`, kinetic and potential (T,), in J.
     """
-    if isinstance(mechanism, Mechanism) and by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
+    if by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
         return Energy(*jax.device_put([*state_arrays(mechanism.without_origin).energy(*history_of(solution)).T]))
     return _evaluate_along(mechanism, solution, _energy)
 
@@ -272,25 +299,17 @@ def _friction_loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
     return at_each(of_state, equations, ts, q, v, sticking)
 
 
-def _psi(equations: AbstractSystem, t: Array, q: Vector, v: Vector) -> Array:
-    return equations.violation(t, q, v)[0]
-
-
-def _residuals(equations: GeneralEquations, t: Array, q: Vector, v: Vector) -> Array:
+def _residuals(equations: ConstrainedRows, t: Array, q: Vector, v: Vector) -> Array:
     return equations.residuals(t, q, v)
 
 
-def _energy(equations: MechanismSystem | GeneralEquations, t: Array, q: Vector, v: Vector) -> Energy:
+def _energy(equations: ConstrainedRows, t: Array, q: Vector, v: Vector) -> Energy:
     return Energy(*equations.energy(t, q, v))
 
 
-def _evaluate_along(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike, quantity: Callable[..., Result]) -> Result:
-    analysis = None
-    if isinstance(mechanism, Mechanism):
-        analysis, mechanism = analyse(mechanism), mechanism.without_origin
-    else:
-        mechanism = mechanism.traced(np.shape(solution.q)[-1])
-    return _evaluate(mechanism, analysis, solution.ts, solution.q, solution.v, quantity)
+def _evaluate_along(mechanism: Model, solution: HistoryLike, quantity: Callable[..., Result]) -> Result:
+    model = mechanism.without_origin.traced(np.shape(solution.q)[-1])
+    return _evaluate(model, analysis_of(mechanism), solution.ts, solution.q, solution.v, quantity)
 
 
 @deferred

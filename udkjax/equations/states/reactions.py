@@ -78,7 +78,7 @@ def reactions(
         if compliances is not None or (frame, about) != ("ground", "centre"):
             raise ValueError("the coordinates of a ConstrainedSystem have no frame: leave out frame, about and compliances")
         states = _states(solution)
-        return _of_system(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
+        return _loads_of_rows(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
     soft = None if compliances is None else compliance_rows(mechanism, compliances)
     analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
     if soft is None and by_numpy(mechanism, (states, analysis, stabilization), method):
@@ -122,7 +122,7 @@ def unique_reactions(
 
 
 @deferred
-def _of_system(system: Any, ts: Array, q: Array, v: Array, method: Pseudoinverse, baumgarte: Baumgarte | None) -> ByBody:
+def _loads_of_rows(system: Any, ts: Array, q: Array, v: Array, method: Pseudoinverse, baumgarte: Baumgarte | None) -> ByBody:
     equations = prepare_general(system, method, baumgarte)
     loads, multipliers = at_each(lambda x, *at: (x.loads(*at), x.multipliers(*at)), equations, ts, q, v)
     m = 0 if system.constraint is None else int(np.prod(jax.eval_shape(system.constraint, ts[0], q[0]).shape))

@@ -6,7 +6,7 @@ memory of intermediate results does not grow with their number.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeGuard
 
 import jax
 import numpy as np
@@ -30,7 +30,7 @@ PIECE = 2**24  # bytes of a piece's largest arrays
 DENSE_ARRAYS = 8  # of the size of Psi_q, which a state needs at once
 
 
-def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = None) -> bool:
+def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = None) -> TypeGuard[Mechanism]:
     """Return whether `StateArrays` has the quantities of a mechanism: its numbers and the given ones are concrete.
 
     `method` must be the SVD, or what stands for it; numbers of the mechanism must not be samples over time, and its friction must

@@ -128,8 +128,9 @@ class TextbookEquations(MechanismSystem):
         """True if friction depends on the loads of joints."""
         return bool(self.rubbing_joints)
 
-    def rank(self, t: Time, q: Vector) -> Int[Array, ""]:
+    def rank(self, t: Time, q: Vector, v: Vector | None = None) -> Int[Array, ""]:
         """Return the rank of D at q by the method's threshold."""
+        del v
         return uk.pseudoinverse(self.method, uk.D(self.mechanism, t, q, self.scales.weights)).rank
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
@@ -164,8 +165,9 @@ class TextbookEquations(MechanismSystem):
         F, friction = loads.force(mechanism, t, q, v), self._friction(t, q, v)
         return jnp.diag(loads.mass(mechanism)), F if friction is None else F + friction, A, c
 
-    def jacobian(self, t: Time, q: Vector) -> Float[Array, "m n"]:
+    def jacobian(self, t: Time, q: Vector, v: Vector | None = None) -> Float[Array, "m n"]:
         """Return Psi_q of all rows."""
+        del v
         return constraints.psi_q(self.mechanism, t, q)
 
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:

@@ -11,25 +11,26 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from typing_extensions import TypeAliasType
 
-from udkjax.annotations import Numbers, Time, Vector
+from udkjax.annotations import Numbers, NumericArray, Time, Vector
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations.laws.abstract_system import ConstrainedRows, TangentPart
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.programs.scales import Scales, UnitScales
-from udkjax.equations.systems.system_numbers import fields_of_system, numbers_by_name, with_numbers
+from udkjax.equations.systems.system_numbers import number_fields, numbers_by_name, with_numbers
 from udkjax.equations.systems.system_programs import system_programs
 from udkjax.equations.systems.traced_system import TracedSystem, joined_rows, load, trace_system
 from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.printing import PrintsLine
-from udkjax.programs.deferred import deferred
+from udkjax.scene.model import Model
+from udkjax.scene.numbers.number_fields import NumberField
 
 ConstraintRows = TypeAliasType("ConstraintRows", Float[ArrayLike, "m"] | Mapping[str, ArrayLike])  # also by name
 
 
-class ConstrainedSystem(PrintsLine):
+class ConstrainedSystem(PrintsLine, Model):
     """M(q) a = F(t, q, v) + constraint forces, subject to Psi(t, q) = 0 and phi(t, q, v) = 0.
 
     `mass(q)` returns M (n, n), symmetric positive definite; `force(t, q, v)` returns F (n,); `constraint(t, q)` returns Psi (m,),
@@ -78,8 +79,8 @@ class ConstrainedSystem(PrintsLine):
         """
         return cls(MassOfEnergy(kinetic), ForceOfEnergy(kinetic, force), **others)
 
-    name: ClassVar[str] = "system"  # in titles, where mechanisms have names of their own
     cure: ClassVar[str] = ", which has no bodies and joints"
+    has_programs: ClassVar[bool] = False  # but those of `traced`
 
     def parameters(self) -> dict[str, Array]:
         """Return the numbers of the system by name: arrays that are fields of the modules whose methods its functions are.
@@ -97,9 +98,8 @@ class ConstrainedSystem(PrintsLine):
         """
         return with_numbers(self, values)
 
-    def number_fields(self) -> dict[str, Any]:
-        """Return the numbers of the system, with their shapes, by name."""
-        return fields_of_system(self)
+    def number_fields(self) -> dict[str, NumberField]:
+        return number_fields(self)
 
     @property
     def is_concrete(self) -> bool:
@@ -108,6 +108,13 @@ class ConstrainedSystem(PrintsLine):
             return False
         traced = self if self.q0 is None else self.traced(np.size(self.q0))
         return traced is self or bool(getattr(traced, "is_concrete", True))
+
+    def state_shape(self, state: Any = None) -> tuple[int, ...]:
+        q = self.q0 if state is None else getattr(getattr(state, "state", state), "q", None)
+        return () if q is None else np.shape(q)
+
+    def with_guess(self, q: NumericArray, v: NumericArray) -> "ConstrainedSystem":
+        return self.with_parameters({"q0": q, "v0": v})
 
     def traced(self, n: int) -> Any:
         """Return the system with functions that are traced for n coordinates; unchanged without float64, for JAX alone.
@@ -243,15 +250,15 @@ class GeneralEquations(ConstrainedRows):
         return kinetic, jnp.zeros_like(kinetic) if potential is None else jnp.asarray(potential(t, q))
 
     def residuals(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
-        """Return Psi and phi."""
         return jnp.concatenate([self._psi(t, q), self._phi(t, q, v)])
 
     def jacobian(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m n"]:
         """Return A = (Psi_q; phi_v)."""
         return self._slopes(t, q, v)
 
-    def rank(self, q: Vector, rows: Float[Array, "m n"]) -> Int[Array, ""]:
-        """Return the rank of rows A M^(-1/2), by the method."""
+    def rank(self, t: Time, q: Vector, v: Vector) -> Int[Array, ""]:
+        """Return the rank of A M^(-1/2), by the method."""
+        rows = self._slopes(t, q, v)
         return self._plus(q, rows)[0].rank if len(rows) else jnp.zeros((), int)
 
     def loads(self, t: Time, q: Vector, v: Vector) -> Float[Array, "2 n"]:
@@ -355,19 +362,3 @@ def prepare_general(system: Any, method: Pseudoinverse | None, baumgarte: Baumga
     method = Auto() if method is None else method
     tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol
     return GeneralEquations(system, eqx.tree_at(lambda m: m.rank_tol, method, tol, is_leaf=lambda x: x is None), baumgarte)
-
-
-@deferred
-def singular_values_of_rows(system: Any, t: Time, q: Vector, v: Vector) -> Float[Array, "k"]:
-    """Return the singular values of A = (Psi_q; phi_v).
-
-    Args:
-        system: The system; its numbers may be traced.
-        t: Time (s).
-        q: Coordinates (n,).
-        v: Velocities (n,).
-
-    Returns:
-        min(m, n) singular values, largest first.
-    """
-    return jnp.linalg.svd(prepare_general(system, None, None).jacobian(t, q, v), compute_uv=False)

@@ -81,9 +81,9 @@ class SmoothLoads:
         return _of_element(traced_loads(element, frames), breaks)
 
     @classmethod
-    def of_system(cls, functions: SystemFunctions, breaks: bool) -> "SmoothLoads":
+    def of_functions(cls, functions: SystemFunctions, breaks: bool) -> "SmoothLoads":
         """Return the smooth loads of a system."""
-        return _of_system(functions, breaks)
+        return _of_functions(functions, breaks)
 
     def held(self, functions: SystemFunctions) -> SystemFunctions:
         """Return the functions of a system with its smooth loads, whose sides are one more array of numbers."""
@@ -100,7 +100,7 @@ def _of_element(traced: TracedLoads, breaks: bool) -> SmoothLoads:
 
 
 @lru_cache(maxsize=64)
-def _of_system(functions: SystemFunctions, breaks: bool) -> SmoothLoads:
+def _of_functions(functions: SystemFunctions, breaks: bool) -> SmoothLoads:
     numbers = [s for array in functions.numbers for s in array.flat]
     state = functions.t, functions.q, functions.v
     return SmoothLoads(functions.graph, numbers, state, functions.force, functions.moving(breaks))

@@ -34,7 +34,7 @@ class NumberPlace(NamedTuple):
     leaf: Any
 
 
-def fields_of_system(system: Any) -> dict[str, NumberField]:
+def number_fields(system: Any) -> dict[str, NumberField]:
     """Return the numbers of a system by name."""
     fields = {}
     for name, places in _places_by_name(system).items():
@@ -127,4 +127,4 @@ def _advice(system: Any, name: str, known: list[str]) -> str:
 
 def numbers_by_name(system: Any) -> dict[str, Array]:
     """Return the values of all numbers of a system."""
-    return {name: field.value for name, field in fields_of_system(system).items() if field.value is not None}
+    return {name: field.value for name, field in number_fields(system).items() if field.value is not None}

@@ -28,6 +28,7 @@ from udkjax.expressions import Differential, Graph, Scalar, may_have_kinks, trac
 from udkjax.expressions.algebra.differential import SparseRow
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.requirements import ArgumentError
+from udkjax.scene.model import RunModel
 
 FUNCTIONS = {"mass": "q", "force": "tqv", "constraint": "tq", "velocity_constraint": "tqv", "potential": "tq"}  # and arguments
 MOST_NUMBERS = 20_000  # more, as of a table, would be copied to the memory of every lane
@@ -188,7 +189,7 @@ class SystemFunctions:
         return [dict(sorted(row.items())) for row in rows]
 
 
-class TracedSystem(eqx.Module):
+class TracedSystem(RunModel):
     """A `ConstrainedSystem` of traced functions: `numbers` are the leaves on which all of them depend.
 
     It has what runs ask of a mechanism: no number of it is sampled, so it is the same at any time.
@@ -227,16 +228,12 @@ class TracedSystem(eqx.Module):
         return TracedSystem([*self.numbers, more], functions, self.row_labels, self.breakpoints)
 
     @property
-    def without_origin(self) -> "TracedSystem":
-        return self
+    def coordinate_count(self) -> int:
+        return self.functions.n
 
-    def at(self, t: Time) -> "TracedSystem":
-        del t
-        return self
-
-    def with_samples(self, samples: dict[Any, Any]) -> "TracedSystem":
-        del samples
-        return self
+    @property
+    def may_have_kinks(self) -> bool:
+        return self.functions.may_have_kinks
 
     @property
     def is_concrete(self) -> bool:

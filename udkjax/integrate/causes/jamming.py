@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.states.textbook import prepare
+from udkjax.equations.states.quantities import equations_of
 from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.pinv import SVD
 from udkjax.scene.elements.friction import Friction
@@ -21,7 +21,7 @@ JAMMING_TIMES = 0.0, 1e-9, 1e-6, 1e-4  # times after the end of a run, as fracti
 def explain_jamming(run: FailedRun) -> str:
     """Name the joints that jam at the end of a run, or just ahead; empty if friction admits a motion there."""
     mechanism = run.mechanism.without_origin
-    joints = prepare(mechanism, analysis=run.analysis).rubbing_joints
+    joints = equations_of(mechanism, analysis=run.analysis).rubbing_joints
     if not joints or not run.states:
         return ""
     t, q, v = run.states[0]
@@ -47,7 +47,7 @@ def _description(mechanism: Mechanism, names: Sequence[str], t: float) -> str:
 
 
 def _jams(run: FailedRun, mechanism: Mechanism, state: tuple[float, np.ndarray, np.ndarray]) -> bool:
-    equations = prepare(mechanism, SVD(), analysis=run.analysis)
+    equations = equations_of(mechanism, SVD(), analysis=run.analysis)
     with jax.ensure_compile_time_eval():
         found = equations.multipliers(*map(jnp.asarray, state))
     return not bool(np.all(np.isfinite(np.asarray(found))))

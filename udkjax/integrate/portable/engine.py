@@ -34,7 +34,6 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.units import units_of
 
 STEPS_OF_A_PAGE = 20_000  # largest number of steps of a run in a page: with more the page would not respond for seconds
 
@@ -124,7 +123,7 @@ def _engine(
     data: JsonObject = {
         "format": 1,
         "bodies": list(mechanism.body_names),
-        "parameters": [{"name": name, "unit": units_of(mechanism, name), "value": x} for name, x in values.items()],
+        "parameters": [{"name": name, "unit": mechanism.unit_of(name), "value": x} for name, x in values.items()],
         "numbers": floats(numbers.base),
         "count": numbers.count,
         "knots": numbers.knots,

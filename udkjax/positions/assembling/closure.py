@@ -13,7 +13,8 @@ from udkjax.annotations import Number, Time
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.position_closure import CLOSURE, Assembly, close_position, damped_step
-from udkjax.equations.states.textbook import TextbookEquations, prepare
+from udkjax.equations.states.quantities import equations_of
+from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.pinv import SVD
 from udkjax.positions.assembling import native_closing
 from udkjax.programs.undefined import defined_along
@@ -74,7 +75,7 @@ class TracedRows(NamedTuple):
 
 def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
     """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D."""
-    return TracedRows(prepare(mechanism, SVD(), analysis=analysis)).assemble(_close_position, t, q, v)
+    return TracedRows(equations_of(mechanism, SVD(), analysis=analysis)).assemble(_close_position, t, q, v)
 
 
 def close_by_machine_code(

@@ -68,5 +68,5 @@ def close_system(system: Any, t: Array, q: Vector, v: Vector) -> ClosedSystem:
     for _ in range(CLOSURE.velocities + 1):
         velocity = equations.correct_velocity(t, closed, velocity)
     psi, rates = equations.violation(t, closed, velocity)
-    rank = stop_gradients(equations.rank(closed, equations.jacobian(t, closed, velocity)))
+    rank = stop_gradients(equations.rank(t, closed, velocity))
     return ClosedSystem(closed, velocity, psi, rates, rank, fixed.scales)

@@ -58,20 +58,9 @@ class NumberField(NamedTuple):
         return _at(groups[self.section][self.owner], self.path[:-1])
 
 
-class NamesNumbers(Protocol):
-    """A model that names its own numbers, as a user-defined system does."""
-
-    def number_fields(self) -> dict[str, NumberField]: ...
-
-
-def parameters_of(mechanism: Sections | NamesNumbers) -> Mapping[str, NumberField]:
-    """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
-    scene: Any = mechanism
-    return scene.number_fields() if hasattr(scene, "number_fields") else _parameters_of_scene(scene)
-
-
 @cached_within_trace  # a loop over values of a number asks for all names each time
-def _parameters_of_scene(scene: Any) -> Mapping[str, NumberField]:
+def parameters_of(scene: Sections) -> Mapping[str, NumberField]:
+    """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
     drawn = {} if scene.drawing is None else parameters_of_drawing(scene.drawing)
     gravity = {"gravity": NumberField("", "", (), scene.gravity, scene.gravity.shape)}
     return MappingProxyType({**gravity, **drawn, **parameters_in(scene.groups)})
@@ -103,7 +92,7 @@ def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
 
 def must_be_positive(mechanism: Any, name: str) -> bool:
     """Return True if a number, or the number that an entry belongs to, must not be negative."""
-    known = parameters_of(mechanism)
+    known = mechanism.number_fields()
     field = known[split_index(name, known)[0]]
     if not field.path:
         return False

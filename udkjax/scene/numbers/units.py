@@ -9,7 +9,7 @@ import re
 from typing import Any, NamedTuple
 
 from udkjax.scene.elements.held import Held
-from udkjax.scene.numbers.number_fields import owner_of, parameters_of, split_index
+from udkjax.scene.numbers.number_fields import owner_of, split_index
 from udkjax.wording import quote
 
 # Numeric settings of a run; one program serves all values.
@@ -88,7 +88,7 @@ def units_of(mechanism: Any, name: str) -> str:
     """Return the unit of a parameter or of a setting; an empty string if unknown."""
     if name in NUMBERS:
         return NUMBERS[name]
-    known = parameters_of(mechanism)
+    known = mechanism.number_fields()
     field = known.get(split_index(name, known)[0])
     if field is None:
         return ""

@@ -12,8 +12,7 @@ from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.number_fields import parameters_of
-from udkjax.scene.numbers.units import conversion_factor, units_of
+from udkjax.scene.numbers.units import conversion_factor
 
 # Names of parameters or of their entries, alone or with the ranges of their sliders; True: all parameters.
 Live = bool | Sequence[str] | Mapping[str, tuple[float, float] | None]
@@ -81,7 +80,7 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
         if wanted is None and (".profile." in name or _base(name) in bound):  # the drawn outline of a cam does not change
             continue
         limits = ranges.get(name) or ranges.get(_base(name))
-        unit = units_of(mechanism, name)
+        unit = mechanism.unit_of(name)
         low, high = limits or usual_range(name, unit, value, length, rate)
         if not low <= value <= high or not low < high:
             raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not contain its value {value:g}")
@@ -103,7 +102,7 @@ def pins_in_line(mechanism: Mechanism) -> set[str]:
         on_line = all(hasattr(pins[p], "to") and {*pins[p].references} <= {*link.pins} for p in link.pins[1:-1])
         if link.kind == "bar" and len(link.pins) > 2 and not on_line:
             bound |= {*link.pins}
-    return {name for name, x in parameters_of(mechanism).items() if x.section == "pin" and x.owner in bound}
+    return {name for name, x in mechanism.number_fields().items() if x.section == "pin" and x.owner in bound}
 
 
 def in_sections(sliders: Iterable[Slider]) -> list[Slider]:

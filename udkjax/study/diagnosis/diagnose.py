@@ -7,7 +7,7 @@ import numpy as np
 from udkjax.equations import determinacy
 from udkjax.equations.rows.analysis import hold_pins
 from udkjax.equations.rows.position_closure import is_closed
-from udkjax.equations.states.textbook import prepare
+from udkjax.equations.states.quantities import equations_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import Closure, State, close, require_closed
@@ -122,7 +122,9 @@ def diagnose(
         clearance=clearance(positions, current, generic_rank, walk),
         timeline=None if solution is None else timeline(mechanism, solution, rank_tol, time_tol),
         held=tuple(pin.name for pin in held),
-        friction=joint_friction(prepare(mechanism, SVD()), current.t, current.q, loose * np.asarray(rows.scales.rows)[:, None]),
+        friction=joint_friction(
+            equations_of(mechanism, SVD()), current.t, current.q, loose * np.asarray(rows.scales.rows)[:, None]
+        ),
     )
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.interpolate import BPoly
 
 from udkjax.equations import determinacy
-from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.rows.analysis import Analysis, analysis_of
 from udkjax.equations.states.quantities import equations_of
 from udkjax.integrate import simulate
 from udkjax.integrate.solution import Solution
@@ -24,7 +24,7 @@ from udkjax.positions.assembling.assembly import State
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.quantities import StudyModel, analysis_of
+from udkjax.study.quantities import StudyModel
 
 SAMPLES_PER_OUTPUT = 4  # samples per output interval, to look for minima
 PARTS_OF_INTERVAL = 8  # number of parts of an interval that is integrated again

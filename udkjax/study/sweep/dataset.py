@@ -12,8 +12,6 @@ from jaxtyping import Int, PyTree
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.units import units_of
-from udkjax.study.quantities import body_names
 from udkjax.study.sweep.axes import AxisColumn, Dimension
 from udkjax.study.sweep.dimensions import NUMBERS_OF, RENAMED, SweepError
 from udkjax.study.sweep.groups import END, RESULT, STEPS, group_run
@@ -58,7 +56,7 @@ def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
 def _derivative_unit(units: str, by: str, plan: SweepPlan) -> str:
     """Return the unit of a derivative; empty if it is unknown."""
     below = next((column.units for column in plan.columns if column.name == by), None)
-    below = units_of(plan.mechanism, by) if below is None else below
+    below = plan.mechanism.unit_of(by) if below is None else below
     return "" if not units or not below or "," in units else f"{units}/({below})"
 
 
@@ -145,7 +143,7 @@ def _write_members(
 def _body_places(plan: SweepPlan) -> dict[int, list[int]]:
     """Return the indices of each group's bodies among all bodies, for groups that do not have all bodies."""
     everyone = list(plan.bodies)
-    names_by_group = {group.index: list(body_names(plan.mechanism_of(group))) for group in plan.groups}
+    names_by_group = {group.index: list(plan.mechanism_of(group).body_names) for group in plan.groups}
     return {index: [everyone.index(name) for name in names] for index, names in names_by_group.items() if names != everyone}
 
 

@@ -17,8 +17,8 @@ from udkjax.positions.assembling.assembly import State
 from udkjax.requirements import describe
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.number_fields import parameters_of, split_index
-from udkjax.scene.numbers.units import NUMBERS, units_of
+from udkjax.scene.numbers.number_fields import split_index
+from udkjax.scene.numbers.units import NUMBERS
 from udkjax.scene.tables.checks import Mistakes, SceneError
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import (
@@ -164,7 +164,7 @@ def _column(
         return None
     if not callable(of):
         problems += _misfits(mechanism, name, of, numbers)
-    units = axis.units if axis.units is not None else "" if callable(of) else units_of(mechanism, of[0])
+    units = axis.units if axis.units is not None else "" if callable(of) else mechanism.unit_of(of[0])
     return AxisColumn(name, numbers, of, units)
 
 
@@ -196,7 +196,7 @@ def _numbers(values: Values) -> np.ndarray | None:
 
 
 def _unknown_targets(mechanism: StudyModel, name: str, of: Sequence[str]) -> Iterator[str]:
-    parameters = parameters_of(mechanism)
+    parameters = mechanism.number_fields()
     for target in of:
         if target not in NUMBERS and target not in CHOICES and split_index(target, parameters)[0] not in parameters:
             near = suggestion(target, (*parameters, *NUMBERS, *CHOICES)) or _suggest_ending(target, parameters)
@@ -295,7 +295,7 @@ def uses_number(setting: str, choice: AxisChoice, name: str) -> bool:
 def check_tangents(mechanism: StudyModel, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
     """Return the mistakes in the names of derivatives."""
     columns = {column.name: column for dimension in dimensions for column in dimension.columns}
-    parameters, problems = parameters_of(mechanism), []
+    parameters, problems = mechanism.number_fields(), []
     for name in names:
         if name in columns:
             if columns[name].is_choice or columns[name].numbers.ndim > 1:

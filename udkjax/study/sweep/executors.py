@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 import jax
 import numpy as np
 
+from udkjax.equations.rows.analysis import analysis_of
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result, versions
 from udkjax.study.members import concurrent_chunks
-from udkjax.study.quantities import analysis_of
 from udkjax.study.sweep.groups import RESULT, STEPS, GroupRun, group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 from udkjax.threads import thread_count

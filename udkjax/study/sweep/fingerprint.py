@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution, scene_text, versions
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.quantities import StudyModel, body_names
+from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn
 from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import SweepPlan
@@ -70,7 +70,7 @@ def _solution(plan: SweepPlan) -> Solution:
     number, states = np.zeros(()), np.zeros((len(plan.ts), *plan.state_shape_of(plan.groups[0])))
     count, model = np.zeros((), int), plan.mechanism
     stats = dict.fromkeys(STATS, count)
-    return Solution(plan.ts, states, states, count, number, stats, number, number, body_names(model), ())  # pyright: ignore[reportArgumentType]
+    return Solution(plan.ts, states, states, count, number, stats, number, number, model.body_names, ())  # pyright: ignore[reportArgumentType]
 
 
 def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:

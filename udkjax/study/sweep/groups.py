@@ -17,7 +17,7 @@ from jaxtyping import Array, Int, PyTree
 
 from udkjax.arrays import number
 from udkjax.devices import default_devices
-from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.rows.analysis import analyse, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
@@ -27,7 +27,7 @@ from udkjax.positions.assembling.assembly import Closure, State, close
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.units import NUMBERS
 from udkjax.study.members import CHUNKED_PLATFORMS, MOST_PROGRAMS, PIECE_MEMBERS, Outputs, Program
-from udkjax.study.quantities import StudyModel, analysis_of, parameter_value
+from udkjax.study.quantities import StudyModel, parameter_value
 from udkjax.study.sweep.dimensions import NUMBERS_OF, refuse_untraceable, uses_number
 from udkjax.study.sweep.measures import SECONDS
 from udkjax.study.sweep.plan import SweepPlan, stack_choices

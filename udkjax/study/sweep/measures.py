@@ -14,7 +14,6 @@ from typing_extensions import TypeAliasType
 
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations.states.quantities import energy, equations_of, violation
-from udkjax.equations.states.textbook import prepare
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
@@ -261,7 +260,7 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     method = method.rank_revealing if isinstance(method, Auto) else method
     if isinstance(run.mechanism, ConstrainedSystem):
         return {"rank": _ranks_of_system(run, method)}
-    equations, (ts, q) = prepare(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
+    equations, (ts, q) = equations_of(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
     if method.rank_tol is None:
         method = replace(method, rank_tol=equations.scales.rank_tol)
     reached = jnp.all(jnp.isfinite(q), axis=1)

@@ -21,7 +21,7 @@ from udkjax.requirements import require_output_times
 from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.members import structure_of
-from udkjax.study.quantities import StudyModel, body_names, state_shape
+from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign
 from udkjax.study.sweep.dimensions import TOGETHER, Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
@@ -154,12 +154,12 @@ class SweepPlan:
 
     def state_shape_of(self, group: Group) -> tuple[int, ...]:
         """Return the shape of the coordinates of a group: (bodies, 3), or (n,) of a user-defined system."""
-        return state_shape(self.mechanism_of(group), self.choice(group, "state"))
+        return self.mechanism_of(group).state_shape(self.choice(group, "state"))
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
         """The bodies of all mechanisms, in order of appearance."""
-        return tuple(dict.fromkeys(name for group in self.groups for name in body_names(self.mechanism_of(group))))
+        return tuple(dict.fromkeys(name for group in self.groups for name in self.mechanism_of(group).body_names))
 
 
 def make_plan(

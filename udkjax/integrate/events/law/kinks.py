@@ -134,7 +134,7 @@ def kinks_of(model: Any) -> FoundKinks:
 @lru_cache(maxsize=64)
 def _kinks_of_system(functions: Any, breaks: bool) -> FoundKinks:
     """Return the kinks of the `SystemFunctions` of a system: only those of its loads are located."""
-    smooth, moving = SmoothLoads.of_system(functions, breaks), functions.moving(breaks)
+    smooth, moving = SmoothLoads.of_functions(functions, breaks), functions.moving(breaks)
     others = [] if not smooth.has_opaque else ["force"]
     others += [name for name, terms in functions.other_terms.items() if has_kinks(functions.graph, terms, moving)]
     return FoundKinks(smooth.count > 0, tuple(others))
@@ -172,7 +172,7 @@ def with_held_forces(model: Any, first: int = 0) -> tuple[Any, tuple[HeldElement
 
 
 def _with_held_loads(system: Any) -> tuple[Any, tuple[HeldElement, ...], tuple[Event, ...]]:
-    smooth = SmoothLoads.of_system(system.functions, system.breakpoints is not None)
+    smooth = SmoothLoads.of_functions(system.functions, system.breakpoints is not None)
     if not smooth.count:
         return system, (), ()
     sides = jnp.full(smooth.count, FREE)

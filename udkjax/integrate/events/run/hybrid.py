@@ -15,7 +15,6 @@ from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.states.quantities import equations_of
-from udkjax.equations.states.textbook import prepare
 from udkjax.equations.terms.loads import mass_of
 from udkjax.integrate import native_engine
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, RunPlan
@@ -161,9 +160,7 @@ class Hybrid(eqx.Module):
     def textbook(self, which: int, at: RunState) -> Any:
         """Return the equations of a phase, of the mechanism `which`, solved by SVD."""
         mechanism = self.phases.mechanism(which, at.phase, at.joints)
-        if self.plan.of_system:
-            return equations_of(mechanism, SVD(), self.baumgarte)
-        return prepare(mechanism, SVD(), self.baumgarte, self.phases.analyses[which])
+        return equations_of(mechanism, SVD(), self.baumgarte, analysis=self.phases.analyses[which])
 
     # --- conditions
 

@@ -27,7 +27,7 @@ from udkjax.study.identify.problem.unknowns import apply_values
 from udkjax.study.identify.records.records import IdentificationError, dataset_of_fit, label_prefixes
 from udkjax.study.identify.search.optimizer import Loss, squares, weighted_residuals
 from udkjax.study.noise import Whiteness
-from udkjax.study.quantities import StudyModel, with_guess
+from udkjax.study.quantities import StudyModel
 from udkjax.study.report import format_value, plain
 from udkjax.wording import join_names, plural, quote, suggestion
 
@@ -107,7 +107,7 @@ class Estimate:
         if start.estimate == "nothing" and start.state is None:
             return self._with_values
         state = self.initial_states[0]
-        return with_guess(self._with_values, np.asarray(state.q), np.asarray(state.v))
+        return self._with_values.with_guess(np.asarray(state.q), np.asarray(state.v))
 
     @property
     def parameters(self) -> dict[str, float]:

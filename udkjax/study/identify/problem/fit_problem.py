@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.rows.analysis import analyse, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
@@ -37,7 +37,7 @@ from udkjax.study.identify.problem.unknowns import Unknowns, conditions_of, gues
 from udkjax.study.identify.problem.windows import BLOCK_BYTES, LEAST_WINDOW, WINDOW_BYTES, cut_into_windows, times_until
 from udkjax.study.identify.records.record_reader import Data, records_of
 from udkjax.study.identify.records.records import Estimated, IdentificationError, Noise, Record, Start, output_times, tabulate
-from udkjax.study.quantities import StudyModel, analysis_of, state_shape
+from udkjax.study.quantities import StudyModel
 from udkjax.wording import suggestion
 
 STILL_DEVIATION = 1e-12  # standard deviation below which a channel is constant, relative to its largest number
@@ -220,7 +220,7 @@ class FitProblem:
     @property
     def _bytes_per_time(self) -> int:
         """Size of the numbers of a run at one time: states and channels, with their derivatives."""
-        states = 2 * math.prod(state_shape(self.mechanism))
+        states = 2 * math.prod(self.mechanism.state_shape())
         return 8 * (states + len(self.channels)) * (1 + len(self.unknowns.names) + self.columns.shape[1])
 
     def _residuals_of(self, prediction: Prediction, rows: Int[np.ndarray, "R"], runs: np.ndarray, z: np.ndarray) -> Residuals:

@@ -19,7 +19,7 @@ from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.identify.problem.unknowns import Unknowns, apply_values, with_conditions
 from udkjax.study.identify.records.records import Estimated, IdentificationError, Record, Start
-from udkjax.study.quantities import StudyModel, jacobians_of_system, state_shape
+from udkjax.study.quantities import StudyModel, jacobians_of_system
 from udkjax.wording import quote
 
 SMALLEST_READABLE_PART = 1e-3  # least pivot, relative to the largest, of coordinates that are chosen as unknowns
@@ -65,7 +65,7 @@ def initial_state_unknowns(
         raise IdentificationError(problems)
     states = tuple(state for _, _, state in by_start.values())
     S = max((len(state.names) for state in states), default=0)
-    columns, bases = np.full((len(records), S), -1), np.zeros((len(records), 2, math.prod(state_shape(mechanism)), S))
+    columns, bases = np.full((len(records), S), -1), np.zeros((len(records), 2, math.prod(mechanism.state_shape()), S))
     for k, record in enumerate(records):
         if record.start.estimate != "nothing":
             _, first, state = by_start[record.start.name or k]

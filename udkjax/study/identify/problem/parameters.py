@@ -11,13 +11,12 @@ from typing_extensions import TypeAliasType
 
 from udkjax.requirements import ArgumentTypeError, describe, require_choice, require_numbers, require_text
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.number_fields import must_be_positive, parameters_of, split_index
-from udkjax.scene.numbers.units import units_of
+from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.identify.problem.unknowns import Target, Transform, Unknown, Unknowns
 from udkjax.study.identify.records.records import IdentificationError
-from udkjax.study.quantities import Length, Setter, StudyModel, body_names, parameter_value
+from udkjax.study.quantities import Length, Setter, StudyModel, parameter_value
 from udkjax.wording import quote, suggestion
 
 
@@ -174,14 +173,14 @@ def _unknown(mechanism: StudyModel, p: Parameter, name: str, part: _Part) -> Unk
 def _units(mechanism: StudyModel, target: Target) -> str:
     if isinstance(target.function, Length):
         return "m"
-    return "1" if target.scaled else units_of(mechanism, target.names[0]) if target.names else ""
+    return "1" if target.scaled else mechanism.unit_of(target.names[0]) if target.names else ""
 
 
 def _is_positive(mechanism: StudyModel, target: Target, guess: float) -> bool:
     """Return True if a value must stay positive."""
     if target.function is not None:
         return isinstance(target.function, Length)
-    return guess > 0 and (target.scaled or all(must_be_positive(mechanism, name) for name in target.names))
+    return guess > 0 and (target.scaled or all(mechanism.must_be_positive(name) for name in target.names))
 
 
 # --- numbers that a parameter refers to
@@ -199,7 +198,7 @@ def _parts(mechanism: StudyModel, p: Parameter) -> list[_Part]:
         return [_Part(Target(function=of), lengths[0], len(set(lengths)) == 1)]
     if callable(of):
         return [_Part(Target(function=of), None, False)]
-    numbers = parameters_of(mechanism)
+    numbers = mechanism.number_fields()
     names = tuple(of)
     problems = []
     for name in names:
@@ -244,4 +243,4 @@ def _length(mechanism: StudyModel, text: str) -> tuple[str, ...]:
     if text.startswith("length(") and text.endswith(")"):
         return tuple(body.strip().strip("\"'") for body in text[7:-1].split(","))
     owner, dot, field = text.rpartition(".")
-    return (owner,) if dot and field == "length" and owner in body_names(mechanism) else ()
+    return (owner,) if dot and field == "length" and owner in mechanism.body_names else ()

@@ -25,7 +25,7 @@ from udkjax.scene.elements.held import Held
 from udkjax.study.channel_values import measure
 from udkjax.study.identify.problem.unknowns import Target, apply_values
 from udkjax.study.members import MOST_PROGRAMS, PIECE_MEMBERS, Program, structure_of
-from udkjax.study.quantities import StudyModel, with_guess
+from udkjax.study.quantities import StudyModel
 
 # Relative and absolute tolerances of the integration: for final estimates (the accuracy of parameters without noise); for
 # singular values and the continuity of pieces; and for the search for a fit.
@@ -137,7 +137,7 @@ class _MemberRun:
         assigned = guess = apply_values(base, self.targets, member.x)
         if run.q is not None and run.v is not None:
             # Length parameters also move the record's guess; constants are computed from the scene's guess.
-            guess = apply_values(with_guess(base, run.q, run.v), self.targets, member.x)
+            guess = apply_values(base.with_guess(run.q, run.v), self.targets, member.x)
         q, v = jnp.einsum("iks,s->ik", run.bases, member.shift)
         q0, v0 = jnp.asarray(guess.q0), jnp.asarray(guess.v0)
         return assigned, State(q0 + q.reshape(q0.shape), v0 + v.reshape(q0.shape)), settings

@@ -17,7 +17,7 @@ from udkjax.arrays import make_module
 from udkjax.positions.assembling.assembly import State
 from udkjax.scene.elements.held import Held
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.number_fields import NumberField, parameters_of, split_index
+from udkjax.scene.numbers.number_fields import NumberField, split_index
 from udkjax.study.identify.records.records import IdentificationError, Record
 from udkjax.study.quantities import Setter, StudyModel, parameter_value
 from udkjax.wording import quote
@@ -202,7 +202,7 @@ def guessed_states(mechanism: StudyModel, records: Sequence[Record]) -> tuple[np
 
 def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str, np.ndarray | Held]:
     """Return the values in all records of each parameter that differs between records, stacked; samples as one `Held`."""
-    numbers, problems = parameters_of(mechanism), []
+    numbers, problems = mechanism.number_fields(), []
     conditions: dict[str, np.ndarray | Held] = {}
     for name in dict.fromkeys(name for record in records for name in record.conditions):
         owner, index = split_index(name, numbers)

@@ -13,7 +13,7 @@ from udkjax.positions.assembling.channels import Channel, Quantity, channel_of
 from udkjax.scene.numbers.units import conversion_factor
 from udkjax.study.identify.records.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
 from udkjax.study.identify.records.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
-from udkjax.study.quantities import StudyModel, body_names
+from udkjax.study.quantities import StudyModel
 from udkjax.wording import abbreviate, quote, suggestion
 
 Data: TypeAlias = "Record | TableData | Sequence[Record | TableData]"
@@ -221,7 +221,7 @@ class _DataReader:
             if isinstance(data, Iterable) and not isinstance(data, str | os.PathLike | np.ndarray | jax.Array):
                 # Its columns may be quantities.
                 self.quantities |= _quantities_by_name(cast("Iterable[Hashable]", data))
-            for table in read_tables(cast(TableData, data), body_names(self.mechanism), source, self.problems):
+            for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems):
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
     def channel(self, given: ChannelKey) -> Channel | Quantity:

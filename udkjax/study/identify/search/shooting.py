@@ -37,7 +37,6 @@ from udkjax.study.identify.search.least_squares import (
     minimize_squares,
 )
 from udkjax.study.identify.search.optimizer import Minimizer
-from udkjax.study.quantities import state_shape
 
 MOST_PIECES = 60  # largest number of pieces of all records, since the linear algebra is dense
 # Singular values below this, relative to the largest, belong to components of a piece's initial state that stay close to the end
@@ -107,7 +106,7 @@ class MultipleShooting(FitProblem):
 
     def _begin_at(self, p: int, state: np.ndarray, x: np.ndarray) -> None:
         """Set the guess of a piece's initial state to a closed state (2, n)."""
-        q, v = state.reshape(2, *state_shape(self.mechanism))
+        q, v = state.reshape(2, *self.mechanism.state_shape())
         basis = self._unknowns_at(self.pieces[p].record, x, float(self.runs.ts[p, 0]), State(q, v)).basis
         self.runs.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
         assert self.runs.q is not None and self.runs.v is not None

@@ -1,0 +1,141 @@
+"""The questions that runs and studies ask of a model, whichever kind it is: a `Mechanism`, or a user-defined system.
+
+What needs the equations of motion is not asked here: `equations_of` and `analysis_of` in `udkjax/equations` answer for all kinds.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from udkjax.annotations import Numbers, NumericArray, Time
+from udkjax.requirements import ArgumentError
+from udkjax.scene.numbers.number_fields import NumberField, must_be_positive
+from udkjax.scene.numbers.units import units_of
+
+_NONE: Mapping[str, Any] = MappingProxyType({})
+
+
+class RunModel(eqx.Module):
+    """What a run asks of a model. By default it has coordinates alone: no bodies, elements or sampled numbers.
+
+    Attributes:
+        has_bodies: whether coordinates are those of bodies, and rows those of joints and drivers.
+        has_programs: whether programs are made of the model, not functions of JAX alone.
+        body_names: the names of the bodies, in the order of coordinates.
+    """
+
+    has_bodies: ClassVar[bool] = False
+    has_programs: ClassVar[bool] = True
+    body_names: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    @abstractmethod
+    def breakpoints(self) -> Float[Array, "k"] | None:
+        """The times (s) where the motion is not smooth; None if it is smooth."""
+
+    @property
+    @abstractmethod
+    def is_concrete(self) -> bool:
+        """True if no number is traced."""
+
+    @property
+    def constraints(self) -> Mapping[str, Any]:
+        """The joints and drivers by name, in the order of the rows."""
+        return _NONE
+
+    @property
+    def forces(self) -> Mapping[str, Any]:
+        """The force elements by name."""
+        return _NONE
+
+    @property
+    def coordinate_count(self) -> int:
+        """The number n of coordinates."""
+        raise NotImplementedError
+
+    @property
+    def may_have_kinks(self) -> bool:
+        """True if jumps or kinks of its loads may be located."""
+        return False
+
+    @property
+    def without_origin(self) -> Self:
+        """The model that programs are made of, without anything that does not enter the equations."""
+        return self
+
+    def without_origin_beside(self, names: Sequence[str]) -> Self:
+        """Return `without_origin`, as far as numbers of these names, which are set later, determine no others."""
+        del names
+        return self.without_origin
+
+    def at(self, t: Time) -> Self:
+        """Return the model with the values of sampled numbers at time t (s)."""
+        del t
+        return self
+
+    def with_samples(self, samples: Mapping[Any, Any]) -> Self:
+        """Return the model with other sampled numbers."""
+        del samples
+        return self
+
+    def require_bodies(self, message: str) -> None:
+        """Raise an `ArgumentError` with this message if the model has no bodies."""
+        if not self.has_bodies:
+            raise ArgumentError(message)
+
+
+class Model(RunModel):
+    """What a study asks of a model in addition: its numbers by name, and its initial guess.
+
+    Attributes:
+        name: the name, for titles.
+    """
+
+    name: ClassVar[str] = "system"
+
+    @property
+    @abstractmethod
+    def q0(self) -> Float[Array, "..."] | None:
+        """The initial guess of the coordinates; None: states are given."""
+
+    @property
+    @abstractmethod
+    def v0(self) -> Float[Array, "..."] | None:
+        """The initial guess of the velocities."""
+
+    @abstractmethod
+    def number_fields(self) -> Mapping[str, NumberField]:
+        """Return all numbers by name, with their shapes, including absent ones."""
+
+    def unit_of(self, name: str) -> str:
+        """Return the unit of a parameter or of a setting of a run; an empty string if unknown."""
+        return units_of(self, name)
+
+    def must_be_positive(self, name: str) -> bool:
+        """Return True if a number, or the number that an entry belongs to, must not be negative."""
+        return must_be_positive(self, name)
+
+    @abstractmethod
+    def parameters(self) -> dict[str, Array]:
+        """Return the values of all numbers by name."""
+
+    @abstractmethod
+    def with_parameters(self, values: Mapping[str, Numbers]) -> Self:
+        """Return the model with new values of some numbers, or of their entries."""
+
+    @abstractmethod
+    def with_guess(self, q: NumericArray, v: NumericArray) -> Self:
+        """Return the model with another initial guess."""
+
+    @abstractmethod
+    def state_shape(self, state: object = None) -> tuple[int, ...]:
+        """Return the shape of coordinates, (bodies, 3) or (n,); without bodies by a state or the guess, else ()."""
+
+    def traced(self, n: int) -> Any:
+        """Return the model with n coordinates of which programs are made."""
+        del n
+        return self
