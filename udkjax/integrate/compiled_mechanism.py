@@ -29,7 +29,6 @@ from udkjax.native.unsupported import unsupported
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.elements.rolling import rolling_joints
-from udkjax.scene.mechanism import Mechanism
 
 if TYPE_CHECKING:
     import diffrax
@@ -158,8 +157,7 @@ def _orders_by_diffrax(system: Any, projected: bool) -> float:
 
 def _is_piecewise(system: Any) -> bool:
     """Return whether constraints or loads of a mechanism are only piecewise smooth in the state."""
-    elements = (*system.constraints.values(), *system.forces.values()) if isinstance(system, Mechanism) else ()
-    return any(map(has_pieces, elements))
+    return any(map(has_pieces, (*system.constraints.values(), *system.forces.values())))
 
 
 @cached_by_identity

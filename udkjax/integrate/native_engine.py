@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array
 
 from udkjax.equations.laws.abstract_system import AbstractSystem
-from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, formulation_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -210,11 +209,6 @@ def _concrete_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
     return inputs._replace(numbers=[numbers_as_vector(inputs.numbers)])
 
 
-def marking(mechanism: Mechanism) -> MarkRows:
-    """Return the operation that marks the independent rows of a mechanism, without samples or at a given time."""
-    return MarkRows(scene_programs(mechanism, None, policy=RankPolicy.FALL_BACK))
-
-
 def mark_rows(
     compiled: CompiledMechanism,
     t: Any,
@@ -248,7 +242,7 @@ def mark_rows(
     if compiled.plan.weighs_rows:
         return equations.scales.weights
     mechanism = equations.mechanism.at(t)
-    operation = MarkRows(equations.programs_of_rows) if among is None else marking(mechanism)
+    operation = MarkRows(equations.programs_of_rows if among is None else equations.programs_of_marked_rows)
     tol = equations.scales.rank_tol
     settings = {"length": 1.0 if length is None else length, "omega": rate}
     numbers = [*mechanism.numbers, *([] if among is None else [xp.asarray(among, float)]), tol**2, 0.0]

@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.arrays import number
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import Analysis, analyse, hold_pins
-from udkjax.equations.systems.general import ConstrainedSystem
+from udkjax.equations.rows.analysis import Analysis, analysis_of, hold_pins
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.outcome import LEAST_ATOL, increases, usable
@@ -28,7 +27,7 @@ from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.undefined import whole
 from udkjax.requirements import ArgumentTypeError, describe
 from udkjax.scene.elements.friction import Friction
-from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.model import RunModel
 from udkjax.scene.tables.checks import numbers_are_valid
 from udkjax.transforms.gradients import stop_gradients
 
@@ -116,8 +115,8 @@ class Choices(NamedTuple):
 
 
 def with_held_pins(
-    mechanism: Mechanism, events: Any, analysis: Analysis | None, choices: Choices
-) -> tuple[Mechanism, Analysis | None, Choices]:
+    mechanism: Any, events: Any, analysis: Analysis | None, choices: Choices
+) -> tuple[Any, Analysis | None, Choices]:
     """Return the mechanism, analysis and choices of a run with held pins; unchanged if no pin is held.
 
     Constraints may prevent a pin from turning to second order only. Its angle is then held to first order, unless an event
@@ -133,8 +132,8 @@ def with_held_pins(
 
 
 @cached_by_identity
-def may_stick(mechanism: Mechanism) -> bool:
-    """Return True if a joint of the mechanism has set-valued friction."""
+def may_stick(mechanism: RunModel) -> bool:
+    """Return True if a joint of the model has set-valued friction."""
     return Friction.may_stick(mechanism.forces.values())
 
 
@@ -150,23 +149,21 @@ def with_kinks(system: Any, choices: Choices) -> tuple[Choices, bool]:
 
 @cached_by_identity
 def _may_have_kinks(system: Any) -> bool:
-    if isinstance(system, Mechanism):
-        return any(force.may_have_kinks for force in system.forces.values())
-    return not isinstance(system, ConstrainedSystem) and system.functions.may_have_kinks  # traced
+    return system.may_have_kinks
 
 
 class Beginning(NamedTuple):
-    """The analysis of a mechanism, and its assembled guess, before a run."""
+    """The analysis of a model, and its assembled guess, before a run."""
 
-    analysis: Analysis
+    analysis: Analysis | None
     closure: Closure | None  # closure of the initial guess; None if the state is given
     is_open: bool  # whether the closure is known to be open
     moves: str  # a warning if assembly moves bodies far from the guess; else empty
 
 
-def begin(mechanism: Mechanism, t: Any, analysis: Analysis | None, state: State | None, closure: Closure | None) -> Beginning:
-    """Analyse a mechanism, and assemble its guess at the time t (s), unless these are given."""
-    analysis = analyse(mechanism) if analysis is None else analysis
+def begin(mechanism: Any, t: Any, analysis: Analysis | None, state: State | None, closure: Closure | None) -> Beginning:
+    """Analyse a model, and assemble its guess at the time t (s), unless these are given."""
+    analysis = analysis_of(mechanism) if analysis is None else analysis
     moves = ""
     if state is None and closure is None:
         closure = close(mechanism, t, analysis=analysis)

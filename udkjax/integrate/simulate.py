@@ -1,6 +1,7 @@
 """Simulate: from a mechanism and output times to a trajectory."""
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Sequence
 from types import ModuleType
@@ -18,10 +19,9 @@ from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arr
 from udkjax.devices import on_host
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.rows.analysis import Analysis, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.causes.find import explained
-from udkjax.integrate.causes.system_causes import explained_system
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
 from udkjax.integrate.derivatives import differentiable, integrate_by_diffrax
 from udkjax.integrate.native_engine import integrate_concrete
@@ -160,7 +160,7 @@ def simulate(
         raise ArgumentError(
             f"rtol = {rtol:g} and atol = {atol:g} are below rounding errors, and no step can meet them: raise one of them"
         )
-    if state is None and isinstance(mechanism, ConstrainedSystem):
+    if state is None and not mechanism.has_bodies:
         times: Any = ts
         state = close(mechanism, times[0])
     if drift_tol is None:
@@ -180,33 +180,25 @@ def simulate(
         engine=engine,
         stepper=stepsize_controller,
     )
-    if isinstance(mechanism, Mechanism):
-        mechanism, analysis, choices = with_held_pins(mechanism, events, analysis, choices)
-    system = mechanism
-    if isinstance(mechanism, ConstrainedSystem):
-        assert state is not None  # closed above
-        start = state.state if isinstance(state, Closure) else state
-        system = mechanism.traced(np.size(start.q))
-        if throw and isinstance(state, Closure):
-            require_closed(mechanism, state)
-    is_concrete = not isinstance(system, ConstrainedSystem) and system.is_concrete
+    mechanism, analysis, choices = with_held_pins(mechanism, events, analysis, choices)
+    system: Any = mechanism if mechanism.has_bodies else mechanism.traced(math.prod(mechanism.state_shape(state)))
+    is_concrete = system.has_programs and system.is_concrete
     state, closure = (None, state) if isinstance(state, Closure) else (state, None)
     all_concrete = is_concrete and not is_traced((ts, analysis, state, closure, choices))
-    if isinstance(mechanism, Mechanism):
-        start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
-        begun = (begin_concrete if all_concrete else begin)(mechanism, start, analysis, state, closure)
-        analysis, closure = begun.analysis, begun.closure
-        if begun.moves:
-            warnings.warn(begun.moves, AssemblyWarning, stacklevel=3)
-        if throw and closure is not None and begun.is_open:
-            require_closed(mechanism, closure, start)  # before anything runs
+    start = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
+    begun = (begin_concrete if all_concrete else begin)(mechanism, start, analysis, state, closure)
+    analysis, closure = begun.analysis, begun.closure
+    if begun.moves:
+        warnings.warn(begun.moves, AssemblyWarning, stacklevel=3)
+    if throw and closure is not None and begun.is_open:
+        require_closed(mechanism, closure, start)  # before anything runs
 
-    sticks, located = isinstance(mechanism, Mechanism) and may_stick(mechanism), None
+    sticks, located = may_stick(mechanism), None
     choices, locates_kinks = with_kinks(system, choices)
     if events is not None or sticks or locates_kinks:
         if without := choices.without_events:
             raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {without}")
-        if isinstance(system, ConstrainedSystem):
+        if not system.has_programs:
             raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
         from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
@@ -214,31 +206,26 @@ def simulate(
         solution, end = simulate_events(system, events, analysis, ts, state, closure, choices, most, all_concrete)
         if not _has_failed(solution.code):
             return solution
-        if not is_concrete or (events is not None and int(solution.stats.get("events", 0))):
+        if not is_concrete or (events is not None and (not mechanism.has_bodies or int(solution.stats.get("events", 0)))):
             return _required(solution, throw)  # events may have changed what moved; joints that stick or slip have not
-        if events is not None and isinstance(mechanism, ConstrainedSystem):
-            return _required(solution, throw)
         if events is not None or sticks:
-            assert isinstance(mechanism, Mechanism)  # no joint of a system sticks
             return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
         located = solution  # locating kinks failed; perhaps a run succeeds without
 
     solution, missed, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
-    if isinstance(mechanism, ConstrainedSystem) and is_concrete and _has_failed(code):
-        return _required(explained_system(solution if located is None else located, system, end), throw)
-    if isinstance(mechanism, Mechanism) and throw and not is_concrete and _has_failed(code):
+    if throw and not is_concrete and mechanism.has_bodies and _has_failed(code):
         found = without_derivatives((solution if located is None else located, mechanism, analysis, choices.drift_tol, end))
         if not is_traced(found):  # as in a call of `jax.grad`
             run, scene, analysed, tol, last = found
             return _required(explained(run, scene, analysed, tol, solver, last), throw)
-    if not isinstance(mechanism, Mechanism) or not is_concrete or isinstance(solution.code, Tracer):
+    if not is_concrete or isinstance(solution.code, Tracer):
         return _required(solution if located is None else _as_located(solution, located), throw)
     if missed:
-        analysis = analyse(mechanism)  # with the numbers of the given analysis more rows were redundant
-        solution, _, end, code = _run(mechanism, analysis, ts, state, closure, choices, all_concrete)
+        analysis = analysis_of(mechanism)  # with the numbers of the given analysis more rows were redundant
+        solution, _, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
     if int(code) not in SUCCESSES:
         found = solution if located is None else located
-        return _required(explained(found, mechanism, analysis, choices.drift_tol, solver, end), throw)
+        return _required(explained(found, system, analysis, choices.drift_tol, solver, end), throw)
     return solution if located is None else _as_located(solution, located)
 
 
@@ -273,20 +260,17 @@ def _run(
     The result is a NumPy number if machine code is called by NumPy: reading that of the solution from a graphics card takes long.
     With concrete numbers NumPy calls machine code directly; everything else is traced.
     """
-    body_names = getattr(system, "body_names", ())
-    if all_concrete and not isinstance(system, ConstrainedSystem):
+    if all_concrete:
         with jax.ensure_compile_time_eval():  # concrete even while something else is traced
             compiled = compile_concrete(system, analysis, *choices.of_mechanism)
             if compiled.plan.is_native:
                 run = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
-                return _finish(run, integrate_concrete(run.problem), body_names, choices, np)
-    scene = system if isinstance(system, ConstrainedSystem) else system.without_origin
-    arguments = scene, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
+                return _finish(run, integrate_concrete(run.problem), system.body_names, choices, np)
+    arguments = system.without_origin, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
     if is_within_jit():  # concrete numbers become tracers, too
         return _simulate(*arguments)
     # Runs by diffrax are compiled at once: each step has hundreds of operations.
-    uses_diffrax = choices.take_diffrax or isinstance(system, ConstrainedSystem)
-    return _compiled(*arguments) if uses_diffrax else _deferred(*arguments)
+    return (_compiled if choices.take_diffrax or not system.has_programs else _deferred)(*arguments)
 
 
 def _simulate(
@@ -304,7 +288,7 @@ def _simulate(
         raw = integrate_by_diffrax(run.problem, choices.adjoint, choices.meter)
     else:
         raw = differentiable(run.problem, has_fixed_times)
-    return _finish(run, raw, getattr(system, "body_names", ()), choices)
+    return _finish(run, raw, system.body_names, choices)
 
 
 _compiled, _deferred = on_host(eqx.filter_jit(_simulate)), deferred(_simulate)

@@ -212,7 +212,7 @@ class Solution(PrintsTable):
         with OptionalImport():
             import xarray
 
-        mechanism = mechanism if isinstance(mechanism, Mechanism) else None  # a system has no numbers or text of a scene
+        mechanism = mechanism if mechanism is not None and mechanism.has_bodies else None  # else without the text of a scene
         if self.bodies:
             dims, coords = ("time", "body", "coordinate"), {"body": list(self.bodies), "coordinate": list(COORDINATES)}
         else:
@@ -256,7 +256,7 @@ def format_work(stats: Mapping[str, ArrayLike]) -> str:
     return ", ".join(f"{counts[name]:,} {words[name]}" for name in sorted(counts, key=_ORDER.find) if counts[name] >= 0)
 
 
-def scene_text(mechanism: Mechanism) -> str:
+def scene_text(mechanism: Any) -> str:
     """Return a mechanism as the text of a scene file, or the reason why this is impossible."""
     from udkjax.scene.files import dumps
     from udkjax.scene.tables.checks import SceneError

@@ -26,7 +26,7 @@ from udkjax.positions.assembling.assembly import State
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.programs.undefined import defined
-from udkjax.requirements import ArgumentError, ArgumentTypeError, describe
+from udkjax.requirements import ArgumentTypeError, describe
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.held import Held
 from udkjax.scene.mechanism import Mechanism
@@ -76,8 +76,13 @@ def step(
         ValueError: there are inputs for a `ConstrainedSystem`.
         TypeError: an input is a `Held`.
     """
-    values, others = _checked_inputs(mechanism, inputs), {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
-    moved: Any = mechanism.traced(np.size(state.q)) if isinstance(mechanism, ConstrainedSystem) else mechanism
+    moved: Any = mechanism
+    if isinstance(mechanism, ConstrainedSystem):
+        if inputs:
+            cure = "make a ConstrainedSystem of functions that hold the inputs of the interval"
+            mechanism.require_bodies(f"inputs are for mechanisms: {cure}")
+        moved = mechanism.traced(np.size(state.q))
+    values, others = _checked_inputs(inputs), {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if not is_concrete(moved, analysis) or is_traced((state.q, state.v, values, others)):
         analysis, has_fixed_times = analysis or analysis_of(moved), not is_traced((t, dt))
         if is_within_jit():
@@ -96,14 +101,10 @@ def step(
     return make_module(State, q=q, v=v)
 
 
-def _checked_inputs(mechanism: Any, inputs: Any) -> dict[str, Any]:
+def _checked_inputs(inputs: Any) -> dict[str, Any]:
     """Return the inputs of an interval; raise an error for anything that is not held constant."""
     if not inputs:
         return {}
-    if isinstance(mechanism, ConstrainedSystem):
-        raise ArgumentError(
-            "inputs are for mechanisms: make a ConstrainedSystem of functions that hold the inputs of the interval"
-        )
     if not isinstance(inputs, Mapping):
         raise ArgumentTypeError(f"inputs must map names of parameters to numbers, {describe(inputs)}")
     for name, value in inputs.items():

@@ -332,7 +332,7 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         Numbers that follow from others, such as the masses of a drawn mechanism, are computed: in a tree of derivatives, as from
         `eqx.filter_grad`, they mean nothing, and `independent_parameters` are the derivatives.
         """
-        return {name: p.value for name, p in parameters_of(self).items() if p.value is not None}
+        return super().parameters()
 
     def independent_parameters(self) -> dict[str, Array]:
         """Return the numbers by name that follow from no others, the leaves of the mechanism: those of a drawing, if it has one.

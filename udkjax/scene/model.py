@@ -57,6 +57,11 @@ class RunModel(eqx.Module):
         """The number n of coordinates."""
         raise NotImplementedError
 
+    def state_shape(self, state: object = None) -> tuple[int, ...]:
+        """Return the shape of coordinates, (bodies, 3) or (n,); of a system by a state or its guess, else ()."""
+        del state
+        return (self.coordinate_count,)
+
     @property
     def may_have_kinks(self) -> bool:
         """True if jumps or kinks of its loads may be located."""
@@ -107,6 +112,11 @@ class Model(RunModel):
     def v0(self) -> Float[Array, "..."] | None:
         """The initial guess of the velocities."""
 
+    @property
+    def groups(self) -> Mapping[str, Mapping[str, Any]]:
+        """The elements of bodies by section and name."""
+        return _NONE
+
     @abstractmethod
     def number_fields(self) -> Mapping[str, NumberField]:
         """Return all numbers by name, with their shapes, including absent ones."""
@@ -119,9 +129,9 @@ class Model(RunModel):
         """Return True if a number, or the number that an entry belongs to, must not be negative."""
         return must_be_positive(self, name)
 
-    @abstractmethod
     def parameters(self) -> dict[str, Array]:
         """Return the values of all numbers by name."""
+        return {name: p.value for name, p in self.number_fields().items() if p.value is not None}
 
     @abstractmethod
     def with_parameters(self, values: Mapping[str, Numbers]) -> Self:
@@ -130,10 +140,6 @@ class Model(RunModel):
     @abstractmethod
     def with_guess(self, q: NumericArray, v: NumericArray) -> Self:
         """Return the model with another initial guess."""
-
-    @abstractmethod
-    def state_shape(self, state: object = None) -> tuple[int, ...]:
-        """Return the shape of coordinates, (bodies, 3) or (n,); without bodies by a state or the guess, else ()."""
 
     def traced(self, n: int) -> Any:
         """Return the model with n coordinates of which programs are made."""

@@ -65,7 +65,7 @@ def parameter_value(mechanism: StudyModel, name: str) -> Array:
 
 @deferred
 @defined
-def jacobians_of_system(system: Any, t: Any, q: Any, v: Any) -> Any:
+def jacobians_at(system: Any, t: Any, q: Any, v: Any) -> Any:
     """Return Psi_q, and the rows (Psi_q; phi_v), of a system of traced functions at a state."""
     equations: Any = equations_of(system, SVD())
     t, q, v = (jnp.asarray(x, float) for x in (t, q, v))

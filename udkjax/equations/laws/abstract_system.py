@@ -6,23 +6,10 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Time, Vector
 from udkjax.equations.programs.run_programs import RunPrograms
-from udkjax.equations.programs.scales import Scales
-
-
-class PseudoinverseOperator(Protocol):
-    """A pseudoinverse as an operator: its products `D_plus @ b` and `D_plus.T @ x`, and its rank."""
-
-    @property
-    def T(self) -> "PseudoinverseOperator": ...
-
-    @property
-    def rank(self) -> Int[Array, ""]: ...
-
-    def __matmul__(self, b: Array) -> Array: ...
 
 
 class HasStates(Protocol):
@@ -136,6 +123,11 @@ class AbstractSystem(eqx.Module):
 class ConstrainedRows(AbstractSystem):
     """A system whose rows of positions and of velocities are known, for formulations that solve them."""
 
+    @property
+    @abstractmethod
+    def programs_of_marked_rows(self) -> RunPrograms:
+        """The programs that find independent rows among those that numbers mark."""
+
     def residuals(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
         """Return Psi of all rows, then phi if there is one."""
         return self.violation(t, q, v)[0]
@@ -175,30 +167,3 @@ class ConstrainedRows(AbstractSystem):
     @abstractmethod
     def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
         """Return the same of all rows of velocities, with their residuals."""
-
-
-class MechanismSystem(ConstrainedRows):
-    """The equations of motion of a mechanism; coordinates and velocities are x, y, angle of each body in turn."""
-
-    scales: eqx.AbstractVar[Scales]
-
-    def size(self, dq: Vector) -> Float[Array, ""]:
-        """Return the largest component of a change of coordinates: lengths per characteristic length, angles in rad."""
-        return self.scales.size(dq)
-
-    def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
-        """Return the largest violation of any row of Psi, each divided by the row's scale."""
-        return self.scales.violation(psi)
-
-    @property
-    @abstractmethod
-    def row_names(self) -> list[tuple[str, int]]:
-        """The constraint that each row of Psi belongs to, and the row's index within it."""
-
-    @abstractmethod
-    def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
-        """Return D^+ by the method, Psi, both with weighted rows, and M^(-1/2)."""
-
-    @abstractmethod
-    def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
-        """Return D^+ by the method, Psi_dot, both with weighted rows, and M^(-1/2)."""

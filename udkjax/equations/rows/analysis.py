@@ -36,7 +36,7 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbe
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.model import RunModel
+from udkjax.scene.model import Model, RunModel
 
 # Rank tolerance, relative to the smallest nonzero singular value of a generic position, where gears make it small. As in a scene
 # without gears, it is then about a hundredth of the usual values.
@@ -247,8 +247,10 @@ class Holding(NamedTuple):
 
 
 @cached_by_identity  # the result must not contain the mechanism, or the cache would keep it in memory
-def hold_pins(mechanism: Mechanism) -> Holding | None:
+def hold_pins(mechanism: Model) -> Holding | None:
     """Hold the pins that constraints hold only to second order (stationary_rows.py), if concrete numbers show any; else None."""
+    if not isinstance(mechanism, Mechanism):
+        return None
     source = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     pins = () if source is None else _held_pins(source)
     with jax.ensure_compile_time_eval() if mechanism.is_concrete else nullcontext():

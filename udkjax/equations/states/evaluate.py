@@ -120,7 +120,8 @@ def singular_values(
 
 @deferred
 def _values_of_rows(model: Any, t: Time, q: Vector, v: Vector) -> Float[Array, "k"]:
-    return jnp.linalg.svd(equations_of(model).jacobian(t, q, v), compute_uv=False)
+    equations: Any = equations_of(model)
+    return jnp.linalg.svd(equations.jacobian(t, q, v), compute_uv=False)
 
 
 uniqueness = compiled(determinacy.uniqueness, _uniqueness)

@@ -1,7 +1,7 @@
 """Quantities of a motion: accelerations, multipliers, energies and violations of the constraints."""
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, TypeVar, overload
+from typing import Any, Literal, NamedTuple, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import Analysis, analyse, analysis_of
 from udkjax.equations.states.state_arrays import by_numpy, history_of, state_arrays
 from udkjax.equations.states.textbook import TextbookEquations, prepare
-from udkjax.equations.systems.general import ConstrainedSystem, GeneralEquations, prepare_general
+from udkjax.equations.systems.general import ConstrainedSystem, prepare_general
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.printing import prints_table, units
 from udkjax.programs.deferred import deferred
@@ -46,31 +46,13 @@ class Energy(NamedTuple):
 
 @overload
 def equations_of(
-    system: Mechanism,
-    method: Pseudoinverse | None = None,
-    baumgarte: Baumgarte | None = None,
-    formulation: None = None,
-    analysis: Analysis | None = None,
+    system: Mechanism, method: Any = None, baumgarte: Any = None, *, analysis: Analysis | None = None
 ) -> TextbookEquations: ...
 
 
 @overload
 def equations_of(
-    system: RunModel,
-    method: Pseudoinverse | None = None,
-    baumgarte: Baumgarte | None = None,
-    formulation: None = None,
-    analysis: Analysis | None = None,
-) -> TextbookEquations | GeneralEquations: ...
-
-
-@overload
-def equations_of(
-    system: RunModel,
-    method: Pseudoinverse | None = None,
-    baumgarte: Baumgarte | None = None,
-    formulation: Formulation | None = None,
-    analysis: Analysis | None = None,
+    system: RunModel, method: Any = None, baumgarte: Any = None, formulation: Any = None, analysis: Analysis | None = None
 ) -> AbstractSystem: ...
 
 

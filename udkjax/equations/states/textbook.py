@@ -13,20 +13,20 @@ from udkjax.equations.friction import rubbing
 from udkjax.equations.friction.loose_friction import LooseFriction, loose_friction
 from udkjax.equations.friction.sticking_state import StickingState, known_sticking
 from udkjax.equations.laws import udwadia_kalaba as uk
-from udkjax.equations.laws.abstract_system import HistoryLike, MechanismSystem, PseudoinverseOperator, TangentPart
+from udkjax.equations.laws.abstract_system import ConstrainedRows, HistoryLike, TangentPart
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.programs.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.terms import constraints, loads
 from udkjax.equations.terms.scene_layout import LoadShares
-from udkjax.pinv import Auto, Elimination, Pseudoinverse
+from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
 
-class TextbookEquations(MechanismSystem):
+class TextbookEquations(ConstrainedRows):
     """The equations of motion of one mechanism by one pseudoinverse.
 
     Coordinates and velocities are flat vectors (3 bodies,): x, y, angle of each body in turn. Rows are weighted by
@@ -41,6 +41,14 @@ class TextbookEquations(MechanismSystem):
     only_switched: bool = eqx.field(static=True, default=False)  # whether unknown ones are those that are switched off
     soft: Float[Array, "m"] | None = None  # compliances of the rows, by which they share redundant forces; None: by least norm
     sticking: Bool[Array, "F"] | None = None  # the joints that are known to stick; None: the law decides
+
+    def size(self, dq: Vector) -> Float[Array, ""]:
+        """Return the largest component of a change of coordinates: lengths per characteristic length, angles in rad."""
+        return self.scales.size(dq)
+
+    def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
+        """Return the largest violation of any row of Psi, each divided by the row's scale."""
+        return self.scales.violation(psi)
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
         """Return a = a_F + M^(-1/2) D^+ b."""
@@ -187,10 +195,10 @@ class TextbookEquations(MechanismSystem):
         return jnp.where(rolling, 0.0, w) if rolling.any() else w
 
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
-        """Kinetic and potential energy (J)."""
         return loads.kinetic_energy(self.mechanism, v), loads.potential_energy(self.mechanism, t, q, v)
 
-    def linearized_position(self, t: Time, q: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
+    def linearized_position(self, t: Time, q: Vector) -> tuple[Plus | uk.ZeroPseudoinverse, Float[Array, "m"], Vector]:
+        """Return D^+ by the method, Psi, both with weighted rows, and M^(-1/2)."""
         mechanism, w = self.mechanism, self.weights
         return (
             uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)),
@@ -198,7 +206,8 @@ class TextbookEquations(MechanismSystem):
             uk.inverse_sqrt_mass(mechanism),
         )
 
-    def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[PseudoinverseOperator, Float[Array, "m"], Vector]:
+    def linearized_velocity(self, t: Time, q: Vector, v: Vector) -> tuple[Plus | uk.ZeroPseudoinverse, Float[Array, "m"], Vector]:
+        """Return D^+ by the method, Psi_dot, both with weighted rows, and M^(-1/2)."""
         mechanism, w = self.mechanism, self.weights
         rate = uk.weigh(w, constraints.psi_dot(mechanism, t, q, v))
         return uk.pseudoinverse(self.method, uk.D(mechanism, t, q, w)), rate, uk.inverse_sqrt_mass(mechanism)
@@ -220,11 +229,16 @@ class TextbookEquations(MechanismSystem):
         return scene_programs(self.mechanism, redundant, self.baumgarte is not None, RankPolicy.of(self.method), sharing=shares)
 
     @property
+    def programs_of_marked_rows(self) -> ScenePrograms:
+        return scene_programs(self.mechanism.at(0.0), None, policy=RankPolicy.FALL_BACK)
+
+    @property
     def programs_of_rows(self) -> ScenePrograms:
         return scene_programs(self.mechanism).with_all_rows
 
     @property
     def row_names(self) -> list[tuple[str, int]]:
+        """The constraint that each row of Psi belongs to, and the row's index within it."""
         return constraints.row_names(self.mechanism)
 
     @property

@@ -17,7 +17,7 @@ from udkjax.equations.laws.abstract_system import ConstrainedRows, TangentPart
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.programs.scales import Scales, UnitScales
-from udkjax.equations.systems.system_numbers import number_fields, numbers_by_name, with_numbers
+from udkjax.equations.systems.system_numbers import number_fields, with_numbers
 from udkjax.equations.systems.system_programs import system_programs
 from udkjax.equations.systems.traced_system import TracedSystem, joined_rows, load, trace_system
 from udkjax.equations.terms.scale_program import RANK_TOL
@@ -89,7 +89,7 @@ class ConstrainedSystem(PrintsLine, Model):
         modules have fields of the same name, it begins with the function: `force.length`. `q0` and `v0` are the initial guess.
         Arrays that plain functions close over have no names.
         """
-        return numbers_by_name(self)
+        return super().parameters()
 
     def with_parameters(self, values: Mapping[str, Numbers]) -> "ConstrainedSystem":
         """Return the system with new values of some numbers, or of their entries (`q0[2]`). The values may be traced.
@@ -165,25 +165,24 @@ class GeneralEquations(ConstrainedRows):
     @property
     def programs(self) -> RunPrograms | None:
         """The programs of a traced system; `Elimination` drops dependent rows, all other methods need marks as input."""
-        if not isinstance(self.system, TracedSystem):
+        if not self.system.has_programs:
             return None
         marks_rows, policy = not isinstance(self.method, Elimination), RankPolicy.of(self.method)
         return system_programs(self.system, marks_rows, self.baumgarte is not None, policy)
 
     @property
     def programs_of_rows(self) -> RunPrograms | None:
-        return system_programs(self.system, False).with_all_rows if isinstance(self.system, TracedSystem) else None
+        return system_programs(self.system, False).with_all_rows if self.system.has_programs else None
 
     @property
     def programs_of_marked_rows(self) -> RunPrograms:
-        """The programs that find independent rows among those that numbers mark."""
         return system_programs(self.system, True, policy=RankPolicy.FALL_BACK)
 
     @property
     def scales(self) -> Scales:
         """Units of one: coordinates are of order one."""
         one: Any = np.ones(())  # NumPy's numbers, since each run asks for them
-        rows: Any = np.ones(sum(self.system.functions.row_counts) if isinstance(self.system, TracedSystem) else 0)
+        rows: Any = np.ones(sum(self.system.functions.row_counts) if self.system.has_programs else 0)
         tol: Any = np.asarray(RANK_TOL)
         return UnitScales(length=one, arm=one, rate=one, mass=one, rows=rows, rank_tol=tol)
 

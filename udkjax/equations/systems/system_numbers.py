@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
 
 from udkjax.annotations import Numbers
 from udkjax.arrays import number
@@ -123,8 +122,3 @@ def _advice(system: Any, name: str, known: list[str]) -> str:
     if not known:
         return ": the functions have no arrays as leaves; make them methods of an equinox module whose fields are arrays"
     return suggestion(name, known) or f"; there are {', '.join(map(quote, known))}"
-
-
-def numbers_by_name(system: Any) -> dict[str, Array]:
-    """Return the values of all numbers of a system."""
-    return {name: field.value for name, field in number_fields(system).items() if field.value is not None}

@@ -11,6 +11,7 @@ from udkjax.integrate.causes.failed_run import FailedRun
 from udkjax.integrate.causes.force_causes import explain_stiff_force, explain_undefined_law, explain_violent_force
 from udkjax.integrate.causes.jamming import explain_jamming
 from udkjax.integrate.causes.reach import explain_reach
+from udkjax.integrate.causes.system_causes import cause_in_functions
 from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import is_explicit
 from udkjax.positions.assembling.open_rows import MOST_NAMED, explain_open, name_not_finite
@@ -236,19 +237,21 @@ def _rank(run: FailedRun) -> int:
 
 
 def explained(
-    solution: Solution, mechanism: Mechanism, analysis: Analysis | None, drift_tol: Any, solver: Any, end: Any = None
+    solution: Solution, mechanism: Any, analysis: Analysis | None, drift_tol: Any, solver: Any, end: Any = None
 ) -> Solution:
-    """Return the solution of a failed single run, with its cause found on demand.
+    """Return the solution of a failed single run, with its cause: found on demand, or at once by the functions of a system.
 
     Args:
         solution: the solution, of concrete numbers.
-        mechanism: the mechanism.
-        analysis: its `Analysis`.
+        mechanism: the mechanism, or the traced system.
+        analysis: the `Analysis` of the mechanism; None of a system.
         drift_tol: the `drift_tol` of the run.
         solver: the run's solver; None: the default.
         end: the last state (t, (q, v)) of the integrator, if available.
     """
-    assert analysis is not None  # a mechanism has one
+    if analysis is None:  # of a system
+        text = cause_in_functions(solution, mechanism, end)
+        return replace(solution, found_cause=FoundCause.of(solution, text)) if text else solution
     q, v = (np.asarray(x).reshape(len(solution.ts), -1) for x in (solution.q, solution.v))
     settings = solution.settings
     last = None

@@ -1,14 +1,12 @@
 """The causes of failed runs of user-defined systems: a singular mass matrix, a function that is not finite, or an open state."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from udkjax.integrate.causes.find import FoundCause
 from udkjax.integrate.solution import Result, Solution
 from udkjax.programs.deferred import deferred
 
@@ -16,8 +14,8 @@ MOST_ROWS = 3  # rows of constraints that a cause names, those with the largest 
 SINGULAR = 1e-12  # M is singular if its smallest eigenvalue is at most this, relative to the largest
 
 
-def explained_system(solution: Solution, system: Any, end: tuple[Any, Any]) -> Solution:
-    """Return a failed solution with its cause, found at the last state of the integrator; unchanged if there is no cause."""
+def cause_in_functions(solution: Solution, system: Any, end: tuple[Any, Any]) -> str:
+    """Return the cause of a failed run that the functions of a system show at the last state of the integrator, if any."""
     t, (q, v) = np.asarray(end[0]), np.split(np.asarray(end[1]), 2)
     with jax.ensure_compile_time_eval():
         text = cause_of(_values(system, t, q, v))
@@ -25,7 +23,7 @@ def explained_system(solution: Solution, system: Any, end: tuple[Any, Any]) -> S
         if not text and is_open and system.constraint is not None:
             psi = _psi(system, np.asarray(solution.ts[0]), np.asarray(solution.q[0]))
             text = cause_of_opening(np.ravel(psi))
-    return replace(solution, found_cause=FoundCause.of(solution, text)) if text else solution
+    return text
 
 
 @deferred

@@ -28,7 +28,7 @@ from udkjax.integrate.events.law.event_plan import event_plan
 from udkjax.integrate.events.law.kinks import FREE, renewed_sides, with_held_forces
 from udkjax.integrate.events.law.phases import SCENE, Phases, phases_of
 from udkjax.integrate.events.law.sticking_joints import with_sticking_joints
-from udkjax.integrate.events.run.condition_program import bodies_of, coordinate_count, watched_conditions, with_cached_functions
+from udkjax.integrate.events.run.condition_program import watched_conditions, with_cached_functions
 from udkjax.integrate.events.run.host_run import HostRun, concrete_plan, event_arrays
 from udkjax.integrate.events.run.hybrid import Hybrid
 from udkjax.integrate.events.run.replay import run_events
@@ -221,8 +221,7 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
     names = names_of_events(given.events, given.phases)
     found, kinks, sticking = listing(found, given.ts, given.events, given.phases, given.max_events, xp)
     count = int(found.count) if xp is np else None
-    names_of_bodies, choices = bodies_of(mechanism), given.choices
-    bodies = (-1, coordinate_count(mechanism)) if names_of_bodies is None else (-1, len(names_of_bodies), 3)
+    choices, bodies = given.choices, (-1, *mechanism.state_shape())
 
     def trim(x: Array, padding: float = np.inf) -> Array:
         if count is not None:
@@ -271,7 +270,7 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
         stats=stats,
         rtol=choices.rtol,
         atol=choices.atol,
-        bodies=names_of_bodies or (),
+        bodies=mechanism.body_names,
         choices=tuple(settings.items()),
         events=events if names else None,
         unlocated=None if kinks is None else kinks.unlocated,

@@ -138,8 +138,6 @@ def assemble(
     """
     if given is not None:
         return _assemble_given(mechanism, t, state, throw, GivenState(mechanism, given))
-    if isinstance(mechanism, ConstrainedSystem):
-        return _assemble_system(mechanism, t, state, throw)
     closure = close(mechanism, t, state, analysis=analysis)
     if throw:
         require_closed(mechanism, closure, t, state)
@@ -160,14 +158,7 @@ def _assemble_given(
         raise AssemblyError(f"with {given} given: {error}", error.state) from None
 
 
-def _assemble_system(system: ConstrainedSystem, t: NumberLike, state: State | None, throw: bool) -> State:
-    closure = close_system_guess(system, t, state)
-    if throw:
-        require_closed(system, closure, t, state)
-    return closure.state
-
-
-def close_system_guess(system: ConstrainedSystem, t: NumberLike, state: State | None = None) -> Closure:
+def _close_system(system: ConstrainedSystem, t: NumberLike, state: State | None = None) -> Closure:
     """Close a user-defined system as `close` does, from a state or its own guess, without derivatives of the rank.
 
     Raises:
@@ -194,8 +185,8 @@ def close(
 
     The closure of concrete numbers of a mechanism is concrete, even while something else is traced.
     """
-    if isinstance(mechanism, ConstrainedSystem):
-        return close_system_guess(mechanism, t, state)
+    if not isinstance(mechanism, Mechanism):
+        return _close_system(mechanism, t, state)
     if not mechanism.is_concrete or is_traced((t, state)):
         state = _with_closed_positions(mechanism, t, state)
         analysis = analyse(mechanism) if analysis is None else analysis
@@ -267,7 +258,7 @@ def require_closed(
     mechanism, closure, t, guess = without_derivatives((mechanism, closure, t, guess))
     if is_traced((mechanism, closure, t, guess)):  # other numbers of a batch
         return
-    if isinstance(mechanism, ConstrainedSystem):
+    if not isinstance(mechanism, Mechanism):
         worst = [float(jnp.max(jnp.abs(x), initial=0.0)) for x in (closure.psi, closure.psi_dot)]
         message = f"the constraints stay violated, Psi by {worst[0]:.3g} and velocities by {worst[1]:.3g}"
         raise AssemblyError(f"{message}: start nearer to a state that satisfies them", closure.state)

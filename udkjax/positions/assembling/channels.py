@@ -170,14 +170,14 @@ def channel_of(mechanism: Mechanism | ConstrainedSystem, text: str) -> Channel:
     """
     text = text.strip()
     if isinstance(mechanism, ConstrainedSystem):
-        return _channel_of_system(mechanism, text)
+        return _parse_entry(mechanism, text)
     section, _, rest = text.partition(".")
     if section not in _PARSERS:
         raise ValueError(f"begins with none of {', '.join(f'{s}.' for s in _PARSERS)}{suggestion(text, channels_of(mechanism))}")
     return _PARSERS[section](mechanism, rest)
 
 
-def _channel_of_system(system: ConstrainedSystem, text: str) -> Channel:
+def _parse_entry(system: ConstrainedSystem, text: str) -> Channel:
     found = re.fullmatch(r"([qv])\[(\d+)\]", text)
     if found is None:
         raise ValueError(f"must be a coordinate such as q[0], a velocity such as v[0], or a Quantity; {quote(text)} is not")

@@ -6,7 +6,7 @@ are closed first, with the coordinates alone, so that a coordinate may be given 
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,44 +47,51 @@ class GivenState:
             require_text("given: a name", name)
         self.model = model
         self.values = {name: _value_called(name, value) for name, value in given.items()}
-        parse = self._entry if isinstance(model, ConstrainedSystem) else self._coordinate
-        self.parsed = {name: parse(name) for name in given}
+        self._conditions: Any = _GivenCoordinates(model) if isinstance(model, Mechanism) else _GivenEntries(model)
+        self.parsed = {name: self._conditions.parse(name) for name in given}
 
     def __str__(self) -> str:
         return ", ".join(f"{name} = {format_number(float(value))}" for name, value in self.values.items())
 
     def at_position(self) -> Any:
         """Return the model whose position has the given coordinates; the model itself if there are none."""
-        known = {name: where for name, (is_rate, where) in self.parsed.items() if not is_rate}
-        if not known:
-            return self.model
-        if isinstance(self.model, ConstrainedSystem):
-            return _with_entries(self.model, {name: (k, self.values[name]) for name, k in known.items()})
-        return _with_drivers(self.model, {name: (c, [self.values[name]]) for name, c in known.items()})
+        known = {name: (where, self.values[name]) for name, (is_rate, where) in self.parsed.items() if not is_rate}
+        return self._conditions.at_position(known) if known else self.model
 
     def at_velocity(self, t: NumberLike, q: Array) -> Any:
         """Return the model whose velocity at time t (s) and position q has the given ones; the model itself if there are none."""
-        known = {name: where for name, (is_rate, where) in self.parsed.items() if is_rate}
-        if not known:
-            return self.model
-        if isinstance(self.model, ConstrainedSystem):
-            return _with_entries(self.model, {name: (k, self.values[name]) for name, k in known.items()}, rates=True)
-        laws = {}
-        for name, coordinate in known.items():
-            rate = self.values[name]
-            laws[name] = coordinate, [value_of(self.model, coordinate)(q) - rate * t, rate]
-        return _with_drivers(self.model, laws)
+        known = {name: (where, self.values[name]) for name, (is_rate, where) in self.parsed.items() if is_rate}
+        return self._conditions.at_velocity(known, t, q) if known else self.model
 
-    def _entry(self, name: str) -> tuple[bool, Any]:
+
+class _GivenEntries(NamedTuple):
+    """Given entries of q and v of a system, as further rows."""
+
+    model: ConstrainedSystem
+
+    def parse(self, name: str) -> tuple[bool, int]:
+        """Return whether a name is that of a velocity, and the index of the entry."""
         try:
             channel = channel_of(self.model, name)
         except ValueError as problem:
             raise ArgumentError(f"given: {problem}") from None
         return channel.owner == "v", int(channel.quantity)
 
-    def _coordinate(self, name: str) -> tuple[bool, Any]:
+    def at_position(self, entries: Mapping[str, tuple[int, Array]]) -> ConstrainedSystem:
+        return _with_entries(self.model, entries)
+
+    def at_velocity(self, entries: Mapping[str, tuple[int, Array]], t: NumberLike, q: Array) -> ConstrainedSystem:
+        return _with_entries(self.model, entries, rates=True)
+
+
+class _GivenCoordinates(NamedTuple):
+    """Given coordinates and rates of a mechanism, as further drivers."""
+
+    model: Mechanism
+
+    def parse(self, name: str) -> tuple[bool, Coordinate]:
+        """Return whether a name is that of a velocity, and the coordinate."""
         owner, _, last = name.strip().rpartition(".")
-        assert isinstance(self.model, Mechanism)
         try:
             coordinate = coordinate_of(self.model, f"{owner}.{_COORDINATE_OF.get(last, last)}")
         except SceneError as error:
@@ -92,6 +99,13 @@ class GivenState:
             cure = "give coordinates such as body.NAME.angle or joint.NAME.angle, and velocities such as body.NAME.omega"
             raise ArgumentError(f"given: {quote(name)} is neither a coordinate nor a velocity ({problem}); {cure}") from None
         return last in RATES, coordinate
+
+    def at_position(self, coordinates: Mapping[str, tuple[Coordinate, Array]]) -> Mechanism:
+        return _with_drivers(self.model, {name: (c, [value]) for name, (c, value) in coordinates.items()})
+
+    def at_velocity(self, coordinates: Mapping[str, tuple[Coordinate, Array]], t: NumberLike, q: Array) -> Mechanism:
+        laws = {name: (c, [value_of(self.model, c)(q) - rate * t, rate]) for name, (c, rate) in coordinates.items()}
+        return _with_drivers(self.model, laws)
 
 
 def _value_called(name: str, value: Any) -> Float[Array, ""]:

@@ -15,7 +15,7 @@ from udkjax.study.diagnosis.configuration import N_NEIGHBOURS, NEIGHBOUR_STEP, S
 from udkjax.study.diagnosis.dependence import dependencies_at
 from udkjax.study.diagnosis.diagnosis import LABEL_WIDTH
 from udkjax.study.diagnosis.timeline import Timeline, timeline
-from udkjax.study.quantities import jacobians_of_system
+from udkjax.study.quantities import jacobians_at
 from udkjax.study.report import plain
 from udkjax.wording import plural
 
@@ -136,7 +136,7 @@ def diagnose_system(
     require_closed(system, closure, t)
     q, v = (np.asarray(x, float) for x in (closure.state.q, closure.state.v))
     traced = system.traced(q.size)
-    here, of_positions = _configuration(traced, t, q, v, rank_tol), jacobians_of_system(traced, t, q, v)[0]
+    here, of_positions = _configuration(traced, t, q, v, rank_tol), jacobians_at(traced, t, q, v)[0]
     neighbours = _neighbours(system, traced, here, v, rank_tol)
     ordinary_rank = max(c.rank for c in (here, *neighbours))
     generic = [c for c in (here, *neighbours) if c.rank == ordinary_rank]
@@ -169,7 +169,7 @@ def _rank_of(rows: np.ndarray, rank_tol: float) -> int:
 
 
 def _configuration(system: Any, t: float, q: np.ndarray, v: np.ndarray, rank_tol: float) -> Configuration:
-    return Configuration(t, q, np.asarray(jacobians_of_system(system, t, q, v)[1], float), rank_tol)
+    return Configuration(t, q, np.asarray(jacobians_at(system, t, q, v)[1], float), rank_tol)
 
 
 def _neighbours(

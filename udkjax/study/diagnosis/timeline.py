@@ -23,7 +23,6 @@ from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import State
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.programs.deferred import deferred
-from udkjax.scene.mechanism import Mechanism
 from udkjax.study.quantities import StudyModel
 
 SAMPLES_PER_OUTPUT = 4  # samples per output interval, to look for minima
@@ -144,8 +143,7 @@ class _Path:
     """Singular values at any time, by quintics through q, v and a of neighbouring states."""
 
     def __init__(self, mechanism: StudyModel, analysis: Analysis | None, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
-        is_scene = isinstance(mechanism, Mechanism)
-        self.mechanism, self.analysis = mechanism.without_origin if is_scene else mechanism.traced(q.shape[1]), analysis
+        self.mechanism, self.analysis = mechanism.without_origin.traced(q.shape[1]), analysis
         a = np.asarray(_accelerations(self.mechanism, analysis, ts, q, v))
         if len(ts) > 1:
             self.q = BPoly.from_derivatives(ts, np.stack([q, v, a], 1))
@@ -160,7 +158,7 @@ class _Path:
 
 @deferred
 def _singular_values(mechanism: Any, analysis: Analysis | None, ts: ArrayLike, q: ArrayLike, v: ArrayLike) -> Array:
-    if not isinstance(mechanism, Mechanism):
+    if not mechanism.has_bodies:
         equations: Any = equations_of(mechanism, SVD())
         jacobian = jax.vmap(equations.jacobian)(jnp.asarray(ts), jnp.asarray(q), jnp.asarray(v))
         return jnp.linalg.svd(jacobian, compute_uv=False)

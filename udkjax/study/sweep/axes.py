@@ -23,7 +23,7 @@ from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.pinv import Auto, Dense, Elimination, OneOf
 from udkjax.positions.assembling.assembly import State
 from udkjax.requirements import ArgumentTypeError, describe, require_count
-from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.model import Model
 from udkjax.study.choices import Choice
 from udkjax.study.members import structure_of
 from udkjax.study.quantities import Setter, StudyModel
@@ -160,7 +160,7 @@ def labels_of(setting: str, choices: Sequence[AxisChoice], replaced: Collection[
 def _short_label(setting: str, choice: AxisChoice) -> str:
     if choice is None:
         return CHOICES[setting]
-    if isinstance(choice, Mechanism | ConstrainedSystem):
+    if isinstance(choice, Model):
         return choice.name
     return str(choice) if isinstance(choice, int) else type(choice).__name__
 

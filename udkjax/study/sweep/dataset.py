@@ -11,7 +11,6 @@ from jaxtyping import Int, PyTree
 
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.elements.bodies import COORDINATES
-from udkjax.scene.mechanism import Mechanism
 from udkjax.study.sweep.axes import AxisColumn, Dimension
 from udkjax.study.sweep.dimensions import NUMBERS_OF, RENAMED, SweepError
 from udkjax.study.sweep.groups import END, RESULT, STEPS, group_run
@@ -196,7 +195,7 @@ def _attributes(plan: SweepPlan) -> dict[str, str | int | float]:
         **{f"version_{name}": value for name, value in versions().items()},
         "start_time": float(plan.ts[0]),
         "parameters": json.dumps({k: np.asarray(v).tolist() for k, v in plan.mechanism.parameters().items()}),
-        **({"scene": scene_text(plan.mechanism)} if isinstance(plan.mechanism, Mechanism) else {}),
+        **({"scene": scene_text(plan.mechanism)} if plan.mechanism.has_bodies else {}),
     }
 
 

@@ -13,10 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution, scene_text, versions
-from udkjax.scene.mechanism import Mechanism
-from udkjax.study.quantities import StudyModel
+from udkjax.scene.model import Model
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn
 from udkjax.study.sweep.measures import Measure
 from udkjax.study.sweep.plan import SweepPlan
@@ -49,7 +47,7 @@ def _axis(plan: SweepPlan, column: AxisColumn) -> dict[str, JsonValue]:
     n = math.prod(plan.state_shape_of(plan.groups[0]))
 
     def described(x: AxisChoice) -> JsonValue:
-        return _mechanism(x, n) if isinstance(x, ConstrainedSystem) else _value(x)
+        return _mechanism(x, n) if isinstance(x, Model) else _value(x)
 
     return {"of": of, "values": [described(value) for value in column.values] if column.is_choice else _value(column.values)}
 
@@ -82,10 +80,10 @@ def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
     return {"name": name, "operations": digest(text.encode()), "constants": digest(constants)}
 
 
-def _mechanism(mechanism: StudyModel, n: int = 0) -> dict[str, JsonValue]:
-    if isinstance(mechanism, ConstrainedSystem):
+def _mechanism(mechanism: Model, n: int) -> dict[str, JsonValue]:
+    if not mechanism.has_bodies:
         traced = mechanism.traced(n)
-        text = traced.functions.text if hasattr(traced, "functions") else repr(mechanism)
+        text = traced.functions.text if traced.has_programs else repr(mechanism)
         numbers = [_value(x) for x in getattr(traced, "numbers", jax.tree.leaves(eqx.filter(mechanism, eqx.is_array)))]
         return {"functions": digest(text.encode()), "numbers": numbers, "guess": [_value(mechanism.q0), _value(mechanism.v0)]}
     numbers = {name: _value(x) for name, x in mechanism.parameters().items()}
@@ -93,11 +91,9 @@ def _mechanism(mechanism: StudyModel, n: int = 0) -> dict[str, JsonValue]:
 
 
 def _value(value: PyTree) -> JsonValue:
-    """Describe a number, an array, a choice or a mechanism."""
+    """Describe a number, an array or a choice."""
     if value is None or isinstance(value, str | bool | int):
         return value
-    if isinstance(value, Mechanism):
-        return _mechanism(value)
     if isinstance(value, float | np.ndarray | np.number | jax.Array):
         array = np.asarray(value)
         if array.size <= MOST_NUMBERS:

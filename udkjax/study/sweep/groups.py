@@ -104,7 +104,7 @@ class GroupRun:
         self.assembled = fixed.get("state") is None
         closure = close(fixed["mechanism"], plan.ts[0]) if self.assembled and not self.varied and not moving else None
         common = None if "mechanism" in self._own else fixed["mechanism"]
-        plain = common.without_origin if isinstance(common, Mechanism) else common
+        plain = None if common is None else common.without_origin
         elements, self._elements = eqx.partition(None if plain is common else plain, eqx.is_array)
         self.shared = jax.tree.map(np.asarray, Shared(arrays, closure, elements))
         method, formulation = fixed.get("method"), fixed.get("formulation")
@@ -140,7 +140,7 @@ class GroupRun:
         if self._elements is not None:
             mechanism.know_elements(eqx.combine(shared.elements, self._elements))
         values: dict[str, np.ndarray | Array] = {}
-        kind = Mechanism if isinstance(mechanism, Mechanism) else ConstrainedSystem
+        kind = Mechanism if mechanism.has_bodies else ConstrainedSystem
         for column in self.numbers:
             x = own.axes[column.name] + shift.get(column.name, 0.0)
             if callable(column.of):

@@ -77,6 +77,10 @@ class Measure:
         outputs = self.compute(MeasuredRun(mechanism, solution, method, self.reference))
         return {name: jnp.asarray(x) for name, x in zip(self.labels or outputs, outputs.values(), strict=True)}
 
+    def for_model(self, model: StudyModel) -> "Measure":
+        """Return the measure with the labels that it has for a model."""
+        return self if model.has_bodies else replace(self, labels=_LABELS_OF_COORDINATES.get(self.name, self.labels))
+
     def renamed(self, key: str) -> "Measure":
         """Return the measure with its variable renamed to `key`, or with `key` as a prefix of several names."""
         if key in ("", self.name):
@@ -124,8 +128,8 @@ def measures_of(given: MeasureChoice, reference: Reference, ts: np.ndarray, mech
 def _measure(key: str, given: OneMeasure, mechanism: StudyModel) -> Measure:
     if isinstance(given, str):
         if given in MEASURES:
-            return MEASURES[given] if isinstance(mechanism, Mechanism) else measure_of_system(MEASURES[given])
-        if "." not in given and isinstance(mechanism, Mechanism):
+            return MEASURES[given].for_model(mechanism)
+        if "." not in given and mechanism.has_bodies:
             near = suggestion(given, MEASURES) or f"; use {', '.join(MEASURES)}, or a channel such as pin.A.x"
             raise ValueError(f"measure {quote(given)} does not exist{near}")
         try:
@@ -162,9 +166,9 @@ def _reference(given: Reference, ts: np.ndarray, mechanism: StudyModel) -> Refer
     if callable(given) and not hasattr(given, "shape"):
         return given
     q = np.asarray(getattr(given, "q", given), float)
-    is_state = q.ndim == 3 and q.shape[2] == 3 if isinstance(mechanism, Mechanism) else q.ndim == 2
+    is_state = q.ndim == 3 and q.shape[2] == 3 if mechanism.has_bodies else q.ndim == 2
     if not is_state or q.shape[0] != len(ts):
-        shape = "(T, bodies, 3)" if isinstance(mechanism, Mechanism) else "(T, n)"
+        shape = "(T, bodies, 3)" if mechanism.has_bodies else "(T, n)"
         raise ValueError(f"reference: must be coordinates at the {len(ts)} output times, {shape}, but is of shape {q.shape}")
     return q
 
@@ -231,7 +235,7 @@ def _error(run: MeasuredRun) -> dict[str, Array]:
     with refuse_untraceable("reference"):
         reference = run.reference(run.mechanism, run.solution.ts) if callable(run.reference) else run.reference
     error = run.solution.q - jnp.asarray(getattr(reference, "q", reference))
-    if not isinstance(run.mechanism, Mechanism):
+    if not run.mechanism.has_bodies:
         return {"error": _largest(error)}
     return {"position_error": _largest(error[..., :2]), "angle_error": _largest(error[..., 2])}
 
@@ -258,9 +262,10 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     """Compute ranks by the method's rule; for `Auto`, by that of its rank-revealing fallback."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
-    if isinstance(run.mechanism, ConstrainedSystem):
-        return {"rank": _ranks_of_system(run, method)}
-    equations, (ts, q) = equations_of(run.mechanism, SVD()), (run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1))
+    if not run.mechanism.has_bodies:
+        return {"rank": _ranks_of_rows(run, method)}
+    equations: Any = equations_of(run.mechanism, SVD())
+    ts, q = run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1)
     if method.rank_tol is None:
         method = replace(method, rank_tol=equations.scales.rank_tol)
     reached = jnp.all(jnp.isfinite(q), axis=1)
@@ -268,9 +273,9 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     return {"rank": jnp.where(reached, ranks, RANK_NOT_REACHED)}
 
 
-# --- measures of user-defined systems, whose states are vectors
+# --- measures of models without bodies, whose states are vectors
 
-_LABELS_OF_SYSTEM = {
+_LABELS_OF_COORDINATES = {
     "final": {
         "q_end": Label(("coordinate",), "", "coordinates at the end"),
         "v_end": Label(("coordinate",), "", "velocities at the end"),
@@ -285,14 +290,9 @@ _LABELS_OF_SYSTEM = {
 }
 
 
-def measure_of_system(measure: Measure) -> Measure:
-    """Return a measure with the labels that it has for user-defined systems."""
-    return replace(measure, labels=_LABELS_OF_SYSTEM.get(measure.name, measure.labels))
-
-
-def _ranks_of_system(run: MeasuredRun, method: Pseudoinverse) -> Array:
+def _ranks_of_rows(run: MeasuredRun, method: Pseudoinverse) -> Array:
     solution, reached = run.solution, jnp.all(jnp.isfinite(run.solution.q), axis=1)
     equations: Any = equations_of(run.mechanism.traced(solution.q.shape[1]), method)
     q, v = (jnp.where(reached[:, None], x, x[0]) for x in (solution.q, solution.v))
-    ranks = jax.vmap(lambda t, q, v: equations.rank(q, equations.jacobian(t, q, v)))(solution.ts, q, v)
+    ranks = jax.vmap(lambda t, q, v: equations.rank(t, q, v))(solution.ts, q, v)
     return jnp.where(reached, ranks, RANK_NOT_REACHED)

@@ -14,12 +14,11 @@ from jaxtyping import Int, PyTree
 
 from udkjax.annotations import Numbers
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import analyse
-from udkjax.equations.systems.general import ConstrainedSystem
+from udkjax.equations.rows.analysis import analysis_of
 from udkjax.integrate.simulate import simulate
 from udkjax.requirements import require_output_times
 from udkjax.scene.arguments import argument_problems
-from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.model import Model
 from udkjax.study.members import structure_of
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign
@@ -149,7 +148,7 @@ class SweepPlan:
     def mechanism_of(self, group: Group) -> StudyModel:
         """Return the mechanism of a group; the first one if mechanisms differ in numbers."""
         mechanism = self.choice(group, "mechanism")
-        assert isinstance(mechanism, Mechanism | ConstrainedSystem)
+        assert isinstance(mechanism, Model)
         return mechanism
 
     def state_shape_of(self, group: Group) -> tuple[int, ...]:
@@ -201,7 +200,7 @@ def make_plan(
         settings.setdefault("stabilization", Baumgarte())  # an axis of gains needs a stabilization
     if dimensions or not axes.keys() & {*TOGETHER}:  # with mistakes in axes their values are unknown
         problems += check_settings(mechanism, dimensions, settings)
-    if isinstance(mechanism, ConstrainedSystem) and mechanism.q0 is None and not {"state"} & {*targets, *settings}:
+    if mechanism.q0 is None and not {"state"} & {*targets, *settings}:
         problems.append("state: a ConstrainedSystem without q0 has no initial guess: give state=State(q, v)")
     problems += check_tangents(mechanism, dimensions, derivatives)
     measures: tuple[Measure, ...] = ()
@@ -215,11 +214,9 @@ def make_plan(
     return SweepPlan(mechanism, dimensions, stored, settings, measures, tuple(derivatives), design, dict(units))
 
 
-def _number_structures(values: Sequence[AxisChoice]) -> np.ndarray:
+def _number_structures(values: Sequence[Any]) -> np.ndarray:
     """Return, for each choice of an axis, the index of the first choice with the same structure."""
-    structures = [
-        (structure_of(value), analyse(value).redundant_rows if isinstance(value, Mechanism) else None) for value in values
-    ]
+    structures = [(structure_of(value), getattr(analysis_of(value), "redundant_rows", None)) for value in values]
     return np.array([structures.index(structure) for structure in structures])
 
 

@@ -132,10 +132,10 @@ def rows_of_directions(
     return ContactRows(W, directions, (directions**2 / mobility).sum(-1) > BLOCKED * given)
 
 
-def rows_of_system(
+def rows_of_mobilities(
     normals: Float[Any, "*m E n"], directions: Float[Any, "*m E n"], mobilities: Float[Any, "*m E n"]
 ) -> ContactRows:
-    """Return the rows of contacts of a system, whose M need not be diagonal: W = n P M^(-1) n^T."""
+    """Return the rows of contacts where M need not be diagonal, from M^(-1) n^T and P M^(-1) n^T: W = n P M^(-1) n^T."""
     W = normals @ directions.swapaxes(-1, -2)
     size, given = (normals * directions).sum(-1), (normals * mobilities).sum(-1)
     return ContactRows((W + W.swapaxes(-1, -2)) / 2, directions, size > BLOCKED_IN_SYSTEM * given)

@@ -18,7 +18,7 @@ from udkjax.integrate.events.instant.impacts import (
     ContactChanges,
     hit_contacts,
     rows_of_directions,
-    rows_of_system,
+    rows_of_mobilities,
 )
 from udkjax.integrate.events.instant.runs import MemberIndices, RunState, take
 from udkjax.integrate.events.instant.sticking import settle_friction
@@ -111,8 +111,8 @@ def _apply_event(
     free, held = state._replace(phase=plan.free(after)), plan.held(phase, xp)
     is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
     state_values = state_values if is_evaluated else system.look(members, free, is_free=True)
-    if plan.of_system:
-        rows = rows_of_system(state_values.by_q, state_values.directions, state_values.mobilities)
+    if not plan.has_bodies:
+        rows = rows_of_mobilities(state_values.by_q, state_values.directions, state_values.mobilities)
     else:
         normals = xp.where(plan.slides[:, None], state_values.by_v, state_values.by_q)
         rows = rows_of_directions(normals, state_values.directions, take(system.inverse_mass, members))

@@ -125,9 +125,9 @@ def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoord
 
 def probe_arguments(model: Any, moving: bool = True) -> tuple[Any, ...]:
     """Return arguments with which conditions can be tried: of a mechanism the frames, of a system q and v; v may be None."""
-    if isinstance(model, Mechanism):
+    if model.has_bodies:
         return (probe_frames(model.body_names, moving),)
-    probe = np.linspace(0.1, 0.9, model.functions.n)
+    probe = np.linspace(0.1, 0.9, model.coordinate_count)
     return probe, probe if moving else None
 
 

@@ -239,8 +239,9 @@ def expand_events(events: Sequence[ExpandsToEvents], mechanism: Any) -> tuple[Ev
 def _expand(event: ExpandsToEvents, k: int, mechanism: Any, found: list[Event]) -> None:
     if not hasattr(event, "expand"):
         raise ValueError(f"must be an Event, a JointLimit or a Contact, not a {type(event).__name__}")
-    if not isinstance(mechanism, Mechanism) and not isinstance(event, Event):
-        raise ValueError(f"a {type(event).__name__} is for mechanisms; write udk.Event(lambda t, q, v: ...) for this system")
+    if not isinstance(event, Event):
+        cure = "write udk.Event(lambda t, q, v: ...) for this system"
+        mechanism.require_bodies(f"a {type(event).__name__} is for mechanisms; {cure}")
     expanded: Any = event
     for one in expanded.expand(mechanism):
         require_text("name", one.name, may_be_empty=True)
@@ -284,7 +285,7 @@ def _check_kinds(event: Event, where: str) -> None:
 
 def _check(event: Event, mechanism: Any) -> None:
     where, action = f"event {quote(event.name)}", event.action
-    arguments = "(t, frames)" if isinstance(mechanism, Mechanism) else "(t, q, v)"
+    arguments = "(t, frames)" if mechanism.has_bodies else "(t, q, v)"
     require_function(f"{where}: the condition", event.condition, arguments)
     if not isinstance(event.condition, BodyCondition):  # a trial would take milliseconds, for each new number
         _try_condition(event, mechanism, where)
@@ -294,7 +295,7 @@ def _check(event: Event, mechanism: Any) -> None:
             raise ValueError(f"{where}: an Impact is where its condition falls to zero, and not where direction=1: {cure}")
         if sees_velocity(event.condition, mechanism):
             raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
-    if isinstance(mechanism, Mechanism):
+    if mechanism.has_bodies:
         action.check(mechanism, where)
     else:
         action.check_for_system(where)
@@ -306,7 +307,7 @@ def _try_condition(event: Event, mechanism: Any, where: str) -> None:
         with nullcontext() if has_traced else jax.ensure_compile_time_eval():
             value = event.condition(0.0, *probe_arguments(mechanism))
     except KeyError as error:
-        if not isinstance(mechanism, Mechanism):
+        if not mechanism.has_bodies:
             raise
         name = error.args[0]
         raise ValueError(f"{where}: no body named {quote(str(name))}{suggestion(name, mechanism.body_names)}") from error

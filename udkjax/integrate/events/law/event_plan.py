@@ -16,7 +16,6 @@ from udkjax.integrate.events.law.event import Event
 from udkjax.integrate.events.law.kinks import MOST_KINKS
 from udkjax.integrate.events.law.phases import SCENE, Phases, Switches
 from udkjax.integrate.events.law.sticking_joints import StickingJoint
-from udkjax.scene.mechanism import Mechanism
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class EventPlan:
     side_count: int  # the number S of sides
     added_by: tuple[int, ...]  # for each joint that events add, its event; the last ones are the locks of joints that stick
     sticking: tuple[StickingJoint, ...]  # the joints that may stick, F
-    of_system: bool = False  # whether a user-defined system moves, whose coordinates have no bodies and masses
+    has_bodies: bool = True  # whether coordinates are those of bodies, with masses of their own
 
     @cached_property
     def kinks(self) -> Bool[np.ndarray, "E"]:
@@ -278,5 +277,5 @@ def event_plan(
         side_count=max([x.sides.stop for x in phases.sided], default=0),
         added_by=tuple(event for event, _ in phases.added_by),
         sticking=phases.sticking,
-        of_system=not isinstance(phases.mechanisms[0], Mechanism),
+        has_bodies=phases.mechanisms[SCENE].has_bodies,
     )

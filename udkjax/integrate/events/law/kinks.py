@@ -126,13 +126,13 @@ class FoundKinks(NamedTuple):
 
 def kinks_of(model: Any) -> FoundKinks:
     """Return which forces of a mechanism, or which functions of a system, have jumps or kinks that the state decides."""
-    if not isinstance(model, Mechanism):
-        return _kinks_of_system(model.functions, model.breakpoints is not None)
+    if not model.has_bodies:
+        return _kinks_of_functions(model.functions, model.breakpoints is not None)
     return (_concrete_kinks if model.is_concrete else _kinks)(model)
 
 
 @lru_cache(maxsize=64)
-def _kinks_of_system(functions: Any, breaks: bool) -> FoundKinks:
+def _kinks_of_functions(functions: Any, breaks: bool) -> FoundKinks:
     """Return the kinks of the `SystemFunctions` of a system: only those of its loads are located."""
     smooth, moving = SmoothLoads.of_functions(functions, breaks), functions.moving(breaks)
     others = [] if not smooth.has_opaque else ["force"]
@@ -168,7 +168,7 @@ def with_held_forces(model: Any, first: int = 0) -> tuple[Any, tuple[HeldElement
 
     `first` is the number of other sides, which come first.
     """
-    return _with_held_elements(model, first) if isinstance(model, Mechanism) else _with_held_loads(model)
+    return _with_held_elements(model, first) if model.has_bodies else _with_held_loads(model)
 
 
 def _with_held_loads(system: Any) -> tuple[Any, tuple[HeldElement, ...], tuple[Event, ...]]:

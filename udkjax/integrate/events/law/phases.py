@@ -106,7 +106,7 @@ class Phases(eqx.Module):
         more |= {name: (*getattr(switches, name), *[-1] * count) for name in ("contacts", "rows")}
         more |= {"joint_rows": (*switches.joint_rows, *[()] * count)}
         found = replace(self, held=held, switches=switches._replace(**more))
-        if not isinstance(model, Mechanism):
+        if not model.has_bodies:
             return replace(found, mechanisms=(model,))
         places = [x.force for x in held if x.force is not None]
         forces = [model._forces[k] for _ in self.mechanisms for k in places]
@@ -133,11 +133,10 @@ def phases_of(
 ) -> Phases:
     """Return the phases of a mechanism, or of a system, with events. A system has one phase."""
     E = len(events)
-    switches = _switches(mechanism, events, sticking) if isinstance(mechanism, Mechanism) else []
+    switches = _switches(mechanism, events, sticking) if mechanism.has_bodies else []
     if not switches:
         none = Switches(removed=((),) * E, added=((),) * E, contacts=(-1,) * E, rows=(-1,) * E, joint_rows=((),) * E)
         return Phases((mechanism.without_origin,), (analysis,), (), (), none)
-    assert isinstance(mechanism, Mechanism)
     assert analysis is not None  # a mechanism has one
     whole = _with(mechanism, switches, events)
     # A joint that an event adds may depend on others.

@@ -23,7 +23,6 @@ from udkjax.integrate.events.law.conditions import BodyCondition, Frames
 from udkjax.integrate.events.law.event import Event
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.joints import Angle, Joint, Revolute, Slot
-from udkjax.scene.mechanism import Mechanism
 
 
 class ContactFriction(DirectedFriction):
@@ -97,7 +96,7 @@ def with_sticking_joints(mechanism: Any, others: Sequence[Event]) -> Sticking:
         others: All other events, which come first, contacts with friction among them.
     """
     contacts = [k for k, e in enumerate(others) if e.action.friction is not None]
-    if not isinstance(mechanism, Mechanism) or not (contacts or Friction.may_stick(mechanism._forces)):
+    if not contacts and not Friction.may_stick(mechanism.forces.values()):
         return Sticking(mechanism, (), ())
     directed, joints, events = DirectedFriction.put_in(mechanism), [], []
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.expressions import Graph, ScalarProgram
 from udkjax.integrate.events.law.conditions import frames_of
 from udkjax.integrate.events.law.phases import SCENE, Phases
-from udkjax.integrate.events.run.condition_program import bodies_of, input_array, trace_scalars
+from udkjax.integrate.events.run.condition_program import input_array, trace_scalars
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -35,7 +35,7 @@ def joint_numbers(phases: Phases) -> list[Array]:
 
 def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
     """Return the joints that events add."""
-    names, joints = bodies_of(phases.mechanisms[SCENE]) or (), []
+    names, joints = phases.mechanisms[SCENE].body_names, []
     for joint in phases.added:
         arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten(arrays)

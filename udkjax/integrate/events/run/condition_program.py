@@ -22,7 +22,6 @@ from udkjax.native.language.program import UnsupportedError, vector_function
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.programs.structure_cache import cached_by_structure
-from udkjax.scene.mechanism import Mechanism
 
 
 def condition_numbers(events: Sequence[Event]) -> list[Array]:
@@ -36,17 +35,17 @@ def watched_conditions(events: Sequence[Event], mechanism: Any) -> Conditions | 
 
 
 def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
-    names, by_velocity = bodies_of(mechanism), tuple(sees_velocity(e.condition, mechanism) for e in events)
+    names, by_velocity = mechanism.body_names, tuple(sees_velocity(e.condition, mechanism) for e in events)
     arrays, rest = eqx.partition(events, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
-    n, graph = coordinate_count(mechanism), Graph()
+    n, graph = mechanism.coordinate_count, Graph()
 
     def evaluate(t: Array, q: Any, v: Any, *numbers: Array) -> Array:
         return conditions_of(eqx.combine(jax.tree.unflatten(tree, numbers), rest), names, t, q, v)
 
     shapes = [(), (n,), (n,), *(np.shape(x) for x in leaves)]
     arguments = [input_array(graph, k, shape) for k, shape in enumerate(shapes)]
-    g = list(trace_scalars(graph, evaluate, arguments, () if names is None else (1, 2))[0].flat)
+    g = list(trace_scalars(graph, evaluate, arguments, (1, 2) if names else ())[0].flat)
     (t,), q, v = (list(x.flat) for x in arguments[:3])
     a, numbers = list(input_array(graph, -1, (n,)).flat), [x for array in arguments[3:] for x in array.flat]
     one, zero = graph.constant(1.0), graph.constant(0.0)
@@ -73,7 +72,7 @@ _conditions_for_structure = cached_by_structure(_conditions)
 @cached_by_identity
 def _concrete_conditions(mechanism: Any, *events: Event) -> Conditions | None:
     # Other conditions are functions, which may read anything: they are traced for each new event.
-    if isinstance(mechanism, Mechanism) and all(isinstance(e.condition, BodyCondition | Kink) for e in events):
+    if mechanism.has_bodies and all(isinstance(e.condition, BodyCondition | Kink) for e in events):
         return _conditions_for_structure(mechanism.without_origin, *events)
     return _conditions(mechanism, *events)
 
@@ -185,17 +184,7 @@ def _text(program: ScalarProgram) -> str:
     return vector_function(program, "conditions", "in", "out").text()
 
 
-def conditions_of(events: Sequence[Event], names: tuple[str, ...] | None, t: Array, q: Any, v: Any) -> Float[Array, "E"]:
-    """Return the conditions of all events at a state, with the names of the bodies; None for those of a system."""
-    arguments = (q, v) if names is None else (frames_of(names, q, v),)
+def conditions_of(events: Sequence[Event], names: tuple[str, ...], t: Array, q: Any, v: Any) -> Float[Array, "E"]:
+    """Return the conditions of all events at a state, with the names of the bodies; a system has none."""
+    arguments = (frames_of(names, q, v),) if names else (q, v)
     return jnp.stack([jnp.asarray(e.condition(t, *arguments), float) for e in events])
-
-
-def bodies_of(model: Any) -> tuple[str, ...] | None:
-    """Return the names of the bodies, whose frames are the arguments of conditions; None for a system."""
-    return model.body_names if isinstance(model, Mechanism) else None
-
-
-def coordinate_count(model: Any) -> int:
-    """Return the number of coordinates."""
-    return 3 * len(model.body_names) if isinstance(model, Mechanism) else model.functions.n

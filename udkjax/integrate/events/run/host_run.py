@@ -21,7 +21,7 @@ from udkjax.integrate.events.law.event_plan import EventPlan, event_plan
 from udkjax.integrate.events.law.kinks import FREE, places_of_kinks
 from udkjax.integrate.events.law.phases import SCENE, Phases
 from udkjax.integrate.events.run.added_joints import added_joints, joint_numbers
-from udkjax.integrate.events.run.condition_program import condition_numbers, coordinate_count, with_forces
+from udkjax.integrate.events.run.condition_program import condition_numbers, with_forces
 from udkjax.integrate.events.run.hybrid import Hybrid, inverse_mass_of
 from udkjax.integrate.events.run.machine_system import MachinePlan, MachineSystem, MemberUnits
 from udkjax.integrate.events.run.phase_code import PhaseCode, phase_arrays, phase_plan
@@ -201,8 +201,7 @@ def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
         xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in numbers), xp.zeros(0)])
         for numbers in (condition_numbers(events), joint_numbers(phases))
     )
-    model = phases.mechanisms[SCENE]
-    inverse_mass = inverse_mass_of(model, coordinate_count(model), xp)
+    inverse_mass = inverse_mass_of(phases.mechanisms[SCENE], xp)
     friction = [0.0 if e.action.friction is None else e.action.friction for e in events]
     of_impacts = xp.stack([_stack([e.action.rebound for e in events], xp), _stack(friction, xp)])
     return [x[None] for x in (of_conditions, of_impacts, inverse_mass, of_joints)]

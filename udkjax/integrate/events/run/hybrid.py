@@ -27,10 +27,9 @@ from udkjax.integrate.events.law.event_plan import EventPlan
 from udkjax.integrate.events.law.kinks import renewed_sides, with_sides
 from udkjax.integrate.events.law.phases import SCENE, SWITCHED, Added, Phases
 from udkjax.integrate.events.law.sticking_joints import forces_of
-from udkjax.integrate.events.run.condition_program import bodies_of, conditions_of
+from udkjax.integrate.events.run.condition_program import conditions_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.pinv import SVD, Pseudoinverse
-from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
 
 T = TypeVar("T")
@@ -69,9 +68,9 @@ class Hybrid(eqx.Module):
         return len(self.events)
 
     @property
-    def names(self) -> tuple[str, ...] | None:
-        """The names of the bodies; None for a system."""
-        return bodies_of(self.phases.mechanisms[SCENE])
+    def names(self) -> tuple[str, ...]:
+        """The names of the bodies; empty for a system."""
+        return self.phases.mechanisms[SCENE].body_names
 
     @property
     def projects(self) -> bool:
@@ -189,7 +188,7 @@ class Hybrid(eqx.Module):
         def of_mechanism(which: int, normals: Array, at: RunState) -> tuple[Array, Array, Array]:
             (t, q, v, *_), equations = at, self.textbook(which, at)
             mobilities = directions = jnp.zeros_like(normals)
-            if is_free and self.plan.of_system:
+            if is_free and not self.plan.has_bodies:
                 mobilities, directions = jax.vmap(lambda normal: equations.impulse(t, q, v, normal))(normals)
             elif is_free or is_directed:
                 directions = contact_rows(equations, t, q, normals).directions
@@ -241,6 +240,6 @@ def rate_along(f: Condition, t: Array, q: Array, v: Array, a: Array) -> tuple[Fl
     return jax.jvp(f, (t, q, v), (jnp.ones(()), v, a))
 
 
-def inverse_mass_of(model: Any, n: int, xp: ModuleType) -> Float[Any, "n"]:
+def inverse_mass_of(model: Any, xp: ModuleType) -> Float[Any, "n"]:
     """Return one over the mass of each coordinate of a mechanism; ones for a system, whose M is a function."""
-    return 1 / mass_of(model, xp) if isinstance(model, Mechanism) else xp.ones(n)
+    return 1 / mass_of(model, xp) if model.has_bodies else xp.ones(model.coordinate_count)

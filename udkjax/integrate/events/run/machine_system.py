@@ -86,7 +86,7 @@ class MachineSystem:
         self._windows: dict[int, Window] = {}  # of the members that go on window by window
         self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
         self.coordinates = np.ones((B, n))
-        if not self.plan.of_system:
+        if self.plan.has_bodies:
             self.coordinates = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
         E = self.plan.count
         holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)

@@ -19,13 +19,12 @@ from udkjax.integrate.events.law.phases import SWITCHED, Phases, Switches
 from udkjax.integrate.events.law.switched import places_of_switches
 from udkjax.integrate.events.run.added_joints import AddedJoint, places_of_joints
 from udkjax.integrate.events.run.passed_events import NumberPlaces, PassedEvents, passed_events
-from udkjax.integrate.native_engine import integrator_output, marking, run_inputs
+from udkjax.integrate.native_engine import integrator_output, run_inputs
 from udkjax.integrate.problem import IntegratorOutput, Problem
 from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.primitive import MemberCalls
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
-from udkjax.scene.mechanism import Mechanism
 
 INPUTS = RunWatched.input_names
 STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # the inputs of a run that are times and initial state
@@ -107,8 +106,7 @@ def phase_plan(
 
 def _marking(textbook: Any) -> MarkRows:
     """Return the operation that marks independent rows among those that numbers mark as possible."""
-    model = textbook.mechanism
-    return marking(model.at(0.0)) if isinstance(model, Mechanism) else MarkRows(textbook.programs_of_marked_rows)
+    return MarkRows(textbook.programs_of_marked_rows)
 
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:

@@ -49,7 +49,7 @@ class PlainSystem:
         self.hybrid, self.plan = hybrid, hybrid.plan
         self.end, self.rate = hybrid.ts[-1:], hybrid.rate[None]
         self.coordinates = hybrid.scales.coordinates(len(hybrid.q))[None]
-        self.inverse_mass = inverse_mass_of(hybrid.phases.mechanisms[SCENE], len(hybrid.q), jnp)[None]
+        self.inverse_mass = inverse_mass_of(hybrid.phases.mechanisms[SCENE], jnp)[None]
 
     def contacts(self, members: MemberIndices) -> Contacts:
         """Return the contacts."""

@@ -15,7 +15,6 @@ from udkjax.integrate.solution import scene_text, versions
 from udkjax.positions.assembling.assembly import State
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.arguments import checked
-from udkjax.scene.mechanism import Mechanism
 from udkjax.study.identify.answers.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.answers.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
 from udkjax.study.identify.answers.uncertainty import Uncertainty
@@ -272,7 +271,7 @@ class Estimate:
             "message": self.message,
             "tolerance": self.tol[0],
             **{f"version_{name}": value for name, value in versions().items()},
-            **({"scene": scene_text(self.mechanism)} if isinstance(self.mechanism, Mechanism) else {}),
+            **({"scene": scene_text(self.mechanism)} if self.mechanism.has_bodies else {}),
         }
         dataset = dataset.merge(xarray.Dataset(data, coords)).assign_attrs(attributes)
         return dataset.merge(profiles_dataset(profiles, self.parameters, uncertainty, level)) if profiles else dataset

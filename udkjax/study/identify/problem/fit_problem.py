@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udkjax.equations.rows.analysis import analyse, analysis_of
-from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
 from udkjax.positions.assembling.assembly import AssemblyError, State, assemble
@@ -294,7 +293,7 @@ def build_problem(
         IdentificationError: lists every mistake in the arguments.
         AssemblyError: the mechanism cannot be closed with the first guess or any guess near it.
     """
-    if isinstance(mechanism, ConstrainedSystem) and mechanism.q0 is None:
+    if mechanism.q0 is None:
         cure = "the initial guess is a number of the fit, too"
         raise IdentificationError([f"a ConstrainedSystem needs q0 and v0, ConstrainedSystem(..., q0=..., v0=...): {cure}"])
     unknowns, records = _collect(
@@ -302,7 +301,7 @@ def build_problem(
         lambda: unknowns_of(mechanism, parameters),
         lambda: _with_initial_state(records_of(mechanism, data, noise, ignore), initial_state),
     )[1:]
-    if isinstance(mechanism, ConstrainedSystem):
+    if not isinstance(mechanism, Mechanism):
         return FitProblem(mechanism, unknowns, records, settings)
     return _closable_problem(mechanism, unknowns, records, settings, seed, tol)
 

@@ -16,10 +16,11 @@ from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.positions.assembling.channels import RATES, UNITS
 from udkjax.scene.elements.bodies import COORDINATES
+from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.identify.problem.unknowns import Unknowns, apply_values, with_conditions
 from udkjax.study.identify.records.records import Estimated, IdentificationError, Record, Start
-from udkjax.study.quantities import StudyModel, jacobians_of_system
+from udkjax.study.quantities import StudyModel, jacobians_at
 from udkjax.wording import quote
 
 SMALLEST_READABLE_PART = 1e-3  # least pivot, relative to the largest, of coordinates that are chosen as unknowns
@@ -85,8 +86,8 @@ def state_unknowns(mech: StudyModel, t0: float, guess: State | None, estimate: E
 
     The names of the unknowns begin with `label`.
     """
-    if isinstance(mech, ConstrainedSystem):
-        return _unknowns_of_system(mech, t0, guess, estimate, label)
+    if not isinstance(mech, Mechanism):
+        return _entries_as_unknowns(mech, t0, guess, estimate, label)
     rows, q = KinematicRows(mech), np.asarray(assemble(mech, t0, guess).q, float).ravel()
     free = np.eye(len(q))
     if rows.count:
@@ -110,14 +111,14 @@ def state_unknowns(mech: StudyModel, t0: float, guess: State | None, estimate: E
     return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(sizes), np.concatenate(parts, axis=2))
 
 
-def _unknowns_of_system(
+def _entries_as_unknowns(
     system: ConstrainedSystem, t0: float, guess: State | None, estimate: Estimated, label: str
 ) -> InitialStateUnknowns:
     """Choose coordinates that parametrize the positions, and velocities that parametrize the velocities, of closed states."""
     state = assemble(system, t0, guess)
     q, v = (np.asarray(x, float) for x in (state.q, state.v))
     n, parts, names, sizes = len(q), [], [], []
-    psi_q, rows = (np.asarray(x, float) for x in jacobians_of_system(system.traced(n), t0, q, v))
+    psi_q, rows = (np.asarray(x, float) for x in jacobians_at(system.traced(n), t0, q, v))
     for place, kind, letter, A in ((0, "position", "q", psi_q), (1, "velocity", "v", rows)):
         if estimate not in (kind, "both"):
             continue

@@ -4,13 +4,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from inspect import isclass
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from typing_extensions import TypeAliasType
 
 from udkjax.requirements import ArgumentTypeError, describe, require_choice, require_numbers, require_text
-from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.reshaping import length_of
 from udkjax.scene.tables.checks import SceneError
@@ -192,9 +191,9 @@ def _parts(mechanism: StudyModel, p: Parameter) -> list[_Part]:
     if isinstance(of, str):
         of, scaled = _read(mechanism, of, scaled)
     if isinstance(of, Length):
-        if not isinstance(mechanism, Mechanism):
-            raise ValueError("a ConstrainedSystem has no bodies, and thus no lengths: name a number of the system")
-        lengths = [float(length_of(mechanism, body)) for body in of.bodies or ("",)]
+        scene: Any = mechanism
+        scene.require_bodies("a ConstrainedSystem has no bodies, and thus no lengths: name a number of the system")
+        lengths = [float(length_of(scene, body)) for body in of.bodies or ("",)]
         return [_Part(Target(function=of), lengths[0], len(set(lengths)) == 1)]
     if callable(of):
         return [_Part(Target(function=of), None, False)]

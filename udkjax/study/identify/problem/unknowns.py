@@ -16,7 +16,6 @@ from scipy.special import expit, logit
 from udkjax.arrays import make_module
 from udkjax.positions.assembling.assembly import State
 from udkjax.scene.elements.held import Held
-from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.number_fields import NumberField, split_index
 from udkjax.study.identify.records.records import IdentificationError, Record
 from udkjax.study.quantities import Setter, StudyModel, parameter_value
@@ -226,7 +225,7 @@ def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str,
 
 def _held_in_scene(mechanism: StudyModel, samples: NumberField | None) -> Held | None:
     """Return the `Held` of these samples, if that is what they are."""
-    holder = samples.holder(mechanism.groups) if samples is not None and isinstance(mechanism, Mechanism) else None
+    holder = samples.holder(mechanism.groups) if samples is not None and mechanism.has_bodies else None
     return holder if isinstance(holder, Held) else None
 
 
