@@ -159,7 +159,12 @@ def _by_rows(
     shapes = [x.shape for x in select(inputs, active)]
     if not shapes:
         return []
-    row = lambda e: jnp.vdot(_flat(cotangents), _flat(rate(_split(e, shapes))))  # noqa: E731
+    weights = _flat(cotangents)
+
+    def row(e: Array) -> Array:
+        change = _flat(rate(_split(e, shapes)))
+        return jnp.vdot(weights, jnp.where((weights == 0) & jnp.isnan(change), 0.0, change))  # a lost derivative that is not used
+
     return _split(jax.vmap(row)(jnp.eye(sum(map(math.prod, shapes)))), shapes)
 
 

@@ -13,6 +13,11 @@ class ForwardTwice(Forward):
 
     Second derivatives are the same sums over stages, ends of steps and outputs; the programs of accelerations and projections
     compute them together with the tangents along either direction.
+
+    They are lost, NaN, where a step by the fallback leaves unbounded loads of joints out of their friction. Near the singular
+    configuration such a load is c / d, with the distance d. The steps of a run keep the range without it at the same distances,
+    but steps are not differentiated: along a change that moves the configuration by x there, the range stays behind, and the
+    second derivatives of log d at its two ends, -(x / d)^2, are missing. This error does not decrease with the steps.
     """
 
     mode = TWICE
@@ -29,6 +34,12 @@ class ForwardTwice(Forward):
             write_saltation(self)
 
     def _finish_change(self, f: Function, s: Lane, accept: Value):
+        if self.settles and self.falls_back:
+            lost = accept & (s.fallback > 0.5)
+            with f.if_(f.any_of(lost)), self._each_group(f), self._in_way(f, self.ways[-1]):
+                with f.each(self.registers("tangent")) as r:
+                    for name in ("result q", "result v"):
+                        self.put(f, name, r, f.select(lost, float("nan"), self.vector(f, name, r, "tangent")), "tangent")
         if self.pieces:
             with f.if_(f.any_of(accept & (s.crosses > 0.5))):
                 f.call("along_motion", f.given["work"])
