@@ -36,15 +36,19 @@ class ForwardTwice(Forward):
     def _finish_change(self, f: Function, s: Lane, accept: Value):
         if self.settles and self.falls_back:
             lost = accept & (s.fallback > 0.5)
-            with f.if_(f.any_of(lost)), self._each_group(f), self._in_way(f, self.ways[-1]):
-                with f.each(self.registers("tangent")) as r:
-                    for name in ("result q", "result v"):
-                        self.put(f, name, r, f.select(lost, float("nan"), self.vector(f, name, r, "tangent")), "tangent")
+            with f.if_(f.any_of(lost)):
+                self._lose(f, lost)
         if self.pieces:
             with f.if_(f.any_of(accept & (s.crosses > 0.5))):
                 f.call("along_motion", f.given["work"])
                 with self._each_group(f):
                     f.call("jump", f.given["work"], f.given["tangent"])
+
+    def _lose(self, f: Function, lanes: Value):
+        """Set the second derivatives of the end of a step to NaN in some lanes."""
+        for name in ("result q", "result v"):
+            with self._each_group(f), self._in_way(f, self.ways[-1]), f.each(self.registers("tangent")) as r:
+                self.put(f, name, r, f.select(lanes, float("nan"), self.vector(f, name, r, "tangent")), "tangent")
 
     def _project_end(self, f: Function, begin: Value):
         # From a state off the manifold, one Newton step is exact to first order, two steps to second order. Only the initial
