@@ -20,7 +20,7 @@ _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
 class RunModel(eqx.Module):
-    """What a run asks of a model. By default it has coordinates alone: no bodies, elements or sampled numbers.
+    """The questions that a run asks of a model. By default it has coordinates alone: no bodies, elements or sampled numbers.
 
     Attributes:
         has_bodies: whether coordinates are those of bodies, and rows those of joints and drivers.
@@ -94,7 +94,7 @@ class RunModel(eqx.Module):
 
 
 class Model(RunModel):
-    """What a study asks of a model in addition: its numbers by name, and its initial guess.
+    """The questions that a study asks of a model in addition: its numbers by name, and its initial guess.
 
     Attributes:
         name: the name, for titles.

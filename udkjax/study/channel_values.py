@@ -55,8 +55,6 @@ def measure(
         Values (T, C) in SI units, one column per channel; NaN where the state is NaN, after a run has failed. At a toggle,
         positions, angles and distances are finite, and velocities are NaN. Derivatives of NaN values are zero.
     """
-    if isinstance(mechanism, ConstrainedSystem):
-        return _measure_system(mechanism, solution, channels)
     motion, placed, reached = _fill(mechanism, solution, TextbookEquations.known_sticking(mechanism, solution))
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
@@ -64,18 +62,6 @@ def measure(
         return jnp.zeros((len(motion.q), 0))
     valid = [placed if isinstance(c, Channel) and c.quantity in POSITIONS else reached for c in channels]
     return jnp.where(jnp.stack(valid, -1), jnp.stack(columns, -1), jnp.nan)
-
-
-def _measure_system(system: ConstrainedSystem, solution: StateHistory, channels: Sequence[Channel | Quantity]) -> Array:
-    """Compute channels of a user-defined system; states after a failure are replaced by the first one, or by ones."""
-    reached = jnp.all(jnp.isfinite(solution.q) & jnp.isfinite(solution.v), axis=1)
-    q, v = (
-        jnp.where(reached[:, None], x, jax.lax.stop_gradient(jnp.where(jnp.isfinite(x[0]), x[0], 1.0)))
-        for x in (solution.q, solution.v)
-    )
-    filled, states = eqx.tree_at(lambda s: (s.q, s.v), solution, (q, v)), {"q": q, "v": v}
-    columns = [c.function(system, filled) if isinstance(c, Quantity) else states[c.owner][:, int(c.quantity)] for c in channels]
-    return jnp.where(reached[:, None], jnp.stack(columns, -1) if columns else jnp.zeros((len(q), 0)), jnp.nan)
 
 
 @checked
@@ -118,16 +104,21 @@ def _path(mechanism, analysis, ts, q, v, a, sticking, local, body, derivative):
 
 
 def _fill(
-    mechanism: Mechanism, solution: StateHistory | SimpleNamespace, sticking: Any, analysis: Analysis | None = None
+    mechanism: Any, solution: StateHistory | SimpleNamespace, sticking: Any, analysis: Analysis | None = None
 ) -> tuple["_Motion", Bool[Array, "T"], Bool[Array, "T"]]:
-    """Return a motion whose NaN states are replaced by the scene's guess, to keep all derivatives finite, and two masks.
+    """Return a motion whose NaN states are replaced, to keep all derivatives finite, and two masks.
 
-    The masks are of the times at which positions are finite, and of those at which velocities are finite too.
+    They are replaced by the scene's guess; without bodies by the first state, or by ones. The masks are of the times at which
+    positions are finite, and of those at which velocities are finite too.
     """
-    placed = jnp.all(jnp.isfinite(solution.q), axis=(1, 2))
-    reached = placed & jnp.all(jnp.isfinite(solution.v), axis=(1, 2))
-    filled = ((placed, solution.q, mechanism.q0), (reached, solution.v, mechanism.v0))
-    q, v = (jnp.where(valid[:, None, None], x, jax.lax.stop_gradient(x0)) for valid, x, x0 in filled)
+    axes = tuple(range(1, jnp.ndim(solution.q)))
+    placed = jnp.all(jnp.isfinite(solution.q), axis=axes)
+    reached = placed & jnp.all(jnp.isfinite(solution.v), axis=axes)
+    guess = (mechanism.q0, mechanism.v0)
+    if not mechanism.has_bodies:
+        guess = (jnp.where(jnp.isfinite(x[0]), x[0], 1.0) for x in (solution.q, solution.v))
+    filled = zip((placed, reached), (solution.q, solution.v), guess, strict=True)
+    q, v = (jnp.where(jnp.expand_dims(valid, axes), x, jax.lax.stop_gradient(x0)) for valid, x, x0 in filled)
     a = getattr(solution, "a", None)
     a = None if a is None else jnp.where(reached[:, None, None], a, 0.0)
     return _Motion(mechanism, solution.ts, q, v, a, analysis, sticking), placed, reached
@@ -254,6 +245,10 @@ def _measure_driver(channel: Channel, motion: _Motion) -> Array:
     return -motion.dynamics.multipliers[:, motion.dynamics.row_owners.index(channel.owner)]
 
 
+def _measure_state(channel: Channel, motion: _Motion) -> Array:
+    return getattr(motion, channel.owner)[:, int(channel.quantity)]
+
+
 def _measure_distance(channel: Channel, motion: _Motion) -> Array:
     return between(channel.points, *(motion.frames[body] for body in channel.bodies)).norm()
 
@@ -264,4 +259,5 @@ _MEASURES: dict[str, Callable[[Channel, _Motion], Array]] = {
     "pin": _measure_pin,
     "driver": _measure_driver,
     "distance": _measure_distance,
+    "state": _measure_state,
 }

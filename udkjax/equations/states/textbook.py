@@ -1,6 +1,7 @@
 """The equations of motion of a mechanism in textbook form (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -105,7 +106,7 @@ class TextbookEquations(ConstrainedRows):
         return replace(self, soft=soft)
 
     @staticmethod
-    def known_sticking(mechanism: Mechanism, solution: HistoryLike) -> Bool[Array, "T F"] | None:
+    def known_sticking(mechanism: Any, solution: HistoryLike) -> Bool[Array, "T F"] | None:
         """Return which joints stick in a run, for `known_to_stick`; None if it does not tell, or there are none."""
         return known_sticking(mechanism, solution)
 

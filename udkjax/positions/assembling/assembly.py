@@ -167,12 +167,12 @@ def _close_system(system: ConstrainedSystem, t: NumberLike, state: State | None 
     if state is None and system.q0 is None:
         raise ValueError("a ConstrainedSystem without q0 has no initial guess: give a state near a closed one, State(q, v)")
     q, v = (system.q0, system.v0) if state is None else (state.q, state.v)
-    traced = system.traced(np.size(q))
-    found = close_system(traced, *(jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v)))
-    sizes = jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in (found.psi, found.rates)])
-    tol = max(CLOSURE.tol, ROUNDING / np.finfo(float).eps * float(jnp.finfo(found.q.dtype).eps))
-    closed = jnp.max(sizes) <= tol * jnp.maximum(1.0, jnp.max(jnp.abs(found.v), initial=0.0))
-    return Closure(State(found.q, found.v), found.psi, found.rates, found.rank, found.scales, closed)
+    given = (jnp.asarray(x, jnp.result_type(float)) for x in (t, q, v))
+    q, v, psi, rates, rank, scales = close_system(system.traced(np.size(q)), *given)
+    sizes = jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in (psi, rates)])
+    tol = max(CLOSURE.tol, ROUNDING / np.finfo(float).eps * float(jnp.finfo(q.dtype).eps))
+    closed = jnp.max(sizes) <= tol * jnp.maximum(1.0, jnp.max(jnp.abs(v), initial=0.0))
+    return Closure(State(q, v), psi, rates, rank, scales, closed)
 
 
 def close(

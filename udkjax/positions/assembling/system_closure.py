@@ -7,7 +7,7 @@ numbers of the system are exact, those with respect to the guess are those of a 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from udkjax.annotations import Time, Vector
 from udkjax.equations.rows.position_closure import CLOSURE, close_position
@@ -34,20 +34,9 @@ class SystemRows(NamedTuple):
         return self.equations.correct_position(t, q) - q
 
 
-class ClosedSystem(NamedTuple):
-    """A closed state with its residuals, and the rank of (Psi_q; phi_v) M^(-1/2)."""
-
-    q: Vector
-    v: Vector
-    psi: Float[Array, "m"]
-    rates: Float[Array, "k"]  # Psi_dot and phi
-    rank: Int[Array, ""]
-    scales: Any
-
-
 @deferred
 @defined
-def close_system(system: Any, t: Array, q: Vector, v: Vector) -> ClosedSystem:
+def close_system(system: Any, t: Array, q: Vector, v: Vector) -> tuple[Any, ...]:
     """Close a state of a system.
 
     Args:
@@ -57,7 +46,8 @@ def close_system(system: Any, t: Array, q: Vector, v: Vector) -> ClosedSystem:
         v: Velocities (n,).
 
     Returns:
-        The closed state, with its residuals; they exceed `CLOSURE.tol` if no closed state is near.
+        q and v of the closed state; Psi, and Psi_dot followed by phi, which exceed `CLOSURE.tol` if no closed state is near;
+        the rank of (Psi_q; phi_v) M^(-1/2), and the scales.
     """
     equations: Any = equations_of(system, SVD())
     fixed, at, start = stop_gradients((equations, t, q))
@@ -69,4 +59,4 @@ def close_system(system: Any, t: Array, q: Vector, v: Vector) -> ClosedSystem:
         velocity = equations.correct_velocity(t, closed, velocity)
     psi, rates = equations.violation(t, closed, velocity)
     rank = stop_gradients(equations.rank(t, closed, velocity))
-    return ClosedSystem(closed, velocity, psi, rates, rank, fixed.scales)
+    return closed, velocity, psi, rates, rank, fixed.scales

@@ -29,6 +29,7 @@ class Action(PrintsLine):
         changes: whether it changes the motion; if not, contacts stay as they are.
         adds: whether it adds a joint, its `addition`.
         on_page: whether the engine of live pages supports it.
+        needs_joints: whether it changes joints, which a user-defined system lacks.
     """
 
     is_impact: ClassVar[bool] = False
@@ -36,6 +37,7 @@ class Action(PrintsLine):
     changes: ClassVar[bool] = True
     adds: ClassVar[bool] = False
     on_page: ClassVar[bool] = False
+    needs_joints: ClassVar[bool] = True
 
     @property
     def rebound(self) -> Any:
@@ -66,12 +68,8 @@ class Action(PrintsLine):
         """Return the name of the joint that it adds, and the joint without the numbers that depend on the state at the event."""
         return None
 
-    def check(self, mechanism: Mechanism, where: str):
-        """Raise an error, whose message begins with `where`, if its arguments do not fit a mechanism."""
-
-    def check_for_system(self, where: str):
-        """Raise an error, whose message begins with `where`, if the action cannot happen to a `ConstrainedSystem`."""
-        raise ValueError(f"{where}: {type(self).__name__} changes the joints of a mechanism, and this system has none")
+    def check(self, mechanism: Any, where: str):
+        """Raise an error, whose message begins with `where`, if its arguments do not fit a model."""
 
     def has_usable_numbers(self) -> Bool[Array, ""]:
         """Return whether its numbers, which may be traced, are within their limits."""
@@ -84,9 +82,7 @@ class Stop(Action):
     stops = True
     changes = False
     on_page = True
-
-    def check_for_system(self, where):
-        pass
+    needs_joints = False
 
 
 class Log(Action):
@@ -94,9 +90,7 @@ class Log(Action):
 
     changes = False
     on_page = True
-
-    def check_for_system(self, where):
-        pass
+    needs_joints = False
 
 
 class Impact(Action):
@@ -117,6 +111,7 @@ class Impact(Action):
 
     is_impact = True
     on_page = True
+    needs_joints = False
 
     @property
     def rebound(self):
@@ -126,14 +121,11 @@ class Impact(Action):
     def rest(self):
         return self.at_rest
 
-    def check_for_system(self, where):
+    def check(self, mechanism, where):
         require_restitution(f"{where}: the restitution", self.restitution)
         if self.at_rest != "stop":
             cure = 'let the run end there, Impact(restitution, at_rest="stop"), or go on with a system that has the row'
-            raise ValueError(f"{where}: the constraints of a ConstrainedSystem do not change; {cure}")
-
-    def check(self, mechanism, where):
-        require_restitution(f"{where}: the restitution", self.restitution)
+            mechanism.require_bodies(f"{where}: the constraints of a ConstrainedSystem do not change; {cure}")
         if not isinstance(self.at_rest, str) or self.at_rest not in ("hold", "stop"):
             raise ValueError(f'{where}: at_rest must be "hold" or "stop", {describe(self.at_rest)}')
 

@@ -295,10 +295,10 @@ def _check(event: Event, mechanism: Any) -> None:
             raise ValueError(f"{where}: an Impact is where its condition falls to zero, and not where direction=1: {cure}")
         if sees_velocity(event.condition, mechanism):
             raise ValueError(f"{where}: the condition of an Impact must depend on positions alone")
-    if mechanism.has_bodies:
-        action.check(mechanism, where)
-    else:
-        action.check_for_system(where)
+    if action.needs_joints:
+        kind = type(action).__name__
+        mechanism.require_bodies(f"{where}: {kind} changes the joints of a mechanism, and this system has none")
+    action.check(mechanism, where)
 
 
 def _try_condition(event: Event, mechanism: Any, where: str) -> None:

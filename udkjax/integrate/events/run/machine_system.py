@@ -85,9 +85,8 @@ class MachineSystem:
         (B, _), n = ts.shape, inverse_mass.shape[1]
         self._windows: dict[int, Window] = {}  # of the members that go on window by window
         self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
-        self.coordinates = np.ones((B, n))
-        if self.plan.has_bodies:
-            self.coordinates = np.tile(np.stack([units.length, units.length, np.ones(B)], axis=1), n // 3)
+        units_of_body = np.stack([units.length, units.length, np.ones(B)], axis=1)  # all are one without bodies
+        self.coordinates = np.tile(units_of_body, -(-n // 3))[:, :n]
         E = self.plan.count
         holds = np.flatnonzero(np.array(self.plan.switches.rows, int) >= 0)
         self._watched = [np.append(np.arange(E), E + holds[: x.force_count]) for x in plan.phases]
