@@ -113,6 +113,12 @@ def require_numbers_by_name(name: str, value: Any, given: GivenArguments = NOTHI
         require_number(f"{name}[{key!r}]", number)
 
 
+def require_name_or_names(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+    """Require a name, or a list of names."""
+    if not (isinstance(value, str) or are_names(value)):
+        raise ArgumentTypeError(f"{name} must be a name, or a list of names, {describe(value)}")
+
+
 def require_choice(name: str, value: Any, choices: Sequence[str]) -> None:
     """Require one of several strings."""
     if not isinstance(value, str) or value not in choices:

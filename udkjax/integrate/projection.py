@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from udkjax.argument_types import checks_instances, require_thresholds
 from udkjax.equations.laws.abstract_system import AbstractSystem, TangentPart
 from udkjax.native.module.steps import NORMAL_ERROR_WEIGHT
 from udkjax.printing import PrintsLine
@@ -14,6 +15,9 @@ STATES_AT_ONCE = 64  # evaluated together at outputs: the memory that they take 
 
 class Projection(PrintsLine):
     """Project positions and velocities after each step, by the smallest change in the mass metric (the default stabilization)."""
+
+
+checks_instances(Projection)(require_thresholds)
 
 
 def project(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, "2n"]:

@@ -5,7 +5,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_OR_INFINITE, TIMES
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays, without_derivatives
 from udkjax.devices import on_host
 from udkjax.equations.laws.formulations import Formulation
@@ -44,6 +45,7 @@ from udkjax.integrate.prepare import (
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
+from udkjax.integrate.solvers.diffrax_arguments import ADJOINT, CONTROLLER, SOLVER
 from udkjax.integrate.stabilization import Stabilization
 from udkjax.pinv import Pseudoinverse
 from udkjax.positions.assembling.assembly import AssemblyWarning, Closure, State, close, require_closed
@@ -63,25 +65,25 @@ MAX_EVENTS, MAX_EVENTS_STICKING = 64, 256  # defaults, without and with joints t
 @checked
 def simulate(
     mechanism: Mechanism | ConstrainedSystem,
-    ts: Numbers | Sequence[float],
+    ts: Annotated[Numbers | Sequence[float], TIMES],
     state: State | Closure | None = None,
-    rtol: NumberLike = 1e-8,
-    atol: NumberLike = 1e-8,
+    rtol: Annotated[NumberLike, NOT_NEGATIVE] = 1e-8,
+    atol: Annotated[NumberLike, NOT_NEGATIVE] = 1e-8,
     method: Pseudoinverse | None = None,
     stabilization: Projection | Baumgarte | Stabilization | None = Projection(),
-    solver: "diffrax.AbstractSolver | None" = None,
-    adjoint: "diffrax.AbstractAdjoint | None" = None,
-    max_steps: int = MAX_STEPS,
-    drift_tol: NumberLike | None = None,
-    dt0: NumberLike | None = None,
+    solver: Annotated["diffrax.AbstractSolver", SOLVER] | None = None,
+    adjoint: Annotated["diffrax.AbstractAdjoint", ADJOINT] | None = None,
+    max_steps: Annotated[int, COUNT] = MAX_STEPS,
+    drift_tol: Annotated[NumberLike, POSITIVE_OR_INFINITE] | None = None,
+    dt0: Annotated[NumberLike, POSITIVE] | None = None,
     formulation: Formulation | None = None,
     throw: bool = True,
     progress: Any = None,
     analysis: Analysis | None = None,
     engine: Literal["auto", "native", "diffrax", "jax"] = "auto",
     events: Any = None,
-    max_events: int | None = None,
-    stepsize_controller: "diffrax.AbstractStepSizeController | None" = None,
+    max_events: Annotated[int, COUNT] | None = None,
+    stepsize_controller: Annotated["diffrax.AbstractStepSizeController", CONTROLLER] | None = None,
 ) -> Solution:
     """Integrate the equations of motion q'' = a(t, q, q') of a mechanism; return its states at output times.
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Time, Vector
+from udkjax.argument_types import checks_instances, require_thresholds
 from udkjax.equations.laws.abstract_system import AbstractSystem, TangentPart
 from udkjax.equations.laws.formulations import WrappedSystem
 from udkjax.equations.terms.scale_program import RANK_TOL
@@ -113,6 +114,9 @@ class Stabilization(PrintsLine):
             The state from which the next step starts.
         """
         return at.q, at.v
+
+
+checks_instances(Stabilization)(require_thresholds)
 
 
 class StabilizedEquations(WrappedSystem):

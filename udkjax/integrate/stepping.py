@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import BY_NAME, COUNT, NOT_NEGATIVE, POSITIVE
 from udkjax.arrays import float_type, is_traced, is_within_jit, make_module, number, stored
 from udkjax.devices import on_host
 from udkjax.equations.rows.analysis import Analysis, analysis_of
@@ -40,12 +41,12 @@ MOST_STEPS_OF_INTERVAL = 1_000  # default
 def step(
     mechanism: Mechanism | ConstrainedSystem,
     state: State,
-    inputs: Mapping[str, Numbers] | None,
-    dt: NumberLike,
+    inputs: Annotated[Mapping[str, Numbers], BY_NAME] | None,
+    dt: Annotated[NumberLike, POSITIVE],
     t: NumberLike = 0.0,
-    rtol: NumberLike = 1e-8,
-    atol: NumberLike = 1e-8,
-    max_steps: int = MOST_STEPS_OF_INTERVAL,
+    rtol: Annotated[NumberLike, NOT_NEGATIVE] = 1e-8,
+    atol: Annotated[NumberLike, NOT_NEGATIVE] = 1e-8,
+    max_steps: Annotated[int, COUNT] = MOST_STEPS_OF_INTERVAL,
     analysis: Analysis | None = None,
     engine: Literal["auto", "native", "diffrax", "jax"] = "auto",
 ) -> State:

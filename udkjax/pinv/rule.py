@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import checks_instances, require_thresholds
 from udkjax.arrays import number_called
 from udkjax.pinv.linear_primitive import linear_primitive
 from udkjax.printing import PrintsLine
@@ -131,6 +132,9 @@ class Pseudoinverse(PrintsLine):
         rows, _ = self.shape(plus.matrix)
         dtype = jnp.result_type(*(leaf for leaf in jtu.tree_leaves(plus.matrix) if eqx.is_inexact_array(leaf)))
         return plus @ jnp.eye(rows, dtype=dtype)
+
+
+checks_instances(Pseudoinverse)(require_thresholds)
 
 
 class Dense(Pseudoinverse):

@@ -77,7 +77,6 @@ from udkjax.scene.mjcf import mjcf_text as mjcf_text
 from udkjax.scene.mjcf import read_mjcf as read_mjcf
 from udkjax.scene.model import Model as Model
 from udkjax.scene.model import RunModel as RunModel
-from udkjax.scene.named_arguments import require_history as require_history
 from udkjax.scene.numbers.description import format_pose as format_pose
 from udkjax.scene.numbers.description import size_of as size_of
 from udkjax.scene.numbers.number_fields import NumberField as NumberField

@@ -1,9 +1,10 @@
 """Checks of the arguments of public functions, before anything is computed.
 
-`@checked` reads the annotations and names of a function's parameters. An argument must be an instance of an annotated class, or a
-choice of a `Literal`. Arrays are recognized by their names (named_arguments.py): shapes must fit the mechanism, numbers must be
-real, finite and of the right sign. Other integers, numbers and lists of names are recognized by their annotations. For traced
-values only shapes and dtypes are checked; `concrete_only` (udkjax/requirements.py) refuses them.
+`@checked` reads the annotations of a function's parameters. An argument must be an instance of an annotated class, or a choice of
+a `Literal`; what instances of a class must be besides is registered by `checks_instances`. Metadata of `Annotated` say what else
+an argument must be (udkjax/argument_types.py): shapes must fit the mechanism, numbers must be real, finite and of the right sign.
+Single numbers, integers and lists of names need no metadata. For traced values only shapes and dtypes are checked;
+`concrete_only` (udkjax/requirements.py) refuses them.
 """
 
 import math
@@ -11,11 +12,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial, wraps
 from inspect import BoundArguments, Parameter, Signature, isclass, signature
 from types import UnionType
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin
 
 import jax
 import numpy as np
+from typing_extensions import TypeAliasType
 
+from udkjax.annotations import NumberLike
+from udkjax.argument_types import INSTANCE_CHECKS, ArgumentRequirement, checks_instances
 from udkjax.arrays import is_within_jit, without_derivatives
 from udkjax.requirements import (
     ArgumentCheck,
@@ -24,10 +28,11 @@ from udkjax.requirements import (
     GivenArguments,
     describe,
     require_count,
+    require_name_or_names,
+    require_names,
     require_number,
 )
 from udkjax.scene.mechanism import Mechanism, require_valid_numbers
-from udkjax.scene.named_arguments import CHECKS, require_history, require_name_or_names, require_names
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import article, quote, suggestion
 
@@ -137,26 +142,38 @@ class ParameterCheck(NamedTuple):
 
 def _checks_of(function: Callable[..., object]) -> list[ParameterCheck]:
     parameter_checks: list[ParameterCheck] = []
-    checks = CHECKS | {"mechanism": _require_usable}
     for name, parameter in signature(function).parameters.items():
-        annotation = parameter.annotation
-        if by_type := _check_of_type(annotation):
+        types, checks = _unfold(parameter.annotation)
+        may_be_none = parameter.default is None or type(None) in types
+        if by_type := _check_of_type(types):
             parameter_checks.append(ParameterCheck(name, by_type))
-        if name in ("solution", "motion") and parameter.default is parameter.empty:
-            parameter_checks.append(ParameterCheck(name, require_history))
-        elif check := checks.get(name, _check_of_kind(annotation)):
-            may_be_none = parameter.default is None or type(None) in _alternatives(annotation)
+        for check in checks or _checks_of_kind(types):
             parameter_checks.append(ParameterCheck(name, check, "passes" if may_be_none else "refuses"))
     return parameter_checks
 
 
-def _check_of_type(annotation: Any) -> ArgumentCheck | None:
+def _unfold(annotation: Any) -> tuple[tuple[Any, ...], tuple[ArgumentCheck, ...]]:
+    """Return the types that an annotation allows, and the checks of its metadata."""
+    if isinstance(annotation, TypeAliasType) and annotation is not NumberLike:
+        return _unfold(annotation.__value__)
+    if get_origin(annotation) is Annotated:
+        inner, *metadata = get_args(annotation)
+        types, checks = _unfold(inner)
+        return types, (*checks, *(x.check for x in metadata if isinstance(x, ArgumentRequirement)))
+    if get_origin(annotation) not in (Union, UnionType):
+        return (annotation,), ()
+    unfolded = [_unfold(x) for x in get_args(annotation)]
+    return tuple(x for types, _ in unfolded for x in types), tuple(x for _, checks in unfolded for x in checks)
+
+
+def _check_of_type(types: tuple[Any, ...]) -> ArgumentCheck | None:
     """Return the check of an annotation that consists of classes, or of choices; None for any other."""
-    alternatives = _alternatives(annotation)
-    choices = [choice for x in alternatives if get_origin(x) is Literal for choice in get_args(x)]
-    classes = tuple(x for x in alternatives if get_origin(x) is not Literal)
+    choices = [choice for x in types if get_origin(x) is Literal for choice in get_args(x)]
+    classes = tuple(x for x in types if get_origin(x) is not Literal)
+    if not _are_ours(classes):
+        return None
     if not choices:
-        return _instance(classes) if (classes := _classes(annotation)) else None
+        return _instance(classes) if any(x is not type(None) for x in classes) else None
     if not classes:
         return _choice(tuple(choices))
     is_instance, is_choice = _instance(classes), _choice(tuple(choices))
@@ -164,30 +181,19 @@ def _check_of_type(annotation: Any) -> ArgumentCheck | None:
     def check(name: str, value: Any, given: GivenArguments):
         (is_choice if isinstance(value, str) else is_instance)(name, value, given=given)
 
-    return check if _are_ours(classes) else None
+    return check
 
 
-def _check_of_kind(annotation: Any) -> ArgumentCheck | None:
-    """Return the check of an integer, a number or names, whatever the name of the argument; None for anything else."""
-    kinds = {x for x in _alternatives(annotation) if x is not type(None)}
+def _checks_of_kind(types: tuple[Any, ...]) -> tuple[ArgumentCheck, ...]:
+    """Return the check of an integer, a number or names; none for anything else."""
+    kinds = {x for x in types if x is not type(None)}
     if kinds == {int}:
-        return partial(require_count, least=-math.inf)
-    if kinds == {float}:
-        return require_number
+        return (partial(require_count, least=-math.inf),)
+    if kinds in ({float}, {NumberLike}):
+        return (require_number,)
     if kinds == {str, Sequence[str]}:
-        return require_name_or_names
-    return require_names if kinds == {Sequence[str]} else None
-
-
-def _alternatives(annotation: Any) -> tuple[Any, ...]:
-    annotation = getattr(annotation, "__value__", annotation)  # of a `TypeAliasType`
-    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-
-
-def _classes(annotation: Any) -> tuple[type, ...]:
-    """Return the classes that an annotation allows; empty unless it consists of classes only."""
-    classes = _alternatives(annotation)
-    return classes if _are_ours(classes) and any(x is not type(None) for x in classes) else ()
+        return (require_name_or_names,)
+    return (require_names,) if kinds == {Sequence[str]} else ()
 
 
 def _are_ours(classes: Sequence[Any]) -> bool:
@@ -206,6 +212,10 @@ def _instance(classes: tuple[type, ...]) -> ArgumentCheck:
         if not isinstance(value, accepted):
             cure = getattr(value, "cure", "")
             raise ArgumentTypeError(f"{name} must be {expected}, {describe(value)}{_remedy(name, value, classes)}{cure}")
+        for cls in type(value).__mro__:
+            if cls in INSTANCE_CHECKS:
+                INSTANCE_CHECKS[cls](name, value, given=given)
+                break
 
     return check
 
@@ -248,10 +258,9 @@ def _choice(known: tuple[Any, ...]) -> ArgumentCheck:
     return check
 
 
-def _require_usable(name: str, value: Any, given: GivenArguments) -> None:
+@checks_instances(Mechanism)
+def _require_usable(name: str, value: Mechanism, given: GivenArguments) -> None:
     """Require a single mechanism, not a batch, whose numbers have a meaning."""
-    if not isinstance(value, Mechanism):
-        return
     if (shape := np.shape(value._source.gravity)) != (2,):
         cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
         raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")

@@ -6,11 +6,13 @@ guess: no pin of the tree opens. `assemble` closes the others.
 """
 
 from collections.abc import Iterator, Sequence
+from typing import Annotated
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number, NumberLike, Numbers
+from udkjax.argument_types import POSITIVE
 from udkjax.arrays import number
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME_AT_REST, Frame
@@ -22,7 +24,9 @@ from udkjax.wording import quote, suggestion
 
 
 @checked
-def with_length(mechanism: Mechanism, bodies: Sequence[str] | str, length: NumberLike, as_rod: bool = False) -> Mechanism:
+def with_length(
+    mechanism: Mechanism, bodies: Sequence[str] | str, length: Annotated[NumberLike, POSITIVE], as_rod: bool = False
+) -> Mechanism:
     """Return the mechanism with another length of bodies: the largest distance between two attachment points of a body.
 
     All attachment points of these bodies, to joints, drivers and forces, are scaled about the centre of mass. Angles do not
@@ -66,7 +70,10 @@ def length_of(mechanism: Mechanism, body: str) -> Float[Array, ""]:
 
 @checked
 def with_angle(
-    mechanism: Mechanism, bodies: Sequence[str] | str, angle: NumberLike, angular_velocity: NumberLike | None = None
+    mechanism: Mechanism,
+    bodies: Sequence[str] | str,
+    angle: NumberLike,
+    angular_velocity: NumberLike | None = None,
 ) -> Mechanism:
     """Return the mechanism with another initial angle, and angular velocity, of bodies.
 

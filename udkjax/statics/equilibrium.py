@@ -1,7 +1,7 @@
 """Static equilibria, stable or not: positions where loads and constraint forces balance, F = Psi_q^T lambda."""
 
 import math
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.argument_types import COUNT, NOT_NEGATIVE_COUNT
 from udkjax.arrays import ArrayLibrary, is_traced, library_for, make_module, number, stored
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.rows.position_closure import CLOSURE
@@ -120,7 +121,11 @@ def _format_rate(omega2: float) -> str:
 
 @checked
 def equilibrium(
-    mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0, stable: bool = False, analysis: Analysis | None = None
+    mechanism: Mechanism,
+    state: State | None = None,
+    t: NumberLike = 0.0,
+    stable: bool = False,
+    analysis: Analysis | None = None,
 ) -> Equilibrium:
     """Return a position of rest near a given position: N^T F = 0 on Psi = 0, where N spans the free directions.
 
@@ -155,7 +160,11 @@ def equilibrium(
 @checked
 @concrete_only()
 def equilibria(
-    mechanism: Mechanism, starts: int = 64, seed: int = 0, t: NumberLike = 0.0, state: State | None = None
+    mechanism: Mechanism,
+    starts: Annotated[int, COUNT] = 64,
+    seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
+    t: NumberLike = 0.0,
+    state: State | None = None,
 ) -> list[Equilibrium]:
     """Return the different equilibria found from several positions: the given position and random positions.
 

@@ -6,6 +6,7 @@ friction locks the mechanism, or redundant joints can be preloaded without limit
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.argument_types import FINITE, NUMBERS_BY_NAME
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.positions.assembling.assembly import State
 from udkjax.positions.assembling.coordinates import Coordinate
@@ -94,9 +96,9 @@ class HoldingEfforts(PrintsTable):
 def holding_efforts(
     mechanism: Mechanism,
     driver: str | Coordinate,
-    values: Float[ArrayLike, "T"] | Sequence[float],
+    values: Annotated[Float[ArrayLike, "T"] | Sequence[float], FINITE],
     state: State | None = None,
-    held: Mapping[str, NumberLike] | None = None,
+    held: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
     preload: bool = True,
 ) -> HoldingEfforts:
     """Return the bounds of the efforts along a coordinate that hold a mechanism at rest, at each value of the coordinate.

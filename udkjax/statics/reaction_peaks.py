@@ -9,13 +9,14 @@ and envelopes are pure functions: they can be differentiated through `simulate`,
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from udkjax.argument_types import HISTORY
 from udkjax.equations.states.reactions import reactions, unique_reactions
 from udkjax.positions.assembling.channels import StateHistory, has_point
 from udkjax.printing import prints_table, units
@@ -68,7 +69,7 @@ class RestingPositions(NamedTuple):
 
 
 @checked
-def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> Peaks:
+def reaction_peaks(mechanism: Mechanism, solution: Annotated[StateHistory, HISTORY], **choices: Any) -> Peaks:
     """Return the peaks and root mean squares of all reactions over a run.
 
     Args:
@@ -92,7 +93,9 @@ def reaction_peaks(mechanism: Mechanism, solution: StateHistory, **choices: Any)
 
 
 @checked
-def pin_reactions(mechanism: Mechanism, solution: StateHistory, **choices: Any) -> dict[str, dict[str, Float[Array, "T 3"]]]:
+def pin_reactions(
+    mechanism: Mechanism, solution: Annotated[StateHistory, HISTORY], **choices: Any
+) -> dict[str, dict[str, Float[Array, "T 3"]]]:
     """Return the load at each pin on each of its bodies, in ground axes: `pin_reactions(mech, sol)["B"]["coupler"]`.
 
     Where k bodies share a pin, k - 1 joints, such as B, B-2, connect them: their loads on one body are added up.

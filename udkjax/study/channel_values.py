@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import HISTORY
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.states.quantities import equations_of
 from udkjax.equations.states.textbook import TextbookEquations
@@ -66,7 +67,11 @@ def measure(
 
 @checked
 def path(
-    mechanism: Mechanism, solution: StateHistory, of: str, point: Numbers | None = None, derivative: Literal[0, 1, 2] = 0
+    mechanism: Mechanism,
+    solution: Annotated[StateHistory, HISTORY],
+    of: str,
+    point: Numbers | None = None,
+    derivative: Literal[0, 1, 2] = 0,
 ) -> Float[Array, "T 2"]:
     """Return the path of a point of a body, or of a pin, over a motion; or the point's velocities or accelerations.
 

@@ -16,7 +16,7 @@ direction v of the motion.
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.argument_types import HISTORY, NUMBERS_BY_NAME, TIMES, ArgumentRequirement, of_kind
 from udkjax.arrays import is_traced, is_within_jit, library_for, make_module, number, number_called, put_arrays
 from udkjax.equations.rows.analysis import analyse
 from udkjax.positions.assembling.channels import StateHistory
@@ -140,13 +141,26 @@ class Effort(ForceElement):
         return self.law.breakpoints
 
 
+DRIVERS = ArgumentRequirement(
+    "names of drivers",
+    of_kind(
+        "be a list of names",
+        lambda x: (
+            not isinstance(x, str | np.ndarray | Mapping)
+            and isinstance(x, Sequence)
+            and all(isinstance(name, str | Coordinate) for name in x)
+        ),
+    ),
+)
+
+
 @checked
 def inverse_dynamics(
     mechanism: Mechanism,
-    ts: Float[ArrayLike, "T"] | Sequence[float],
-    motion: AcceleratedTrajectory | None = None,
-    drivers: Sequence[str | Coordinate] | None = None,
-    weights: Mapping[str, NumberLike] | None = None,
+    ts: Annotated[Float[ArrayLike, "T"] | Sequence[float], TIMES],
+    motion: Annotated[AcceleratedTrajectory, HISTORY] | None = None,
+    drivers: Annotated[Sequence[str | Coordinate], DRIVERS] | None = None,
+    weights: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
 ) -> InverseDynamics:
     """Compute the efforts of drivers at the times ts (s) for a prescribed motion: M a - F = J^T mu + C^T f.
 

@@ -8,13 +8,14 @@ the power of dampers, forces, torques and friction, of potentials that depend on
 side is the derivative of the energies along (v, a); the right side is computed from forces only.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.argument_types import HISTORY
 from udkjax.equations import constraints, loads
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import analyse
@@ -83,7 +84,10 @@ class PowerBalance(NamedTuple):
 
 @checked
 def power_balance(
-    mechanism: Mechanism, solution: StateHistory, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+    mechanism: Mechanism,
+    solution: Annotated[StateHistory, HISTORY],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
 ) -> PowerBalance:
     """Return the power of each driver, force element and joint along a motion, and the rates of the energies.
 

@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import COUNT, NOT_NEGATIVE_COUNT
 from udkjax.positions.following.drive import Drive, only_driver
 from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.requirements import require_count, require_number
@@ -147,8 +148,8 @@ def design(
     transmission: float = 0.0,
     rotation: bool | None = None,
     driver: Drive = None,
-    starts: int = 300,
-    seed: int = 0,
+    starts: Annotated[int, COUNT] = 300,
+    seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
     results: int = 5,
 ) -> Designs:
     """Find mechanisms with the structure of a drawing that meet a goal, by least squares from many starts.

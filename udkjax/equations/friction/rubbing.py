@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from udkjax.annotations import Time, Vector
+from udkjax.annotations import NumberLike, Time, Vector
 from udkjax.equations.friction.compliance import sharing
 from udkjax.equations.laws import udwadia_kalaba as uk
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte, Weights
@@ -50,7 +50,7 @@ def rubbing_names(mechanism: Mechanism) -> list[str]:
 
 
 def rubbing_loads(
-    mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
 ) -> Float[Array, "n"]:
     """Return G, the loads of all friction that depends on the loads of joints.
 
@@ -68,7 +68,7 @@ def rubbing_loads(
 
 
 def single_rubbing_loads(
-    mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
 ) -> dict[str, Float[Array, "n"]]:
     """Return the loads of each friction that depends on the load of a joint, by the name of the joint; see `rubbing_loads`."""
     time, places = jnp.asarray(t, jnp.result_type(float)), frames(mechanism, q, v)
@@ -100,7 +100,7 @@ def _with_multipliers(mechanism: Mechanism, multipliers: Float[Array, "m"]) -> d
 
 
 def loads_of_friction(
-    mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
 ) -> dict[str, Float[Array, "n"]]:
     """Return the loads of each friction, constant torques included, by its own name; see `rubbing_loads`."""
     time, places = jnp.asarray(t, jnp.result_type(float)), frames(mechanism, q, v)

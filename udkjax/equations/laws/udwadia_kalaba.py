@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from udkjax.annotations import NumberLike
+from udkjax.argument_types import checks_instances, require_thresholds
 from udkjax.arrays import number_called
 from udkjax.equations.terms import constraints, loads
 from udkjax.equations.terms.constraints import BodyArray, vector
@@ -53,6 +54,9 @@ class Baumgarte(PrintsLine):
 
     def __init__(self, alpha: NumberLike = 5.0, beta: NumberLike = 5.0):
         self.alpha, self.beta = number_called("alpha")(alpha), number_called("beta")(beta)
+
+
+checks_instances(Baumgarte)(require_thresholds)
 
 
 def D(mechanism: Mechanism, t: NumberLike, q: BodyArray, w: Weights = None) -> Float[Array, "m n"]:

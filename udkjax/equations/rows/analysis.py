@@ -24,6 +24,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
+from udkjax.argument_types import checks_instances
 from udkjax.arrays import is_traced, make_module, number
 from udkjax.equations.programs.scales import Scales, concrete_scales, traced_scales
 from udkjax.equations.programs.scene_programs import scene_programs
@@ -34,6 +35,7 @@ from udkjax.equations.rows.stationary_rows import HeldPin, with_held_pins
 from udkjax.equations.terms.structure import structure
 from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbers
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.requirements import ArgumentError, GivenArguments
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.model import Model, RunModel
@@ -140,6 +142,16 @@ class Analysis(PrintsTable):
         xp = jnp if is_traced((self.scales, own)) else np
         scales = self.scales._replace(rows=own.rows, rank_tol=xp.minimum(self.scales.rank_tol, own.rank_tol))
         return Analysis(jax.tree.map(number, scales), self.coordinates, _row_names(mechanism), None, None, only_switched)
+
+
+@checks_instances(Analysis)
+def _check_analysis(name: str, value: Analysis, given: GivenArguments) -> None:
+    mechanism = given.get("mechanism")
+    if not isinstance(mechanism, Mechanism):
+        return
+    owners = list(dict.fromkeys(owner for owner, _ in value.row_names))
+    if value.coordinates != 3 * len(mechanism.body_names) or owners != list(mechanism.constraints):
+        raise ArgumentError(f"{name} belongs to another mechanism: give udk.analyse(mechanism), or leave it out")
 
 
 @checked

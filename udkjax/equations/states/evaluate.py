@@ -8,7 +8,7 @@ uncompiled functions.
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
-from typing import Any, ParamSpec, TypeVar
+from typing import Annotated, Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import NumberLike, Time, Vector
+from udkjax.argument_types import COORDINATES_OF_BODIES
 from udkjax.equations.rows import determinacy
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.states.quantities import equations_of
@@ -96,7 +97,7 @@ def singular_values(
     t: NumberLike,
     q: BodyArray,
     analysis: Analysis | None = None,
-    v: Float[ArrayLike, "n"] | None = None,
+    v: Annotated[Float[ArrayLike, "n"], COORDINATES_OF_BODIES] | None = None,
 ) -> Float[Array, "k"]:
     """Return the singular values of the scaled Jacobian J = diag(1 / rows) Psi_q diag(L, L, 1, ...), largest first.
 

@@ -1,7 +1,7 @@
 """Quantities of a motion: accelerations, multipliers, energies and violations of the constraints."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, TypeVar, overload
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import NumberLike, Vector
+from udkjax.argument_types import COORDINATES_OF_BODIES, HISTORY
 from udkjax.equations.friction.sticking_state import known_sticking
 from udkjax.equations.laws.abstract_system import AbstractSystem, ConstrainedRows, HistoryLike
 from udkjax.equations.laws.formulations import Formulation
@@ -115,8 +116,8 @@ def accelerations(
 def accelerations(
     mechanism: Mechanism | ConstrainedSystem,
     t: NumberLike,
-    q: Float[ArrayLike, "bodies 3"],
-    v: Float[ArrayLike, "bodies 3"],
+    q: Annotated[Float[ArrayLike, "bodies 3"], COORDINATES_OF_BODIES],
+    v: Annotated[Float[ArrayLike, "bodies 3"], COORDINATES_OF_BODIES],
     method: Pseudoinverse | None = None,
     stabilization: Baumgarte | None = None,
     multipliers: bool = False,
@@ -154,7 +155,7 @@ def accelerations(
 
 
 @checked
-def violation(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> Float[Array, "T m"]:
+def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[HistoryLike, HISTORY]) -> Float[Array, "T m"]:
     """Return Psi at each time of a solution.
 
     Args:
@@ -172,7 +173,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -
 
 
 @checked
-def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> Energy:
+def energy(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[HistoryLike, HISTORY]) -> Energy:
     """Return T = v^T M v / 2 and V at each time of a solution.
 
     Args:
@@ -189,7 +190,10 @@ def energy(mechanism: Mechanism | ConstrainedSystem, solution: HistoryLike) -> E
 
 @checked
 def efforts(
-    mechanism: Mechanism, solution: HistoryLike, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+    mechanism: Mechanism,
+    solution: Annotated[HistoryLike, HISTORY],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
 ) -> dict[str, Float[Array, "T"]]:
     """Return the effort of each driver, which acts on the driver's second body along the driven coordinate: -lambda of its row.
 
@@ -219,7 +223,10 @@ def efforts(
 
 @checked
 def friction_loads(
-    mechanism: Mechanism, solution: HistoryLike, method: Pseudoinverse | None = None, stabilization: Baumgarte | None = None
+    mechanism: Mechanism,
+    solution: Annotated[HistoryLike, HISTORY],
+    method: Pseudoinverse | None = None,
+    stabilization: Baumgarte | None = None,
 ) -> dict[str, dict[str, Float[Array, "T 3"]]]:
     """Return the load of each friction on the bodies of its joint: `friction_loads(mech, sol)["rub"]["link1"]`.
 

@@ -6,7 +6,7 @@ default the least norm, each row in units of its scale; or the least elastic ene
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Number, NumberLike
+from udkjax.argument_types import ARRAYS_BY_NAME, HISTORY, NOT_NEGATIVE
 from udkjax.arrays import ArrayLibrary, array_namespace
 from udkjax.equations.friction.compliance import compliance_rows
 from udkjax.equations.friction.sticking_state import known_sticking
@@ -43,12 +44,12 @@ ByBody = dict[str, dict[str, Array]]  # by joint or driver, then by body
 @checked
 def reactions(
     mechanism: Mechanism | ConstrainedSystem,
-    solution: HistoryLike,
+    solution: Annotated[HistoryLike, HISTORY],
     method: Pseudoinverse | None = None,
     stabilization: Baumgarte | None = None,
     frame: Axes = "ground",
     about: About = "centre",
-    compliances: Mapping[str, NumberLike] | None = None,
+    compliances: Annotated[Mapping[str, NumberLike], ARRAYS_BY_NAME] | None = None,
 ) -> dict[str, dict[str, Float[Array, "T 3"]]]:
     """Return the load -Psi_q^T lambda of each joint and driver on each of its bodies: `reactions(mech, sol)["A"]["link1"]`.
 
@@ -94,10 +95,10 @@ def reactions(
 @checked
 def unique_reactions(
     mechanism: Mechanism,
-    solution: HistoryLike,
+    solution: Annotated[HistoryLike, HISTORY],
     frame: Axes = "ground",
     about: About = "centre",
-    rank_tol: NumberLike = STATIC_RANK_TOL,
+    rank_tol: Annotated[NumberLike, NOT_NEGATIVE] = STATIC_RANK_TOL,
 ) -> dict[str, dict[str, Bool[Array, "T 3"]]]:
     """Mark the components of `reactions` that equilibrium determines, c^T lambda with c^T N = 0.
 

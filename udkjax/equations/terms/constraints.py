@@ -10,13 +10,15 @@ of the velocities, and their Psi_dot is Psi_q v.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Annotated, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from udkjax.annotations import Number
+from udkjax.annotations import Number, NumberLike
+from udkjax.argument_types import COORDINATES_OF_BODIES
 from udkjax.equations.terms.structure import ElementKind, element_kinds, evaluate_by_kind, numbers_as_vector
 from udkjax.programs.deferred import traced_once
 from udkjax.scene.elements.bodies import Frame
@@ -24,11 +26,12 @@ from udkjax.scene.elements.joints import Constraint
 from udkjax.scene.elements.rolling import RollingJoint
 from udkjax.scene.mechanism import Mechanism
 
-BodyArray = Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"]
+# x, y and angle of each body, or their rates
+BodyArray: TypeAlias = Annotated[Float[ArrayLike, "n"] | Float[ArrayLike, "bodies 3"], COORDINATES_OF_BODIES]
 
 
 @traced_once
-def psi(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m"]:
+def psi(mechanism: Mechanism, t: NumberLike, q: BodyArray) -> Float[Array, "m"]:
     """Return Psi(t, q), the residuals of all constraints, which are zero where all joints are closed.
 
     Args:
@@ -46,7 +49,7 @@ def psi(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m"]:
 
 
 @traced_once
-def psi_q(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m n"]:
+def psi_q(mechanism: Mechanism, t: NumberLike, q: BodyArray) -> Float[Array, "m n"]:
     """Return Psi_q = dPsi/dq, the Jacobian of the constraints.
 
     Args:
@@ -64,7 +67,7 @@ def psi_q(mechanism: Mechanism, t: ArrayLike, q: BodyArray) -> Float[Array, "m n
 
 
 @traced_once
-def psi_dot(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
+def psi_dot(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
     """Return Psi_dot = Psi_q v + Psi_t, the rate of Psi along a motion.
 
     Args:
@@ -80,7 +83,7 @@ def psi_dot(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> F
     return rate + rolling_rates(mechanism, t, q, v) if rolling_rows(mechanism).any() else rate
 
 
-def rolling_rates(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
+def rolling_rates(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
     """Return A v of the rows of rolling joints, which take the place of Psi_q v, and zero for all others.
 
     Args:
@@ -112,7 +115,7 @@ def rolling_rows(mechanism: Mechanism) -> Bool[np.ndarray, "m"]:
 
 
 @traced_once
-def gamma(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
+def gamma(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
     """Return gamma = -(Psi_q v)_q v - 2 Psi_qt v - Psi_tt, with which Psi_ddot = Psi_q a - gamma.
 
     -gamma is the rate of Psi_dot along a motion with constant v.
@@ -146,7 +149,7 @@ def _row_order(kinds: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
     return np.argsort(owner, kind="stable")
 
 
-def rate_along_motion(f: Callable[[Array, Array], Array], t: ArrayLike, q: BodyArray, v: BodyArray) -> Array:
+def rate_along_motion(f: Callable[[Array, Array], Array], t: NumberLike, q: BodyArray, v: BodyArray) -> Array:
     """Return df/dt + (df/dq) v, the rate of f(t, q) along a motion with velocities v."""
     t, q, v = jnp.asarray(t, jnp.result_type(float)), vector(q), vector(v)
     return jax.jvp(f, (t, q), (jnp.ones_like(t), v))[1]

@@ -9,9 +9,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from udkjax.annotations import NumericArray
+from udkjax.annotations import NumberLike, NumericArray
 from udkjax.arrays import ArrayLibrary
 from udkjax.equations.terms.constraints import BodyArray, bodies, vector
 from udkjax.equations.terms.structure import ElementKind, Result, evaluate_by_kind, numbers_as_vector
@@ -41,7 +41,7 @@ def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
 
 
 @traced_once
-def force(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
+def force(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
     """Return F = -V_q + the loads of force elements.
 
     Args:
@@ -70,7 +70,7 @@ def kinetic_energy(mechanism: Mechanism, v: BodyArray) -> Float[Array, ""]:
 
 
 @traced_once
-def potential_energy(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, ""]:
+def potential_energy(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, ""]:
     """Return V, the potential energy of gravity, zero at the origin, and of the force elements that have one.
 
     Args:
@@ -88,7 +88,7 @@ def potential_energy(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyAr
 
 
 @traced_once
-def element_loads(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
+def element_loads(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
     """Return the sum of the loads that the method `loads` of force elements returns, without those of potentials."""
 
     time = jnp.asarray(t, jnp.result_type(float))
@@ -104,7 +104,7 @@ def element_loads(mechanism: Mechanism, t: ArrayLike, q: BodyArray, v: BodyArray
     return total.ravel()
 
 
-def loads_on_frames(element: ForceElement, t: ArrayLike, *frames: Frame) -> Float[Array, "frames 3"]:
+def loads_on_frames(element: ForceElement, t: NumberLike, *frames: Frame) -> Float[Array, "frames 3"]:
     """Return all loads of a force element on its frames (N, N m), those of its potential included."""
     time = jnp.asarray(t, jnp.result_type(float))
 

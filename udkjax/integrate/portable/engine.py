@@ -4,12 +4,13 @@ import base64
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
 
 from udkjax.annotations import JsonObject
+from udkjax.argument_types import NOT_NEGATIVE
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.rows.analysis import Analysis, analyse
@@ -56,8 +57,8 @@ class PortableEngine(NamedTuple):
 def portable_engine(
     mechanism: Mechanism,
     parameters: Sequence[str] = (),
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
+    rtol: Annotated[float, NOT_NEGATIVE] = 1e-8,
+    atol: Annotated[float, NOT_NEGATIVE] = 1e-8,
     pull: bool = True,
     runs: bool = True,
     events: Sequence[ExpandsToEvents] = (),

@@ -1,12 +1,13 @@
 """Characteristics of a mechanism as a course asks for them: type, mobility, strokes, dead points, transmission, ratios."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from udkjax.argument_types import COORDINATES_OF_BODIES
 from udkjax.arrays import ROUNDING
 from udkjax.positions.answers.counting import Count, count_of
 from udkjax.positions.answers.linkage_type import FourBarType, Mobility, four_bars, mobility, transmission_pins
@@ -282,7 +283,9 @@ class InstantCentre(NamedTuple):
 @checked
 @concrete_only()
 def instant_centres(
-    mechanism: Mechanism, q: Float[ArrayLike, "bodies 3"], v: Float[ArrayLike, "bodies 3"]
+    mechanism: Mechanism,
+    q: Annotated[Float[ArrayLike, "bodies 3"], COORDINATES_OF_BODIES],
+    v: Annotated[Float[ArrayLike, "bodies 3"], COORDINATES_OF_BODIES],
 ) -> Mapping[tuple[str, str], InstantCentre]:
     """Return the instant centres of all pairs of links in a position, by the names of the links; "ground" is one of them.
 

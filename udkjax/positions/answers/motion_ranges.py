@@ -1,9 +1,12 @@
 """Ranges of a motion: swing angles and strokes of the links on the ground, least and largest transmission angles."""
 
+from typing import Annotated
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.argument_types import HISTORY
 from udkjax.positions.answers.transmission import transmission_angle
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.assembling.coordinates import element_of
@@ -38,7 +41,7 @@ class MotionRanges(PrintsTable):
 
 
 @checked
-def motion_ranges(mechanism: Mechanism, motion: StateHistory, driver: Drive = None) -> MotionRanges:
+def motion_ranges(mechanism: Mechanism, motion: Annotated[StateHistory, HISTORY], driver: Drive = None) -> MotionRanges:
     """Return the swing angles and strokes of the links on the ground along a motion, and the ranges of its transmission angles.
 
     Positions that are not reached (NaN) are ignored.

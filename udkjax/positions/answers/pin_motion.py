@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.argument_types import HISTORY, NUMBERS_BY_NAME, ArgumentRequirement
 from udkjax.arrays import by_numpy, library_for
 from udkjax.positions.answers.counting import Count, count_of, nearest_turn, read_number
 from udkjax.positions.assembling.channels import pins_of, point_of_pin
@@ -15,6 +17,7 @@ from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.drive import Drive, constant_speed, only_driver
 from udkjax.positions.following.kinematics import Kinematics, kinematics
 from udkjax.printing import PRINTED_AS_ZERO, PrintedTable, PrintsTable, fields_table, format_number, has_numbers, units
+from udkjax.requirements import GivenArguments, require_finite
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Revolute
@@ -121,8 +124,16 @@ def rate_text(rate: float, count: Count) -> str:
     return f"at {format_number(rate / count.size, count.unit)}/s"
 
 
+def _require_finite_or_text(name: str, value: Any, given: GivenArguments) -> None:
+    if not isinstance(value, str):
+        require_finite(name, value)
+
+
+FINITE_OR_TEXT = ArgumentRequirement("finite, or a number with its unit", _require_finite_or_text)
+
+
 @checked
-def pin_motion(mechanism: Mechanism, motion: Kinematics) -> PinMotion:
+def pin_motion(mechanism: Mechanism, motion: Annotated[Kinematics, HISTORY]) -> PinMotion:
     """Return position, velocity and acceleration of each moving pin, and angle, angular velocity and acceleration of each link.
 
     With the arm r from the centre of a link, v = v_c + omega x r and a = a_c + alpha x r - omega^2 r. A drawn link's angle is
@@ -168,9 +179,9 @@ def motion_at(
     mechanism: Mechanism,
     at: NumberLike | str | Sequence[float | str],
     driver: Drive = None,
-    rate: NumberLike | str | None = None,
-    acceleration: NumberLike | str = 0.0,
-    held: Mapping[str, NumberLike] | None = None,
+    rate: Annotated[NumberLike | str, FINITE_OR_TEXT] | None = None,
+    acceleration: Annotated[NumberLike | str, FINITE_OR_TEXT] = 0.0,
+    held: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
 ) -> PinMotion:
     """Return the motion of all pins and links where a course asks for it: `udk.motion_at(mech, "60 deg", rate="600 rpm")`.
 

@@ -1,10 +1,13 @@
 """Pressure angles of cams: between the force on a follower and the way it gives."""
 
+from typing import Annotated
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.argument_types import HISTORY
 from udkjax.arrays import ROUNDING
 from udkjax.equations.rows.redundancy import kinematic_rows
 from udkjax.positions.assembling.channels import StateHistory
@@ -22,7 +25,9 @@ RANK = 1e3 * ROUNDING  # relative to the largest singular value: motions with le
 
 
 @checked
-def pressure_angle(mechanism: Mechanism, motion: StateHistory, cam: str, driver: Drive = None) -> Float[np.ndarray, "T"]:
+def pressure_angle(
+    mechanism: Mechanism, motion: Annotated[StateHistory, HISTORY], cam: str, driver: Drive = None
+) -> Float[np.ndarray, "T"]:
     """Return the pressure angle (rad, 0 to pi/2) of a cam: that between the normal at its contact and the way of the follower.
 
     With the driver held and the cam taken away, the follower can move in one way, w at the contact. With the normal n of the

@@ -1,19 +1,21 @@
 """Transmission of motion and force through a linkage: transmission angle, mechanical advantage; and reachable points."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import FINITE, HISTORY, POINT, ArgumentRequirement
 from udkjax.arrays import number
 from udkjax.positions.assembling.assembly import State
 from udkjax.positions.assembling.channels import StateHistory
-from udkjax.positions.assembling.coordinates import Coordinate, value_of
+from udkjax.positions.assembling.coordinates import COORDINATE, Coordinate, is_coordinate, value_of
 from udkjax.positions.following.kinematics import Kinematics, kinematics
 from udkjax.printing import prints_table, units
+from udkjax.requirements import ArgumentTypeError, GivenArguments, describe, require_finite
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import Frame
 from udkjax.scene.elements.joints import Revolute
@@ -37,8 +39,18 @@ class Workspace(NamedTuple):
     _units = units(points="m")
 
 
+def _require_values_of_drivers(name: str, value: Any, given: GivenArguments) -> None:
+    if not (isinstance(value, Mapping) and all(map(is_coordinate, value))):
+        raise ArgumentTypeError(f"{name} must map two drivers to their values, {describe(value)}")
+    for driver, values in value.items():
+        require_finite(f"{name}[{driver!r}]", values)
+
+
+VALUES_OF_DRIVERS = ArgumentRequirement("finite numbers by driver", _require_values_of_drivers)
+
+
 @checked
-def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -> Float[Array, "T"]:
+def transmission_angle(mechanism: Mechanism, motion: Annotated[StateHistory, HISTORY], joint: str) -> Float[Array, "T"]:
     """Return the angle (rad, 0 to pi) at a pin between the two links that it joins: acos(u . w / (|u| |w|)).
 
     u and w point from the pin to the other pin of each link. Force is transmitted best at pi/2, and not at 0 and pi.
@@ -71,7 +83,9 @@ def transmission_angle(mechanism: Mechanism, motion: StateHistory, joint: str) -
 
 
 @checked
-def mechanical_advantage(mechanism: Mechanism, motion: Kinematics, output: str | Coordinate) -> Float[Array, "T"]:
+def mechanical_advantage(
+    mechanism: Mechanism, motion: Annotated[Kinematics, HISTORY], output: Annotated[str | Coordinate, COORDINATE]
+) -> Float[Array, "T"]:
     """Return the effort of the output for one unit of effort at the driver: s_dot / o_dot, since power in is power out.
 
     Efforts are torques (N m) for angles and forces (N) for lengths; losses and inertia are neglected.
@@ -96,9 +110,9 @@ def mechanical_advantage(mechanism: Mechanism, motion: Kinematics, output: str |
 def coupler_curve(
     mechanism: Mechanism,
     driver: str | Coordinate,
-    values: Float[ArrayLike, "T"],
+    values: Annotated[Float[ArrayLike, "T"], FINITE],
     body: str,
-    point: Numbers = (0.0, 0.0),
+    point: Annotated[Numbers, POINT] = (0.0, 0.0),
     **choices: Any,
 ) -> Float[Array, "T 2"]:
     """Return the path of a point of a body over the values of a driver.
@@ -124,9 +138,9 @@ def coupler_curve(
 @checked
 def workspace(
     mechanism: Mechanism,
-    drivers: Mapping[str, Float[ArrayLike, "S"]],
+    drivers: Annotated[Mapping[str, Float[ArrayLike, "S"]], VALUES_OF_DRIVERS],
     body: str,
-    point: Numbers = (0.0, 0.0),
+    point: Annotated[Numbers, POINT] = (0.0, 0.0),
     state: State | None = None,
 ) -> Workspace:
     """Return the places of a point of a body over all pairs of values of two drivers, all reached along the branch of `state`.

@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import checks_instances, require_coordinates
 from udkjax.arrays import (
     ROUNDING,
     float_type,
@@ -48,6 +49,7 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.undefined import defined, whole
+from udkjax.requirements import ArgumentError, GivenArguments
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.rolling import rolling_joints
 from udkjax.scene.mechanism import Mechanism
@@ -101,6 +103,20 @@ class Closure(NamedTuple):
     rank: Int[Array, ""]
     scales: Scales
     is_closed: Bool[Array, ""]  # whether the residuals are within `CLOSURE.tol` of the scene's scales, or rounding
+
+
+@checks_instances(State)
+def _check_state(name: str, value: State, given: GivenArguments) -> None:
+    for part in ("q", "v"):
+        require_coordinates(f"{name}.{part}", getattr(value, part), given, flat=False)
+    shapes = np.shape(value.q), np.shape(value.v)
+    if shapes[0] != shapes[1]:
+        raise ArgumentError(f"{name}.v must have the shape of {name}.q, {shapes[0]}; it has the shape {shapes[1]}")
+
+
+@checks_instances(Closure)
+def _check_closure(name: str, value: Closure, given: GivenArguments) -> None:
+    _check_state(name, value.state, given)
 
 
 @checked

@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import ArgumentRequirement, of_kind
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.positions.assembling.channels import channel_of, point_of_pin
 from udkjax.printing import PrintsLine
@@ -173,3 +174,13 @@ def choose_name(name: str, taken: Container[str]) -> str:
 def constant_motion(value: Numbers) -> Polynomial:
     """Return the motion law that holds a value (rad, m)."""
     return Polynomial(jnp.stack([value]) if isinstance(value, Tracer) else np.reshape(value, 1))
+
+
+def is_coordinate(x: Any) -> bool:
+    """Return True for the name of a driver or a coordinate, or a `Coordinate`."""
+    return bool(x) if isinstance(x, str) else hasattr(x, "bodies")
+
+
+COORDINATE = ArgumentRequirement(
+    "a coordinate", of_kind("be the name of a coordinate, such as body.crank.angle, or a Coordinate", is_coordinate)
+)

@@ -1,6 +1,7 @@
 """Assembly branches: all ways to assemble a mechanism for one value of its driver."""
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import NumberLike
+from udkjax.argument_types import COUNT, NOT_NEGATIVE_COUNT, NUMBERS_BY_NAME
 from udkjax.arrays import number
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.rows.analysis import Analysis, analyse
@@ -25,9 +27,9 @@ def branches(
     mechanism: Mechanism,
     driver: Drive,
     value: NumberLike,
-    starts: int = 400,
-    seed: int = 0,
-    held: Mapping[str, NumberLike] | None = None,
+    starts: Annotated[int, COUNT] = 400,
+    seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
+    held: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
 ) -> Float[Array, "k bodies 3"]:
     """Return the positions that close a mechanism, Psi(s, q) = 0, for one value s of its driver: its assembly branches.
 

@@ -1,7 +1,7 @@
 """Kinematics: positions, velocities and accelerations of a mechanism over the values of a driver."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import FINITE, NUMBERS_BY_NAME
 from udkjax.arrays import is_traced, library_for, make_module, number, stored
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.positions.assembling.assembly import State, assemble, close
@@ -141,11 +142,11 @@ class Travel(PrintsTable):
 def kinematics(
     mechanism: Mechanism,
     driver: Drive,
-    values: Float[ArrayLike, "T"] | Sequence[float],
+    values: Annotated[Float[ArrayLike, "T"] | Sequence[float], FINITE],
     state: State | None = None,
-    rate: Float[ArrayLike, "*T"] = 1.0,
-    acceleration: Float[ArrayLike, "*T"] = 0.0,
-    held: Mapping[str, NumberLike] | None = None,
+    rate: Annotated[Float[ArrayLike, "*T"], FINITE] = 1.0,
+    acceleration: Annotated[Float[ArrayLike, "*T"], FINITE] = 0.0,
+    held: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
 ) -> Kinematics:
     """Return the positions Psi(s, q) = 0 of a mechanism over the values s of a driver, one after another on one branch.
 
@@ -211,7 +212,10 @@ def _over_values(
 
 @checked
 def travel(
-    mechanism: Mechanism, driver: Drive, state: State | None = None, held: Mapping[str, NumberLike] | None = None
+    mechanism: Mechanism,
+    driver: Drive,
+    state: State | None = None,
+    held: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
 ) -> Travel:
     """Return the values between which a coordinate can be driven: the toggles on either side, where ds/dsigma = 0.
 

@@ -3,12 +3,13 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from udkjax.annotations import JsonObject, Numbers
+from udkjax.argument_types import COORDINATES_OF_BODIES, require_history
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.extras import WRITERS, require
 from udkjax.integrate.events.law.conditions import Gap
@@ -16,7 +17,6 @@ from udkjax.integrate.events.law.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.named_arguments import require_history
 from udkjax.show.player import pictures
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
@@ -259,7 +259,7 @@ def _live_runs(
 @checked
 def animate_modes(
     mechanism: Mechanism,
-    q: Numbers,
+    q: Annotated[Numbers, COORDINATES_OF_BODIES],
     shapes: Numbers,
     frequencies: Sequence[float] | None = None,
     labels: Sequence[str] | None = None,

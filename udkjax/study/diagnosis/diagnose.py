@@ -1,9 +1,10 @@
 """`diagnose`: mobility, redundancy, singularities and unique forces of a mechanism, and its rank along a trajectory."""
 
-from typing import Any, overload
+from typing import Annotated, Any, overload
 
 import numpy as np
 
+from udkjax.argument_types import HISTORY, NOT_NEGATIVE, POSITIVE
 from udkjax.equations import determinacy
 from udkjax.equations.rows.analysis import hold_pins
 from udkjax.equations.rows.position_closure import is_closed
@@ -43,10 +44,10 @@ def diagnose(mechanism: ConstrainedSystem, state: State | None = None, *argument
 def diagnose(
     mechanism: Mechanism | ConstrainedSystem,
     state: State | None = None,
-    solution: StateHistory | None = None,
+    solution: Annotated[StateHistory, HISTORY] | None = None,
     t: float = 0.0,
-    rank_tol: float = determinacy.STATIC_RANK_TOL,
-    time_tol: float | None = None,
+    rank_tol: Annotated[float, NOT_NEGATIVE] = determinacy.STATIC_RANK_TOL,
+    time_tol: Annotated[float, POSITIVE] | None = None,
     fixes: bool = True,
     walk: bool = True,
 ) -> Diagnosis | SystemDiagnosis:

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import FINITE, NOT_NEGATIVE, NOT_NEGATIVE_COUNT
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.requirements import concrete_only
@@ -25,9 +26,9 @@ from udkjax.study.identify.records.records import Estimated, IdentificationError
 from udkjax.study.identify.search.least_squares import CostHistory, Fit
 from udkjax.study.identify.search.optimizer import (
     Loss,
+    LossChoice,
     Minimizer,
     Optimizer,
-    UserLoss,
     choose_method,
     named_loss,
     squares,
@@ -52,12 +53,12 @@ def identify(
     noise: Noise = None,
     initial_state: Start | Estimated | None = None,
     n_starts: int = N_STARTS,
-    guesses: Numbers | None = None,
-    loss: str | UserLoss = "least_squares",
+    guesses: Annotated[Numbers, FINITE] | None = None,
+    loss: LossChoice = "least_squares",
     optimizer: Optimizer = None,
     strategy: Strategy = "auto",
-    tol: float = TIGHT_TOL,
-    seed: int = 0,
+    tol: Annotated[float, NOT_NEGATIVE] = TIGHT_TOL,
+    seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
     ignore: Sequence[str] = (),
     progress: ProgressOption = None,
     **settings: Any,

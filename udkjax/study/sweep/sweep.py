@@ -5,12 +5,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from inspect import isclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import BY_NAME, COUNT, TIMES, ArgumentRequirement, of_kind
 from udkjax.extras import require
 from udkjax.integrate.solution import Result
 from udkjax.progress import Progress, ProgressOption, report_progress
@@ -34,22 +36,35 @@ if TYPE_CHECKING:  # imported only for results and clusters
 Engine = Literal["auto", "devices", "dask"]
 
 
+TEXTS_BY_NAME = ArgumentRequirement(
+    "texts by name",
+    of_kind(
+        'map names to units, such as {name: "m"}',
+        lambda x: isinstance(x, Mapping) and all(isinstance(text, str) for pair in x.items() for text in pair),
+    ),
+)
+PATH = ArgumentRequirement("a path", of_kind("be a path, or None", lambda x: isinstance(x, str | os.PathLike)))
+CLIENT = ArgumentRequirement(
+    "a client of Dask", of_kind("be a dask.distributed.Client, or None", lambda x: hasattr(x, "submit") and not isclass(x))
+)
+
+
 @checked
 @concrete_only()
 def sweep(
     mechanism: StudyModel,
-    axes: Mapping[str, AxisValues],
-    ts: Numbers,
+    axes: Annotated[Mapping[str, AxisValues], BY_NAME],
+    ts: Annotated[Numbers, TIMES],
     measure: MeasureChoice = "final",
     *,
     design: SweepDesign | None = None,
     reference: Reference = None,
     derivatives: Sequence[str] = (),
-    units: Mapping[str, str] = MappingProxyType({}),
+    units: Annotated[Mapping[str, str], TEXTS_BY_NAME] = MappingProxyType({}),
     engine: Engine = "auto",
-    client: "distributed.Client | None" = None,
-    out: str | os.PathLike[str] | None = None,
-    memory: int = MEMORY,
+    client: Annotated["distributed.Client", CLIENT] | None = None,
+    out: Annotated[str | os.PathLike[str], PATH] | None = None,
+    memory: Annotated[int, COUNT] = MEMORY,
     progress: ProgressOption = None,
     **settings: Any,
 ) -> "xarray.Dataset":

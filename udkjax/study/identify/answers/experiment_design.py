@@ -9,12 +9,13 @@ other parameters) are eliminated by projecting J on the complement of their colu
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import NOT_NEGATIVE, TIMES, ArgumentRequirement, of_kind
 from udkjax.positions.assembling.assembly import State
 from udkjax.printing import PrintedTable, prints_table
 from udkjax.requirements import concrete_only
@@ -84,20 +85,32 @@ class Design(NamedTuple):
         return PrintedTable("experiments, the best first: score and standard errors", rows, ("", self.criterion, *self.names))
 
 
+def _are_channels(x: Any) -> bool:
+    """Return True for a list of names of channels, and of user-defined quantities."""
+    is_list = isinstance(x, Sequence) and not isinstance(x, str) and len(x) > 0
+    return is_list and all(isinstance(channel, str) or hasattr(channel, "name") for channel in x)
+
+
+CHANNELS = ArgumentRequirement("channels", of_kind("be a list of channels, by name or as a Quantity", _are_channels))
+CANDIDATES = ArgumentRequirement(
+    "candidates", of_kind("be a list of candidates", lambda x: isinstance(x, Sequence) and not isinstance(x, str))
+)
+
+
 @checked
 @concrete_only()
 def design_experiment(
     mechanism: Mechanism,
-    candidates: Sequence[Candidate | Mapping[str, Numbers] | Start | State],
+    candidates: Annotated[Sequence[Candidate | Mapping[str, Numbers] | Start | State], CANDIDATES],
     parameters: ParametersLike,
-    channels: Sequence[ChannelKey],
-    ts: Numbers,
+    channels: Annotated[Sequence[ChannelKey], CHANNELS],
+    ts: Annotated[Numbers, TIMES],
     noise: Noise,
     criterion: Criterion = "D",
     pick: int = 1,
     of: str | Sequence[str] | None = None,
     given: Estimate | None = None,
-    tol: float = MEDIUM_TOL,
+    tol: Annotated[float, NOT_NEGATIVE] = MEDIUM_TOL,
     **settings: Any,
 ) -> Design:
     """Rank experiments by how well they would determine parameters, and choose some to be carried out together.

@@ -14,11 +14,12 @@ therefore excluded if h J d exceeds the values of a channel and the channel chan
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udkjax.argument_types import NOT_NEGATIVE, NOT_NEGATIVE_COUNT
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.requirements import concrete_only
@@ -169,9 +170,9 @@ def check_gradients(
     data: Data,
     parameters: ParametersLike,
     *,
-    tol: float = TIGHT_TOL,
+    tol: Annotated[float, NOT_NEGATIVE] = TIGHT_TOL,
     ignore: Sequence[str] = (),
-    seed: int = 0,
+    seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
     order: Literal[1, 2] = 1,
     directions: Directions | None = None,
     **settings: Any,

@@ -1,17 +1,33 @@
 """Directions along which derivatives are compared with differences: vectors of unit length in the space of all unknowns."""
 
 from collections.abc import Mapping
-from typing import TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.argument_types import ArgumentRequirement
+from udkjax.requirements import ArgumentTypeError, GivenArguments, describe, require_number
 from udkjax.study.identify.problem.fit_problem import FitProblem
 from udkjax.study.identify.records.records import IdentificationError
 from udkjax.wording import quote, suggestion
 
 RANDOM_DIRECTIONS = 3  # number of directions in which all unknowns change
-Directions: TypeAlias = Mapping[str, Mapping[str, float]]  # changes of unknowns by name, by the name of the direction
+
+
+def _require_directions(name: str, value: Any, given: GivenArguments) -> None:
+    if not isinstance(value, Mapping) or not all(isinstance(x, str) and isinstance(y, Mapping) for x, y in value.items()):
+        example = '{"both": {"body.a.mass": 1.0, "body.b.mass": -1.0}}'
+        raise ArgumentTypeError(f"{name} must map names to changes of unknowns, such as {example}, {describe(value)}")
+    for direction, changes in value.items():
+        for unknown, change in changes.items():
+            require_number(f"{name}[{direction!r}][{unknown!r}]", change, infinite=True)
+
+
+# changes of unknowns by name, by the name of the direction
+Directions: TypeAlias = Annotated[
+    Mapping[str, Mapping[str, float]], ArgumentRequirement("changes of unknowns by name", _require_directions)
+]
 
 
 def usual_directions(problem: FitProblem, seed: int) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:

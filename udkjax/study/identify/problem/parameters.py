@@ -4,11 +4,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from inspect import isclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from udkjax.argument_types import ArgumentRequirement, of_kind
 from udkjax.requirements import ArgumentTypeError, describe, require_choice, require_numbers, require_text
 from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.reshaping import length_of
@@ -75,7 +76,22 @@ class Parameter:
 
 
 ParameterLike = TypeAliasType("ParameterLike", str | Length | Parameter | Setter)
-ParametersLike = TypeAliasType("ParametersLike", ParameterLike | Sequence[ParameterLike])
+
+
+def _is_parameter(x: Any) -> bool:
+    """Return True for the name of a parameter, a `Parameter`, or names of tied parameters."""
+    is_tie = isinstance(x, list | tuple) and all(isinstance(name, str) for name in x)
+    return isinstance(x, str) or is_tie or callable(x) or hasattr(x, "of")
+
+
+PARAMETERS = ArgumentRequirement(
+    "parameters",
+    of_kind(
+        "be the name of a parameter, a Parameter, or a list of these",
+        lambda x: all(map(_is_parameter, x)) if isinstance(x, list | tuple) else _is_parameter(x),
+    ),
+)
+ParametersLike = TypeAliasType("ParametersLike", Annotated[ParameterLike | Sequence[ParameterLike], PARAMETERS])
 
 
 class _Part(NamedTuple):

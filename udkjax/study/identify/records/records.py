@@ -2,17 +2,18 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float
 from typing_extensions import TypeAliasType
 
 from udkjax.annotations import Numbers
+from udkjax.argument_types import ArgumentRequirement
 from udkjax.extras import OptionalImport
 from udkjax.positions.assembling.assembly import State
 from udkjax.positions.assembling.channels import Channel, Quantity
-from udkjax.requirements import array, describe, require_number
+from udkjax.requirements import GivenArguments, array, describe, require_number
 from udkjax.scene.elements.held import Held
 from udkjax.scene.tables.checks import Mistakes
 from udkjax.wording import quote
@@ -25,9 +26,23 @@ Estimated = Literal["nothing", "position", "velocity", "both"]
 ChannelKey: TypeAlias = str | Quantity  # the name of a channel, or a user-defined quantity
 T = TypeVar("T")
 ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[ChannelKey, T]
+
+
+def _require_noise(name: str, value: Any, given: GivenArguments) -> None:
+    """Require numbers for all channels, or by channel, where None leaves a channel out."""
+    by_channel = {f"{name}[{str(key)!r}]": x for key, x in value.items()} if isinstance(value, Mapping) else {name: value}
+    for place, numbers in by_channel.items():
+        if numbers is not None:
+            array(place, numbers)
+
+
+# standard deviations, by channel or one for all
 Noise = TypeAliasType(
-    "Noise", ByChannel[Numbers] | ByChannel[Numbers | None] | float | None
-)  # standard deviations, by channel or one for all
+    "Noise",
+    Annotated[
+        ByChannel[Numbers] | ByChannel[Numbers | None] | float | None, ArgumentRequirement("standard deviations", _require_noise)
+    ],
+)
 
 
 class IdentificationError(Mistakes):

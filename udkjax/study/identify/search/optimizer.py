@@ -4,13 +4,15 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from inspect import isclass
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.argument_types import ArgumentRequirement, of_kind
 from udkjax.extras import OptionalImport
 from udkjax.study.identify.problem.prediction import TolerancePair
 from udkjax.study.identify.problem.residuals import Reduction, Residuals, residual_vector
@@ -36,7 +38,20 @@ TUNING_CONSTANT = 1.345  # in standard deviations; with it, estimates lose 5 % o
 
 Loss: TypeAlias = Callable[[Residuals], Residuals]  # transforms plain residuals into residuals whose squares are minimized
 UserLoss: TypeAlias = Callable[[Array], Array]
-Optimizer: TypeAlias = "optax.GradientTransformation | None"
+LossChoice: TypeAlias = Annotated[
+    str | UserLoss,
+    ArgumentRequirement(
+        "a name or a function",
+        of_kind('be a name, such as "huber", or a function', lambda x: isinstance(x, str) or (callable(x) and not isclass(x))),
+    ),
+]
+Optimizer: TypeAlias = Annotated[
+    "optax.GradientTransformation | None",
+    ArgumentRequirement(
+        "an optimizer of optax",
+        of_kind("be an optax optimizer, or None", lambda x: hasattr(x, "init") and hasattr(x, "update") and not isclass(x)),
+    ),
+]
 
 
 class GradientMethod(NamedTuple):

@@ -1,0 +1,144 @@
+"""Requirements on arguments of public functions, written at the parameter: `rtol: Annotated[NumberLike, NOT_NEGATIVE]`.
+
+None is not checked here: it is accepted where a parameter may be None, and refused elsewhere (udkjax/scene/arguments.py).
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from inspect import isclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+
+from udkjax.requirements import (
+    ArgumentCheck,
+    ArgumentError,
+    ArgumentTypeError,
+    GivenArguments,
+    array,
+    describe,
+    require_count,
+    require_finite,
+    require_number,
+    require_numbers_by_name,
+    require_times,
+)
+from udkjax.wording import quote
+
+
+class ArgumentRequirement(NamedTuple):
+    """A requirement on an argument beyond its type: metadata of `Annotated`, which `help` shows by its `text`."""
+
+    text: str
+    check: ArgumentCheck
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+INSTANCE_CHECKS: dict[type, ArgumentCheck] = {}  # a check holds for subclasses, too
+
+
+def checks_instances(cls: type) -> Callable[[ArgumentCheck], ArgumentCheck]:
+    """Return a decorator of the check of arguments that are instances of a class."""
+
+    def register(check: ArgumentCheck) -> ArgumentCheck:
+        INSTANCE_CHECKS[cls] = check
+        return check
+
+    return register
+
+
+def require_thresholds(name: str, value: Any, given: GivenArguments) -> None:
+    """Require that the numbers of a choice, such as a method or gains, are finite, and not negative."""
+    for field in dataclasses.fields(value):
+        x = getattr(value, field.name)
+        if eqx.is_array(x) or isinstance(x, float):
+            require_number(f"{name}.{field.name}", x, "not negative")
+
+
+def of_kind(condition: str, is_valid: Callable[[Any], bool]) -> ArgumentCheck:
+    """Return a check that an argument satisfies `is_valid`; `condition` describes valid arguments in messages."""
+
+    def check(name: str, value: Any, given: GivenArguments):
+        if not is_valid(value):
+            raise ArgumentTypeError(f"{name} must {condition}, {describe(value)}")
+
+    return check
+
+
+_require_mapping = of_kind(
+    "map names to numbers, such as {name: number}",
+    lambda x: isinstance(x, Mapping) and all(isinstance(name, str) for name in x),
+)
+
+
+def _require_arrays_by_name(name: str, value: Any, given: GivenArguments) -> None:
+    _require_mapping(name, value, given)
+    for key, numbers in value.items():
+        require_finite(f"{name}[{key!r}]", numbers)
+
+
+def _require_point(name: str, value: Any, given: GivenArguments) -> None:
+    if array(name, value).shape != (2,):
+        raise ArgumentError(f"{name} must be two numbers, x and y in m, {describe(value)}")
+    require_finite(name, value)
+
+
+def require_coordinates(name: str, value: Any, given: GivenArguments, flat: bool = True) -> None:
+    """Require x, y and angle of each body of the mechanism, or their rates: (bodies, 3), or (n,) if `flat`."""
+    names, coordinates = getattr(given["mechanism"], "body_names", None), array(name, value)
+    if names is None:  # the number of coordinates of a user-written system is not known
+        if coordinates.ndim != 1:
+            raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {coordinates.shape}")
+        require_finite(name, value)
+        return
+    shape = (len(names), 3)
+    if coordinates.shape != shape and not (flat and coordinates.shape == (3 * len(names),)):
+        order = f": x, y and angle of {', '.join(map(quote, names[:4]))}{', ...' if len(names) > 4 else ''}"
+        cure = "; a batch of states is for jax.vmap" if coordinates.ndim > 2 and coordinates.shape[-2:] == shape else ""
+        raise ArgumentError(f"{name} must have the shape {shape}{order}; it has the shape {coordinates.shape}{cure}")
+    require_finite(name, coordinates, lambda *k: _place(names, k))
+
+
+def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
+    body, coordinate = index if len(index) == 2 else divmod(index[0], 3)
+    return f" ({('x', 'y', 'angle')[coordinate]} of {quote(names[body])})"
+
+
+def require_history(name: str, value: Any, given: GivenArguments) -> None:
+    """Require a solution, or any object with times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
+    names = getattr(given["mechanism"], "body_names", None)
+    missing = [part for part in ("ts", "q", "v") if not hasattr(value, part)]
+    if missing or isclass(value):
+        raise ArgumentTypeError(f"{name} must have times and states, ts, q and v, as a Solution: {describe(value)}")
+    bodies = getattr(value, "bodies", None)
+    if names is not None and isinstance(bodies, tuple) and bodies and bodies != names:
+        listed = [", ".join(map(quote, x[:6])) + (", ..." if len(x) > 6 else "") for x in (bodies, names)]
+        raise ArgumentError(f"{name} belongs to another mechanism: its bodies are {listed[0]}, not {listed[1]}")
+    ts, q, v = (array(f"{name}.{part}", getattr(value, part)) for part in ("ts", "q", "v"))
+    expected_shape = q.shape if names is None else (*ts.shape, len(names), 3)
+    if q.ndim == 4:
+        first_member, all_of_them = "jax.tree.map(lambda x: x[0], batch)", "jax.vmap(lambda one: function(mechanism, one))(batch)"
+        raise ArgumentError(
+            f"{name} is a batch of {len(q)} solutions: take one of them, {first_member}, or map over them, {all_of_them}"
+        )
+    if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != expected_shape or v.shape != q.shape:
+        expected = "ts (T,), q and v (T, n)" if names is None else f"ts (T,), q and v (T, bodies, 3) of {len(names)} bodies"
+        raise ArgumentError(f"{name} must have {expected}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
+
+
+NOT_NEGATIVE = ArgumentRequirement("zero or positive", partial(require_number, sign="not negative"))
+POSITIVE = ArgumentRequirement("positive", partial(require_number, sign="positive"))
+POSITIVE_OR_INFINITE = ArgumentRequirement("positive or infinite", partial(require_number, sign="positive", infinite=True))
+COUNT = ArgumentRequirement("at least 1", require_count)
+NOT_NEGATIVE_COUNT = ArgumentRequirement("at least 0", partial(require_count, least=0))
+FINITE = ArgumentRequirement("finite", require_finite)
+TIMES = ArgumentRequirement("a vector of finite times", require_times)
+POINT = ArgumentRequirement("x and y (m)", _require_point)
+BY_NAME = ArgumentRequirement("by name", _require_mapping)
+NUMBERS_BY_NAME = ArgumentRequirement("finite numbers by name", require_numbers_by_name)
+ARRAYS_BY_NAME = ArgumentRequirement("finite arrays by name", _require_arrays_by_name)
+COORDINATES_OF_BODIES = ArgumentRequirement("x, y and angle of each body, or their rates", require_coordinates)
+HISTORY = ArgumentRequirement("times and states of the mechanism", require_history)
