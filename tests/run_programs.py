@@ -18,13 +18,19 @@ def run(program: UnrolledProgram, given: dict[str, np.ndarray]) -> dict[str, np.
 
 
 def evaluate_programs(
-    programs: ScenePrograms, names: Sequence[str], numbers: Sequence[float], t: float, q: np.ndarray, v: np.ndarray, **more
+    programs: ScenePrograms,
+    asked: Sequence[tuple[str, ...]],
+    numbers: Sequence[float],
+    t: float,
+    q: np.ndarray,
+    v: np.ndarray,
+    **more,
 ) -> dict[str, np.ndarray]:
-    """Return the results of some programs at a state."""
-    unrolled, found = Unrolled(programs, names), {}
+    """Return the results of some programs at a state, by the outputs that each is asked for."""
+    unrolled, found = Unrolled(programs, asked), {}
     given = {"constants": np.array(unrolled.prologue(list(numbers))), "t": np.array([t]), "q": np.ravel(q), "v": np.ravel(v)}
-    for name in names:
-        found |= run(unrolled.program(name), given | more)
+    for outputs in asked:
+        found |= run(unrolled.program(*outputs), given | more)
     return found
 
 

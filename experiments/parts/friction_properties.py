@@ -53,6 +53,7 @@ PROPERTIES["friction power of a run" + WITH] = Property("Friction takes power al
 SAME, DIFFERENT = 1e-9, 1e-6  # relative changes of unique quantities, and of others; no verdict in between
 # Redundant structures whose accelerations are checked, and mechanisms of these: one of this number, as each is compiled.
 REDUNDANT_STRUCTURES, REDUNDANT_MEMBERS = 32, 8
+MULTIPLIERS = "a", "safe", "multipliers"  # the outputs of a program
 MOST_SHARED = 4  # redundant rows of programs that are unrolled, whose lengths grow as its square
 SAMPLES = 4  # of loads that balance each other
 
@@ -75,7 +76,7 @@ def check_friction(tally: Tally, seed: int, structures: Iterable[int], members: 
             found = _by_textbook(scenes, q, v)
             _check_shares(tally, scenes, q, v, found)
         else:
-            found = Programs(build(table), (), [scene.table for scene in scenes], ["multipliers"]).run("multipliers", q, v)
+            found = Programs(build(table), (), [scene.table for scene in scenes], [MULTIPLIERS]).run(MULTIPLIERS, q, v)
         for k, scene in enumerate(scenes):
             count += _check_state(tally, scene, *(found[name][k] for name in ("a", "multipliers", "safe")))
     return count
@@ -101,7 +102,7 @@ def _check_shares(
         tally.leave_out("friction shared by many redundant rows, or not by the same ones")
         return
     weights, tables = np.array([x.scales.weights for x in analyses]), [scene.table for scene in scenes]
-    found = Programs(build(tables[0]), rows, tables, ["multipliers"], weights).run("multipliers", q, v)
+    found = Programs(build(tables[0]), rows, tables, [MULTIPLIERS], weights).run(MULTIPLIERS, q, v)
     for k, scene in enumerate(scenes):
         solved = solve(scene)
         if not (found["safe"][k, 0] > 0 and solved.is_clear and all(np.isfinite(x["a"][k]).all() for x in (found, expected))):

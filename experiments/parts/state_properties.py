@@ -124,6 +124,12 @@ def growth(solved: Solved, power: int = 2, without: Sequence[int] = ()) -> float
     return max(1.0, condition / ORDINARY) ** power
 
 
+# The outputs of the programs of `Programs`.
+ACCELERATIONS = "a", "safe", "unsettled"
+TANGENT_PART = "dq1", "dv1", "distance"
+TERMS = "terms with friction", "psi_q", "psi", "psi_dot"
+
+
 class Programs:
     """The programs of mechanisms of one structure with their numbers in, run by NumPy on all of them at once."""
 
@@ -132,7 +138,7 @@ class Programs:
         mechanism: udk.Mechanism,
         redundant: Sequence[int],
         tables: Sequence[Table] = (),
-        names: Sequence[str] = ("accelerations", "tangent_part", "rows_and_loads"),
+        asked: Sequence[tuple[str, ...]] = (ACCELERATIONS, TANGENT_PART, TERMS),
         weights: np.ndarray | None = None,
     ):
         """Evaluators by programs of one mechanism, or of `tables` of its structure, whose numbers replace its own.
@@ -141,33 +147,33 @@ class Programs:
         """
         sharing = LoadShares.NONE if weights is None else LoadShares.KNOWN
         programs = scene_programs(mechanism, tuple(redundant), False, RankPolicy.REFUSE, sharing=sharing)
-        self._unrolled = Unrolled(programs, names)
+        self._unrolled = Unrolled(programs, asked)
         self.entries, (self.rows, self.coordinates) = programs.psi_q_entries, (programs.row_count, programs.coordinate_count)
         own = np.concatenate([np.ravel(x) for x in mechanism.numbers])
         rows = _at_start(mechanism.without_origin, numbers_of(mechanism, tables) if tables else own[None])
         numbers = np.hstack([rows, *([] if weights is None else [weights]), np.tile([0.0, SAFE], (len(rows), 1))])
         self._constants = _run(self._unrolled.prologue, numbers)
 
-    def run(self, name: str, q: np.ndarray, v: np.ndarray, dv: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
+    def run(self, outputs: tuple[str, ...], q: np.ndarray, v: np.ndarray, dv: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
         """Return the results (members, ...) of a program at q and v (members, n), t = 0, by array."""
         given = {"constants": self._constants, "t": np.zeros((len(q), 1)), "q": q, "v": v, "dq": 0.0 * q, "dv": dv + 0.0 * v}
-        program, inputs, outputs = self._unrolled.program(name)
+        program, inputs, outputs = self._unrolled.program(*outputs)
         unused = np.zeros(len(q))  # loads of friction that other programs begin with
         values = _run(program, np.stack([given[x][:, k] if x in given else unused for x, k in inputs], 1))
         return {x: values[:, [i for i, (y, _) in enumerate(outputs) if y == x]] for x in dict.fromkeys(y for y, _ in outputs)}
 
     def accelerations(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """a (members, n) by elimination, and whether each is safe."""
-        found = self.run("accelerations", q, v)
+        found = self.run(ACCELERATIONS, q, v)
         return found["a"], found["safe"][:, 0] > 0
 
     def impulse_response(self, q: np.ndarray, v: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Return the part of a change of the velocities that the constraints allow."""
-        return self.run("tangent_part", q, v, change)["dv1"]
+        return self.run(TANGENT_PART, q, v, change)["dv1"]
 
     def terms(self, q: np.ndarray, v: np.ndarray) -> list[dict[str, np.ndarray]]:
         """Psi, Psi_q, Psi_dot, b and a_F of each member."""
-        found = self.run("rows_and_loads", q, v)
+        found = self.run(TERMS, q, v)
         row, column, place, factor = self.entries
         psi_q = np.zeros((len(q), self.rows, self.coordinates))
         if len(row):

@@ -49,13 +49,15 @@ def states(mechanism: udk.Mechanism, count: int) -> list[tuple[jnp.ndarray, jnp.
 
 
 FAST = "pendulum", "moving guide"
+ACCELERATIONS = "a", "safe", "unsettled"  # by one round of Newton's method
+MULTIPLIERS = "a", "multipliers"  # by as many rounds as friction needs
 
 
 @pytest.mark.parametrize("name", [*FAST, *(pytest.param(x, marks=pytest.mark.slow) for x in MECHANISMS if x not in FAST)])
 def test_elimination_agrees_with_the_textbook(name):
     mechanism = MECHANISMS[name]()
     for q, v in states(mechanism, 1):
-        found = evaluated(mechanism, prepare(mechanism).programs, "multipliers", q, v)
+        found = evaluated(mechanism, prepare(mechanism).programs, MULTIPLIERS, q, v)
         expected = np.asarray(udk.accelerations(mechanism, 0.0, q.reshape(-1, 3), v.reshape(-1, 3))).ravel()
         np.testing.assert_allclose(found["a"], expected, atol=1e-10 * np.abs(expected).max())
 
@@ -66,7 +68,7 @@ def test_redundant_rows_share_loads_by_least_norm(name):
     for factor in (1.0, 8.0):
         changed = scaled(mechanism, factor)
         for q, v in states(changed, 2):
-            found = evaluated(changed, prepare(changed).programs, "multipliers", q, v)
+            found = evaluated(changed, prepare(changed).programs, MULTIPLIERS, q, v)
             state = 0.0, q.reshape(-1, 3), v.reshape(-1, 3)
             a, multipliers = udk.accelerations(changed, *state, method=udk.pinv.SVD(), multipliers=True)
             np.testing.assert_allclose(found["a"], np.ravel(a), atol=1e-12 * np.abs(a).max())
@@ -81,10 +83,10 @@ def test_only_redundant_rows_take_operations():
     assert marked.shares_by_marks and not equations.programs.marks_rows
     switched = replace(equations, redundant=None, only_switched=True).programs
     for programs in (equations.programs, marked.with_shared_rows(())):
-        assert not own & {*programs.scratch, *programs.accelerations.arrays}
+        assert not own & {*programs.scratch, *programs.of("a").arrays}
     assert marked.with_shared_rows(()) is switched
     shared = prepare(REDUNDANT["parallelogram"]()).programs
-    assert shared.weighs_rows and own <= {*shared.accelerations.arrays}
+    assert shared.weighs_rows and own <= {*shared.of("a").arrays}
 
 
 def scaled(mechanism: udk.Mechanism, factor: float) -> udk.Mechanism:
@@ -93,11 +95,13 @@ def scaled(mechanism: udk.Mechanism, factor: float) -> udk.Mechanism:
     return mechanism.with_parameters({x: factor * mechanism.parameters()[x] for x in names})
 
 
-def evaluated(mechanism: udk.Mechanism, programs: ScenePrograms, name: str, q: jnp.ndarray, v: jnp.ndarray) -> dict:
+def evaluated(
+    mechanism: udk.Mechanism, programs: ScenePrograms, outputs: tuple[str, ...], q: jnp.ndarray, v: jnp.ndarray
+) -> dict:
     """Return the results of a program of a mechanism."""
     numbers = map(float, np.concatenate([np.ravel(x) for x in mechanism.without_origin.numbers]))
     weights = map(float, udk.analyse(mechanism).scales.weights if programs.weighs_rows else ())
-    return evaluate_programs(programs, [name], [*numbers, *weights, 0.0, 0.0], 0.0, np.asarray(q), np.asarray(v))
+    return evaluate_programs(programs, [outputs], [*numbers, *weights, 0.0, 0.0], 0.0, np.asarray(q), np.asarray(v))
 
 
 @pytest.mark.slow
@@ -110,7 +114,7 @@ def test_friction_settles_up_to_jams(name, jam):
     mechanism = MECHANISMS[name]()
     programs = prepare(mechanism).programs
     for q, v in states(mechanism, 2):
-        for part, program in ((0.02, "accelerations"), (0.3, "multipliers"), (0.9, "multipliers")):
+        for part, program in ((0.02, ACCELERATIONS), (0.3, MULTIPLIERS), (0.9, MULTIPLIERS)):
             changed = scaled(mechanism, part * jam)
             found = evaluated(changed, programs, program, q, v)["a"]
             expected = np.asarray(udk.accelerations(changed, 0.0, q.reshape(-1, 3), v.reshape(-1, 3))).ravel()
@@ -124,7 +128,7 @@ def test_both_forms_settle_loads_that_change_their_signs():
     programs, ts = prepare(mechanism).programs, [0.0, 0.02, 0.03, 0.0325, 0.04]
     solution = udk.simulate(mechanism, ts)
     for q, v in zip(solution.q[1:], solution.v[1:], strict=True):
-        found = evaluated(mechanism, programs, "multipliers", jnp.ravel(q), jnp.ravel(v))["a"]
+        found = evaluated(mechanism, programs, MULTIPLIERS, jnp.ravel(q), jnp.ravel(v))["a"]
         expected = np.asarray(udk.accelerations(mechanism, 0.0, q, v)).ravel()
         np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
 
@@ -138,7 +142,7 @@ def test_accelerations_hardly_depend_on_what_counts_as_settled(settled, monkeypa
         tree, shapes = structure(mechanism.without_origin)
         programs = ScenePrograms(tree, shapes, (), False, RankPolicy.FALL_BACK)
         for q, v in states(mechanism, 2):
-            found = evaluated(mechanism, programs, "multipliers", q, v)["a"]
+            found = evaluated(mechanism, programs, MULTIPLIERS, q, v)["a"]
             expected = np.asarray(udk.accelerations(mechanism, 0.0, q.reshape(-1, 3), v.reshape(-1, 3))).ravel()
             np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
@@ -148,7 +152,7 @@ def test_friction_takes_few_operations():
     mechanism = udk.library.four_bar()
     counts = []
     for x in (mechanism, rubbing(mechanism)):
-        program = Unrolled(prepare(x).programs, ["accelerations"]).program("accelerations").program
+        program = Unrolled(prepare(x).programs, [ACCELERATIONS]).program(*ACCELERATIONS).program
         counts.append(len(program.order))
     assert counts[1] < 3.5 * counts[0]
 

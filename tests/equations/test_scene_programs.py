@@ -277,7 +277,7 @@ def test_floats_and_arrays_find_the_same(monkeypatch):
 
     few = float_loops.FEW_ROWS
     by_arrays, by_floats = evaluate(0), evaluate(few)
-    assert ArrayLoops(scene_programs(mechanism).geometry, np)._on_floats
+    assert ArrayLoops(scene_programs(mechanism).of("psi_q", "psi", "psi_dot"), np)._on_floats
     assert_allclose(by_floats, by_arrays, rtol=1e-12, atol=1e-12)
     assert np.isnan(by_floats[-1]).any() and np.isfinite(by_floats[:-1]).all()
     assert (np.array(by_floats[:-1]) == by_floats[0]).all()  # to the last bit
@@ -310,12 +310,12 @@ def test_many_states_at_once_are_single_states(monkeypatch):
 
 def test_one_position_is_evaluated_once(monkeypatch):
     runs, run = [], SceneArrays._run
-    monkeypatch.setattr(SceneArrays, "_run", lambda self, name, *state: runs.append(name) or run(self, name, *state))
+    monkeypatch.setattr(SceneArrays, "_run", lambda self, outputs, *state: runs.append(outputs) or run(self, outputs, *state))
     mechanism = udk.library.four_bar()
     terms, q = DenseTerms(mechanism), np.array(mechanism.q0).ravel()
     slopes, psi = terms.slopes(0.0, q)[0], terms.psi(0.0, q)
     assert_allclose(terms.slopes(0.0, q + 0.0)[0], slopes)
-    assert runs == ["geometry"]
+    assert runs == [("psi_q", "psi", "psi_dot")]
     assert not np.allclose(terms.psi(0.0, q + 0.1), psi)  # of another position
     q += 0.1  # and of the same array with other numbers
     assert not np.allclose(terms.slopes(0.0, q)[0], slopes)

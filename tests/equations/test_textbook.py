@@ -186,7 +186,8 @@ def test_programs_are_the_textbook(moved, policy):
     programs = scene_programs(mech, redundant, True, policy)
     leaves, n = mech.at(T0).numbers, q.size
     numbers = [*map(float, numbers_as_vector(leaves)), 2.0, 3.0, 1e-14, 1e-14]
-    found = evaluate_programs(programs, ["accelerations", "rows_and_loads"], numbers, float(T0), q, v)
+    asked = [("a", "safe"), ("terms", "psi_q", "psi", "psi_dot")]
+    found = evaluate_programs(programs, asked, numbers, float(T0), q, v)
     (free, b), psi, psi_dot = np.split(found["terms"], [n]), found["psi"], found["psi_dot"]
     psi_q = dense(programs, found["psi_q"])
     terms = {"psi": psi, "psi_q": psi_q, "psi_dot": psi_dot, "gamma": b + psi_q @ free + 4.0 * psi_dot + 9.0 * psi}

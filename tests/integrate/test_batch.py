@@ -111,5 +111,5 @@ def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
     jax.jit(jax.jacfwd(angle)).lower(1.0)
     (run,) = (x for x in found if isinstance(x, runs.RunTangents))
     assert sum(run.active) == 1 and len(run.active) > 30
-    unrolled = Unrolled(run.code, [], ["accelerations"], run.active)
+    unrolled = Unrolled(run.code, [], [("a",)], run.active)
     assert 1 <= len(unrolled.moving) <= 8 < len(run.code.constants)

@@ -458,8 +458,8 @@ from udkjax.equations.programs.unrolled import Unrolled
 import hashlib
 mechanism = udk.library.parallelogram()
 programs = scene_programs(mechanism, udk.analyse(mechanism).redundant_rows)
-unrolled = Unrolled(programs, [], ["projection"], [True] * programs.number_count, mode="reverse")
-program = unrolled.derivative("projection").derivative.program
+unrolled = Unrolled(programs, [], [("q1", "v1 at q1")], [True] * programs.number_count, mode="reverse")
+program = unrolled.derivative("q1", "v1 at q1").derivative.program
 graph, order = program.graph, program.order
 text = str([(graph.nodes[k].kind, [a.index for a in graph.nodes[k].arguments]) for k in order])
 print(hashlib.sha256(text.encode()).hexdigest())

@@ -16,6 +16,7 @@ from tests.choices import fast
 from tests.run_programs import run
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
+from udkjax.equations.programs.differentiable_programs import PROJECTION
 from udkjax.equations.programs.scene_arrays import constants_of
 from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.programs.unrolled import Unrolled
@@ -28,6 +29,8 @@ from udkjax.pinv.elimination_order import order_blocks
 from udkjax.pinv.rank_policy import RankPolicy
 
 O = ((0.0, 0.0), (0.0, 0.0))  # noqa: E741
+TANGENT_PART = "dq1", "dv1", "distance"
+END_OF_STEP = "v1", "a at v1", "safe", *TANGENT_PART
 NOTHING = 1e-20  # a threshold of pivots below that of any that is more than rounding
 
 
@@ -101,27 +104,28 @@ class At:
         found |= {x: np.full(1, np.nan) for x in ("safe", "distance", "rank")}
         given = {"constants": self.constants, "t": np.array([self.t]), "q": self.q, "v": self.v}
         given |= {k: x for k, x in (("constants", constants), ("q", q), ("v", v)) if x is not None}
-        return found | given | {"psi": np.full(code.row_count, np.nan), "terms": np.full(code.term_count, np.nan)} | more
+        found |= {x: np.full(code.row_count, np.nan) for x in ("psi", "psi_dot")}
+        return found | given | {"terms": np.full(code.term_count, np.nan)} | more
 
-    def run(self, name, **given):
+    def run(self, *outputs, **given):
         found = self.arrays(**given)
-        loops.run(getattr(self.code, name), found)
+        loops.run(self.code.of(*outputs), found)
         return found
 
-    def value(self, name, constants, q, v, steps):
+    def value(self, outputs, constants, q, v, steps):
         """The results of a differentiable program; a projection takes `steps` steps."""
-        if name == "projection":
+        if outputs == PROJECTION:
             for _ in range(steps):
-                q = self.run("newton_q", constants=constants, q=q)["q1"]
-            return np.append(q, self.run("newton_v_and_psi", constants=constants, q=q, v=v)["v1"])
+                q = self.run("q1", constants=constants, q=q)["q1"]
+            return np.append(q, self.run("v1", constants=constants, q=q, v=v)["v1"])
         found = self.arrays(constants, q, v)
-        loops.run(self.code.differentiable[name].program, found)
-        return np.concatenate([found[x] for x in RESULTS[name]])
+        loops.run(self.code.differentiable.of(*outputs).program, found)
+        return found[outputs[0]]
 
-    def evaluated(self, name, q, v):
+    def evaluated(self, outputs, q, v):
         """The arrays after a differentiable program."""
         found = self.arrays(q=q, v=v)
-        loops.run(self.code.differentiable[name].program, found)
+        loops.run(self.code.differentiable.of(*outputs).program, found)
         return found
 
 
@@ -131,7 +135,7 @@ def at(request):
 
 
 def test_accelerations_are_those_of_the_textbook(at):
-    found, expected = at.run("accelerations"), at.textbook["a"]
+    found, expected = at.run("a", "safe"), at.textbook["a"]
     assert_allclose(found["a"], expected, atol=1e-9 * max(1.0, np.abs(expected).max()))
     assert found["safe"] == 1
 
@@ -141,12 +145,12 @@ def test_accelerations_with_baumgarte_are_those_of_the_textbook():
     gains = udk.Baumgarte(5.0, 7.0)
     at = At(loaded(), gains)
     expected = textbook(at.mechanism.without_origin, at.t, at.q, at.v, at.weights, gains)
-    assert_allclose(at.run("accelerations")["a"], expected["a"], atol=1e-8)
+    assert_allclose(at.run("a")["a"], expected["a"], atol=1e-8)
 
 
 def test_residuals_are_those_of_the_textbook(at):
     assert_allclose(at.run("psi")["psi"], at.textbook["psi"], atol=1e-13)
-    assert_allclose(at.run("psi_dot")["psi"], at.textbook["psi_dot"], atol=1e-13)
+    assert_allclose(at.run("psi_dot")["psi_dot"], at.textbook["psi_dot"], atol=1e-13)
 
 
 def test_corrections_take_residuals_away(at):
@@ -155,17 +159,17 @@ def test_corrections_take_residuals_away(at):
     kept = at.weights > 0
     root, A = uk.inverse_sqrt_mass(at.mechanism), np.asarray(at.textbook["psi_q"])[kept]
     D = A * root
-    psi, rate = (np.asarray(x)[kept] for x in (at.textbook["psi"], at.run("psi_dot")["psi"]))
-    for name, x, array, residual in (("newton_q", at.q, "q1", psi), ("newton_v_and_psi", at.v, "v1", rate)):
+    psi, rate = (np.asarray(x)[kept] for x in (at.textbook["psi"], at.run("psi_dot")["psi_dot"]))
+    for output, x, residual in (("q1", at.q, psi), ("v1", at.v, rate)):
         expected = x - root * (np.linalg.pinv(D) @ residual)
-        assert_allclose(at.run(name)[array], expected, atol=1e-9)
+        assert_allclose(at.run(output)[output], expected, atol=1e-9)
 
 
 def test_what_is_tangential(at):
     random = np.random.default_rng(2)
     dq, dv = random.standard_normal((2, at.code.coordinate_count))
-    found = at.run("tangent_part", dq=dq, dv=dv)
-    again = at.run("end_of_step", dq=dq, dv=dv)
+    found = at.run(*TANGENT_PART, dq=dq, dv=dv)
+    again = at.run(*END_OF_STEP, dq=dq, dv=dv)
     A = np.asarray(at.textbook["psi_q"])[at.weights > 0]
     mass = np.asarray(loads.mass(at.mechanism))
     for name, given in (("dq1", dq), ("dv1", dv)):
@@ -184,19 +188,19 @@ def test_steps_with_care_take_all_rows():
     loops.run(at.code.prologue, {"numbers": at.numbers, "constants": at.constants})
     still = np.zeros(at.code.coordinate_count)
     expected = textbook(at.mechanism.without_origin, at.t, flat, still, np.ones(at.code.row_count), None, udk.SVD(1e-6))
-    assert_allclose(at.run("accelerations", q=flat, v=still)["a"], expected["a"], atol=1e-8)
-    ranks = at.run("accelerations", q=flat, v=still)
-    loops.run(at.code.rank, ranks)
+    assert_allclose(at.run("a", q=flat, v=still)["a"], expected["a"], atol=1e-8)
+    ranks = at.run("a", q=flat, v=still)
+    loops.run(at.code.of("rank"), ranks)
     assert ranks["rank"] == np.linalg.matrix_rank(expected["psi_q"])
 
 
-RESULTS = {"accelerations": ["a"], "projection": ["q1", "v1"], "newton_q": ["q1"], "newton_v": ["v1"]}
+DIFFERENTIABLE = [("a",), PROJECTION, ("q1",), ("v1",)]
 
 
 def test_no_number_is_written_once_it_was_read():
     """Derivatives rely on this."""
     code = At(loaded()).code
-    programs = [code.differentiable[name].program for name in RESULTS]
+    programs = [code.differentiable.of(*outputs).program for outputs in DIFFERENTIABLE]
     for program in programs:
         read: set[tuple[str, int]] = set()
         for part in program.parts:
@@ -219,26 +223,26 @@ def test_no_number_is_written_once_it_was_read():
 def on_the_manifold(at):
     q, v = at.q, at.v
     for _ in range(6):
-        q = at.run("newton_q", q=q)["q1"]
-        v = at.run("newton_v_and_psi", q=q, v=v)["v1"]
+        q = at.run("q1", q=q)["q1"]
+        v = at.run("v1", q=q, v=v)["v1"]
     return q, v
 
 
-@pytest.mark.parametrize("name", RESULTS)
-def test_derivatives_against_differences(at, name):
+@pytest.mark.parametrize("outputs", DIFFERENTIABLE, ids="-".join)
+def test_derivatives_against_differences(at, outputs):
     code, random = at.code, np.random.default_rng(4)
-    results, evaluated = RESULTS[name], code.differentiable[name]
-    q, v = on_the_manifold(at) if name == "projection" else (at.q, at.v)  # of which its derivatives are
+    results, evaluated = [x.partition(" ")[0] for x in outputs], code.differentiable.of(*outputs)
+    q, v = on_the_manifold(at) if outputs == PROJECTION else (at.q, at.v)  # of which its derivatives are
     dconstants = random.standard_normal(len(code.constants)) * at.constants
     dconstants[:2] = 0.0
     dq, dv = random.standard_normal((2, code.coordinate_count))
 
     def value(h):
-        return at.value(name, at.constants + h * dconstants, q + h * dq, v + h * dv, 3)
+        return at.value(outputs, at.constants + h * dconstants, q + h * dq, v + h * dv, 3)
 
     h = 1e-6
     slope = (value(h) - value(-h)) / (2 * h)
-    found = at.evaluated(name, q, v)
+    found = at.evaluated(outputs, q, v)
     changes = {f"d_{x}": np.full(len(a), np.nan) for x, a in found.items()}
     changes |= {"d_constants": dconstants, "d_q": dq, "d_v": dv}
     forward = found | changes
@@ -255,12 +259,12 @@ def test_derivatives_against_differences(at, name):
 
 
 @pytest.mark.parametrize("at", ["linkage", "gears", "loaded"], indirect=True)
-@pytest.mark.parametrize("name", ["accelerations", "projection", "newton_q"])
-def test_second_derivatives_against_differences(at, name):
+@pytest.mark.parametrize("outputs", DIFFERENTIABLE[:3], ids="-".join)
+def test_second_derivatives_against_differences(at, outputs):
     """This includes two directions that open the loops: a projection repeated once is right to second order."""
     code, random = at.code, np.random.default_rng(7)
-    results, evaluated = RESULTS[name], code.differentiable[name]
-    q, v = on_the_manifold(at) if name == "projection" else (at.q, at.v)
+    results, evaluated = [x.partition(" ")[0] for x in outputs], code.differentiable.of(*outputs)
+    q, v = on_the_manifold(at) if outputs == PROJECTION else (at.q, at.v)
     numbers = random.standard_normal((2, len(at.numbers))) * at.numbers
     numbers[:, -2:] = 0.0  # thresholds
     dq, dv = random.standard_normal((2, 2, code.coordinate_count))
@@ -268,7 +272,7 @@ def test_second_derivatives_against_differences(at, name):
     def value(h):
         constants = at.constants.copy()
         loops.run(code.prologue, {"numbers": at.numbers + h @ numbers, "constants": constants})
-        return at.value(name, constants, q + h @ dq, v + h @ dv, 4)
+        return at.value(outputs, constants, q + h @ dq, v + h @ dv, 4)
 
     def mixed(h):
         one, two = h * np.array([1.0, 1.0]), h * np.array([1.0, -1.0])
@@ -276,15 +280,15 @@ def test_second_derivatives_against_differences(at, name):
 
     h = 2e-4
     expected = (4 * mixed(h) - mixed(2 * h)) / 3
-    found = at.evaluated(name, q, v)
+    found = at.evaluated(outputs, q, v)
     found["numbers"] = at.numbers
     found |= {prefix + x: np.full(len(a), np.nan) for x, a in found.items() for prefix in PREFIXES[TWICE]}
     for x, given in {"numbers": numbers, "q": dq, "v": dv}.items():
         found |= dict(zip((prefix + x for prefix in PREFIXES[TWICE]), (*given.copy(), 0.0 * given[0]), strict=True))
     loops.run(LoopDerivative(code.prologue.parts, ()).second(()), found)
-    for _ in range(2 if name == "projection" else 1):
+    for _ in range(2 if outputs == PROJECTION else 1):
         loops.run(evaluated.in_mode(TWICE), found)
-        if name == "projection":
+        if outputs == PROJECTION:
             found |= {prefix + x: found[f"{prefix}{x}1"].copy() for prefix in PREFIXES[TWICE] for x in "qv"}
     second = np.concatenate([found[f"de_{x}"] for x in results])
     assert_allclose(second, expected, atol=1e-6 * max(1.0, np.abs(expected).max()))
@@ -300,9 +304,9 @@ def test_constants_by_jax_are_those_of_the_loops(at):
     [("loaded", 1), ("loaded", processor.lanes()), ("linkage", processor.lanes()), ("gears", processor.lanes())],
     indirect=True,
 )
-@pytest.mark.parametrize("name", ["end_of_step", "equation_terms"])
-def test_machine_code_runs_the_loops(at, name, code, width):
-    program = getattr(at.code, name)
+@pytest.mark.parametrize("outputs", [END_OF_STEP, ("terms",)], ids="-".join)
+def test_machine_code_runs_the_loops(at, outputs, code, width):
+    program = at.code.of(*outputs)
     random = np.random.default_rng(5)
     given = at.arrays(dq=random.standard_normal(at.code.coordinate_count), dv=random.standard_normal(at.code.coordinate_count))
     writer = LoopWriter(width)
@@ -320,8 +324,8 @@ def test_machine_code_runs_the_loops(at, name, code, width):
 def test_the_code_does_not_grow_with_the_scene():
     few, many = (scene_programs(udk.library.n_four_bar(n)) for n in (7, 70))
     for code in (few, many):
-        for name in ("accelerations", "end_of_step", "equation_terms"):
-            getattr(code, name)
+        for outputs in (("a", "safe"), END_OF_STEP, ("terms",)):
+            code.of(*outputs)
     assert len(few._kernels) == len(many._kernels) < 60
 
 
@@ -340,7 +344,8 @@ def test_blocks_that_are_alike_are_eliminated_in_a_run():
 # --- unrolled
 
 
-PROGRAMS = "accelerations newton_q newton_v_and_psi project end_of_step tangent_part equation_terms psi psi_dot".split()
+PROGRAMS = [("a", "safe"), ("q1", "safe"), ("v1", "psi"), ("q1", "v1 at q1", "psi at q1"), END_OF_STEP, TANGENT_PART]
+PROGRAMS += [("terms",), ("psi",), ("psi_dot",)]
 
 
 def test_unrolled_programs_equal_loops(at):
@@ -348,12 +353,12 @@ def test_unrolled_programs_equal_loops(at):
     dq, dv = random.standard_normal((2, code.coordinate_count))
     unrolled = Unrolled(code, PROGRAMS)
     given = {"constants": np.array(unrolled.prologue(at.numbers.tolist())), "t": np.array([at.t]), "q": at.q, "v": at.v}
-    for name in PROGRAMS:
-        found, expected = run(unrolled.program(name), given | {"dq": dq, "dv": dv}), at.run(name, dq=dq, dv=dv)
+    for outputs in PROGRAMS:
+        found, expected = run(unrolled.program(*outputs), given | {"dq": dq, "dv": dv}), at.run(*outputs, dq=dq, dv=dv)
         assert found or not code.row_count
         for x, value in found.items():
             size = max(1.0, np.abs(expected[x]).max(initial=0.0))
-            assert_allclose(value, expected[x], rtol=1e-9, atol=1e-9 * size, err_msg=name)
+            assert_allclose(value, expected[x], rtol=1e-9, atol=1e-9 * size, err_msg=f"{x} of {outputs}")
 
 
 # --- trajectories: many mechanisms side by side are a large scene, and each moves as it does alone

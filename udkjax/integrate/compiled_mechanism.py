@@ -58,7 +58,7 @@ class RunPlan:
     def has_timed_pieces(self) -> bool:
         """True if the smooth piece of an element depends on time, so that the rate of the state alone does not lead across."""
         code = self.operation.code if self.operation else None
-        return code is not None and code.piece_count > 0 and "t" in code.pieces.arrays
+        return code is not None and code.piece_count > 0 and "t" in code.of("pieces").arrays
 
     @cached_property
     def marks_rows(self) -> bool:

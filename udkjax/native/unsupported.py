@@ -4,6 +4,7 @@ from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.expressions.loops.loop_program import Reset
 from udkjax.native.language.ir import Function
 from udkjax.native.language.program import UnsupportedError, Writer
+from udkjax.native.module.programs import PROGRAMS
 from udkjax.programs.identity_cache import cached_by_identity
 
 
@@ -13,8 +14,9 @@ def unsupported(code: RunPrograms) -> str:
 
     Only operations that are not arithmetic are looked at, once for each kernel: nothing is written that is written again later.
     """
-    names = ("prologue", "accelerations", "newton_v_and_psi", *(["pieces"] if code.piece_count else []))
-    parts = [part for name in names for part in getattr(code, name).parts if not isinstance(part, Reset)]
+    names = ("accelerations", "newton_v_and_psi", *(["pieces"] if code.piece_count else []))
+    programs = [code.prologue, *(code.of(*PROGRAMS[name].outputs) for name in names)]
+    parts = [part for program in programs for part in program.parts if not isinstance(part, Reset)]
     try:
         for program in {id(part.kernel): part.kernel.program for part in parts}.values():
             Writer(Function("check", [], 1), program).check()

@@ -1,4 +1,4 @@
-"""Sequences of loops that the programs of a scene share: linear systems, Newton steps, tangent parts."""
+"""Sequences of loops that the programs of a scene share: their linear systems."""
 
 from collections.abc import Iterable
 
@@ -41,16 +41,6 @@ class SceneSolver:
             yield from self.friction.settle(solve, v, reports)
 
     @property
-    def free_with_friction(self) -> list[KernelLoop | Reset]:
-        """Compute sines, cosines and a_F, including friction proportional to x = -lambda; elimination drops dependent rows."""
-        terms = self.terms
-        if self.friction is None:
-            return [terms.sincos(), *terms.free_accelerations("v")]
-        solved = [*self.acceleration_system, *self.factorize_dropping, *self.accelerating_solve(0)]
-        friction = [Reset("jt_x0", 0, terms.layout.coordinate_count), *self.friction.add_loads(0)]
-        return [*solved, *friction, terms.add("free", solution=0, update=ADD)]
-
-    @property
     def factorize_dropping(self) -> ProgramParts:
         """The factorization for corrections, without rows that depend on others."""
         return self.elimination.factorize(True)
@@ -69,12 +59,6 @@ class SceneSolver:
         """Compute Psi_q, a_F, and b as the right-hand side."""
         return [self.terms.sincos(), *self.terms.free_accelerations("v"), *self.terms.element_terms(("psi_q", "b"))]
 
-    def newton(self, residual: str, x: str, dropping: bool = True) -> list[KernelLoop | Reset]:
-        """Compute x - M^(-1) Psi_q^T y for x = q or v, with y such that the linearized residual vanishes."""
-        factorize = self.factorize_dropping if dropping else self.factorize
-        step = [*self.solve(), self.terms.add(f"{x}1", start=x, solution=0, sign=-1)]
-        return [*self.position_terms("psi_q", residual), *factorize, *step]
-
     def refined_solve(self, solve: int, correction: int) -> ProgramParts:
         """Solve the system `solve` with iterative refinement (corrected seminormal equations, Bjorck 1987).
 
@@ -85,30 +69,6 @@ class SceneSolver:
             yield from self.terms.remainder(solve, correction)
             yield from self.solve(correction)
             yield self.terms.add(f"jt_x{solve}", start=f"jt_x{correction}", update=ADD)
-
-    @property
-    def project(self) -> list[KernelLoop | Reset]:
-        """Compute q1 and v1 after Newton steps to Psi = 0 and Psi_dot = 0, from one factorization."""
-        terms = self.terms
-        at_q1 = terms.element_terms(("psi_dot",), "v", 1, q="q1", sines="sines1")
-        velocity = [*at_q1, *self.solve(1), terms.add("v1", start="v", solution=1, sign=-1)]
-        return [*self.newton("psi", "q"), terms.sincos("q1", "sines1"), *velocity]
-
-    @property
-    def project_and_accelerate(self) -> list[KernelLoop | Reset]:
-        """Compute v1 after a Newton step to Psi_dot = 0, and a at v1, from one factorization."""
-        terms = self.terms
-        system = [*terms.free_accelerations("v1"), *terms.element_terms(("b",), "v1", 1)]
-        solve = [*self.accelerating_solve(1, "v1", reports=True), terms.add("a", start="free", solution=1), self.safe]
-        return [*self.newton("psi_dot", "v", dropping=False), *system, *solve]
-
-    def tangent_parts(self, solve: int) -> ProgramParts:
-        """Compute dq1 and dv1, the tangent parts of dq and dv, by the systems `solve` and `solve` + 1, and distance."""
-        for k, change in enumerate(("dq", "dv"), solve):
-            yield from self.terms.rates(change, k, of_positions=change == "dq")
-            yield from self.solve(k)
-            yield self.terms.add(f"{change}1", start=change, solution=k, sign=-1)
-        yield self.elimination.distance()
 
 
 def program(*sequences: Iterable[KernelLoop | Reset]) -> LoopProgram:

@@ -1,4 +1,5 @@
 """Programs of a scene: loops, or straight-line code, that compute accelerations, Newton steps, projections and positions.
 
-Machine code and NumPy evaluate the same programs. A new result is a new program here; a new term belongs to `terms`.
+Machine code and NumPy evaluate the same programs, each asked for by its outputs. A new result is an output of run_programs.py and
+scene_writer.py; a new term belongs to `terms`.
 """

@@ -1,7 +1,6 @@
 """The differentiable programs of a scene: accelerations, Newton steps and the projection of a state."""
 
 from collections.abc import Collection, Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 from udkjax.equations.elimination.friction_elimination import FrictionElimination
@@ -17,6 +16,11 @@ from udkjax.expressions.loops.loop_program import ADD, KernelLoop, KernelWriter,
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
 NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "misfit", "rubbing", "drag", "new_drag")  # of friction
 NOT_DIFFERENTIATED += LoadSharing.FIXED
+
+# The outputs that are x + z or x - z with z = C J^T y, J C J^T y = right: the right-hand side, x, and the sign.
+IMPLICIT = {"a": ("b", "free", 1), "q1": ("psi", "q", -1), "v1": ("psi_dot", "v", -1)}
+# The outputs of the projection of a state on the manifold.
+PROJECTION = ("q1", "v1 at q1")
 
 # Arrays of the second correction of a solution, whose first-order changes vanish after the first correction.
 SECOND_CORRECTION = ("right2", "sum2", "y2", "x2")
@@ -58,31 +62,22 @@ class DifferentiableProgram(NamedTuple):
 
 
 class DifferentiablePrograms:
-    """The differentiable programs of a scene, by their names."""
+    """The differentiable programs of a scene, by their outputs."""
 
     def __init__(self, solver: SceneSolver):
         self._solver, self._implicit_terms = solver, ImplicitTerms(solver.terms)
+        self._programs: dict[tuple[str, ...], DifferentiableProgram] = {}
 
-    def __getitem__(self, name: str) -> DifferentiableProgram:
-        return getattr(self, name)
+    def of(self, *outputs: str) -> DifferentiableProgram:
+        """Return the program of one of the outputs `IMPLICIT`, or of the `PROJECTION` of a state on the manifold.
 
-    @cached_property
-    def accelerations(self) -> DifferentiableProgram:
-        """Compute a; set safe. The loads of joints with friction have `settled` before."""
-        return self._implicit(list(self._solver.terms.free_accelerations("v")), "b", "free", "a", 1)
+        With accelerations it sets `safe`. The loads of joints with friction have `settled` before.
+        """
+        if outputs not in self._programs:
+            self._programs[outputs] = self._projection() if outputs == PROJECTION else self._implicit(*outputs)
+        return self._programs[outputs]
 
-    @cached_property
-    def newton_q(self) -> DifferentiableProgram:
-        """Compute q1."""
-        return self._implicit([], "psi", "q", "q1", -1)
-
-    @cached_property
-    def newton_v(self) -> DifferentiableProgram:
-        """Compute v1."""
-        return self._implicit([], "psi_dot", "v", "v1", -1)
-
-    @cached_property
-    def projection(self) -> DifferentiableProgram:
+    def _projection(self) -> DifferentiableProgram:
         """Compute q1 and v1 of a state on the manifold, where they equal q and v."""
         solver, terms = self._solver, self._solver.terms
         copies = [terms.add(f"{x}1", start=x) for x in ("q", "v", "sines")]
@@ -128,9 +123,10 @@ class DifferentiablePrograms:
             yield from friction.sharing.share(0, "moved_null")
             yield from friction.add_loads(0)
 
-    def _implicit(self, loads: Sequence[KernelLoop | Reset], right: str, x: str, target: str, sign: int) -> DifferentiableProgram:
-        """Compute x + z or x - z, with z = C J^T y and J C J^T y = `right`."""
-        solver, terms = self._solver, self._solver.terms
+    def _implicit(self, target: str) -> DifferentiableProgram:
+        """Return the program of one of the outputs `IMPLICIT`."""
+        solver, terms, (right, x, sign) = self._solver, self._solver.terms, IMPLICIT[target]
+        loads = [*terms.free_accelerations("v")] if target == "a" else []
         z, result = terms.add("z", solution=0), terms.add(target, start=x, change="z", sign=sign)
         system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]
         friction = self._friction(right)

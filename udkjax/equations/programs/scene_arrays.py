@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from operator import attrgetter
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
@@ -10,20 +9,11 @@ import numpy as np
 from udkjax.annotations import AnyArray, Time
 from udkjax.arrays import ArrayLibrary
 from udkjax.equations.programs.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.terms.rest_program import CURVATURE
+from udkjax.equations.terms.rest_program import CURVATURE, OF_LOADS
 from udkjax.equations.terms.structure import concrete_numbers
 from udkjax.expressions.loops.array_loops import ArrayLoops
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
-
-RESULTS = {  # arrays that callers of a program need
-    "psi": ("psi",),
-    "psi_q": ("psi_q",),
-    "geometry": ("psi", "psi_dot", "psi_q"),
-    "equation_terms": ("terms",),
-    "energy": ("energy",),
-    "newton_q_and_distance": ("q1", "psi", "distance"),
-}
 
 
 class SceneArrays(Generic[AnyArray]):
@@ -38,12 +28,12 @@ class SceneArrays(Generic[AnyArray]):
     def __init__(self, programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary):
         self.programs, self.numbers, self._xp = programs, numbers, xp
         self._constants = constants_of(programs, numbers, xp)
-        self._evaluators = dict[str, _Evaluator]()
+        self._evaluators = dict[tuple[str, ...], _Evaluator]()
 
-    def _evaluator(self, name: str) -> "_Evaluator":
-        if name not in self._evaluators:
-            self._evaluators[name] = _evaluator(self.programs, name, self._xp)
-        return self._evaluators[name]
+    def _evaluator(self, outputs: tuple[str, ...]) -> "_Evaluator":
+        if outputs not in self._evaluators:
+            self._evaluators[outputs] = _evaluator(self.programs, self._xp, *outputs)
+        return self._evaluators[outputs]
 
     @cached_property
     def _constant_list(self) -> list[float]:
@@ -51,16 +41,16 @@ class SceneArrays(Generic[AnyArray]):
 
     def psi(self, t: Time, q: AnyArray) -> AnyArray:
         """Return Psi (m,)."""
-        return self._run("psi", t, q, q)["psi"]
+        return self._run(("psi",), t, q, q)["psi"]
 
     def geometry(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return Psi (m,), Psi_dot (m,), and the entries of Psi_q in the order of `ScenePrograms.psi_q_entries`."""
-        arrays = self._run("geometry", t, q, v)
+        arrays = self._run(("psi_q", "psi", "psi_dot"), t, q, v)
         return arrays["psi"], arrays["psi_dot"], self._entries(arrays)
 
     def jacobian(self, t: Time, q: AnyArray) -> AnyArray:
         """Return the entries of Psi_q in the order of `ScenePrograms.psi_q_entries`."""
-        return self._entries(self._run("psi_q", t, q, q))
+        return self._entries(self._run(("psi_q",), t, q, q))
 
     def _entries(self, arrays: Mapping[str, AnyArray]) -> AnyArray:
         _, _, places, factors = self.programs.psi_q_entries
@@ -68,20 +58,20 @@ class SceneArrays(Generic[AnyArray]):
 
     def loads(self, t: Time, q: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return a_F (n,), and b (m,)."""
-        terms = self._run("equation_terms", t, q, v)["terms"]
+        terms = self._run(("terms",), t, q, v)["terms"]
         return terms[: self.programs.coordinate_count], terms[self.programs.coordinate_count :]
 
     def energy(self, t: Time, q: AnyArray, v: AnyArray) -> AnyArray:
         """Return the kinetic and the potential energy (2,)."""
-        return self._run("energy", t, q, v)["energy"]
+        return self._run(("energy",), t, q, v)["energy"]
 
     def element_loads(self, t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
         """Return the entries of the loads of force elements and of their derivatives, as `RestProgram.places` orders them."""
-        return self._run("at_rest.loads", t, q, v)
+        return self._run(OF_LOADS, t, q, v)
 
     def curvature(self, t: Time, q: AnyArray, multipliers: AnyArray) -> AnyArray:
         """Return the entries of (lambda^T Psi)_qq, as `RestProgram.places` orders them."""
-        found = self._run("at_rest.curvature", t, q, q, multipliers=multipliers)
+        found = self._run((CURVATURE,), t, q, q, multipliers=multipliers)
         return found[CURVATURE] if CURVATURE in found else self._xp.zeros(0)
 
     def newton_step(self, t: Time, q: AnyArray) -> tuple[AnyArray, AnyArray, float] | None:
@@ -89,26 +79,26 @@ class SceneArrays(Generic[AnyArray]):
 
         The step is the smallest in the metric of M. It is computed on Python's floats; None if that is not possible.
         """
-        found = self._run_on_floats("newton_q_and_distance", t, q, q, {}, often=True)
+        found = self._run_on_floats(("q1", "distance", "psi"), t, q, q, {}, often=True)
         return None if found is None else (found["q1"], found["psi"], float(found["distance"][0]))
 
-    def _run(self, name: str, t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
-        """Run a program whose loops have independent iterations."""
+    def _run(self, outputs: tuple[str, ...], t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
+        """Run the program of some outputs; its loops have independent iterations."""
         xp = self._xp
         many = q.shape[1:]
-        if not many and xp is np and (found := self._run_on_floats(name, t, q, v, given)) is not None:
+        if not many and xp is np and (found := self._run_on_floats(outputs, t, q, v, given)) is not None:
             return found
-        evaluate, sizes, _ = self._evaluator(name)
+        evaluate, sizes, _ = self._evaluator(outputs)
         blank = {x: xp.zeros((size, *many)) for x, size in sizes.items()}
         constants = self._constants[:, None] if many else self._constants
         state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}
         return evaluate(blank | state | given)
 
     def _run_on_floats(
-        self, name: str, t: Any, q: AnyArray, v: AnyArray, given: Mapping[str, AnyArray], often: bool = False
+        self, outputs: tuple[str, ...], t: Any, q: AnyArray, v: AnyArray, given: Mapping[str, AnyArray], often: bool = False
     ) -> dict[str, AnyArray] | None:
         """Run a program at one state on Python's floats, and return its results alone; None if that is not possible."""
-        evaluate, sizes, results = self._evaluator(name)
+        evaluate, sizes, results = self._evaluator(outputs)
         needed = evaluate.needed
         lists: dict[str, Any] = {x: [0.0] * size for x, size in sizes.items() if needed is None or x in needed or x in results}
         lists |= {"constants": self._constant_list, "t": [float(t)], "q": q.tolist(), "v": v.tolist()}
@@ -136,9 +126,13 @@ def _arrays_at(mechanism: Mechanism, t: Time) -> SceneArrays[np.ndarray]:
 
 def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
     """Return the constants of the loops from the numbers of a scene and the gains."""
-    evaluate, *_ = _evaluator(programs, "prologue", xp)
     arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(programs.constants))}
-    return evaluate(arrays)["constants"]
+    return _prologue(programs, xp)(arrays)["constants"]
+
+
+@cached_by_identity
+def _prologue(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
+    return ArrayLoops(programs.prologue, xp)
 
 
 class _Evaluator(NamedTuple):
@@ -150,12 +144,12 @@ class _Evaluator(NamedTuple):
 
 
 @cached_by_identity
-def _evaluator(programs: ScenePrograms, name: str, xp: ArrayLibrary) -> _Evaluator:
-    """Return a program as a function of its arrays."""
-    program, p = attrgetter(name)(programs), programs
-    at_rest = p.at_rest.sizes if name.startswith("at_rest.") else {}
+def _evaluator(programs: ScenePrograms, xp: ArrayLibrary, *outputs: str) -> _Evaluator:
+    """Return the program of some outputs as a function of its arrays."""
+    p, at_rest = programs, programs.at_rest.sizes if outputs[0] in (*OF_LOADS, CURVATURE) else {}
+    program = p.at_rest.of(*outputs) if at_rest else p.of(*outputs)
     sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count, "energy": 2} | at_rest
     sizes |= {"q1": p.coordinate_count, "distance": 1}
-    results = RESULTS.get(name) or tuple(x for x in at_rest if x in program.written)
+    results = tuple(x for x in outputs if not at_rest or x in program.written)
     blank = {x: size for x, size in sizes.items() if x in program.arrays | set(results)}
     return _Evaluator(ArrayLoops(program, xp, results or None), blank, results)

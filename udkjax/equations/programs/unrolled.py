@@ -4,23 +4,20 @@ Results that depend only on numbers of the scene, the `constants`, are computed 
 the constants of the loops.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
 from udkjax.equations.programs.differentiable_programs import DifferentiableProgram
-from udkjax.equations.programs.run_programs import RESULTS, RunPrograms
+from udkjax.equations.programs.run_programs import ENTRIES, RESULTS, RunPrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
 from udkjax.expressions.loops.loop_derivative import COTANGENT, FORWARD, OTHER, PREFIXES, REVERSE, SECOND, TANGENT, TWICE
 from udkjax.expressions.loops.loop_program import LoopProgram
 from udkjax.expressions.loops.unroll import ArrayPlace, Arrays, unroll
 
-WITH_ENTRIES = (  # programs that return Psi_q
-    *("rows_and_loads", "dense_accelerations", "dense_newton_q", "dense_newton_v"),
-    *("rows_of_positions", "rows_of_velocities"),
-)
-ENTRIES = "psi_q", "couplings"  # the arrays that only these return
+Outputs = tuple[str, ...]
+SLOPES = ("slopes",)  # the key of the derivative of the accelerations by the state alone
 
 
 class UnrolledProgram(NamedTuple):
@@ -39,12 +36,12 @@ class UnrolledDerivative(NamedTuple):
 
 
 class Unrolled:
-    """Programs of a scene, by their names, and the derivatives of some of them.
+    """Programs of a scene, by their outputs, and the derivatives of some of them.
 
     Args:
         programs: The programs as loops.
-        names: Names of the programs to unroll.
-        differentiated: Names of the programs of `differentiable` to differentiate.
+        asked: The outputs of each program to unroll.
+        differentiated: The outputs of each program of `differentiable` to differentiate.
         active: For each input of the prologue, whether derivatives with respect to it are needed.
         mode: Mode of differentiation: `FORWARD`, `TWICE`, or `REVERSE`, from cotangents of the results to those of q, v and the
             constants.
@@ -54,8 +51,8 @@ class Unrolled:
     def __init__(
         self,
         programs: RunPrograms,
-        names: Sequence[str],
-        differentiated: Sequence[str] = (),
+        asked: Iterable[Outputs],
+        differentiated: Iterable[Outputs] = (),
         active: Sequence[bool] = (),
         mode: str = FORWARD,
         slopes: bool = False,
@@ -72,20 +69,18 @@ class Unrolled:
         begins = self._begins = {
             x: {k: graph.input((x, k), "loads") for k in range(programs.scratch[x])} for x in RunPrograms.BEGINS if programs.rubs
         }
-        given: dict[str, Arrays] = dict.fromkeys((programs.FURTHER, "multipliers_of_settled"), begins)
-        self._results = {
-            name: _entries(
-                self._unroll(getattr(programs, name), given.get(name)), RESULTS + (ENTRIES if name in WITH_ENTRIES else ())
-            )
-            for name in names
-        }
+        self._results = {}
+        for outputs in asked:
+            arrays = self._unroll(programs.of(*outputs), begins if programs.goes_on(outputs) else None)
+            returned = ENTRIES if {"psi_q", "psi_q of q"} & {*outputs} else ()
+            self._results[outputs] = _entries(arrays, RESULTS + returned)
         active_nodes = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
         self.moving = [k for k, s in sorted(layout.items()) if s.index in active_nodes]
         """The constants that depend on active numbers; derivatives index only these."""
-        self._derivatives = {x: self._differentiate(programs.differentiable[x], n, mode, self.moving) for x in differentiated}
+        self._derivatives = {x: self._differentiate(programs.differentiable.of(*x), n, mode, self.moving) for x in differentiated}
         if slopes:
-            accelerations = programs.for_derivatives.differentiable["accelerations"]
-            self._derivatives["slopes"] = self._differentiate(accelerations, n, FORWARD, ())
+            accelerations = programs.for_derivatives.differentiable.of("a")
+            self._derivatives[SLOPES] = self._differentiate(accelerations, n, FORWARD, ())
         outputs = [
             s
             for result in (*self._results.values(), *(x for d in self._derivatives.values() for x in d))
@@ -101,13 +96,13 @@ class Unrolled:
         self._inputs = {s: ("constants", k) for k, s in enumerate(self.constants)}
         self._inputs |= {s: (x, k) for x, scalars in (state | begins).items() for k, s in scalars.items()}
 
-    def program(self, name: str) -> UnrolledProgram:
-        """Return a program by its name."""
-        return self._program(self._results[name], {})
+    def program(self, *outputs: str) -> UnrolledProgram:
+        """Return the program with some outputs."""
+        return self._program(self._results[outputs], {})
 
-    def derivative(self, name: str) -> UnrolledDerivative:
+    def derivative(self, *of: str) -> UnrolledDerivative:
         """Return a differentiable program with its derivative."""
-        results, outputs = self._derivatives[name]
+        results, outputs = self._derivatives[of]
         before_seeds = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
         others = {s for scalars in self._begins.values() for s in scalars.values()}  # of another state by the time of `reverse`
         stored = [s for s in before_seeds if s not in self._inputs or s in others]
@@ -118,13 +113,13 @@ class Unrolled:
     @property
     def slopes(self) -> UnrolledDerivative:
         """The accelerations with their derivative by the state alone."""
-        return self.derivative("slopes")
+        return self.derivative(*SLOPES)
 
-    def evaluations(self, names: Sequence[str]) -> UnrolledProgram:
+    def evaluations(self, named: Mapping[str, Outputs]) -> UnrolledProgram:
         """Return the program of the numbers that derivatives need at one state, in arrays "stored" plus the name of a program."""
         stored: dict[ArrayPlace, Scalar] = {}
-        for name in names:
-            evaluation = self.derivative(name).evaluation
+        for name, outputs in named.items():
+            evaluation = self.derivative(*outputs).evaluation
             scalars = zip(evaluation.outputs, evaluation.program.outputs, strict=True)
             stored |= {(f"stored {name}", k): s for (x, k), s in scalars if x == "stored"}
         return self._program(stored, {})

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from udkjax.equations.programs.differentiable_programs import DifferentiableProgram
+from udkjax.equations.programs.differentiable_programs import PROJECTION, DifferentiableProgram
 from udkjax.equations.systems.system_solver import SystemFactors
 from udkjax.expressions import Graph, Scalar
 from udkjax.expressions.algebra.differential import SparseRow
@@ -46,7 +46,7 @@ class SystemEquation:
 
 
 class DifferentiableSystem:
-    """The differentiable programs of a system, by their names.
+    """The differentiable programs of a system, by their outputs.
 
     Args:
         graph: The graph of the terms.
@@ -68,11 +68,15 @@ class DifferentiableSystem:
         self._of_accelerations, self._of_positions, self._of_velocities = of_accelerations, of_positions, of_velocities
         self._n = len(of_velocities.mass)
 
-    def __getitem__(self, name: str) -> DifferentiableProgram:
-        return getattr(self, name)
+    def of(self, *outputs: str) -> DifferentiableProgram:
+        """Return the program of "a", which sets `safe`, or of the `PROJECTION` of a state on the manifold."""
+        if outputs == PROJECTION:
+            return self._projection
+        assert outputs == ("a",)
+        return self._accelerations
 
     @cached_property
-    def accelerations(self) -> DifferentiableProgram:
+    def _accelerations(self) -> DifferentiableProgram:
         """Compute a; set safe."""
         equation, factors, reports = self._of_accelerations
         a, x = factors.respond(equation.load, equation.c)
@@ -83,7 +87,7 @@ class DifferentiableSystem:
         )
 
     @cached_property
-    def projection(self) -> DifferentiableProgram:
+    def _projection(self) -> DifferentiableProgram:
         """Compute q1 and v1 of a state on the manifold, where they equal q and v."""
         position, factors = self._of_positions
         velocity, rest = self._of_velocities, Reset(SOLUTION, 0, self._n + len(self._of_velocities.c))

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from udkjax.equations.programs.run_programs import RunPrograms
-from udkjax.equations.systems.system_derivatives import ONCE, WrittenScalars
+from udkjax.equations.systems.system_derivatives import ONCE
 from udkjax.equations.systems.system_solver import MassFactors, PivotRule, SystemFactors, factorize_mass, factorize_rows
 from udkjax.equations.systems.traced_system import SystemFunctions
 from udkjax.expressions import Scalar, ScalarProgram
@@ -164,11 +164,8 @@ class SystemTerms(RunPrograms):
         values = self._at([*self.functions.force, *self._c], v=v)
         return factors.respond(values[: self.coordinate_count], values[self.coordinate_count :])[0]
 
-    def _safe(self, factors: SystemFactors) -> WrittenScalars:
-        return {"safe": [factors.trusted if self.policy.reports else self._graph.constant(1.0)]}
-
-    def _distance(self, factors: SystemFactors) -> WrittenScalars:
-        return {"distance": [self._graph.constant(1.0) / self._graph.sqrt(factors.nearness)]}
+    def _safe(self, factors: SystemFactors) -> list[Scalar]:
+        return [factors.trusted if self.policy.reports else self._graph.constant(1.0)]
 
 
 def less(a: Iterable[Scalar], b: Iterable[Scalar]) -> list[Scalar]:

@@ -16,6 +16,7 @@ from udkjax.equations.terms.scene_terms import ProgramParts, SceneTerms
 from udkjax.expressions import KernelWriter, LoopProgram, Scalar, tangents
 
 LOADS, STIFFNESS, DAMPING, CURVATURE = "loads at rest", "stiffness", "damping", "curvature"
+OF_LOADS = LOADS, STIFFNESS, DAMPING
 
 
 class EntryPlaces(NamedTuple):
@@ -35,6 +36,10 @@ class RestProgram(NamedTuple):
     loads: LoopProgram
     curvature: LoopProgram
     places: dict[str, EntryPlaces]  # of the entries in each array
+
+    def of(self, *outputs: str) -> LoopProgram:
+        """Return the program that computes some arrays."""
+        return self.curvature if outputs == (CURVATURE,) else self.loads
 
     @property
     def sizes(self) -> dict[str, int]:

@@ -20,6 +20,7 @@ Large scenes use elimination of all rows, with dependent rows left out.
 from udkjax.expressions.loops.loop_derivative import COTANGENT, TANGENT, LoopDerivative
 from udkjax.expressions.loops.loop_program import LoopProgram, Reset
 from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.language.program import PointerPlace
 from udkjax.native.module.module import Module
 from udkjax.native.module.program_derivative import ProgramDerivative
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
@@ -52,9 +53,10 @@ class LeastNormCorrection:
     def __init__(self, module: Module, name: str, rows: WeightedRows):
         self._module, self._name, self._x, self._rows = module, name, name[-1], rows
         self.stored = 2 * module.n + module.m
-        self._parts = module.code.rows("psi" if self._x == "q" else "psi_dot")
+        self._residual = "psi" if self._x == "q" else "psi_dot"
+        self._program = module.code.of("psi_q", self._residual, "root")
         fixed = {"t", "sines"} if module.moving else {"t", "sines", "constants"}
-        self._derivative = LoopDerivative(self._parts, fixed)
+        self._derivative = LoopDerivative(self._program.parts, fixed)
         if "root" not in module.places.places:
             module.places.add("root", module.n)
             for name, size in {"psi_q": module.code.scratch["psi_q"], "psi": module.m, "root": module.n}.items():
@@ -68,7 +70,13 @@ class LeastNormCorrection:
         """Do nothing: an evaluation sets `rank`."""
 
     def _changes(self, prefix: str) -> dict[str, tuple[str, int]]:
-        return {prefix + x: ("work", self._module.places[f"change {x}"]) for x in ("psi_q", "psi", "root")}
+        arrays = {"psi_q": "psi_q", self._residual: "psi", "root": "root"}
+        return {prefix + x: ("work", self._module.places[f"change {to}"]) for x, to in arrays.items()}
+
+    @property
+    def _arrays(self) -> dict[str, PointerPlace]:
+        places = self._module.places
+        return self._module.arrays | {"root": ("work", places["root"]), self._residual: ("work", places["psi"])}
 
     def _at(self, f: Function, name: str, i: Value) -> Value:
         return self._rows.array(f, name, i)
@@ -85,8 +93,7 @@ class LeastNormCorrection:
     def evaluation(self):
         """Write `evaluation_...(work, out, stored)`: the correction and z, with the rank."""
         module = self._module
-        at = module.arrays | {"root": ("work", module.places["root"])}
-        module.loops.write(LoopProgram([module.code.sincos, *self._parts]), f"rows_{self._x}", ("work", "out"), at)
+        module.loops.write(self._program, f"rows_{self._x}", ("work", "out"), self._arrays)
         f, s = module.function(f"evaluation_{self._name}", [(POINTER, "work"), (POINTER, "out"), (POINTER, "stored")])
         module.invoke(f, f"rows_{self._x}")
         self._rows.factor(f)
@@ -114,7 +121,7 @@ class LeastNormCorrection:
     def forward(self):
         """Write `forward_...(work, stored, tangent, out)`: the tangent of the correction along one direction."""
         module, w = self._module, self._module.tangents
-        at = module.arrays | {"root": ("work", module.places["root"])} | self._changes(TANGENT)
+        at = self._arrays | self._changes(TANGENT)
         places = {"constants": "constants", "q": "state q", "v": "state v"}
         at |= {TANGENT + x: ("tangent", w[place]) for x, place in places.items()}
         name = f"row_changes_{self._x}"
@@ -148,7 +155,7 @@ class LeastNormCorrection:
         """Write `reverse_...(work, stored, bar)`: from cotangents of the correction to those of the state and the constants."""
         module, p = self._module, self._module.places
         bars = {"constants": "bar constants", "q": "bar state q", "v": "bar state v"}
-        at = module.arrays | {"root": ("work", p["root"])} | self._changes(COTANGENT)
+        at = self._arrays | self._changes(COTANGENT)
         at |= {COTANGENT + x: ("work", p[place]) for x, place in bars.items()}
         counts = {"constants": len(module.moving), "q": module.n, "v": module.n}
         cleared = [Reset(COTANGENT + x, 0, count) for x, count in counts.items()]

@@ -3,6 +3,7 @@
 from udkjax.native.language.ir import Function
 from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.program_derivative import ProgramDerivative
+from udkjax.native.module.programs import DIFFERENTIATED
 from udkjax.native.run.manifold import with_loads_of_fallback
 from udkjax.native.run.trajectory import Trajectory
 
@@ -73,7 +74,8 @@ class Differentiated(Trajectory):
         if self.unrolled and self._shares_factors:
             names = ("accelerations", "projection")
             at = {f"stored {name}": (name, 0) for name in names} | self.arrays
-            self.write_scalars(self.unrolled.evaluations(names), "evaluation_end", ("work", *names), at)
+            program = self.unrolled.evaluations({name: DIFFERENTIATED[name] for name in names})
+            self.write_scalars(program, "evaluation_end", ("work", *names), at)
 
     @property
     def _linearizations(self) -> list[ProgramDerivative]:

@@ -9,6 +9,7 @@ from udkjax.native.language.ir import BOOL, POINTER, Function, Value
 from udkjax.native.language.loops import LoopWriter
 from udkjax.native.language.program import PointerPlace, consecutive, write
 from udkjax.native.module.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
+from udkjax.native.module.programs import DIFFERENTIATED, FURTHER, OUT, PROGRAMS
 from udkjax.native.module.running import Running
 from udkjax.native.module.settling import AT_END, SETTLING, write_settle_end, write_settle_state
 from udkjax.native.module.steps import AIM_ACROSS, POINTS
@@ -31,7 +32,7 @@ COLD = (
     "newton_v_and_psi",
     "evaluation_slopes",
     "measure_speed",
-    RunPrograms.FURTHER,
+    FURTHER,
     "settle_state",
     "settle_end",
 )
@@ -76,7 +77,7 @@ class Module(Running):
         self.pieces = code.piece_count if plan.breaks else 0
         names = self.program_names()
         self.settles = code.rubs and any(name in SETTLING for name in names)  # friction may need further rounds
-        self.programs = {name: getattr(code, name) for name in (*names, *((code.FURTHER,) if self.settles else ()))}
+        self.programs = {name: PROGRAMS[name] for name in (*names, *((FURTHER,) if self.settles else ()))}
         self.unrolled = self._unroll(differentiated, active) if plan.unrolled else None
         self.constants = len(self.unrolled.constants if self.unrolled else code.constants)
         self.moving = range(self.constants if any(active) else 0) if self.unrolled is None else self.unrolled.moving
@@ -91,7 +92,9 @@ class Module(Running):
         self.rowcount = -(-n * plan.width // plan.vector)
 
     def _unroll(self, differentiated: Sequence[str], active: Sequence[bool]) -> Unrolled:
-        return Unrolled(self.code, list(self.programs), differentiated, active, self.mode, self.implicit is not None)
+        asked = [program.outputs for program in self.programs.values()]
+        of = [DIFFERENTIATED[name] for name in differentiated]
+        return Unrolled(self.code, asked, of, active, self.mode, self.implicit is not None)
 
     def _lay_out(self):
         """Reserve memory for all arrays; layout.py describes them."""
@@ -229,9 +232,9 @@ class Module(Running):
         return {x: ("work", self.places[place]) for x, place in named.items()}
 
     def write_programs(self):
-        for name in self.programs:
-            out = {"a": ("out", 0)} if name.startswith("accelerations") else {}
-            self.write_program(name, self.arrays | out)
+        for name, program in self.programs.items():
+            stored = {x: (OUT, 0) if to == OUT else self.arrays[to] for x, to in program.stored.items()}
+            self.write_program(name, self.arrays | stored)
         self.write_prologue("prologue", self.unrolled)
         if self.settles:
             arguments = [(POINTER, "work"), (POINTER, "out")]
@@ -246,9 +249,9 @@ class Module(Running):
     def write_program(self, name: str, at: Mapping[str, PointerPlace]):
         """Write one of the scene's programs as a function of `work` and `out`, with its arrays at the places `at`."""
         if self.unrolled:
-            self.write_scalars(self.unrolled.program(name), name, ("work", "out"), at)
+            self.write_scalars(self.unrolled.program(*self.programs[name].outputs), name, ("work", "out"), at)
         else:
-            self.loops.write(self.programs[name], name, ("work", "out"), at)
+            self.loops.write(self.code.of(*self.programs[name].outputs), name, ("work", "out"), at)
 
     def write_scalars(
         self,

@@ -21,6 +21,7 @@ from udkjax.expressions.loops.loop_program import LoopProgram, Reset
 from udkjax.native.language.program import PointerPlace
 from udkjax.native.module.layout import Layout
 from udkjax.native.module.module import Module
+from udkjax.native.module.programs import DIFFERENTIATED
 
 SLOPES = "slopes"  # suffix of the functions of the slopes of the accelerations
 WAYS = ("d", "e", "de")  # derivatives along two directions and along both, one in each of three tangents
@@ -40,12 +41,12 @@ class ProgramDerivative:
         self._evaluation = evaluation + self._suffix
         self._mode, self._tangent = (module.mode, None) if slopes is None else (FORWARD, slopes)
         code = module.code if slopes is None else module.code.for_derivatives
-        self._evaluated: DifferentiableProgram = code.differentiable[name]
+        self._evaluated: DifferentiableProgram = code.differentiable.of(*DIFFERENTIATED[name])
         self._fixed = [] if module.moving and slopes is None else ["constants"]
         self._stored: dict[str, int] = {}  # offsets of the arrays of loops
         self.stored = 0
         if module.unrolled:
-            self._unrolled = module.unrolled.derivative(name) if slopes is None else module.unrolled.slopes
+            self._unrolled = module.unrolled.derivative(*DIFFERENTIATED[name]) if slopes is None else module.unrolled.slopes
             self.stored = sum(x == "stored" for x, _ in self._unrolled.evaluation.outputs)
             return
         parts = self._evaluated.second_parts if self._mode == TWICE else self._evaluated.parts

@@ -16,6 +16,7 @@ from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.native.language.ir import DOUBLE, INT, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.memory import Memory
+from udkjax.native.module.programs import FURTHER
 from udkjax.native.module.steps import SETTLING_ROUNDS, STAGE_ROUNDS
 
 AT_STATE = ("accelerations", "accelerations_and_drift")
@@ -73,7 +74,7 @@ def _write_rounds(module: Memory, f: Function, s: Lane, most: int, goes_on: Call
         open_ = goes_on(before)
         if f.width > 1:  # a single lane is open here
             _keep(module, f, "settled", "settled before", open_ | ~open_)
-        module.invoke(f, RunPrograms.FURTHER, "further a")
+        module.invoke(f, FURTHER, "further a")
         module.copy(f, "further a", "out", open_)
         if f.width > 1:  # other lanes keep theirs: what follows from it must not depend on the lanes beside
             _keep(module, f, "settled before", "settled", ~open_)

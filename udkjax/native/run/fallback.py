@@ -14,6 +14,7 @@ import numpy as np
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
+from udkjax.native.module.programs import PROGRAMS
 from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.pseudoinverses.dense import MatrixRow
 from udkjax.native.pseudoinverses.svd import SVDCode
@@ -70,8 +71,8 @@ def _write_elimination(module: Module):
     at = module.arrays | {x: ("work", module.places[f"fallback {x}"]) for x in (*all_rows.scratch, "constants", "a")}
     at |= {f"{x}1": ("work", module.places[f"fallback {x}"]) for x in ("q", "v", "dq", "dv")}
     at |= dict.fromkeys(("safe", "distance"), ("work", module.places["rank"]))
-    module.loops.write(all_rows.corrections_and_accelerations, "fallback", ("work", "out"), at)
-    module.loops.write(all_rows.tangent_part, "tangent_part_of_all_rows", ("work", "out"), at)
+    module.loops.write(all_rows.of("a refined", "q1 refined", "v1 refined"), "fallback", ("work", "out"), at)
+    module.loops.write(all_rows.of(*PROGRAMS["tangent_part"].outputs), "tangent_part_of_all_rows", ("work", "out"), at)
     module.write_prologue("fallback_prologue", None)
     f, _ = module.function("fallback_tangent_part", [(POINTER, "work"), (POINTER, "out")])
     place = module.places["fallback constants"] + module.code.drop_tol_index

@@ -180,7 +180,7 @@ class Evaluation:
         loops = LoopWriter(1)
         at = {name: ("work", place) for name, place in self.places.items()}
         loops.write(self._code.prologue, "prologue", ("numbers", "work"), at | {"numbers": ("numbers", 0)})
-        programs = {"accelerations": self._code.accelerations_and_friction, "energy": self._code.energy}
+        programs = {"accelerations": self._code.of("a", "safe", "friction_power"), "energy": self._code.of("energy")}
         for name, program in programs.items():
             loops.write(program, name, ("work", "out"), at)
         return text_of_module([*self._further, *loops.functions], loops.globals)
