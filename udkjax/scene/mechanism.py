@@ -313,7 +313,6 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         return any(force.may_have_kinks for force in self._forces)
 
     def state_shape(self, state: object = None) -> tuple[int, ...]:
-        del state
         return len(self.body_names), 3
 
     def with_guess(self, q: NumericArray, v: NumericArray) -> "Mechanism":

@@ -59,7 +59,6 @@ class RunModel(eqx.Module):
 
     def state_shape(self, state: object = None) -> tuple[int, ...]:
         """Return the shape of coordinates, (bodies, 3) or (n,); of a system by a state or its guess, else ()."""
-        del state
         return (self.coordinate_count,)
 
     @property
@@ -74,17 +73,14 @@ class RunModel(eqx.Module):
 
     def without_origin_beside(self, names: Sequence[str]) -> Self:
         """Return `without_origin`, as far as numbers of these names, which are set later, determine no others."""
-        del names
         return self.without_origin
 
     def at(self, t: Time) -> Self:
         """Return the model with the values of sampled numbers at time t (s)."""
-        del t
         return self
 
     def with_samples(self, samples: Mapping[Any, Any]) -> Self:
         """Return the model with other sampled numbers."""
-        del samples
         return self
 
     def require_bodies(self, message: str) -> None:
@@ -112,11 +108,6 @@ class Model(RunModel):
     def v0(self) -> Float[Array, "..."] | None:
         """The initial guess of the velocities."""
 
-    @property
-    def groups(self) -> Mapping[str, Mapping[str, Any]]:
-        """The elements of bodies by section and name."""
-        return _NONE
-
     @abstractmethod
     def number_fields(self) -> Mapping[str, NumberField]:
         """Return all numbers by name, with their shapes, including absent ones."""
@@ -143,5 +134,4 @@ class Model(RunModel):
 
     def traced(self, n: int) -> Any:
         """Return the model with n coordinates of which programs are made."""
-        del n
         return self

@@ -139,7 +139,6 @@ class TextbookEquations(ConstrainedRows):
 
     def rank(self, t: Time, q: Vector, v: Vector | None = None) -> Int[Array, ""]:
         """Return the rank of D at q by the method's threshold."""
-        del v
         return uk.pseudoinverse(self.method, uk.D(self.mechanism, t, q, self.scales.weights)).rank
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
@@ -176,7 +175,6 @@ class TextbookEquations(ConstrainedRows):
 
     def jacobian(self, t: Time, q: Vector, v: Vector | None = None) -> Float[Array, "m n"]:
         """Return Psi_q of all rows."""
-        del v
         return constraints.psi_q(self.mechanism, t, q)
 
     def weighted_rows(self, t: Time, q: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:

@@ -152,37 +152,32 @@ class GeneralEquations(ConstrainedRows):
     a = a_F + L^(-T) D^+ b, which is a_F + M^(-1/2) D^+ b in other coordinates of the same metric.
     """
 
-    system: Any
+    mechanism: Any  # the system
     method: Pseudoinverse
     baumgarte: Baumgarte | None
     redundant: tuple[int, ...] | None = eqx.field(static=True, default=None)  # rows are known when a run begins
 
     @property
-    def mechanism(self) -> Any:
-        """The system."""
-        return self.system
-
-    @property
     def programs(self) -> RunPrograms | None:
         """The programs of a traced system; `Elimination` drops dependent rows, all other methods need marks as input."""
-        if not self.system.has_programs:
+        if not self.mechanism.has_programs:
             return None
         marks_rows, policy = not isinstance(self.method, Elimination), RankPolicy.of(self.method)
-        return system_programs(self.system, marks_rows, self.baumgarte is not None, policy)
+        return system_programs(self.mechanism, marks_rows, self.baumgarte is not None, policy)
 
     @property
     def programs_of_rows(self) -> RunPrograms | None:
-        return system_programs(self.system, False).with_all_rows if self.system.has_programs else None
+        return system_programs(self.mechanism, False).with_all_rows if self.mechanism.has_programs else None
 
     @property
     def programs_of_marked_rows(self) -> RunPrograms:
-        return system_programs(self.system, True, policy=RankPolicy.FALL_BACK)
+        return system_programs(self.mechanism, True, policy=RankPolicy.FALL_BACK)
 
     @property
     def scales(self) -> Scales:
         """Units of one: coordinates are of order one."""
         one: Any = np.ones(())  # NumPy's numbers, since each run asks for them
-        rows: Any = np.ones(sum(self.system.functions.row_counts) if self.system.has_programs else 0)
+        rows: Any = np.ones(sum(self.mechanism.functions.row_counts) if self.mechanism.has_programs else 0)
         tol: Any = np.asarray(RANK_TOL)
         return UnitScales(length=one, arm=one, rate=one, mass=one, rows=rows, rank_tol=tol)
 
@@ -209,7 +204,7 @@ class GeneralEquations(ConstrainedRows):
 
     def correct_position(self, t: Time, q: Vector) -> Vector:
         """Take a Newton step to Psi = 0."""
-        if self.system.constraint is None:
+        if self.mechanism.constraint is None:
             return q
         plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
         return q - weight(plus @ self._psi(t, q))
@@ -223,7 +218,7 @@ class GeneralEquations(ConstrainedRows):
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
         """Return (I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq; with phi, dv follows dq in Psi_dot = 0 and phi = 0."""
-        if self.system.constraint is not None:
+        if self.mechanism.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)
             plus, weight = self._plus(q, slopes)
             dq = dq - weight(plus @ (slopes @ dq))
@@ -238,14 +233,14 @@ class GeneralEquations(ConstrainedRows):
 
     def impulse(self, t: Time, q: Vector, v: Vector, normal: Vector) -> tuple[Vector, Vector]:
         """Return M^(-1) n, and its part that all rows allow: the change of velocities by a unit impulse along n."""
-        factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.system.mass(q)), lower=True)
+        factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.mechanism.mass(q)), lower=True)
         mobility = jax.scipy.linalg.cho_solve(factor, normal)
         return mobility, self.tangent_part(t, q, v, jnp.zeros_like(q), mobility).dv
 
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Return v^T M v / 2 and V, zero without a potential."""
-        potential = self.system.potential
-        kinetic = v @ jnp.asarray(self.system.mass(q)) @ v / 2
+        potential = self.mechanism.potential
+        kinetic = v @ jnp.asarray(self.mechanism.mass(q)) @ v / 2
         return kinetic, jnp.zeros_like(kinetic) if potential is None else jnp.asarray(potential(t, q))
 
     def residuals(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
@@ -273,7 +268,7 @@ class GeneralEquations(ConstrainedRows):
 
     @property
     def constrained(self) -> bool:
-        return self.system.constraint is not None or self.system.velocity_constraint is not None
+        return self.mechanism.constraint is not None or self.mechanism.velocity_constraint is not None
 
     @property
     def stabilized(self) -> bool:
@@ -281,7 +276,7 @@ class GeneralEquations(ConstrainedRows):
 
     @property
     def restricts_velocities(self) -> bool:
-        return self.system.velocity_constraint is not None
+        return self.mechanism.velocity_constraint is not None
 
     @property
     def row_weights(self) -> Float[Array, "m"]:
@@ -302,10 +297,10 @@ class GeneralEquations(ConstrainedRows):
         return self._slopes(t, q, v) * root, self.violation(t, q, v)[1], root
 
     def _units(self, q: Vector) -> Vector:
-        return 1 / jnp.sqrt(jnp.diag(jnp.asarray(self.system.mass(q))))
+        return 1 / jnp.sqrt(jnp.diag(jnp.asarray(self.mechanism.mass(q))))
 
     def matrices(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Vector, Array, Array]:
-        return jnp.asarray(self.system.mass(q)), load(self.system, t, q, v), *self._rows(t, q, v)
+        return jnp.asarray(self.mechanism.mass(q)), load(self.mechanism, t, q, v), *self._rows(t, q, v)
 
     def _rows(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"]]:
         """Return A and c of A a = c."""
@@ -332,23 +327,23 @@ class GeneralEquations(ConstrainedRows):
 
     def _plus(self, q: Vector, slopes: Float[Array, "m n"]) -> tuple[Plus, Callable[[Vector], Vector]]:
         """Return D^+ and x -> L^(-T) x."""
-        L = jnp.linalg.cholesky(jnp.asarray(self.system.mass(q)))
+        L = jnp.linalg.cholesky(jnp.asarray(self.mechanism.mass(q)))
         D = jax.scipy.linalg.solve_triangular(L, slopes.T, lower=True).T
         return self.method.plus(D), lambda x: jax.scipy.linalg.solve_triangular(L, x, lower=True, trans=1)
 
     def _free(self, t: Time, q: Vector, v: Vector) -> Vector:
-        factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.system.mass(q)), lower=True)
-        return jax.scipy.linalg.cho_solve(factor, load(self.system, t, q, v))
+        factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.mechanism.mass(q)), lower=True)
+        return jax.scipy.linalg.cho_solve(factor, load(self.mechanism, t, q, v))
 
     def _slopes(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m n"]:
         return jnp.concatenate([jax.jacfwd(self._psi, 1)(t, q), jax.jacfwd(self._phi, 2)(t, q, v)])
 
     def _psi(self, t: Time, q: Vector) -> Array:
-        constraint = self.system.constraint
+        constraint = self.mechanism.constraint
         return jnp.zeros(0) if constraint is None else jnp.atleast_1d(jnp.asarray(joined_rows(constraint(t, q))))
 
     def _phi(self, t: Time, q: Vector, v: Vector) -> Array:
-        constraint = self.system.velocity_constraint
+        constraint = self.mechanism.velocity_constraint
         return jnp.zeros(0) if constraint is None else jnp.atleast_1d(jnp.asarray(joined_rows(constraint(t, q, v))))
 
     def _psi_dot(self, t: Time, q: Vector, v: Vector) -> Array:

@@ -55,13 +55,15 @@ class GivenState:
 
     def at_position(self) -> Any:
         """Return the model whose position has the given coordinates; the model itself if there are none."""
-        known = {name: (where, self.values[name]) for name, (is_rate, where) in self.parsed.items() if not is_rate}
-        return self._conditions.at_position(known) if known else self.model
+        return self._imposed(False)
 
     def at_velocity(self, t: NumberLike, q: Array) -> Any:
         """Return the model whose velocity at time t (s) and position q has the given ones; the model itself if there are none."""
-        known = {name: (where, self.values[name]) for name, (is_rate, where) in self.parsed.items() if is_rate}
-        return self._conditions.at_velocity(known, t, q) if known else self.model
+        return self._imposed(True, t, q)
+
+    def _imposed(self, rates: bool, *at: Any) -> Any:
+        known = {name: (where, self.values[name]) for name, (is_rate, where) in self.parsed.items() if is_rate == rates}
+        return self._conditions.impose(known, *at) if known else self.model
 
 
 class _GivenEntries(NamedTuple):
@@ -77,11 +79,19 @@ class _GivenEntries(NamedTuple):
             raise ArgumentError(f"given: {problem}") from None
         return channel.owner == "v", int(channel.quantity)
 
-    def at_position(self, entries: Mapping[str, tuple[int, Array]]) -> ConstrainedSystem:
-        return _with_entries(self.model, entries)
+    def impose(self, entries: Mapping[str, tuple[int, Array]], *at: Any) -> ConstrainedSystem:
+        """Return the system with further rows, that entries of q have given values, or, `at` a state, entries of v."""
+        places, values = np.array([k for k, _ in entries.values()]), jnp.stack([value for _, value in entries.values()])
+        name = "velocity_constraint" if at else "constraint"
+        old = getattr(self.model, name)
 
-    def at_velocity(self, entries: Mapping[str, tuple[int, Array]], t: NumberLike, q: Array) -> ConstrainedSystem:
-        return _with_entries(self.model, entries, rates=True)
+        def rows(*state: Any) -> Any:
+            own, more = {} if old is None else old(*state), state[-1][places] - values
+            if isinstance(own, Mapping):
+                return {**own, "given": more}
+            return jnp.concatenate([jnp.atleast_1d(jnp.asarray(own)), more])
+
+        return replace(self.model, **{name: rows})
 
 
 class _GivenCoordinates(NamedTuple):
@@ -100,12 +110,14 @@ class _GivenCoordinates(NamedTuple):
             raise ArgumentError(f"given: {quote(name)} is neither a coordinate nor a velocity ({problem}); {cure}") from None
         return last in RATES, coordinate
 
-    def at_position(self, coordinates: Mapping[str, tuple[Coordinate, Array]]) -> Mechanism:
-        return _with_drivers(self.model, {name: (c, [value]) for name, (c, value) in coordinates.items()})
+    def impose(self, coordinates: Mapping[str, tuple[Coordinate, Array]], *at: Any) -> Mechanism:
+        """Return the mechanism with further drivers, of constant coordinates, or, `at` time t and position q, of given rates."""
 
-    def at_velocity(self, coordinates: Mapping[str, tuple[Coordinate, Array]], t: NumberLike, q: Array) -> Mechanism:
-        laws = {name: (c, [value_of(self.model, c)(q) - rate * t, rate]) for name, (c, rate) in coordinates.items()}
-        return _with_drivers(self.model, laws)
+        def motion(coordinate: Coordinate, x: Array) -> Polynomial:
+            return Polynomial(jnp.stack([value_of(self.model, coordinate)(at[1]) - x * at[0], x] if at else [x]))
+
+        more = {f"given {name}": c.driver(motion(c, x)).complete() for name, (c, x) in coordinates.items()}
+        return self.model.with_drivers({**self.model.drivers, **more})
 
 
 def _value_called(name: str, value: Any) -> Float[Array, ""]:
@@ -116,26 +128,3 @@ def _value_called(name: str, value: Any) -> Float[Array, ""]:
     if found is None or np.shape(found) != ():
         raise ArgumentError(f"given[{quote(name)}] must be a number, {describe(value)}")
     return found
-
-
-def _with_drivers(mechanism: Mechanism, laws: Mapping[str, tuple[Coordinate, list[Any]]]) -> Mechanism:
-    """Return a mechanism with further drivers by the names of the coordinates, whose motions are polynomials."""
-    more = {
-        f"given {name}": coordinate.driver(Polynomial(jnp.stack(coefficients))).complete()
-        for name, (coordinate, coefficients) in laws.items()
-    }
-    return mechanism.with_drivers({**mechanism.drivers, **more})
-
-
-def _with_entries(system: ConstrainedSystem, entries: Mapping[str, tuple[int, Array]], rates: bool = False) -> ConstrainedSystem:
-    """Return a system with further rows, that entries of q, or of v, have given values."""
-    places, values = np.array([k for k, _ in entries.values()]), jnp.stack([value for _, value in entries.values()])
-    old = system.velocity_constraint if rates else system.constraint
-
-    def rows(*state: Any) -> Any:
-        own, more = {} if old is None else old(*state), state[-1][places] - values
-        if isinstance(own, Mapping):
-            return {**own, "given": more}
-        return jnp.concatenate([jnp.atleast_1d(jnp.asarray(own)), more])
-
-    return replace(system, **{"velocity_constraint" if rates else "constraint": rows})

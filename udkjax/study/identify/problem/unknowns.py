@@ -223,7 +223,7 @@ def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str,
     return conditions
 
 
-def _held_in_scene(mechanism: StudyModel, samples: NumberField | None) -> Held | None:
+def _held_in_scene(mechanism: Any, samples: NumberField | None) -> Held | None:
     """Return the `Held` of these samples, if that is what they are."""
     holder = samples.holder(mechanism.groups) if samples is not None and mechanism.has_bodies else None
     return holder if isinstance(holder, Held) else None
