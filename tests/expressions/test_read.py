@@ -9,6 +9,7 @@ from jax import lax
 from tests.choices import fast
 from tests.fresh_process import python
 from udkjax.programs.deferred import deferred
+from udkjax.programs.undefined import defined
 
 
 @jax.custom_jvp
@@ -52,6 +53,8 @@ FUNCTIONS = {
     "custom_jvp": lambda x, y: _doubled(x) + jax.nn.relu(y) + jax.nn.silu(x),
     "checkpoint": lambda x, y: jax.checkpoint(lambda a: jnp.sin(a) * y)(x),
     "derivative": lambda x, y: jax.jacfwd(lambda a: jnp.sin(a) * y[0])(x),
+    "derivative of what may be undefined": lambda x, y: jax.jacfwd(defined(lambda a: jnp.sin(a) * y[0]))(x),
+    "gradient of what may be undefined": lambda x, y: jax.grad(lambda a: defined(lambda b: jnp.sin(b) * y[0])(a).sum())(x),
     "stack": lambda x, y: jnp.stack([x, y], axis=1),
     "iota": lambda x, y: x * jnp.arange(3.0),
     "no argument at all": lambda x, y: jnp.ones(2),

@@ -110,7 +110,7 @@ def compare(seed: int) -> str:
     return f"{seed:6} {free.redundant:9} {len(free.limits):8} {bounds[0]:14.6f} {bounds[1]:14.6f}"
 
 
-@pytest.mark.parametrize("seed", [1004, 1006])  # redundant: unbounded by preloads, and bounded
+@pytest.mark.parametrize("seed", [1004, 1006, 1178])  # unbounded by preloads; bounded; with a load that turns round on the way
 def test_bounds_are_those_of_linear_programs_over_free_bodies(seed):
     compare(seed)
 
@@ -270,8 +270,8 @@ def test_random_scenes_beside_linear_programs():
 
 @pytest.mark.slow
 def test_derivatives_of_bounds_of_a_linkage():
-    """By every number of friction, and by a length, against differences; with preloads and without."""
-    base, driver = random_scene(1007)  # a slider-crank
+    """By every number of friction, and by a length, against differences."""
+    base, driver = random_scene(1001)  # a slider-crank
     names = [name for name in base.parameters() if name.startswith("force.rub") and np.ndim(base.parameters()[name]) == 0]
     names.append("joint.C.points")
 

@@ -4,7 +4,7 @@ Loops and branches run in Python. An operation without a NumPy rule is expanded 
 alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -26,6 +26,16 @@ _EVALUATIONS: dict[Primitive, Callable[..., Any]] = {}
 def expand_as(primitive: Primitive, function: Callable[..., Callable[..., Any]]) -> None:
     """Expand a primitive into the operations of `function(**parameters)`, a function of arrays that JAX can trace."""
     _EXPANSIONS[primitive] = function
+
+
+def expansion_of(primitive: Primitive, parameters: Mapping[str, Any]) -> Callable[..., Any] | None:
+    """Return the function into whose operations a primitive is expanded, ours or one of JAX's; None if there is none."""
+    if primitive in _EXPANSIONS:
+        return _EXPANSIONS[primitive](**parameters)
+    if "_prim" not in parameters:
+        return None
+    defined = parameters["_prim"]
+    return lambda *xs: defined.expand(*jax.tree.unflatten(defined.in_tree, xs))
 
 
 def evaluate_as(primitive: Primitive, function: Callable[..., Any]) -> None:
@@ -229,11 +239,8 @@ class _Expanded:
 
     def _function(self) -> Callable[..., Any] | None:
         primitive, parameters = self._primitive, self._parameters
-        if primitive in _EXPANSIONS:
-            return _EXPANSIONS[primitive](**parameters)
-        if "_prim" in parameters:  # a JAX primitive defined by other operations
-            defined = parameters["_prim"]
-            return lambda *xs: defined.expand(*jax.tree.unflatten(defined.in_tree, xs))
+        if (expansion := expansion_of(primitive, parameters)) is not None:
+            return expansion
         impl = primitive.impl
         if isinstance(impl, partial) or impl.__module__.startswith(("jax.", "jaxlib")):
             return None

@@ -10,9 +10,11 @@ its multiplier is -f. Masses enter by weights only: lambda = lambda_0 + A phi + 
 L is a norm of loads, and lies above its tangents. So for tangents at any lambda, the phi and s that meet their inequalities are a
 convex set of admissible ones, over which a linear program finds the largest f. New tangents at its solution allow more, until
 nothing changes, as in Newton's method. All states on the way are admissible, those between them as well: friction can hold the
-mechanism by every effort from that without friction to the bound.
+mechanism by every effort from that without friction to the bound. The set of all admissible states is not convex, and where the
+load of a joint turns round, the search may end at a smaller bound: further ones begin where the friction of each joint is largest.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -143,7 +145,8 @@ class _TangentSearch(NamedTuple):
 def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> Float[Array, ""]:
     """Return the largest `sign` times f among the admissible reactions; infinity if it is unbounded.
 
-    Internal loads that are large enough press on each joint that they reach: a second search begins with some.
+    Searches begin without friction; with internal loads, which press on each joint that they reach if they are large enough; and
+    where the friction of one joint is as large as it can be, for each joint and sign.
 
     The derivative is that of the linear program: its multipliers times those of the inequalities (envelope theorem).
     """
@@ -156,7 +159,7 @@ def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> F
 
     constant = limits(scene, fixed._replace(multipliers=0 * fixed.multipliers), origin)  # of joints without load
 
-    def again(search: _TangentSearch) -> _TangentSearch:
+    def again(c: Array, search: _TangentSearch) -> _TangentSearch:
         """Move to the solution of the linear program with tangents at z; those of unloaded joints turn to the other side."""
         z, touches = search.z, jnp.where(search.count == 0, search.z + aside, search.z)
         slope = jax.jacfwd(lambda z: limits(scene, fixed, z))(touches)
@@ -167,7 +170,7 @@ def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> F
         left = jnp.concatenate([available - z[:K], available + z[:K]])
         found = maximize(c, rows, left, jnp.concatenate([sides + jnp.abs(slope)] * 2))
         z = z + found.x
-        changes = jnp.abs(c @ found.x) > LAST_CHANGE * jnp.abs(fixed.effort(z))
+        changes = jnp.abs(c @ found.x) > LAST_CHANGE * (jnp.abs(c) @ jnp.abs(z))
         idle = jnp.where(changes, 0, search.idle + 1)
         goes_on = found.solved & (idle < 2) & (search.count < MOST_TANGENTS)
         return _TangentSearch(z, found.y, slope, search.count + 1, idle, goes_on, found.solved & ~goes_on, found.endless)
@@ -176,11 +179,11 @@ def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> F
     aside = origin.at[:K].set(STEP_ASIDE * size * jnp.sign(c[:K]))
     loaded = origin.at[K:].set(PRELOAD * size * np.random.default_rng(0).standard_normal(len(origin) - K))
 
-    def search(z: Array) -> _TangentSearch:
-        """Return the end of a search from an admissible state."""
+    def search(z: Array, c: Array) -> _TangentSearch:
+        """Return the end of a search for the largest c z from an admissible state."""
         counts, marks = [jnp.asarray(0)] * 2, [jnp.asarray(x) for x in (True, False, False)]
         start = _TangentSearch(z, jnp.zeros(2 * K), 0 * sides, *counts, *marks)
-        return jax.lax.while_loop(lambda search: search.goes_on, again, start)
+        return jax.lax.while_loop(lambda search: search.goes_on, partial(again, c), start)
 
     def value(found: _TangentSearch) -> Array:
         z, forward, backward = found.z, found.y[:K], found.y[K:]
@@ -188,7 +191,10 @@ def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> F
         return jnp.where(found.endless, jnp.inf, jnp.where(found.solved, bound, jnp.nan))
 
     starts = jnp.stack([origin] if len(origin) == K else [origin, loaded])
-    return jnp.max(jax.vmap(value)(jax.vmap(search)(starts)))
+    extreme = jax.vmap(search, (None, 0))(origin, jnp.concatenate([sides, -sides]))
+    is_end = extreme.solved & ~extreme.endless
+    starts = jnp.concatenate([starts, jnp.where(is_end[:, None], extreme.z, 0.0)])
+    return jnp.max(jax.vmap(value)(jax.vmap(search, (0, None))(starts, c)))
 
 
 @deferred

@@ -19,6 +19,7 @@ from udkjax.expressions.reading.loop_reader import unroll
 from udkjax.expressions.reading.matrix_rules import is_small
 from udkjax.expressions.scalars.graph import BoundPrimitive, Graph, Scalar
 from udkjax.expressions.scalars.selection import fold
+from udkjax.programs.numpy_program import expansion_of
 
 ClosedJaxpr: TypeAlias = Any  # JAX exports the class, but not to type checkers
 Equation: TypeAlias = Any  # its annotations omit the shapes of its variables
@@ -197,9 +198,8 @@ def _write_out(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> li
         counts, programs = equation.params["const_lengths"], equation.params["jaxprs"]
         first, right = counts.matvec + counts.vecmat, counts.matvec + counts.vecmat + counts.solve + counts.transpose_solve
         return _read_inner(graph, programs.solve, [*inputs[first : first + counts.solve], *inputs[right:]])
-    if name == "call_hi_primitive":  # such as `searchsorted`: JAX has an expansion of it
-        expanded = jax.make_jaxpr(equation.params["_prim"].expand)(*(v.aval for v in equation.invars))
-        return read_jaxpr(graph, expanded, inputs)
+    if (expansion := expansion_of(equation.primitive, equation.params)) is not None:  # such as that of `searchsorted`
+        return read_jaxpr(graph, jax.make_jaxpr(expansion)(*(v.aval for v in equation.invars)), inputs)
     return RULES[name](graph, inputs, equation) if name in RULES else None
 
 
