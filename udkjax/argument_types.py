@@ -88,8 +88,8 @@ def _require_point(name: str, value: Any, given: GivenArguments) -> None:
 
 def require_coordinates(name: str, value: Any, given: GivenArguments, flat: bool = True) -> None:
     """Require x, y and angle of each body of the mechanism, or their rates: (bodies, 3), or (n,) if `flat`."""
-    names, coordinates = getattr(given["mechanism"], "body_names", None), array(name, value)
-    if names is None:  # the number of coordinates of a user-written system is not known
+    names, coordinates = getattr(given["mechanism"], "body_names", ()), array(name, value)
+    if not names:  # the number of coordinates of a user-written system is not known
         if coordinates.ndim != 1:
             raise ArgumentError(f"{name} must be a vector (n,), not an array of the shape {coordinates.shape}")
         require_finite(name, value)
@@ -109,23 +109,23 @@ def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
 
 def require_history(name: str, value: Any, given: GivenArguments) -> None:
     """Require a solution, or any object with times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
-    names = getattr(given["mechanism"], "body_names", None)
+    names = getattr(given["mechanism"], "body_names", ())
     missing = [part for part in ("ts", "q", "v") if not hasattr(value, part)]
     if missing or isclass(value):
         raise ArgumentTypeError(f"{name} must have times and states, ts, q and v, as a Solution: {describe(value)}")
     bodies = getattr(value, "bodies", None)
-    if names is not None and isinstance(bodies, tuple) and bodies and bodies != names:
+    if names and isinstance(bodies, tuple) and bodies and bodies != names:
         listed = [", ".join(map(quote, x[:6])) + (", ..." if len(x) > 6 else "") for x in (bodies, names)]
         raise ArgumentError(f"{name} belongs to another mechanism: its bodies are {listed[0]}, not {listed[1]}")
     ts, q, v = (array(f"{name}.{part}", getattr(value, part)) for part in ("ts", "q", "v"))
-    expected_shape = q.shape if names is None else (*ts.shape, len(names), 3)
+    expected_shape = (*ts.shape, len(names), 3) if names else q.shape
     if q.ndim == 4:
         first_member, all_of_them = "jax.tree.map(lambda x: x[0], batch)", "jax.vmap(lambda one: function(mechanism, one))(batch)"
         raise ArgumentError(
             f"{name} is a batch of {len(q)} solutions: take one of them, {first_member}, or map over them, {all_of_them}"
         )
     if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != expected_shape or v.shape != q.shape:
-        expected = "ts (T,), q and v (T, n)" if names is None else f"ts (T,), q and v (T, bodies, 3) of {len(names)} bodies"
+        expected = f"ts (T,), q and v (T, bodies, 3) of {len(names)} bodies" if names else "ts (T,), q and v (T, n)"
         raise ArgumentError(f"{name} must have {expected}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
 
 

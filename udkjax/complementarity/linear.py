@@ -1,9 +1,9 @@
 """Linear complementarity problems of contacts: 0 <= x, y = W x + b >= 0, x y = 0, for a symmetric W >= 0 of a few rows.
 
-These are the conditions of the minimum of x W x / 2 + b x over x >= 0. Lawson and Hanson's active-set method (Solving Least
-Squares Problems, 1974, chapter 23) determines the positive x, the passive set, in few steps, and keeps the rows of this set
-independent. x is then the solution of linear equations, and has its derivatives. Arrays are those of JAX or NumPy, with any
-leading dimensions.
+These are the conditions of the minimum of x W x / 2 + b x over x >= 0. The symmetric principal pivoting method (Cottle, Pang and
+Stone, The Linear Complementarity Problem, 1992, section 4.3) determines the positive x, the passive set, in few steps, and keeps
+the rows of this set independent. x is then the solution of linear equations, and has its derivatives. Arrays are those of JAX or
+NumPy, with any leading dimensions.
 """
 
 from types import ModuleType
@@ -22,7 +22,7 @@ LEMKE_STEPS = 10  # for each row; Lemke's method takes about as many steps as ro
 # Bound on the variable x0, relative to max |q|, where Lemke's method ends on a ray: in degenerate problems, a smaller one is a
 # rounding error, and the problem is solved.
 ON_RAY = 1e-9
-STEPS_PER_ROW = 6  # Lawson and Hanson observed half a step per row; the limit stops cycles caused by rounding
+STEPS_PER_ROW = 6  # one step per positive x is usual; the limit stops cycles caused by rounding
 
 
 class Complementary(NamedTuple):
@@ -33,9 +33,10 @@ class Complementary(NamedTuple):
     passive: Bool[Any, "*m E"]  # where x may be positive
 
 
-class _ActiveSet(NamedTuple):
+class _Pivoting(NamedTuple):
     x: Any
     passive: Any
+    driving: Any  # mask of the x that is raised until its y is zero
     steps: Any
     done: Any
 
@@ -48,7 +49,7 @@ def solve_complementarity(
     xp: ModuleType = jnp,
     equalities: Bool[Any, "*m E"] | None = None,
 ) -> Complementary:
-    """Solve 0 <= x, W x + b >= 0, x (W x + b) = 0 by Lawson and Hanson's active-set method.
+    """Solve 0 <= x, W x + b >= 0, x (W x + b) = 0 by principal pivoting.
 
     Args:
         W: symmetric, and positive semidefinite.
@@ -213,25 +214,33 @@ def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, equalities: Any, xp: 
     if xp is np and not equalities.any() and allowed.sum(-1).max(initial=0) <= 1:
         return allowed & (b + floor < 0)
 
-    def step(state: _ActiveSet) -> _ActiveSet:  # changes nothing once done
-        z = _solve_passive(W, b, state.passive, xp)
-        leaves = state.passive & ~equalities & (z <= 0)
-        # Go towards z until the first x becomes zero; these entries leave the passive set.
-        decrease = state.x - z
-        fraction = xp.where(leaves, xp.where(decrease > 0, state.x / xp.where(decrease > 0, decrease, 1.0), 0.0), xp.inf)
+    def step(state: _Pivoting) -> _Pivoting:  # changes nothing once done
+        y = times(W, state.x) + b
+        excess = xp.where(allowed & ~state.passive, y + floor, xp.inf)
+        lowest = np.arange(b.shape[-1]) == xp.argmin(excess, axis=-1)[..., None]
+        enters = lowest & (xp.min(excess, axis=-1, keepdims=True) < 0)
+        driving = xp.where(xp.any(state.driving, -1, keepdims=True), state.driving, enters)
+        # Raise this x, and move all positive ones so that their y stay zero, until its y is zero or one of them is.
+        way = xp.where(driving, 1.0, _solve_passive(W, times(W, driving * 1.0), state.passive, xp))
+        slope, rest = (xp.sum(xp.where(driving, x, 0.0), -1, keepdims=True) for x in (times(W, way), -y))
+        full = xp.where(slope > TIGHT, rest / xp.where(slope > TIGHT, slope, 1.0), xp.inf)  # a dependent row's y stays
+        falls = state.passive & ~equalities & (way < 0)
+        fraction = xp.where(falls, xp.maximum(state.x, 0.0) / xp.where(falls, -way, 1.0), xp.inf)
         smallest = xp.min(fraction, axis=-1, keepdims=True)
-        partial = state.x + xp.where(xp.isfinite(smallest), smallest, 0.0) * (z - state.x)
-        y = xp.where(allowed & ~state.passive, times(W, z) + b + floor, xp.inf)
-        enters = np.arange(b.shape[-1]) == xp.argmin(y, axis=-1)[..., None]
-        any_leaves, any_enters = xp.any(leaves, -1, keepdims=True), xp.min(y, axis=-1, keepdims=True) < 0
-        passive = xp.where(any_leaves, state.passive & ~(leaves & (fraction <= smallest)), state.passive | (enters & any_enters))
-        x = xp.where(passive, xp.where(any_leaves, partial, z), 0.0)
-        return _ActiveSet(x, passive, state.steps + 1, ~xp.any(any_leaves | any_enters))
+        length = xp.minimum(full, smallest)
+        goes = xp.any(driving, -1, keepdims=True) & (length < xp.inf)  # else it is solved, or has no solution
+        leaves, ends = goes & falls & (fraction <= length) & (smallest < full), full <= smallest
+        x = xp.where(goes, state.x + xp.where(goes, length, 0.0) * way, state.x)
+        passive = (state.passive & ~leaves) | (goes & ends & driving)
+        return _Pivoting(xp.where(leaves, 0.0, x), passive, driving & goes & ~ends, state.steps + 1, ~xp.any(goes))
 
-    def goes_on(state: _ActiveSet) -> Any:
+    def goes_on(state: _Pivoting) -> Any:
         return ~state.done & (state.steps < STEPS_PER_ROW * b.shape[-1] + 2)
 
-    state = _ActiveSet(xp.zeros_like(b), equalities, xp.asarray(0), xp.asarray(False))
+    start = (
+        xp.where(equalities, _solve_passive(W, b, equalities, xp), 0.0) if xp is not np or equalities.any() else xp.zeros_like(b)
+    )
+    state = _Pivoting(start, equalities, equalities & False, xp.asarray(0), xp.asarray(False))
     if xp is not np:
         return jax.lax.while_loop(goes_on, step, state).passive
     while goes_on(state):

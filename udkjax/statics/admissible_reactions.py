@@ -10,8 +10,8 @@ its multiplier is -f. Masses enter by weights only: lambda = lambda_0 + A phi + 
 L is a norm of loads, and lies above its tangents. So for tangents at any lambda, the phi and s that meet their inequalities are a
 convex set of admissible ones, over which a linear program finds the largest f. New tangents at its solution allow more, until
 nothing changes, as in Newton's method. All states on the way are admissible, those between them as well: friction can hold the
-mechanism by every effort from that without friction to the bound. The set of all admissible states is not convex, and where the
-load of a joint turns round, the search may end at a smaller bound: further ones begin where the friction of each joint is largest.
+mechanism by every effort from that without friction to the bound. All admissible states are no convex set, and a search may
+end at a smaller bound where a load turns round: further ones begin where the friction of each joint is largest.
 """
 
 from functools import partial

@@ -281,21 +281,27 @@ def hit_contacts(
     hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
     if xp is not np or stays.any():
         pull = second_rates(stop(velocities(impact)))
-        solution = solve_complementarity(W, pull, stays, pressed, xp)
-        # A pressed contact that rises so slowly is at rest, too: the impact is one without its rebound. It may still rise, lifted
-        # by other contacts, and is then let go.
-        presses = solution.passive & (solution.x > 0)
+        weak = xp.maximum(pressed, STILL * _largest(pull, stays, xp))
+
+        def pressed_and_idle(stays: Any) -> tuple[Any, Any]:
+            """Return masks of the contacts that are pressed, and of all that do not open."""
+            solution = solve_complementarity(W, pull, stays, pressed, xp)
+            return solution.passive & (solution.x > 0), xp.abs(solution.y) <= weak
+
+        # A pressed contact that rises so slowly is at rest, too: the impact is one without its rebound, and without that of
+        # contacts that depend on it. It may still rise, lifted by other contacts, and is then let go.
+        presses, idle = pressed_and_idle(stays)
         rises = xp.any(presses & (stop(impact.rate) > still), axis=-1, keepdims=True)
         if xp is not np or rises.any():
-            closed = xp.where(presses & rises, SLOW, closed)  # recorded: derivatives follow the impact that was chosen
-            again = impulses(xp.where(presses & rises, 0.0, restitution))
+            rests = presses | (stays & idle & _depends(W, presses, contacts.impacts, xp))
+            closed = xp.where(rests & rises, SLOW, closed)  # recorded: derivatives follow the impact that was chosen
+            again = impulses(xp.where(rests & rises, 0.0, restitution))
             impact = Impulses(*(_where_any(rises, x, y, xp) for x, y in zip(again, impact, strict=True)))
         stays = may_stay & (stop(impact.rate) <= still)
-        solution = solve_complementarity(W, pull, stays, pressed, xp)
-        presses = solution.passive & (solution.x > 0)
+        presses, idle = pressed_and_idle(stays)
         is_held = xp.where(touches, presses & contacts.hold, held)
-        is_slow, weak = may_stay & (stop(impact.rate) <= slow), xp.maximum(pressed, STILL * _largest(pull, stays, xp))
-        carried = is_slow & ~is_held & (xp.abs(solution.y) <= weak) & _depends(W, is_held, contacts.impacts, xp)
+        is_slow = may_stay & (stop(impact.rate) <= slow)
+        carried = is_slow & ~is_held & idle & _depends(W, is_held, contacts.impacts, xp)
         ends, stays = presses & contacts.stop, stays | carried
     v = velocities(impact)
     return ContactChanges(v, closed, hits, is_held, stays, ends, carried, impact.remaining)
