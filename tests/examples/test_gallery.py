@@ -22,7 +22,7 @@ FACTS = {  # of each example, what must be true of the numbers that it prints
     "hammer": lambda blows, rebound, between: blows > 10 and abs(rebound - 0.6) < 1e-9 and abs(between - 1) < 1e-6,
     "toggle_clamp": lambda limit, dry, greased: limit == 2 and abs(dry - 0.5) < 1e-9 and greased > 20,
     "woodpecker": lambda pecks, time, descent, gain: (
-        pecks == 7 and abs(time - 0.193) < 0.001 and 50 < descent < 60 and gain < 1e-9
+        pecks == 6 and abs(time - 0.220) < 0.001 and 75 < descent < 80 and gain < 1e-9
     ),
     "rod_on_floor": lambda slides, vaults, found, limit: abs(slides) + abs(vaults - 180) < 1e-6 and abs(found - limit) < 1e-8,
     "identification": lambda off, *_: off < 3,
