@@ -10,10 +10,13 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
+from tests.run_programs import evaluate_programs
 from udkjax.equations import constraints, loads, prepare
 from udkjax.equations.programs.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.programs.scene_programs import _scene_programs, scene_programs
+from udkjax.equations.programs.unrolled import Unrolled
 from udkjax.equations.rows.dense_rows import DenseTerms
+from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.expressions.loops import float_loops
 from udkjax.expressions.loops.array_loops import ArrayLoops
 from udkjax.expressions.loops.float_loops import _WORTH_WRITING_FOR_MANY, FloatLoops
@@ -319,3 +322,17 @@ def test_one_position_is_evaluated_once(monkeypatch):
     assert not np.allclose(terms.psi(0.0, q + 0.1), psi)  # of another position
     q += 0.1  # and of the same array with other numbers
     assert not np.allclose(terms.slopes(0.0, q)[0], slopes)
+
+
+def test_outputs_do_not_depend_on_what_else_a_program_computes():
+    """All are by one elimination: each pivot of the four-bar has one reciprocal, and the distance has one."""
+    mechanism, random = udk.library.four_bar(), np.random.default_rng(0)
+    programs, n = scene_programs(mechanism), mechanism.q0.size
+    outputs = ("a", "q1", "v1", "dv1", "psi", "psi_dot", "terms", "energy", "distance")
+    numbers = [*map(float, numbers_as_vector(mechanism.without_origin.numbers)), 1e-14, 1e-14]
+    q, v, dq, dv = np.ravel(mechanism.q0) + 0.01 * random.standard_normal(n), *random.standard_normal((3, n))
+    evaluate = lambda asked: evaluate_programs(programs, asked, numbers, 0.0, q, v, dq=dq, dv=dv)  # noqa: E731
+    together, apart = evaluate([outputs]), evaluate([(x,) for x in outputs])
+    for x in outputs:
+        assert_allclose(together[x], apart[x], rtol=1e-9, atol=1e-9, err_msg=x)
+    assert Unrolled(programs, [outputs]).program(*outputs).program.count()["div"] == programs.row_count + 1

@@ -115,7 +115,7 @@ class RunPrograms:
         return {}
 
     def of(self, *outputs: str) -> LoopProgram:
-        """Return the program that computes some `OUTPUTS`, in this order."""
+        """Return the program that computes some `OUTPUTS`, in this order; scenes have arrays for four linear systems."""
         if outputs not in self._programs:
             self._programs[outputs] = self._write(outputs)
         return self._programs[outputs]
