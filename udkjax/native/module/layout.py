@@ -115,7 +115,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "begin": "1 if the run begins at point 3, at the start or anew after a breakpoint; -1 if the attempt is implicit, else 0",
     "last": "whether the attempted step ends at the end of the run",
     "lands": "whether the attempted step ends at a breakpoint",
-    "behind": "time just after the breakpoints at the current time (s)",
+    "past_breaks": "time just after the breakpoints at the current time (s)",
     "knot": "number of breakpoints that have been passed",
     "passed": "time of the last of these breakpoints (s)",
     "row": "index of the row of samples in the constants",

@@ -15,7 +15,7 @@ def aim(module: Module, f: Function, s: Lane):
     start, end, stop = s.point3_t, s.end, s.end
     crossing = s.crossing if module.pieces else f.const(np.inf, DOUBLE, f.width)
     if module.plan.breaks:
-        s.t1, s.behind = f.const(np.inf, DOUBLE, f.width), start
+        s.t1, s.past_breaks = f.const(np.inf, DOUBLE, f.width), start
         next_breakpoint(module, f, s, start)
         end = s.t1
         stop = f.min(end, crossing)
@@ -47,9 +47,9 @@ def aim(module: Module, f: Function, s: Lane):
         last = last & ~reaches & ~splits
         final = s.end - f.max(s.end - end, 0.0)
         t1 = where(reaches, stop, where(last, final, t1))
-        t1 = where(begin, s.behind, t1)
+        t1 = where(begin, s.past_breaks, t1)
         s.lands = where(reaches & (end <= crossing), yes, 0.0)
-    t1 = where(begin, s.behind if module.plan.breaks else s.point3_t, t1)
+    t1 = where(begin, s.past_breaks if module.plan.breaks else s.point3_t, t1)
     s.t1 = t1
     s.step = where((s.stepping > 0.5) & ~begin, t1 - s.point3_t, 0.0)
     s.begin = where(begin, yes, where(s.trial > 0.0, -yes, -s.stiff) if module.plan.stiff else -s.stiff)
@@ -63,7 +63,7 @@ def halve(f: Function, s: Lane, t1: Value, stop: Value, otherwise: Value) -> Val
 
 
 def next_breakpoint(module: Module, f: Function, s: Lane, now: Value):
-    """Set `t1` just before the next breakpoint, and `behind` just after all breakpoints at the time `now`."""
+    """Set `t1` just before the next breakpoint, and `past_breaks` just after all breakpoints at the time `now`."""
     work, call = f.given["work"], f.given["call"]
     f.call("next_breakpoint", work, call)
     with f.while_(lambda: f.any_of(s.due <= now + s.smallest)):
@@ -71,7 +71,7 @@ def next_breakpoint(module: Module, f: Function, s: Lane, now: Value):
         s.where(is_passed, knot=s.knot + 1.0, passed=s.due)
         f.call("next_breakpoint", work, call)
     s.t1 = s.due - s.smallest * ENDS_BEFORE
-    s.behind = f.max(s.passed + s.smallest * BEGINS_BEHIND, now)
+    s.past_breaks = f.max(s.passed + s.smallest * BEGINS_BEHIND, now)
     if module.plan.sampled:
         with f.each(f.width) as k:
             stale = (s.active > 0.5) & s.row.is_not(s.knot)

@@ -3,7 +3,7 @@
 Numbers of a lane `s` (layout.py has them all):
 
     point3_t, t1            time of the latest accepted state, and end of the attempted step (s)
-    h, behind               step length chosen by the controller (s); scratch
+    h                       step length chosen by the controller (s)
     error, rate             error of the attempt, relative to the tolerance; error of the previous step divided by length^order
     begin, last, lands      one if the attempt begins a run, ends it, ends at a breakpoint
     fallback, fallback_due  one if the fallback makes this attempt, if it must make the next
@@ -72,10 +72,10 @@ def write_decide(module: Module):
         h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, time_left, step, h), h)
     if tries is not None:  # a trial that fails leaves no trace
         h = where(tries & ~accept, s.h, h)
-    s.behind = h
+    chosen = f.variable(h)
     with f.if_(f.any_of(begun)):
-        s.behind = where(begun, first_step(module, f, s), s.behind)
-    h = s.behind
+        chosen.value = where(begun, first_step(module, f, s), chosen.value)
+    h = chosen.value
     if module.plan.breaks:
         h = where(accept & stepped & (step < s.h - s.smallest), f.max(h, s.h), h)
         h = where(begun & (tried > 0.0), s.h * RESTART_FACTOR, h)

@@ -56,11 +56,10 @@ def write_end_piece(module: Module):
     s.share, s.low = yes, f.const(0.0, DOUBLE, f.width)
     with f.if_(f.any_of(leaves)), f.each(HALVINGS):
         middle = (s.low + s.share) * 0.5
-        s.behind = middle
-        find_pieces(f.fma(middle, step, s.point3_t), lambda r: interpolate_step(module, f, s.behind, step, r))
+        find_pieces(f.fma(middle, step, s.point3_t), lambda r: interpolate_step(module, f, middle, step, r))
         has_left = moved()
-        s.where(leaves & has_left, share=s.behind)
-        s.where(leaves & ~has_left, low=s.behind)
+        s.where(leaves & has_left, share=middle)
+        s.where(leaves & ~has_left, low=middle)
     setattr(s, "state t", s.t1)
     with f.each(module.rowcount) as r:
         module.put(f, "state q", r, module.vector(f, "corrected q", r))
