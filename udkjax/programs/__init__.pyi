@@ -20,6 +20,7 @@ from udkjax.programs.numpy_program import Meter as Meter
 from udkjax.programs.numpy_program import TooLongError as TooLongError
 from udkjax.programs.numpy_program import evaluate_as as evaluate_as
 from udkjax.programs.numpy_program import expand_as as expand_as
+from udkjax.programs.numpy_program import expansion_of as expansion_of
 from udkjax.programs.numpy_program import has_rules as has_rules
 from udkjax.programs.numpy_program import numpy_program as numpy_program
 from udkjax.programs.numpy_rules import RULES as RULES
