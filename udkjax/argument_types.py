@@ -22,6 +22,7 @@ from udkjax.requirements import (
     require_finite,
     require_number,
     require_numbers_by_name,
+    require_output_times,
     require_times,
 )
 from udkjax.wording import quote
@@ -136,6 +137,7 @@ COUNT = ArgumentRequirement("at least 1", require_count)
 NOT_NEGATIVE_COUNT = ArgumentRequirement("at least 0", partial(require_count, least=0))
 FINITE = ArgumentRequirement("finite", require_finite)
 TIMES = ArgumentRequirement("a vector of finite times", require_times)
+OUTPUT_TIMES = ArgumentRequirement("at least two increasing times", require_output_times)
 POINT = ArgumentRequirement("x and y (m)", _require_point)
 BY_NAME = ArgumentRequirement("by name", _require_mapping)
 NUMBERS_BY_NAME = ArgumentRequirement("finite numbers by name", require_numbers_by_name)

@@ -158,7 +158,7 @@ def require_times(name: str, value: Any, given: GivenArguments = NOTHING) -> Non
     require_finite(name, times)
 
 
-def require_output_times(name: str, value: Any) -> None:
+def require_output_times(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
     """Require at least two finite, increasing times; of traced times, only the shape is checked."""
     times = array(name, value)
     if times.ndim != 1 or len(times) < 2:

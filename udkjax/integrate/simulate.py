@@ -5,7 +5,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
-from udkjax.argument_types import COUNT, NOT_NEGATIVE, POSITIVE, POSITIVE_OR_INFINITE, TIMES
+from udkjax.argument_types import COUNT, NOT_NEGATIVE, OUTPUT_TIMES, POSITIVE, POSITIVE_OR_INFINITE
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays, without_derivatives
 from udkjax.devices import on_host
 from udkjax.equations.laws.formulations import Formulation
@@ -50,7 +50,7 @@ from udkjax.integrate.stabilization import Stabilization
 from udkjax.pinv import Pseudoinverse
 from udkjax.positions.assembling.assembly import AssemblyWarning, Closure, State, close, require_closed
 from udkjax.programs.deferred import deferred
-from udkjax.requirements import ArgumentError, require_output_times
+from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients
@@ -65,7 +65,7 @@ MAX_EVENTS, MAX_EVENTS_STICKING = 64, 256  # defaults, without and with joints t
 @checked
 def simulate(
     mechanism: Mechanism | ConstrainedSystem,
-    ts: Annotated[Numbers | Sequence[float], TIMES],
+    ts: Annotated[Numbers | Sequence[float], OUTPUT_TIMES],
     state: State | Closure | None = None,
     rtol: Annotated[NumberLike, NOT_NEGATIVE] = 1e-8,
     atol: Annotated[NumberLike, NOT_NEGATIVE] = 1e-8,
@@ -156,7 +156,6 @@ def simulate(
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
-    require_output_times("ts", ts)
     ts = jnp.asarray(ts) if is_traced(ts) else ts  # also a list with tracers
     if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and np.asarray(rtol) + np.asarray(atol) < LEAST_ATOL:
         raise ArgumentError(
@@ -195,45 +194,70 @@ def simulate(
     if throw and closure is not None and begun.is_open:
         require_closed(mechanism, closure, start)  # before anything runs
 
-    sticks, located = may_stick(mechanism), None
     choices, locates_kinks = with_kinks(system, choices)
-    if events is not None or sticks or locates_kinks:
-        if without := choices.without_events:
-            raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {without}")
-        if not system.has_programs:
-            raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
-        from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
-
-        most = (MAX_EVENTS_STICKING if sticks else MAX_EVENTS) if max_events is None else max_events
-        solution, end = simulate_events(system, events, analysis, ts, state, closure, choices, most, all_concrete)
-        if not _has_failed(solution.code):
-            return solution
-        if not is_concrete or (events is not None and (not mechanism.has_bodies or int(solution.stats.get("events", 0)))):
-            return _required(solution, throw)  # events may have changed what moved; joints that stick or slip have not
-        if events is not None or sticks:
-            return _required(explained(solution, mechanism, analysis, choices.drift_tol, solver, end), throw)
-        located = solution  # locating kinks failed; perhaps a run succeeds without
-
-    solution, missed, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
-    if throw and not is_concrete and mechanism.has_bodies and _has_failed(code):
-        found = without_derivatives((solution if located is None else located, mechanism, analysis, choices.drift_tol, end))
-        if not is_traced(found):  # as in a call of `jax.grad`
-            run, scene, analysed, tol, last = found
-            return _required(explained(run, scene, analysed, tol, solver, last), throw)
-    if not is_concrete or isinstance(solution.code, Tracer):
-        return _required(solution if located is None else _as_located(solution, located), throw)
-    if missed:
-        analysis = analysis_of(mechanism)  # with the numbers of the given analysis more rows were redundant
-        solution, _, end, code = _run(system, analysis, ts, state, closure, choices, all_concrete)
-    if int(code) not in SUCCESSES:
-        found = solution if located is None else located
-        return _required(explained(found, system, analysis, choices.drift_tol, solver, end), throw)
-    return solution if located is None else _as_located(solution, located)
+    run = _Run(mechanism, system, analysis, ts, state, closure, choices, is_concrete, all_concrete, may_stick(mechanism))
+    if events is not None or locates_kinks or run.sticks:
+        found = _with_events(run, events, max_events)
+        if not (locates_kinks and _has_failed(found.code) and events is None and is_concrete and not run.sticks):
+            return _required(found, throw)
+        return _without_events(run, throw, found)  # perhaps it succeeds where kinks are not located
+    return _without_events(run, throw)
 
 
-def _as_located(solution: Solution, located: Solution) -> Solution:
-    """Return a solution without located kinks, with the time until which a run that failed has located them."""
-    return dataclasses.replace(solution, unlocated=located.time)
+class _Run(NamedTuple):
+    """A run that is about to begin."""
+
+    mechanism: Mechanism | ConstrainedSystem
+    system: Any  # the mechanism, or a traced system
+    analysis: Analysis | None
+    ts: Any
+    state: State | None
+    closure: Closure | None
+    choices: Choices
+    is_concrete: bool  # whether all numbers of the mechanism are
+    all_concrete: bool  # whether those of the run are, too
+    sticks: bool  # whether friction may hold a joint
+
+    def explained(self, solution: Solution, end: Any) -> Solution:
+        """Return a failed solution with its cause, which the last state (t, (q, v)) shows."""
+        return explained(solution, self.system, self.analysis, self.choices.drift_tol, self.choices.solver, end)
+
+
+def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:
+    """Return the solution with events, kinks and joints that stick located."""
+    if without := run.choices.without_events:
+        raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {without}")
+    if not run.system.has_programs:
+        raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
+    from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
+
+    most = (MAX_EVENTS_STICKING if run.sticks else MAX_EVENTS) if max_events is None else max_events
+    given = run.analysis, run.ts, run.state, run.closure, run.choices
+    solution, end = simulate_events(run.system, events, *given, most, run.all_concrete)
+    # Events may have changed what moved, whose cause is not known then; joints that stick or slip have not.
+    changes = events is not None and (not run.mechanism.has_bodies or int(solution.stats.get("events", 0)) > 0)
+    if not run.is_concrete or not _has_failed(solution.code) or changes:
+        return solution
+    return run.explained(solution, end) if events is not None or run.sticks else solution
+
+
+def _without_events(run: _Run, throw: bool, located: Solution | None = None) -> Solution:
+    """Return the solution without events, or raise the error: of the run with `located` kinks, where both fail."""
+    solution, missed, end, code = _integrate(run)
+    if throw and not run.is_concrete and run.mechanism.has_bodies and _has_failed(code):
+        given = solution if located is None else located, run.mechanism, run.analysis, run.choices.drift_tol, end
+        if not is_traced(found := without_derivatives(given)):  # as in a call of `jax.grad`
+            failed, mechanism, analysis, tol, last = found
+            return _required(explained(failed, mechanism, analysis, tol, run.choices.solver, last), throw)
+    if not run.is_concrete or isinstance(solution.code, Tracer):
+        solution = solution if located is None else dataclasses.replace(solution, unlocated=located.time)
+        return solution if isinstance(code, Tracer) else _required(solution, throw)
+    if missed:  # with the numbers of the given analysis more rows were redundant
+        run = run._replace(analysis=analysis_of(run.mechanism))
+        solution, _, end, code = _integrate(run)
+    if int(code) in SUCCESSES:
+        return solution if located is None else dataclasses.replace(solution, unlocated=located.time)
+    return _required(run.explained(solution if located is None else located, end), throw)
 
 
 def _has_failed(code: Any) -> bool:
@@ -248,26 +272,19 @@ def _required(solution: Solution, throw: bool) -> Solution:
     return solution
 
 
-def _run(
-    system: Any,
-    analysis: Analysis | None,
-    ts: Any,
-    state: State | None,
-    closure: Closure | None,
-    choices: Choices,
-    all_concrete: bool,
-) -> tuple[Solution, Any, Any, Any]:
+def _integrate(run: _Run) -> tuple[Solution, Any, Any, Any]:
     """Return the solution, whether rows left out as redundant are independent, the last state (t, (q, v)), and the `Result`.
 
     The result is a NumPy number if machine code is called by NumPy: reading that of the solution from a graphics card takes long.
     With concrete numbers NumPy calls machine code directly; everything else is traced.
     """
+    _, system, analysis, ts, state, closure, choices, _, all_concrete, _ = run
     if all_concrete:
         with jax.ensure_compile_time_eval():  # concrete even while something else is traced
             compiled = compile_concrete(system, analysis, *choices.of_mechanism)
             if compiled.plan.is_native:
-                run = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
-                return _finish(run, integrate_concrete(run.problem), system.body_names, choices, np)
+                prepared = prepare_run(compiled, analysis, np.asarray(ts, float), state, closure, choices, np)
+                return _finish(prepared, integrate_concrete(prepared.problem), system.body_names, choices, np)
     arguments = system.without_origin, analysis, number(ts), state, closure, choices.arrays(), not is_traced(ts)
     if is_within_jit():  # concrete numbers become tracers, too
         return _simulate(*arguments)
