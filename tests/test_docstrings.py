@@ -16,7 +16,11 @@ NO_SUBJECT = re.compile("(What|Whatever|Whether|Which|Who|Whose|How|Where|When|A
 OBJECT = re.compile("(?:Return|Iterate over) (what|whatever|who|how many|how far|how much|how often|where)\\b")  # likewise
 CLAUSE = re.compile("(what|whatever|which|who|whose|how|that|those)\\b", re.IGNORECASE)  # begins no description, and no comment
 PUBLIC = {f"udkjax.{name}": getattr(udkjax, name) for name in udkjax.__all__}
-PUBLIC |= {f"udkjax.equations.{name}": found for name, found in vars(evaluate).items() if hasattr(found, "__wrapped__")}
+PUBLIC |= {
+    f"udkjax.equations.{name}": found
+    for name, found in vars(evaluate).items()
+    if hasattr(found, "__wrapped__") and name[0] != "_"
+}
 FUNCTIONS = {name: x for name, x in PUBLIC.items() if inspect.isfunction(x)}
 
 
