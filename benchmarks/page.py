@@ -1,6 +1,5 @@
 """The page of results: figures and one table, self-contained."""
 
-import re
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
@@ -10,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.table import VERDICT, Figures, Rows
-from experiments.paper import page
-from experiments.paper.page import embedded
+from udkjax.show.report import embedded, report_style
 
 WIDTH = 9.2  # inches
 MOTIONS = {-45.0: "released at −45°", 60.0: "released at +60°: singular configurations"}
@@ -20,12 +18,11 @@ STYLES = {"udkjax": {"color": "black", "lw": 2.2}, "C++": {"color": "#c03030", "
 
 def write(figures: Figures, judged: Rows, about: dict[str, Any], missing: Iterable[str], target: Path) -> None:
     """Write the page from the results of the benchmarks, by name."""
-    style = re.search(r"<style>.*?</style>", Path(page.__file__).with_name("page.html").read_text(encoding="utf-8"), re.DOTALL)
     missing = list(missing)
     parts = [
         "<!DOCTYPE html>",
         '<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>How fast udkjax is</title>{style[0] if style else ''}</head><body>",
+        f"<title>How fast udkjax is</title><style>{report_style()}</style></head><body>",
         "<h1>How fast udkjax is</h1>",
         f'<p class="lead">{escape("; ".join(f"{key} {value}" for key, value in about.items()))}</p>',
         f"<p>Not measured here: {escape(', '.join(missing))}.</p>" if missing else "",

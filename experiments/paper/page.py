@@ -1,19 +1,17 @@
 """The report: one HTML page, drawn from the study's dataset alone."""
 
-import base64
-import io
 from collections.abc import Callable
 from pathlib import Path
 from string import Template
 from typing import Any
 
 from udkjax.extras import OptionalImport
+from udkjax.show.report import embedded, report_style
 
 from . import figures, tables
 from .findings import findings, growth_time, nfunc_note, psi2_note, repeat, second_choice, summary
 
 with OptionalImport():
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
 FIGURES: dict[str, tuple[Callable[[Any], Figure], str, str]] = {
@@ -61,6 +59,7 @@ def page(data: Any) -> str:
     pictures = {name: figure(data, name) if _drawable(data, name) else "" for name in FIGURES}
     template = Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
     return template.substitute(
+        style=report_style(),
         summary=summary(data),
         findings=findings(data),
         rules=tables.rules(data),
@@ -94,16 +93,6 @@ def figure(data: Any, name: str) -> str:
     """Return one of the `FIGURES` as HTML, its picture inside."""
     draw, alt, caption = FIGURES[name]
     return embedded(lambda: draw(data), alt, caption, name)
-
-
-def embedded(draw: Callable[[], Figure], alt: str, caption: str, kind: str = "") -> str:
-    """Return a picture with its caption as HTML that needs no other file."""
-    with rc_context({"svg.hashsalt": "udkjax", "path.simplify_threshold": 1.0}):
-        buffer = io.BytesIO()
-        draw().savefig(buffer, format="svg", metadata={"Date": None})
-    source = base64.b64encode(buffer.getvalue()).decode()
-    image = f'<img src="data:image/svg+xml;base64,{source}" alt="{alt}">'
-    return f'<figure class="{kind}">{image}<figcaption>{caption}</figcaption></figure>'
 
 
 def _drawable(data: Any, name: str) -> bool:
