@@ -48,6 +48,11 @@ def project(slow, tmp_path, monkeypatch):
     return tmp_path
 
 
+def test_few_tests_have_no_faster_counterpart(slow):
+    """The number may only fall: a faster test of what one of them shows takes it from the list, and lowers the number."""
+    assert sum(len(tests) for tests in slow.ONLY_SLOW.values()) <= 51
+
+
 def test_results_of_parts_are_those_of_pytest(slow, project):
     parts = slow.collect(sys.executable)
     assert {name: len(tests) for name, tests in parts.items()} == {"a": 2, "rest": 1}
