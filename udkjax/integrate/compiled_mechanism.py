@@ -239,7 +239,7 @@ def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, brea
         code=textbook.programs,
         method=method_of(solver),
         projected=projected,
-        breaks=breakpoints is not None or _is_piecewise(mechanism),
+        breaks=breakpoints is not None or _is_piecewise(mechanism) or textbook.programs.piece_count > 0,
         sampled=SampleRows(mechanism, breakpoints).places(mechanism),
         **_method_code(equations)._asdict(),
         changes=solver is None and not equations.solves_constraints,

@@ -25,7 +25,7 @@ OUTPUTS = {
     "terms": "a_F without friction that depends on the loads of joints, followed by b of all rows",
     "terms with friction": "the same with such friction, by the loads of elimination",
     "energy": "the kinetic and the potential energy (J); the potential of gravity is zero at the origin",
-    "pieces": "the index of the smooth piece of each piecewise smooth element",
+    "pieces": "the index of the smooth piece of each piecewise smooth element, and the loads of edges, of `settled`",
     # by elimination, under the policy in a program that computes accelerations, and else without dependent rows
     "a": "accelerations; if the program reports `unsettled`, friction takes one round of Newton's method for the loads of joints",
     "unsettled": "whether friction needs further rounds, or its loads may be no solution",
@@ -127,7 +127,7 @@ class RunPrograms:
     @classmethod
     def goes_on(cls, outputs: Collection[str]) -> bool:
         """Return whether a program with these outputs begins with the arrays `BEGINS`."""
-        return not {"a further", "a settled"}.isdisjoint(outputs)
+        return not {"a further", "a settled", "pieces"}.isdisjoint(outputs)
 
     def drops(self, outputs: Collection[str]) -> bool:
         """Return whether a program with these outputs leaves out rows with small pivots."""

@@ -65,6 +65,7 @@ class ScenePrograms(RunPrograms):
         self._terms = SceneTerms(layout, self._kernels)
         self._solver = SceneSolver(self._terms, policy)
         self.scratch, self.row_names, self.has_piecewise_loads = layout.sizes, layout.row_names, layout.has_piecewise_loads
+        self.first_edge = layout.first_edge
         self.coordinate_count, self.row_count = layout.coordinate_count, layout.row_count
         self.scale_count = ROWS + self.row_count  # the number of values that `scales` returns
         self.rolling_rows = layout.rolling_rows

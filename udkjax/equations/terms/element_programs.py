@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udkjax.equations.terms.elements import differentiate_constraint, has_pieces, trace_force, trace_piece, trace_rubbing
+from udkjax.equations.terms.elements import (
+    differentiate_constraint,
+    has_pieces,
+    trace_edge_loads,
+    trace_force,
+    trace_piece,
+    trace_rubbing,
+)
 from udkjax.equations.terms.structure import Element, ElementStructure, element_kinds
 from udkjax.expressions import Graph, Scalar, frontier
 from udkjax.scene.mechanism import Mechanism
@@ -99,7 +106,8 @@ class RubbingPrograms(ElementPrograms):
     """The friction of a joint that depends on its load, with x = -lambda of its eliminated rows among the inputs.
 
     Outputs: `loads`, 3 for each body, and `slopes`, their derivatives by each x, row by row. The loads are homogeneous in x, of
-    degree one: they are the sum of x times the slopes.
+    degree one: they are the sum of x times the slopes. Where one of the `edges`, loads whose magnitudes count, passes through
+    zero, the friction has a kink.
     """
 
     def __init__(self, structure: ElementStructure, row_count: int, rows: tuple[int, ...]):
@@ -109,7 +117,8 @@ class RubbingPrograms(ElementPrograms):
         x = dict(zip(rows, self.x, strict=True))
         multipliers = [-x[row] if row in x else zero for row in range(row_count)]
         loads, slopes = trace_rubbing(self.graph, structure, self.leaves, self.t, self.q, self.v, multipliers)
-        self.outputs = {"loads": loads, "slopes": [-s for row in rows for s in slopes[row]]}
+        edges = trace_edge_loads(self.graph, structure, self.leaves, multipliers)
+        self.outputs = {"loads": loads, "slopes": [-s for row in rows for s in slopes[row]], "edges": edges}
         self._find_constants()
 
 

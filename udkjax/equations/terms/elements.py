@@ -183,6 +183,25 @@ def traced_loads(element: ForceElement, frames: Sequence[str]) -> TracedLoads:
     return _traced_loads(element_structure(element, frames))
 
 
+def trace_edge_loads(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], multipliers: list[Scalar]) -> list[Scalar]:
+    """Return the loads of a `RubbingJoint` whose magnitudes its friction depends on."""
+    found = _trace_edge_loads(kind.tree, kind.shapes, len(multipliers))
+    return [] if found is None else [as_scalar(s) for s in found(graph, leaves, [np.asarray(s, object) for s in multipliers])[0]]
+
+
+@lru_cache(maxsize=256)
+def _trace_edge_loads(tree: TreeDef, shapes: LeafShapes, rows: int) -> TraceFunction | None:
+    arguments = [jax.ShapeDtypeStruct(*s) for s in shapes], [jax.ShapeDtypeStruct((), jnp.result_type(float))] * rows
+
+    def edge_loads(leaves, multipliers):
+        element = jax.tree.unflatten(tree, leaves)
+        return element.friction.edge_loads(element.joint, multipliers)
+
+    if not jax.eval_shape(edge_loads, *arguments):
+        return None
+    return trace(lambda *given: (jnp.stack(edge_loads(*given)),), *arguments)
+
+
 def has_pieces(element: Element) -> bool:
     """Return whether an element is piecewise smooth, that is, overrides the method `piece`."""
     if isinstance(element, RubbingJoint):

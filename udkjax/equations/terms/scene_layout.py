@@ -213,7 +213,13 @@ class SceneLayout:
             for group in (*self.constraints, *self.forces)
             if "piece" in group.programs.outputs
         ]
-        self.has_piecewise_loads = any(isinstance(group, ForceGroup) for group, _ in self.pieces)
+        self.edges, self.first_edge = [], self.sizes["pieces"]  # shared loads are no results of a run's programs
+        for group in self.rubbing if not self.shared else ():
+            assert group.rubbing is not None
+            count = len(group.rubbing.outputs["edges"])
+            if count:
+                self.edges.append((group, self.reserve("pieces", count * len(group.table)) + count * np.arange(len(group.table))))
+        self.has_piecewise_loads = bool(self.edges) or any(isinstance(group, ForceGroup) for group, _ in self.pieces)
         self.body_table = np.array([[3 * b, 2 * b, self.of_body(b)] for b in range(self.body_count)]).reshape(-1, 3)
 
     def _kinds(self, labels: Sequence[Hashable] | None = None) -> list[ElementKind]:

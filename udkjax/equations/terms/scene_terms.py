@@ -25,6 +25,7 @@ from udkjax.equations.terms.scene_layout import (
 )
 from udkjax.expressions import Graph, Scalar, trace
 from udkjax.expressions.loops.loop_program import ADD, SET, Kernel, KernelLoop, KernelWriter, Reset
+from udkjax.expressions.scalars.selection import greater, where
 from udkjax.scene.elements.friction import Friction
 
 ProgramParts = Iterator[KernelLoop | Reset]
@@ -240,7 +241,11 @@ class SceneTerms:
             yield self.over_rubbing("power", group, writer(group.rubbing), x=self.loads_of(solution))
 
     def pieces(self) -> ProgramParts:
-        """Compute the index of the smooth piece of each piecewise smooth element."""
+        """Compute the index of the smooth piece of each piecewise smooth element, and the loads of edges.
+
+        An edge has two pieces, by the sign of its load. Its load is given as the acceleration of the lighter body by it (m/s^2);
+        the loads of joints with friction have `settled` before.
+        """
         for group, places in self.layout.pieces:
             base = group.table.shape[1]
 
@@ -248,6 +253,20 @@ class SceneTerms:
                 w.write(group.programs.outputs["piece"][0], "pieces", base)
 
             loop = self.over_group("piece", group, write)
+            yield loop._replace(table=np.concatenate([group.table, places[:, None]], 1))
+        for group, places in self.layout.edges:
+            base = group.table.shape[1]
+
+            def write_edges(w: KernelWriter, group: ConstraintGroup = group, base: int = base):
+                assert group.rubbing is not None
+                lightest = w.graph.constant(0.0)
+                for b in range(len(group.bodies)):
+                    mobility = compliance(w, 0, BODIES + 3 * b + BODY_CONSTANTS)
+                    lightest = where(greater(mobility, lightest), mobility, lightest)
+                for k, edge in enumerate(group.rubbing.outputs["edges"]):
+                    w.write(edge * lightest, "pieces", base, k)
+
+            loop = self.over_rubbing("edges", group, write_edges, x="settled")
             yield loop._replace(table=np.concatenate([group.table, places[:, None]], 1))
 
     # --- products with the eliminated rows of Psi_q and their transpose

@@ -3,9 +3,10 @@
 from udkjax.expressions.loops.loop_derivative import TWICE
 from udkjax.native.derivatives.saltation import add_memory, write_saltation
 from udkjax.native.derivatives.tangents import Forward
-from udkjax.native.language.ir import Function, Value
+from udkjax.native.language.ir import BOOL, Function, Value
 from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.program_derivative import WAYS
+from udkjax.native.module.steps import ACROSS_EDGE
 
 
 class ForwardTwice(Forward):
@@ -17,7 +18,8 @@ class ForwardTwice(Forward):
     They are lost, NaN, where a step by the fallback leaves unbounded loads of joints out of their friction. Near the singular
     configuration such a load is c / d, with the distance d. The steps of a run keep the range without it at the same distances,
     but steps are not differentiated: along a change that moves the configuration by x there, the range stays behind, and the
-    second derivatives of log d at its two ends, -(x / d)^2, are missing. This error does not decrease with the steps.
+    second derivatives of log d at its two ends, -(x / d)^2, are missing. This error does not decrease with the steps. They are
+    lost, too, where a load that depends on time changes its sign: the jump (saltation.py) is that of a surface at rest.
     """
 
     mode = TWICE
@@ -34,8 +36,12 @@ class ForwardTwice(Forward):
             write_saltation(self)
 
     def _finish_change(self, f: Function, s: Lane, accept: Value):
+        lost = f.const(False, BOOL, f.width)
         if self.settles and self.falls_back:
-            lost = accept & (s.fallback > 0.5)
+            lost = lost | (accept & (s.fallback > 0.5))
+        if self.finds_edges and "t" in self.code.of(*self.programs["accelerations"].outputs).arrays:
+            lost = lost | (accept & s.crosses.is_(ACROSS_EDGE))
+        if self.settles:
             with f.if_(f.any_of(lost)):
                 self._lose(f, lost)
         if self.pieces:

@@ -169,10 +169,8 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "lost": "index of the first output at which Psi is violated by more than `drift_tol`; infinite if none",
     "crossing": "time at which a piece of the state is expected to end (s)",
     "aim": "where the attempt ends relative to the crossing: before, beyond, or across it",
-    "crosses": "whether the attempt leads across the crossing",
+    "crosses": "what the attempt leads across: nothing, ACROSS_PIECE, ACROSS_EDGE",
     "tries": "number of successive attempts to end at the crossing",
-    "share": "upper bound of the end of the piece, as a fraction of the attempted step",
-    "low": "lower bound of the end of the piece, as a fraction of the attempted step",
     "again": "whether the step is repeated to end at the crossing",
 }
 

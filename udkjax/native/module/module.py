@@ -75,6 +75,7 @@ class Module(Running):
         self.measures_drift = plan.steps and m > 0 and not plan.projected
         self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports and not self.partitions
         self.pieces = code.piece_count if plan.breaks else 0
+        self.finds_edges = self.pieces > 0 and code.first_edge < self.pieces
         names = self.program_names()
         self.settles = code.rubs and any(name in SETTLING for name in names)  # friction may need further rounds
         self.programs = {name: PROGRAMS[name] for name in (*names, *((FURTHER,) if self.settles else ()))}
@@ -131,6 +132,10 @@ class Module(Running):
         p.add("terms", code.term_count)
         for name in ("pieces", "pieces before"):
             p.add(name, self.pieces)
+        if self.finds_edges:
+            p.add("piece a", n)
+            for name in ("edges", "edges before"):
+                p.add(name, self.pieces - code.first_edge)
         if plan.sampled:
             p.add("numbers", -(-code.number_count // plan.width))
         if not self.unrolled:

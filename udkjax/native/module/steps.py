@@ -54,7 +54,14 @@ NEAR_END = 0.01
 # A repeated step ends slightly beyond the end of a piece. Once the end of the piece has been located, a step ends just before it,
 # and the next step crosses it.
 AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
-HALVINGS = 40  # bisections that locate the end of a piece within a step
+# A step crosses the end of a piece of an element, or a state where the load of a joint with friction changes its sign.
+ACROSS_PIECE, ACROSS_EDGE = 1.0, 2.0
+HALVINGS = 40  # at most; they locate the end of a piece within a step
+# Share of the tolerance of velocities. A load that would change them less in a step may be a rounding error of random sign: the
+# slide has no load.
+NO_LOAD = 0.01
+# Share of the load of an edge at the start of a step. If it is smaller at the end, stages near the end may be beyond its zero.
+NEAR_ZERO = 0.2
 TRIES = 8  # successive attempts to end a step at the end of a piece; for a state at rest there, rounding decides between pieces
 
 # Stages of implicit methods. A correction below STAGE_TOL of the tolerance of a step is the last. The rate of convergence, the

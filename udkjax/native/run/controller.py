@@ -64,6 +64,10 @@ def write_decide(module: Module):
         f.call("end_piece", f.given["work"])
         repeats = s.again > 0.5
     accept = stepping & (error < 1.0) & ~shortens & ~repeats
+    if module.finds_edges:
+        with f.each(module.pieces - module.code.first_edge) as k:
+            new, old = (module.entry(f, name, k) for name in ("edges", "edges before"))
+            module.put_entry(f, "edges before", k, where(accept, new, old))
     stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
     factor, rate = _step_factor(module, f, s, accept, step, tries)
     h = where(stepping, step * where(shortens, f.const(FACTORS.safety, DOUBLE, f.width), factor), s.h)

@@ -47,19 +47,19 @@ def write_locate(module: WatchMemory):
         return count.value
 
     inf = f.const(float("inf"), DOUBLE, f.width)
-    s.where(s.seeks > 0.5, aim=inf, looks=zero)
+    s.where(s.seeks > 0.5, next_look=inf, looks=zero)
     watched = s.holds
     s.holds = f.select(s.seeks > 0.5, hit_forces(), zero)  # the others are not asked for
     with f.while_(wide):
-        is_between = (s.aim > s.low) & (s.aim < s.high) & (s.looks < float(MOST_AIMS))
-        s.look = f.select(is_between, s.aim, (s.low + s.high) * 0.5)
+        is_between = (s.next_look > s.low) & (s.next_look < s.high) & (s.looks < float(MOST_AIMS))
+        s.look = f.select(is_between, s.next_look, (s.low + s.high) * 0.5)
         f.call("look", work)
         due, is_beyond, root = s.due > 0.5, crossed() >= 0.0, zero_ahead()
         s.where(due & is_beyond, high=s.look)
         s.where(due & ~is_beyond, low=s.look)
         change = s.look - root
         beyond = f.max(change * change * s.omega, s.smallest * (UNIT * 0.25))  # the error of Newton's step, or a bound's distance
-        s.where(due, aim=f.select(is_beyond, root - beyond, root + beyond), looks=s.looks + 1.0)
+        s.where(due, next_look=f.select(is_beyond, root - beyond, root + beyond), looks=s.looks + 1.0)
     s.look, s.due = s.high, s.seeks
     f.call("look", work)
     s.holds = watched

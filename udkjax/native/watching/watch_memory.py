@@ -25,7 +25,7 @@ LANE_NUMBERS = {
     "look": "time at which conditions are evaluated (s)",
     "low": "lower bound of the time of a crossing (s)",
     "high": "upper bound of the time of a crossing (s)",
-    "aim": "time at which the search for a crossing is to look next (s)",
+    "next_look": "time at which the search for a crossing is to look next (s)",
     "looks": "number of times at which it has looked",
     "holds": "number of forces of interest where conditions are evaluated",
     "seeks": "whether a crossing is being located",
@@ -45,6 +45,7 @@ class WatchMemory(PassingRuns):
         self.outputs = ("crossing", "passed") if passing else ("crossing",)
         self.inputs = (*self.inputs, "watch")
         for name in LANE_NUMBERS:
+            assert name not in self.places.places, name  # one place for two numbers
             self.places.add(name)
         self.places.add("condition numbers", conditions.number_count)
         for name in ("side", "on", "floor", "direction", "g", "rate", "g0", "rate0", "g1", "rate1", "side1", "side2", "hit"):

@@ -197,16 +197,22 @@ class Friction(ForceElement):
         size = self._load_of(joint, multipliers) if arm is None else arm * self._load_of(joint, multipliers)
         return total + (self.coefficient if self.static_coefficient is None else self.static_coefficient) * size
 
+    def edge_loads(self, joint: Joint, multipliers: Sequence[Number]) -> list[Number]:
+        """Return the loads (N) of a slot, or of both edges of a guide, whose magnitudes count; none in a revolute joint."""
+        if isinstance(joint, Revolute):
+            return []
+        if self.length is None:
+            return [multipliers[0]]
+        half, couple = multipliers[0] / 2, multipliers[1] / self.length
+        return [half + couple, half - couple]
+
     def _load_of(self, joint: Joint, multipliers: Sequence[Number]) -> Number:
         """Return the load (N) that the coefficient multiplies: |R|, or |N| of the edges of a guide."""
         if isinstance(joint, Revolute):
             x, y = multipliers
             square = x * x + y * y
             return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))  # NaN stays: it is a jam
-        if self.length is None:
-            return jnp.abs(multipliers[0])
-        half, couple = multipliers[0] / 2, multipliers[1] / self.length
-        return jnp.abs(half + couple) + jnp.abs(half - couple)
+        return sum(map(jnp.abs, self.edge_loads(joint, multipliers)))
 
     def _direction(self, speed: Number) -> Number:
         """Return the sign of a speed, 0 at rest."""

@@ -28,6 +28,9 @@ from udkjax.scene.elements.joints import Angle, Joint, Revolute, Slot
 class ContactFriction(DirectedFriction):
     """Friction of a contact, in the slot that holds it at rest: its load has a sign, and is negative where the contact pulls."""
 
+    def edge_loads(self, joint, multipliers):
+        return []
+
     def _load_of(self, joint, multipliers):
         return -multipliers[0]
 
