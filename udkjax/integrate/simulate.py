@@ -234,10 +234,10 @@ def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:
     most = (MAX_EVENTS_STICKING if run.sticks else MAX_EVENTS) if max_events is None else max_events
     given = run.analysis, run.ts, run.state, run.closure, run.choices
     solution, end = simulate_events(run.system, events, *given, most, run.all_concrete)
-    # Events may have changed what moved, whose cause is not known then; joints that stick or slip have not.
-    changes = events is not None and (not run.mechanism.has_bodies or int(solution.stats.get("events", 0)) > 0)
-    if not run.is_concrete or not _has_failed(solution.code) or changes:
+    if not run.is_concrete or not _has_failed(solution.code):
         return solution
+    if events is not None and (not run.mechanism.has_bodies or int(solution.stats.get("events", 0))):
+        return solution  # events may have changed what moved; joints that stick or slip have not
     return run.explained(solution, end) if events is not None or run.sticks else solution
 
 

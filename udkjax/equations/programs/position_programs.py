@@ -21,7 +21,7 @@ from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontie
 from udkjax.expressions.algebra.differential import Differential
 from udkjax.expressions.algebra.elimination import SymbolicFactors
 
-Model = Callable[..., dict[str, jax.Array]]
+PositionModel = Callable[..., dict[str, jax.Array]]
 TracedModel = Callable[..., list[np.ndarray]]
 
 
@@ -193,7 +193,7 @@ class PositionPrograms:
         return tau, [tau * slope for slope in slopes]
 
 
-def trace_model(model: Model, parameters: int, coordinates: int, data: int = 0) -> TracedModel:
+def trace_model(model: PositionModel, parameters: int, coordinates: int, data: int = 0) -> TracedModel:
     """Trace a model for any number of programs; the arguments are those of `PositionPrograms`."""
     examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
     return trace(lambda *numbers: [model(*numbers)[k] for k in ("psi", "q0", "s0", "measures")], *examples)

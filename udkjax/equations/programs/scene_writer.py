@@ -17,7 +17,7 @@ RIGHTS = {
     "psi": ("q1", "q1 refined"),
     "psi_dot": ("v1", "v1 refined", "dq1 by value"),
 }
-Needs = tuple[str, ...]
+Requires = tuple[str, ...]
 Loops = Callable[[], Iterable[KernelLoop | Reset]]
 
 
@@ -36,7 +36,7 @@ class SceneWriter:
     def __init__(self, solver: SceneSolver, outputs: Sequence[str], drops: bool):
         self._solver, self._terms, self._outputs, self._drops = solver, solver.terms, outputs, drops
         has_friction = solver.friction is not None
-        with_friction: Needs = ("solution",) if has_friction and "terms with friction" in outputs else ()
+        with_friction: Requires = ("solution",) if has_friction and "terms with friction" in outputs else ()
         self._rights = [right for right, users in RIGHTS.items() if not {*outputs, *with_friction}.isdisjoint(users)]
         self._solves = len(self._rights)
         self._table = self._terms_of_equations(with_friction) | self._results_of_elimination()
@@ -57,7 +57,7 @@ class SceneWriter:
         write(self._outputs)
         return LoopProgram(parts)
 
-    def _terms_of_equations(self, with_friction: Needs) -> dict[str, tuple[Needs, Loops]]:
+    def _terms_of_equations(self, with_friction: Requires) -> dict[str, tuple[Requires, Loops]]:
         """Return the loops of each result, with the results that they need first."""
         terms = self._terms
         return {
@@ -77,7 +77,7 @@ class SceneWriter:
             "pieces": (("sines",), terms.pieces),
         }
 
-    def _results_of_elimination(self) -> dict[str, tuple[Needs, Loops]]:
+    def _results_of_elimination(self) -> dict[str, tuple[Requires, Loops]]:
         terms, solver, elimination = self._terms, self._solver, self._solver.elimination
         by_value = "dq1 by value" in self._outputs
         of_system = (*(["rest"] if by_value else []), "sines", *(["free"] if "b" in self._rights else []))

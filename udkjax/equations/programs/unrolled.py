@@ -16,7 +16,7 @@ from udkjax.expressions.loops.loop_derivative import COTANGENT, FORWARD, OTHER, 
 from udkjax.expressions.loops.loop_program import LoopProgram
 from udkjax.expressions.loops.unroll import ArrayPlace, Arrays, unroll
 
-Outputs = tuple[str, ...]
+OutputNames = tuple[str, ...]
 SLOPES = ("slopes",)  # the key of the derivative of the accelerations by the state alone
 
 
@@ -51,8 +51,8 @@ class Unrolled:
     def __init__(
         self,
         programs: RunPrograms,
-        asked: Iterable[Outputs],
-        differentiated: Iterable[Outputs] = (),
+        asked: Iterable[OutputNames],
+        differentiated: Iterable[OutputNames] = (),
         active: Sequence[bool] = (),
         mode: str = FORWARD,
         slopes: bool = False,
@@ -115,7 +115,7 @@ class Unrolled:
         """The accelerations with their derivative by the state alone."""
         return self.derivative(*SLOPES)
 
-    def evaluations(self, named: Mapping[str, Outputs]) -> UnrolledProgram:
+    def evaluations(self, named: Mapping[str, OutputNames]) -> UnrolledProgram:
         """Return the program of the numbers that derivatives need at one state, in arrays "stored" plus the name of a program."""
         stored: dict[ArrayPlace, Scalar] = {}
         for name, outputs in named.items():
