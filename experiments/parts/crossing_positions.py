@@ -10,7 +10,7 @@ from udkjax.positions.answers.counting import count_of
 
 
 def first_body(m: Any) -> str:
-    return getattr(m, "body_names", ("none",))[0]
+    return (getattr(m, "body_names", ()) or ("none",))[0]
 
 
 def still(case: Case) -> Any:
