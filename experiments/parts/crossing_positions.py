@@ -9,8 +9,13 @@ from experiments.parts.crossing_case import TS, Case, WrongError, agree, by_twin
 from udkjax.positions.answers.counting import count_of
 
 
+def bodies_of(m: Any) -> tuple[str, ...]:
+    """Return the names of the bodies of a model; without bodies, a name that the functions refuse."""
+    return getattr(m, "body_names", ()) or ("none",)
+
+
 def first_body(m: Any) -> str:
-    return (getattr(m, "body_names", ()) or ("none",))[0]
+    return bodies_of(m)[0]
 
 
 def still(case: Case) -> Any:
@@ -234,10 +239,10 @@ def workspace(case: Case) -> str:
     m, held = case.model, dict(case.held or {})
     second = next(iter(held), None)
     if second is None:  # one degree of freedom: refused
-        second = f"body.{getattr(m, 'body_names', ('none',))[-1]}.angle"
+        second = f"body.{bodies_of(m)[-1]}.angle"
         held = {second: 0.0}
     first = held.pop(second)
-    body = getattr(m, "body_names", ("none",))[-1]
+    body = bodies_of(m)[-1]
     found = udk.workspace(m, {case.driver: case.values(), second: first + np.linspace(0.0, 0.05, 3)}, body, [0.01, 0.0])
     q = np.asarray(case.kinematics(m).q)[:, m.body_names.index(body)]
     wanted = q[:, :2] + 0.01 * np.stack([np.cos(q[:, 2]), np.sin(q[:, 2])], 1)
@@ -260,7 +265,7 @@ def check(case: Case) -> str:
 def with_length(case: Case) -> str:
     """All attachment points of the body are as far apart as asked for."""
     m = case.model
-    for name in getattr(m, "body_names", ("none",)):
+    for name in bodies_of(m):
         try:
             found = udk.with_length(m, name, 0.3)
         except udk.SceneError as error:
