@@ -262,6 +262,7 @@ run = lambda mass: udk.simulate(changed(mass), np.linspace(0.0, 0.1, 3), throw=F
 with warnings.catch_warnings(record=True) as found:
     warnings.simplefilter("always")
     lowered = jax.jit(jax.jacfwd(run)).lower(np.float32(1.0))
-print(lowered.out_info.dtype, *{str(warning.message) for warning in found})
+others = {str(warning.message) for warning in found if not issubclass(warning.category, DeprecationWarning)}
+print(lowered.out_info.dtype, *others)  # older Equinox uses what JAX deprecates
 """
     assert python(code, JAX_ENABLE_X64=0).strip() == "float32"
