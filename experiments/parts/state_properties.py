@@ -157,10 +157,10 @@ class Programs:
     def run(self, outputs: tuple[str, ...], q: np.ndarray, v: np.ndarray, dv: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
         """Return the results (members, ...) of a program at q and v (members, n), t = 0, by array."""
         given = {"constants": self._constants, "t": np.zeros((len(q), 1)), "q": q, "v": v, "dq": 0.0 * q, "dv": dv + 0.0 * v}
-        program, inputs, outputs = self._unrolled.program(*outputs)
+        program, inputs, places = self._unrolled.program(*outputs)
         unused = np.zeros(len(q))  # loads of friction that other programs begin with
         values = _run(program, np.stack([given[x][:, k] if x in given else unused for x, k in inputs], 1))
-        return {x: values[:, [i for i, (y, _) in enumerate(outputs) if y == x]] for x in dict.fromkeys(y for y, _ in outputs)}
+        return {x: values[:, [i for i, (y, _) in enumerate(places) if y == x]] for x in dict.fromkeys(y for y, _ in places)}
 
     def accelerations(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """a (members, n) by elimination, and whether each is safe."""

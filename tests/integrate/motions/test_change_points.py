@@ -64,7 +64,8 @@ def test_second_derivatives_end_where_loads_are_left_out_of_friction():
     """Past a change point, at 0.06 s, they would depend on the steps that leave the loads out; before it they are right."""
 
     def angles(x):
-        mech = parallelogram(*SIZES[1, :4], 0.1 * x[0]).with_parameters({"body.coupler.mass": 0.7 * x[1]})
+        length, spacing, radius, speed = SIZES[1, :4]
+        mech = parallelogram(length, spacing, radius, speed, 0.1 * x[0]).with_parameters({"body.coupler.mass": 0.7 * x[1]})
         return udk.simulate(mech, [0.0, 0.03, 0.1], rtol=1e-9, atol=1e-9).q[1:, 0, 2]
 
     first = np.asarray(jax.jit(jax.vmap(jax.jacrev(angles)))(jnp.concatenate([ONE[None], ONE + SHIFTS / 10])))

@@ -92,7 +92,7 @@ def test_second_derivatives_end_at_zeros_of_loads_that_depend_on_time():
     def moved(x):
         mech, start = slot("smooth")
         swing = {"swing": Swing(("body",), 0.5 * x)}
-        mech = udk.Mechanism(mech.bodies, mech.joints, forces=mech.forces | swing, gravity=mech.gravity)
+        mech = udk.Mechanism(mech.bodies, mech.joints, forces={**mech.forces, **swing}, gravity=mech.gravity)
         return udk.simulate(mech, [0.0, EARLY, END], start, rtol=1e-8, atol=1e-8).q[1:, 0, 0]
 
     early, late = jax.jit(jax.jacfwd(jax.jacfwd(moved)))(1.0)
