@@ -20,6 +20,10 @@ RANK = 1e-8  # singular values, relative to the largest, of rows that count
 STIFF = 30.0  # damping (N m s or N s/m) beyond which SciPy's explicit method takes too long
 STEP = 1e-5  # of differences around an equilibrium
 EVALUATIONS = 40_000  # of the reference in one run
+NEAR, FINE = (
+    0.02,
+    400,
+)  # smallest of the singular values that count, relative to the largest, at a change point; outputs to find it
 PROPERTIES = {
     "closed": Property("Joints stay closed along a run, positions and velocities", 1e-8, "Newton's method after each step"),
     "accelerations": Property("Accelerations are those of the reference", 1e-9, "rounding, and its growth"),
@@ -137,7 +141,19 @@ def check_reference(case: Case) -> None:
         y = found.y[:, -1]
     right = np.concatenate([y[:n].reshape(-1, 3), y[n:].reshape(-1, 3)], axis=-1)
     last = np.concatenate([np.asarray(case.tight.q)[-1], np.asarray(case.tight.v)[-1]], axis=-1)
-    case.check("reference", difference(last, right) / case.growth, ending(case.tight))
+    error = difference(last, right) / case.growth
+    if error > case.tolerances["reference"] and _passes_a_change_point(case):
+        case.tally.leave_out("the reference, without projection, takes the other branch at a change point")
+        return
+    case.check("reference", error, ending(case.tight))
+
+
+def _passes_a_change_point(case: Case) -> bool:
+    """Return whether motions branch somewhere along the run, where a rounding error decides which one the reference follows."""
+    run = case.run(TIGHT, np.linspace(0.0, SPAN, FINE))
+    ordinary = int(np.sum((start := np.asarray(udk.singular_values(case.mechanism, 0.0, run.q[0]))) > RANK * start[0]))
+    along = (np.asarray(udk.singular_values(case.mechanism, t, q)) for t, q in zip(run.ts, run.q, strict=True))
+    return any(s[ordinary - 1] < NEAR * s[0] for s in along)
 
 
 def _breakpoints(case: Case) -> list[float]:
