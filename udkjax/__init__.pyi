@@ -143,6 +143,7 @@ from udkjax.statics.modes import modes as modes
 from udkjax.statics.reaction_peaks import envelope as envelope
 from udkjax.statics.reaction_peaks import pin_reactions as pin_reactions
 from udkjax.statics.reaction_peaks import reaction_peaks as reaction_peaks
+from udkjax.study.belief import inference as inference
 from udkjax.study.channel_values import path as path
 from udkjax.study.diagnosis import Diagnosis as Diagnosis
 from udkjax.study.diagnosis import SystemDiagnosis as SystemDiagnosis

@@ -123,6 +123,7 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "identify": {"": studies.identify, "names": studies.identify_names},
     "check_gradients": {"": studies.check_gradients, "names": studies.check_gradients_names},
     "design_experiment": {"": studies.design_experiment},
+    "inference": {"": studies.inference},
     "sweep": {"": studies.sweep, "names": studies.sweep_names},
     "design": {"": studies.design},
     "design_all": {"": studies.design_all},

@@ -87,6 +87,20 @@ def design_experiment(case: Case) -> str:
     return agree(found.standard_errors[0, 0], information**-0.5, "sensitivities by differences", 1e-3)
 
 
+def inference(case: Case) -> str:
+    """The likelihood of a record at a number that did not make it, from a run with that number."""
+    name, values = case.number, next(iter(channel(case).values()))
+    model = case.model.with_parameters({name: 1.01 * np.asarray(case.model.parameters()[name])})
+    noise = 1e-2 * float(np.ptp(values)) + 1e-4
+    problem = udk.inference(model, {"time": TS, **channel(case)}, [name], noise=noise, tol=EXACT["rtol"])
+    run = udk.simulate(model, TS, case.state, **EXACT)
+    predicted = np.asarray(run.q).reshape(len(TS), -1)[:, 0 if case.is_system else 2]
+    likelihood = -0.5 * np.sum(((predicted - values) / noise) ** 2) - len(TS) * np.log(noise * np.sqrt(2.0 * np.pi))
+    found = float(problem.log_densities(problem.start[None])[0] - problem.log_prior(problem.start))
+    claim(abs(found - likelihood) < 1e-4 * (1.0 + abs(likelihood)), f"{found:.8g} instead of {likelihood:.8g}")
+    return "likelihood of a run"
+
+
 def sweep(case: Case) -> str:
     name = case.number
     x0 = np.asarray(case.model.parameters()[name])

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from udkjax.annotations import NumericArray
 from udkjax.equations.rows.analysis import analyse, analysis_of
 from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Result
@@ -130,18 +131,20 @@ class FitProblem:
             )
         return tuple(tables)
 
-    def members(self, z: Float[np.ndarray, "B K"], runs: Int[np.ndarray, "N"], horizon: float | None = None) -> Members:
-        """Return the members of B sets of unknowns: N runs of the first set, then the same of the next."""
+    def members(
+        self, z: Float[NumericArray, "B K"], runs: Int[np.ndarray, "N"], horizon: float | None = None, xp: Any = np
+    ) -> Members:
+        """Return the members of B sets of unknowns: N runs of the first set, then the same of the next; by NumPy or JAX."""
         columns, sets = self.columns[runs], len(z)
-        x = np.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)]), len(runs), axis=0)
-        shift = np.where(columns < 0, 0.0, z[:, columns]).reshape(len(x), columns.shape[1])
+        x = xp.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)], xp), len(runs), axis=0)
+        shift = xp.where(columns < 0, 0.0, z[:, columns]).reshape(len(x), columns.shape[1])
         members = self.members_of(np.tile(runs, sets), x, shift)
         if horizon is None:
             return members
         ts = np.tile([times_until(ts, horizon) for ts in self.runs.ts[runs]], (sets, 1))
         return members._replace(runs=members.runs._replace(ts=ts))
 
-    def members_of(self, runs: Int[np.ndarray, "M"], x: Float[np.ndarray, "M P"], shift: Float[np.ndarray, "M S"]) -> Members:
+    def members_of(self, runs: Int[np.ndarray, "M"], x: Float[NumericArray, "M P"], shift: Float[NumericArray, "M S"]) -> Members:
         """Return the members of some runs with given parameters and unknowns of their initial states."""
         return Members(x, shift, jax.tree.map(lambda leaf: leaf[runs], self.runs))
 
@@ -225,7 +228,7 @@ class FitProblem:
     def _residuals_of(self, prediction: Prediction, rows: Int[np.ndarray, "R"], runs: np.ndarray, z: np.ndarray) -> Residuals:
         """Return the residuals of some rows from the prediction of their runs."""
         entries = np.searchsorted(runs, self.run[rows]), self.time[rows], self.index[rows, 2]
-        r = (prediction.y[:, *entries] - self.measured[rows]) / self.sigma[rows]
+        r = weighted(prediction.y[:, *entries], self.measured[rows], self.sigma[rows])
         by = prediction.dy[:, *entries]
         by /= self.sigma[rows, None]
         return Residuals(r, self.by_unknowns(by, self.run[rows], z), prediction.code.max(1), rows)
@@ -246,7 +249,7 @@ class FitProblem:
         z = z[:, : len(u.names)]
         J = np.zeros((len(z), len(which), self.K))
         J[:, np.arange(len(which)), which] = u.dx_dz(z)[:, which] / u.sigma[which]
-        yield (u.values(z)[:, which] - u.mean[which]) / u.sigma[which], J
+        yield weighted(u.values(z)[:, which], u.mean[which], u.sigma[which]), J
 
     def by_unknowns(self, by: np.ndarray, run: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Convert derivatives with respect to x and the state of each row's run, (B, R, P + S), to those for z, (B, R, K).
@@ -262,6 +265,11 @@ class FitProblem:
         np.put_along_axis(J, np.broadcast_to(columns, (len(z), *columns.shape)), by[..., P:], 2)
         J[..., :P] = by[..., :P] * self.unknowns.dx_dz(z[:, :P])[:, None]
         return J[..., : self.K]
+
+
+def weighted(predicted: Any, measured: np.ndarray, sigma: Any) -> Any:
+    """Return residuals: predicted minus measured values, or parameters minus the means of priors, in standard deviations."""
+    return (predicted - measured) / sigma
 
 
 def _size_of(values: np.ndarray) -> float:

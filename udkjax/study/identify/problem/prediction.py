@@ -62,6 +62,7 @@ class Prediction(NamedTuple):
     code: Int[np.ndarray, "M"]
     ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies): states at the first and last time, if requested
     d_ends: np.ndarray | None = None  # (M, 2 times, 2, 3 bodies, P + S): derivatives of `ends`
+    steps: np.ndarray | None = None  # (M,): numbers of steps of the integrations
 
 
 class Predictor:
@@ -93,12 +94,23 @@ class Predictor:
         program = _program(self._run, members.x.shape[1] + members.shift.shape[1], piece, structure_of((self._arrays, member)))
         with computing_on_host():
             values, slopes = program((self._arrays, np.array(tol)), members, on_threads=True)
-        predicted = Prediction(values["y"], slopes["y"], values["code"], values.get("ends"), slopes.get("ends"))
+        predicted = Prediction(values["y"], slopes["y"], values["code"], values.get("ends"), slopes.get("ends"), values["steps"])
         if sum(part.nbytes for part in predicted if part is not None) <= CACHE_BYTES:
             self._cache[key] = predicted
             if len(self._cache) > CACHE_SIZE:
                 self._cache.popitem(last=False)
         return predicted
+
+    def traced(self, members: Members, tol: TolerancePair) -> dict[str, Array]:
+        """Predict members within a program of JAX: values y (M, T, C), and the result `code` (M,) of each run."""
+
+        def predict(member: Members) -> dict[str, Array]:
+            no_shift = jnp.zeros(member.x.shape[0] + member.shift.shape[0])
+            return self._run((self._arrays, jnp.array(tol)), member, no_shift)
+
+        if len(members.x) == 1:  # `vmap` of a single member would execute all branches
+            return jax.tree.map(lambda x: jnp.asarray(x)[None], predict(jax.tree.map(lambda x: x[0], members)))
+        return jax.vmap(predict)(members)
 
     def second_derivatives(
         self, members: Members, tol: TolerancePair, first: Float[np.ndarray, "M P+S"], second: Float[np.ndarray, "M P+S"]
@@ -149,7 +161,7 @@ class _MemberRun:
         mechanism, guess, settings = self.place(arrays, member)
         closure = close(mechanism, member.runs.ts[0], guess, analysis=settings["analysis"])
         solution = simulate(mechanism, member.runs.ts, closure, rtol, atol, throw=False, **settings)
-        predicted = {"y": measure(mechanism, solution, self.channels), "code": solution.code}
+        predicted = {"y": measure(mechanism, solution, self.channels), "code": solution.code, "steps": solution.stats["steps"]}
         if self.ends:
             ends = jnp.stack([solution.q[jnp.array([0, -1])], solution.v[jnp.array([0, -1])]], axis=1)
             predicted["ends"] = ends.reshape(2, 2, -1)

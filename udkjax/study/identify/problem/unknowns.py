@@ -7,12 +7,14 @@ some coordinates and rates, one coordinate and one rate per degree of freedom.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.special import expit, logit
+from scipy.special import logit
 
+from udkjax.annotations import NumericArray
 from udkjax.arrays import make_module
 from udkjax.positions.assembling.assembly import State
 from udkjax.scene.elements.held import Held
@@ -83,25 +85,47 @@ class Unknowns:
         names, units, targets, kinds, at_scene_value, *numbers = zip(*each, strict=True)
         return cls(names, units, targets, kinds, all(at_scene_value), *np.array(numbers, float))
 
-    def values(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """Return x(z)."""
-        return self._values_and_slopes(z)[0]
+    def values(self, z: Float[NumericArray, "... P"], xp: Any = np) -> Any:
+        """Return x(z), by NumPy or, with `xp` the module `jax.numpy`, by JAX."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._values(z, xp)[0]
 
     def dx_dz(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
         """Return dx/dz."""
-        return self._values_and_slopes(z)[1]
+        with np.errstate(over="ignore"):
+            return np.exp(self.log_dx_dz(z))
 
     def d2x_dz2(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
         """Return d2x/dz2."""
-        return self._values_and_slopes(z)[2]
+        slope = self.dx_dz(z)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._by_kind(slope, slope * (1.0 - 2.0 * self._values(z, np)[1]), np.zeros_like(slope))
 
-    @np.errstate(over="ignore", invalid="ignore")
-    def _values_and_slopes(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        width, x = self.high - self.low, self.guess * np.exp(z)
-        part = expit(z + logit((self.guess - self.low) / width))
-        values = self._by_kind(x, self.low + width * part, self.guess + self.scale * z)
-        slope = width * part * (1.0 - part)
-        return values, self._by_kind(x, slope, self.scale), self._by_kind(x, slope * (1.0 - 2.0 * part), np.zeros_like(x))
+    def log_dx_dz(self, z: Float[NumericArray, "... P"], xp: Any = np) -> Any:
+        """Return log(dx/dz), which is finite where dx/dz overflows or is rounded to zero; by NumPy or JAX, as `values`."""
+        positive, bounded, own, _, width = self._safe
+        u = xp.where(bounded, z, 0.0) + own
+        at_bound = np.log(width) - xp.logaddexp(0.0, u) - xp.logaddexp(0.0, -u)
+        return xp.where(positive, own + z, xp.where(bounded, at_bound, np.log(self.scale)))
+
+    def _values(self, z: Any, xp: Any) -> tuple[Any, Any]:
+        """Return x(z), and the part of the way from the lower to the upper bound."""
+        positive, bounded, own, low, width = self._safe
+        factor = xp.exp(xp.where(positive, z, 0.0))
+        part = xp.exp(-xp.logaddexp(0.0, -(xp.where(bounded, z, 0.0) + own)))
+        return xp.where(positive, self.guess * factor, xp.where(bounded, low + width * part, self.guess + self.scale * z)), part
+
+    @cached_property
+    def _safe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Masks of the positive and the bounded, z + own as the logarithm or logit of their first guesses, bounds and widths.
+
+        All are finite for parameters of every kind: derivatives of JAX multiply those of the other kinds by zero.
+        """
+        kinds = np.array(self.kinds)
+        positive, bounded = kinds == "positive", kinds == "bounded"
+        low, width = np.where(bounded, self.low, 0.0), np.where(bounded, self.high - self.low, 1.0)
+        part = np.where(bounded, (self.guess - low) / width, 0.5)
+        return positive, bounded, np.where(positive, np.log(np.where(positive, self.guess, 1.0)), logit(part)), low, width
 
     @np.errstate(divide="ignore", invalid="ignore")
     def z_of(self, x: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:

@@ -1,0 +1,183 @@
+"""The logarithm of a posterior density, as a pure function of JAX of an unconstrained vector.
+
+With y the measured and yhat the predicted values, sigma the standard deviations of the noise, and p the prior density of the
+unknowns x, which are transforms x(z) of the components of a vector z,
+
+    log p(z | y) = log p(x(z)) + sum log(dx/dz) - sum ((yhat - y) / sigma)^2 / 2 - sum log(sigma (2 pi)^(1/2)).
+
+The transforms are those of `identify`: a positive number is the exponential of a component, a bounded one a logistic function;
+dx/dz is their Jacobian, so that priors are densities of the numbers themselves.
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udkjax.annotations import Numbers
+from udkjax.integrate.solution import CAUSES, Result
+from udkjax.study.identify.density.priors import LogDensityOfNumber, PriorDensity, require_priors_of
+from udkjax.study.identify.problem.fit_problem import FitProblem, weighted
+from udkjax.study.identify.problem.prediction import Predictor, TolerancePair
+from udkjax.study.identify.problem.residuals import reduce_groups
+from udkjax.study.identify.problem.unknowns import Target, Unknown, Unknowns
+from udkjax.study.identify.records.records import IdentificationError
+
+# Largest number of steps of a run, relative to those at the start. With numbers far from the start, such as masses times 1e13, a
+# run could take minutes, and all other chains of a batch would wait for it.
+MOST_STEPS = 20
+LEAST_NOISE = 1e-9  # least noise at the start, relative to the channel's scale, where records fit exactly
+
+
+class InferenceProblem:
+    """The posterior density of parameters, as a function of an unconstrained vector x, which is zero at the start.
+
+    Attributes:
+        names: names of the unknowns: parameters, changes of initial states, and standard deviations of noise that is not given
+            ("noise of body.crank.angle"), which is one more number for each channel.
+        units: their units.
+        start: the vector (K,) of the scene's own numbers.
+        max_steps: largest number of steps of a run; beyond, the density is zero.
+        tol: tolerances of the integration.
+    """
+
+    def __init__(
+        self,
+        problem: FitProblem,
+        functions: Mapping[str, LogDensityOfNumber],
+        tol: TolerancePair,
+        z: Float[np.ndarray, "K"] | None = None,
+    ):
+        """Take records, parameters and normal priors from a problem of least squares, near its unknowns z, and other priors."""
+        self.fit_problem, self.tol = problem, tol
+        z = np.zeros(problem.K) if z is None else z
+        self.groups = problem.noise_groups()[: len(problem.index)]
+        steps = self._scale_noise(z)
+        self.unknowns = _all_unknowns(problem, self.scales)
+        self.names, self.units = self.unknowns.names, self.unknowns.units
+        self.start = np.zeros(len(self.names))
+        require_priors_of(self.unknowns, functions)
+        of_noise = range(problem.K, len(self.names))
+        self.prior = PriorDensity(self.unknowns, {self.names.index(n): f for n, f in functions.items()}, of_noise)
+        self.max_steps = int(problem.settings.get("max_steps", MOST_STEPS * steps))
+        settings = {**problem.settings, "max_steps": self.max_steps}
+        self.predictor = Predictor(problem.mechanism, problem.unknowns.targets, problem.channels, settings)
+        self._density = jax.custom_jvp(self._log_density)
+        self._density.defjvp(self._slope)
+        self._require_support()
+
+    def _scale_noise(self, z: np.ndarray) -> int:
+        """Set the standard deviations of noise that is not given to those of the residuals at z; return the steps of a run."""
+        problem = self.fit_problem
+        used = np.concatenate([np.ones(len(problem.index), bool), np.zeros(problem.extra_rows, bool)])
+        code = problem.code(z, self.tol)
+        if code != Result.successful:
+            cure = "change the scene's numbers, or the first guess of a Parameter"
+            raise IdentificationError([f"the records cannot be simulated at the start: {CAUSES[Result(code)]}; {cure}"])
+        reduced = reduce_groups(problem.row_blocks(z[None], self.tol), problem.K, problem.noise_groups(), 0, used)
+        sizes = [np.sqrt(group.r @ group.r / group.count) for group in reduced.groups[:-1]]
+        scales = np.ones(len(sizes))
+        for g, size in enumerate(sizes):
+            row = int(np.argmax(self.groups == g))
+            scales[g] = max(size, LEAST_NOISE * problem.channel_scale[problem.index[row, 2]] / problem.sigma[row])
+        self.factors = scales
+        self.sigma = problem.sigma * np.append(scales, 1.0)[self.groups]
+        self.scales = {
+            f"noise of {problem.channel_names[problem.index[row, 2]]}": (float(self.sigma[row]), problem.index[row, 2])
+            for row in (int(np.argmax(self.groups == g)) for g in range(len(scales)))
+        }
+        runs = np.arange(len(problem.runs.ts))
+        taken = problem.predictor(problem.members(z[None], runs), self.tol).steps
+        return int(np.max(taken)) if taken is not None else 1
+
+    def _require_support(self) -> None:
+        """Raise an error if the prior density is zero at the start."""
+        x = self.unknowns.values(self.start)
+        bad = [k for k, f in self.prior.functions.items() if not np.isfinite(np.asarray(f(jnp.asarray(x[k]))))]
+        if bad:
+            cure = "start where its density is positive, Parameter(..., guess=...), or change the prior"
+            raise IdentificationError([f"priors: {self.names[k]} has no density at its start, {x[k]:.6g}: {cure}" for k in bad])
+
+    def log_density(self, x: Float[Array, "K"] | Numbers) -> Float[Array, ""]:
+        """Return the logarithm of the posterior density, up to a constant of the records.
+
+        It is a pure function of JAX (`jit`, `vmap`, `grad`, `hessian`). Where a run fails or takes more than `max_steps` steps,
+        it is -inf with zero gradient.
+
+        Args:
+            x: the unconstrained vector (K,): zero at the start; a positive number is its start times exp(x), a bounded one a
+                logistic function, others their start plus a scale times x. The Jacobian of these transforms is included.
+        """
+        return self._density(jnp.asarray(x, float))
+
+    def log_prior(self, x: Float[Array, "K"] | Numbers) -> Float[Array, ""]:
+        """Return the part of `log_density` that does not depend on the records, including the Jacobian of the transforms."""
+        x = jnp.asarray(x, float)
+        return self.prior(self.unknowns.values(x, jnp)) + jnp.sum(self.unknowns.log_dx_dz(x, jnp))
+
+    def parameters(self, x: Float[Array, "K"] | Numbers) -> dict[str, Any]:
+        """Return the numbers of a vector (K,) by name, in `units`; or arrays of those of several vectors (..., K)."""
+        values = self.unknowns.values(jnp.asarray(x, float), jnp)
+        return {name: values[..., k] for k, name in enumerate(self.names)}
+
+    def log_likelihoods(self, x: Float[Array, "K"] | Numbers) -> Float[Array, "R"]:
+        """Return the logarithm of the density of each measured value, in the order of record, time and channel."""
+        return self._likelihoods(jnp.asarray(x, float))[0]
+
+    def predicted(self, x: Float[Array, "K"] | Numbers) -> Float[Array, "R"]:
+        """Return the predicted value for each measured one, in the units of its channel."""
+        return self._predict(jnp.asarray(x, float))[0]
+
+    def _predict(self, x: Array) -> tuple[Array, Array]:
+        problem = self.fit_problem
+        runs = np.arange(len(problem.runs.ts))
+        found = self.predictor.traced(problem.members(x[None, : problem.K], runs, xp=jnp), self.tol)
+        return found["y"][problem.run, problem.time, problem.index[:, 2]], found["code"]
+
+    def _likelihoods(self, x: Array) -> tuple[Array, Array]:
+        predicted, code = self._predict(x)
+        sigma = self.sigma * jnp.exp(jnp.append(x[self.fit_problem.K :], 0.0))[self.groups]
+        r = weighted(predicted, self.fit_problem.measured, sigma)
+        return -0.5 * r**2 - jnp.log(sigma * np.sqrt(2.0 * np.pi)), code
+
+    def _log_density(self, x: Array) -> Array:
+        each, code = self._likelihoods(x)
+        total = self.log_prior(x) + jnp.sum(each)
+        return jnp.where(jnp.all(code == Result.successful) & jnp.isfinite(total), total, -jnp.inf)
+
+    def _slope(self, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        value, slopes = jax.value_and_grad(self._log_density)(primals[0])
+        return value, jnp.dot(jnp.where(jnp.isfinite(value), slopes, 0.0), tangents[0])
+
+    @cached_property
+    def prior_curvature(self) -> Any:
+        """A compiled function that returns `log_prior`, its gradient and its second derivatives."""
+        gradient = jax.grad(self.log_prior)
+        return jax.jit(lambda x: (self.log_prior(x), gradient(x), jax.jacfwd(gradient)(x)))
+
+    @cached_property
+    def log_densities(self) -> Any:
+        """A compiled function that returns `log_density` of several vectors (B, K)."""
+        return jax.jit(jax.vmap(self.log_density))
+
+
+def _all_unknowns(problem: FitProblem, scales: Mapping[str, tuple[float, int]]) -> Unknowns:
+    """Return parameters, changes of initial states, and standard deviations of noise, all with their transforms."""
+    u, P = problem.unknowns, len(problem.unknowns.names)
+    numbers = zip(u.guess, u.low, u.high, u.scale, u.mean, u.sigma, strict=True)
+    text = zip(u.names, u.units, u.targets, u.kinds, strict=True)
+    parameters = [Unknown(*one, True, *own) for one, own in zip(text, numbers, strict=True)]
+    no = np.nan
+    states = [
+        Unknown(name, unit, Target(), "free", True, 0.0, no, no, size, no, no)
+        for name, unit, size in zip(problem.all_names[P:], problem.all_units[P:], problem.state_sizes.tolist(), strict=True)
+    ]
+    noise = [
+        Unknown(name, problem.channels[c].units, Target(), "positive", True, size, no, no, size, no, no)
+        for name, (size, c) in scales.items()
+    ]
+    return Unknowns.of([*parameters, *states, *noise])
