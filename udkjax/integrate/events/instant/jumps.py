@@ -16,6 +16,7 @@ from udkjax.integrate.events.instant.impacts import (
     ATTACHABLE,
     OPEN,
     ContactChanges,
+    Contacts,
     hit_contacts,
     rows_of_directions,
     rows_of_mobilities,
@@ -23,6 +24,7 @@ from udkjax.integrate.events.instant.impacts import (
 from udkjax.integrate.events.instant.runs import MemberIndices, RunState, take
 from udkjax.integrate.events.instant.sticking import settle_friction
 from udkjax.integrate.events.instant.system import StateValues, System
+from udkjax.integrate.events.law.actions import NUMBERS_OF_ACTIONS
 from udkjax.integrate.events.law.crossings import NO_EVENT, ConditionValues
 from udkjax.integrate.solution import Result
 from udkjax.transforms.gradients import stop_gradients
@@ -122,7 +124,7 @@ def _apply_event(
         after = state._replace(v=v, phase=plan.without_contacts(state.phase))
         return system.look(members, after if xp is np else stop_gradients(after), is_free=not plan.sticking).rate_2
 
-    hit = hit_contacts(system.contacts(members), k, v, held, values, rows, rate, second_rates, closed, xp)
+    hit = hit_contacts(_contacts(system, members), k, v, held, values, rows, rate, second_rates, closed, xp)
     contacts = hit._replace(
         closed=xp.where(acts, hit.closed, OPEN),
         hits=hit.hits & acts,
@@ -135,6 +137,14 @@ def _apply_event(
     result = JumpResult(state._replace(v=xp.where(acts, hit.v, v), phase=phase), contacts, code)
     may_push = plan.adds.any() or (plan.held_at_rest.any() and plan.impacts.sum() > 1)
     return result, Gaps(rows, state_values.g, values.scale, plan.impacts & rows.free & acts) if may_push else None
+
+
+def _contacts(system: System, members: MemberIndices) -> Contacts:
+    """Return the contacts of members."""
+    plan, numbers = system.plan, system.numbers_of_actions(members)
+    restitution, friction = (numbers[:, NUMBERS_OF_ACTIONS.index(name)] for name in ("rebound", "friction"))
+    given = restitution, friction, take(system.rate, members)
+    return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, plan.tangents, *given)
 
 
 def _code(blocked: Bool[Any, "b"], xp: ModuleType) -> Int[Any, "b"]:

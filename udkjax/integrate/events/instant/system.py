@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.integrate.events.instant.impacts import Contacts
 from udkjax.integrate.events.instant.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.law.crossings import ConditionValues
 from udkjax.integrate.events.law.event_plan import EventPlan
@@ -49,8 +48,8 @@ class System(Protocol):
     coordinates: Float[Any, "B n"]
     inverse_mass: Float[Any, "B n"]
 
-    def contacts(self, members: MemberIndices) -> Contacts:
-        """Return the contacts of members."""
+    def numbers_of_actions(self, members: MemberIndices) -> Float[Any, "b N E"]:
+        """Return the numbers of the actions of members (`actions.numbers_of_actions`)."""
         ...
 
     def look(

@@ -1,9 +1,13 @@
 """Actions: what an event does.
 
-To add an action, write a class here, and add its name to the stubs. If the attributes of `Action` cannot describe the effect, add
-a jump in `jumps`. The plan of a run, its phases and pages use attributes and methods of `Action`, never the type of an action.
+To add an action, write a class here (CONTRIBUTING.md). The plan of a run, its phases and pages use attributes and methods of
+`Action`, never the type of an action. If these cannot describe the effect, add an attribute, and use it in `jumps`: one that does
+not depend on numbers through a mask of `EventPlan`, a number through `NUMBERS_OF_ACTIONS`, so that both engines and derivatives
+have it.
 """
 
+from collections.abc import Sequence
+from types import ModuleType
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -74,6 +78,20 @@ class Action(PrintsLine):
     def has_usable_numbers(self) -> Bool[Array, ""]:
         """Return whether its numbers, which may be traced, are within their limits."""
         return jnp.array(True)
+
+
+# The attributes of actions that are numbers, which may be traced, in the order of `numbers_of_actions`. None counts as zero.
+NUMBERS_OF_ACTIONS = ("rebound", "friction")
+
+
+def numbers_of_actions(actions: Sequence[Action], xp: ModuleType) -> Float[Any, "N E"]:
+    """Return the numbers of E actions, one row for each of `NUMBERS_OF_ACTIONS`."""
+
+    def row(name: str) -> Any:
+        values = [getattr(action, name) for action in actions]
+        return xp.stack([xp.asarray(0.0 if x is None else x, float) for x in values])
+
+    return xp.stack([row(name) for name in NUMBERS_OF_ACTIONS])
 
 
 class Stop(Action):

@@ -16,6 +16,7 @@ from udkjax.annotations import TreeDef
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.instant.loop import run_loop
 from udkjax.integrate.events.instant.runs import EventRun, RunState, results, runs_before, shapes_of_run
+from udkjax.integrate.events.law.actions import numbers_of_actions
 from udkjax.integrate.events.law.event import Event
 from udkjax.integrate.events.law.event_plan import EventPlan, event_plan
 from udkjax.integrate.events.law.kinks import FREE, places_of_kinks
@@ -112,13 +113,13 @@ class HostRun:
         joints = np.split(of_joints, np.cumsum(widths)[:-1], axis=1)  # views
         joints[-1][:] = FREE
         shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED])
-        ts, q, v, code, units, _, of_impacts, inverse_mass, joint_numbers = shared
+        ts, q, v, code, units, _, of_actions, inverse_mass, joint_numbers = shared
         for phase in plan.phases:
             phases.append(
                 PhaseCode(phase, plan.events.switches, further[: phase.count], numbers, inverse_mass, of_joints, widths)
             )
             further = further[phase.count :]
-        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), of_impacts, inverse_mass, joint_numbers, numbers)
+        system = MachineSystem(plan, phases, ts, MemberUnits(*units.T), of_actions, inverse_mass, joint_numbers, numbers)
         state = RunState(ts[:, 0].copy(), q.copy(), v.copy(), np.tile(plan.events.first, (B, 1)), joints)
         joints[-1][:] = system.first_sides(state)
         runs = run_loop(system, runs_before(plan.events, state, self.times, code[:, 0].astype(int), np))
@@ -196,15 +197,14 @@ def _stack(numbers: Sequence[Any], xp: ModuleType) -> Any:
 
 
 def _numbers(xp: ModuleType, phases: Phases, *events: Event) -> list[Any]:
-    """Return the numbers of conditions, impacts, masses and joints, which depend neither on states nor on choices."""
+    """Return the numbers of conditions, actions, masses and joints, which depend neither on states nor on choices."""
     of_conditions, of_joints = (
         xp.concatenate([*(xp.ravel(xp.asarray(x, float)) for x in numbers), xp.zeros(0)])
         for numbers in (condition_numbers(events), joint_numbers(phases))
     )
     inverse_mass = inverse_mass_of(phases.mechanisms[SCENE], xp)
-    friction = [0.0 if e.action.friction is None else e.action.friction for e in events]
-    of_impacts = xp.stack([_stack([e.action.rebound for e in events], xp), _stack(friction, xp)])
-    return [x[None] for x in (of_conditions, of_impacts, inverse_mass, of_joints)]
+    of_actions = numbers_of_actions([e.action for e in events], xp)
+    return [x[None] for x in (of_conditions, of_actions, inverse_mass, of_joints)]
 
 
 _concrete_numbers = cached_by_identity(_numbers)

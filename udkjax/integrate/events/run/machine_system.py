@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.integrate.events.instant.impacts import OPEN, Contacts
+from udkjax.integrate.events.instant.impacts import OPEN
 from udkjax.integrate.events.instant.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.instant.system import StateValues
 from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO, zero_of
@@ -58,7 +58,7 @@ class MachineSystem:
         phases: the machine code of the phases of each mechanism.
         ts: output times (B, T).
         units: numbers of each member.
-        of_impacts: restitutions and coefficients of friction of all events (B, 2, E).
+        of_actions: the numbers of all actions (B, N, E), as `actions.numbers_of_actions`.
         inverse_mass: of all coordinates (B, n).
         joint_numbers: the numbers of joints that events add, except those that depend on the state (B, k).
         event_numbers: the numbers of all events (1 or B, K).
@@ -72,7 +72,7 @@ class MachineSystem:
         phases: list[PhaseCode],
         ts: np.ndarray,
         units: MemberUnits,
-        of_impacts: np.ndarray,
+        of_actions: np.ndarray,
         inverse_mass: np.ndarray,
         joint_numbers: np.ndarray,
         event_numbers: np.ndarray,
@@ -80,7 +80,7 @@ class MachineSystem:
         self._event_numbers, self._held = event_numbers, plan.held
         self.lost_kinks = np.full(len(ts), np.inf)  # times (s) from which sides are no longer held
         self.plan, self._added, self._is_projected = plan.events, plan.added, [x.projected for x in plan.phases]
-        self._phases, self.ts, self._units, self._of_impacts = phases, ts, units, of_impacts
+        self._phases, self.ts, self._units, self._of_actions = phases, ts, units, of_actions
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
         (B, _), n = ts.shape, inverse_mass.shape[1]
         self._windows: dict[int, Window] = {}  # of the members that go on window by window
@@ -94,12 +94,9 @@ class MachineSystem:
         self._most_passed = [None if x.run.passing is None else x.run.passing.most for x in plan.phases]
         self._watches = [self._watch_before(*phase) for phase in zip(plan.phases, self._watched, strict=True)]
 
-    def contacts(self, members: MemberIndices) -> Contacts:
-        """Return the contacts of members."""
-        plan = self.plan
-        restitution, friction = take(self._of_impacts, members).swapaxes(0, 1)
-        numbers = restitution, friction, take(self.rate, members)
-        return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, plan.tangents, *numbers)
+    def numbers_of_actions(self, members: MemberIndices) -> np.ndarray:
+        """Return the numbers of the actions of members."""
+        return take(self._of_actions, members)
 
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.integrate.events.instant.impacts import Contacts
 from udkjax.integrate.events.instant.loop import run_loop
 from udkjax.integrate.events.instant.runs import Change, EventRun, MemberIndices, MemberRuns, RunState, results, runs_before
 from udkjax.integrate.events.instant.system import StateValues
+from udkjax.integrate.events.law.actions import numbers_of_actions
 from udkjax.integrate.events.law.phases import SCENE, Added
 from udkjax.integrate.events.run.hybrid import Hybrid, inverse_mass_of
 from udkjax.integrate.events.run.windows import WatchedConditions, WindowUnits, advance_window, first_window
@@ -51,13 +51,9 @@ class PlainSystem:
         self.coordinates = hybrid.scales.coordinates(len(hybrid.q))[None]
         self.inverse_mass = inverse_mass_of(hybrid.phases.mechanisms[SCENE], jnp)[None]
 
-    def contacts(self, members: MemberIndices) -> Contacts:
-        """Return the contacts."""
-        plan = self.plan
-        e = [jnp.asarray(e.action.rebound, float) for e in self.hybrid.events]
-        friction = [jnp.asarray(0.0 if e.action.friction is None else e.action.friction, float) for e in self.hybrid.events]
-        numbers = jnp.stack(e)[None], jnp.stack(friction)[None], self.rate
-        return Contacts(plan.impacts, plan.held_at_rest, plan.stops_at_rest, plan.tangents, *numbers)
+    def numbers_of_actions(self, members: MemberIndices) -> Float[Array, "1 N E"]:
+        """Return the numbers of the actions."""
+        return numbers_of_actions([e.action for e in self.hybrid.events], jnp)[None]
 
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
