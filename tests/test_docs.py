@@ -20,6 +20,7 @@ import pytest
 import udkjax
 from udkjax.cli import COMMANDS
 from udkjax.cli import main as udkjax_cli
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys
 
 ROOT = Path(__file__).parents[1]
 OTHERS = [ROOT / name for name in ("CONTRIBUTING.md", "experiments/README.md", "benchmarks/README.md")]
@@ -227,6 +228,21 @@ def missing(text: str) -> Iterator[str]:
 @every_page
 def test_its_names_and_files_exist(page):
     assert list(missing(BLOCK.sub("", page.read_text()))) == []
+
+
+@pytest.mark.parametrize("section", CLASSES_BY_TYPE)
+def test_the_page_of_the_format_has_a_row_for_each_type_with_its_keys(section):
+    """A type may have several rows: together they name all keys. The introductions name the keys that all types share."""
+    rows = re.findall(r"^\| `(\w+)` \| (.*)\|$", (ROOT / "docs" / "reference" / "format.md").read_text(), re.M)
+    for name, cls in CLASSES_BY_TYPE[section].items():
+        named = set(re.findall(r"\w+", " ".join(text for type_, text in rows if type_ == name)))
+        assert named, f"docs/reference/format.md: no row for {name}"
+        assert set(keys(cls)) - {"bodies"} <= named, f"docs/reference/format.md: keys of {name}"
+
+
+def test_the_readme_names_each_joint():
+    row = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("| Joints, drivers |"))
+    assert [name for name in CLASSES_BY_TYPE["joint"] if name.replace("_", " ") not in row] == []
 
 
 def prose() -> Iterator[tuple[str, str]]:

@@ -14,6 +14,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.parts.fuzz import Case
+from udkjax.equations.states import evaluate
 from udkjax.wording import quote
 
 POINTS = [[0.0, 0.0], [0.1, 0.2]]
@@ -27,6 +28,18 @@ ELEMENTS: dict[str, dict[str, Any]] = {
     "Angle": {"bodies": ["ground", "b"], "angle": 0.0},
     "Gear": {"bodies": ["ground", "b"], "radii": [0.1, 0.2], "internal": True, "carrier": "c"},
     "Rack": {"bodies": ["ground", "b"], "radius": 0.1, "axis": 0.2},
+    "Screw": {"bodies": ["ground", "b"], "points": POINTS, "axis": 0.1, "turning": ["ground", "c"], "lead": 0.1},
+    "Coupling": {
+        "bodies": ["ground", "b"],
+        "to": ["ground", "c"],
+        "coefficients": [0.1, 2.0],
+        "axis": 0.1,
+        "to_axis": 0.2,
+        "points": POINTS,
+        "to_points": POINTS,
+    },
+    "KnifeEdge": {"bodies": ["ground", "b"], "point": [0.0, 0.1], "axis": 0.1},
+    "Wheel": {"bodies": ["ground", "b"], "point": [0.0, 0.1], "axis": 0.1, "turning": ["b", "c"], "radius": 0.2},
     "Cam": {"bodies": ["ground", "b"], "points": POINTS, "profile": {"angle": [0.0, 2.0, 4.0], "radius": [1.0, 1.1, 1.2]}},
     "Spring": {"bodies": ["ground", "b"], "points": POINTS, "stiffness": 1.0, "length": 0.1, "damping": 0.1},
     "TorsionSpring": {"bodies": ["ground", "b"], "stiffness": 1.0, "damping": 0.1, "angle": 0.1},
@@ -233,8 +246,9 @@ def targets() -> list[tuple[str, Callable[..., Any], dict[str, Any]]]:
                 given |= {"motion": fitting()["motion"], "drivers": ["body.b.angle"]}
             found += [(name, function, given)] * (1 if name in SELDOM else 12)
     found += [("simulate", udk.simulate, {"mechanism": scene(), "ts": fitting()["ts"]})] * 60
-    for name in ("psi", "psi_q", "psi_dot", "gamma", "force", "mass", "kinetic_energy", "potential_energy"):
-        function = getattr(udk.equations, name)
+    for name, function in vars(evaluate).items():
+        if not hasattr(function, "__wrapped__") or not function.__module__.startswith("udkjax.equations.terms."):
+            continue
         needed = list(inspect.signature(function).parameters)
         found += [(f"equations.{name}", function, {p: fitting()[p] for p in needed})] * 4
     found += [(name, functools.partial(_element, name), given) for name, given in ELEMENTS.items()] * 8

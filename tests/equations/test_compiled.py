@@ -1,5 +1,7 @@
 """The public functions of a state: each is one program, with the values and derivatives of the uncompiled function."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,17 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.equations import constraints, determinacy, loads
+from tests.quantities import QUANTITIES, arguments
+from udkjax.equations import constraints, determinacy
 
-STATE = ("psi", "psi_q", "psi_dot", "gamma", "mass", "force", "kinetic_energy", "potential_energy")
-PLAIN = {name: getattr(constraints, name, None) or getattr(loads, name) for name in STATE}
+PLAIN = {name: sys.modules[function.__module__].__dict__[name] for name, function in QUANTITIES.items()}
 PLAIN |= {name: getattr(determinacy, name) for name in ("singular_values", "uniqueness")}
 MECH = udk.library.slider_crank(0.3, 4.0)
 Q, V = np.asarray(MECH.q0), np.asarray(MECH.v0)
-
-
-def arguments(name, t=0.1):
-    return {"mass": (), "kinetic_energy": (V,)}.get(name, (t, Q, V) if name in STATE[2:] else (t, Q))
 
 
 @pytest.mark.parametrize("name", PLAIN)
@@ -26,9 +24,9 @@ def test_it_is_one_program(name, compilations):
     udk.analyse(MECH)
     other = MECH.with_parameters({"body.rod.mass": 3.0})
     udk.analyse(other)
-    given = [jnp.asarray(x, float) for x in arguments(name)]  # JAX compiles this conversion
+    given = [jnp.asarray(x, float) for x in arguments(PLAIN[name], 0.1, Q, V)]  # JAX compiles this conversion
     assert len(compilations(lambda: function(MECH, *given))) <= 1  # none where another test has called it
-    assert not compilations(lambda: function(other, *arguments(name, 0.2)))  # numbers are not part of it
+    assert not compilations(lambda: function(other, *arguments(PLAIN[name], 0.2, Q, V)))  # numbers are not part of it
     plain = jax.jit(lambda *state: PLAIN[name](MECH, *state))(*given)
     jax.tree.map(lambda x, y: assert_allclose(x, y, rtol=1e-12, atol=1e-12), function(MECH, *given), plain)
 

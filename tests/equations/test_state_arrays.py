@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.quantities import QUANTITIES, arguments
 from udkjax.equations.states import state_arrays
 
 SCENES = {
@@ -46,10 +47,7 @@ def test_quantities_of_concrete_numbers_are_those_of_the_textbook(name, monkeypa
             udk.unique_reactions(mech, states, frame="body"),
             udk.singular_values(mech, t, q),
             udk.uniqueness(mech, t, q),
-            [f(mech, t, q) for f in (udk.equations.psi, udk.equations.psi_q)],
-            [f(mech, t, q, v) for f in (udk.equations.psi_dot, udk.equations.force, udk.equations.potential_energy)],
-            udk.equations.mass(mech),
-            udk.equations.kinetic_energy(mech, v),
+            [f(mech, *arguments(f, t, q, v)) for f in QUANTITIES.values()],
         )
 
     by_numpy = found()

@@ -32,6 +32,7 @@ from experiments.parts.tally import Tally
 from experiments.properties import PROPERTIES, page
 from udkjax.cli import main
 from udkjax.integrate.events import simulate_events
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE
 
 SEED = 3
 
@@ -234,6 +235,12 @@ def test_fuzz(kind, count, tmp_path, monkeypatch):
         if wrong:
             found[k, case.about] = wrong, text
     assert not found, found
+
+
+def test_wrong_arguments_are_given_to_each_type_of_the_format():
+    types = {cls.__name__ for known in CLASSES_BY_TYPE.values() for cls in known.values()}
+    missing = types - fuzz_arguments.ELEMENTS.keys()
+    assert not missing, f"give arguments for each in ELEMENTS of experiments/parts/fuzz_arguments.py: {sorted(missing)}"
 
 
 @pytest.mark.parametrize("name", fuzz_arguments.ELEMENTS)
