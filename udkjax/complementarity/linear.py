@@ -186,7 +186,7 @@ def diagonal(W: Any, xp: ModuleType) -> Any:
 
 
 def times(W: Any, x: Any) -> Any:
-    """Return W x, with any leading dimensions."""
+    """Return the products of matrices and vectors, W x, with any leading dimensions."""
     return (W @ x[..., None])[..., 0]
 
 

@@ -20,6 +20,10 @@ class ActiveNumbers:
 
     Machine code receives them as one vector, followed by two thresholds of pivots, which are inactive.
 
+    Args:
+        numbers: the tree; None where it has no number.
+        active: a tree of the same form, True for active numbers, False or None for all others.
+
     Attributes:
         mask: for each number, and for the two thresholds, whether it is active.
     """

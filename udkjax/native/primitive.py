@@ -346,7 +346,7 @@ def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:
 def _batch(
     inputs: Sequence[Any], axes: Sequence[int | None], operation: Operation, times: int
 ) -> tuple[list[Any], list[int | None]]:
-    """Bind a batch as more members, or a batch only of directions as more directions."""
+    """Bind a batch as more members, or a batch only of directions as more directions; return results and their batch axes."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
     shared, results = len(inputs) - operation.tangents, operation.results

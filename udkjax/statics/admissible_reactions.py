@@ -59,16 +59,16 @@ class Reactions(NamedTuple):
 
     @property
     def without_internal(self) -> "Reactions":
-        """The equilibria with internal loads of least norm."""
+        """The same equilibria, but with the internal loads of least norm only: s has no entries."""
         return self._replace(internal=self.internal[:, :0])
 
     def at(self, z: Float[Array, "N"]) -> Float[Array, "m"]:
-        """Return lambda for x and s, concatenated."""
+        """Return the multipliers lambda for the vector z of the friction x in each joint (K,), then the internal loads s."""
         count = len(self.units)
         return self.multipliers + self.by_friction @ z[:count] + self.internal @ z[count:]
 
     def effort(self, z: Float[Array, "N"]) -> Float[Array, ""]:
-        """Return f (N, N m)."""
+        """Return the effort f (N, N m) along the coordinate, for z as in `at`."""
         return -self.at(z)[self.row]
 
 

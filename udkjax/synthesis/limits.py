@@ -121,7 +121,7 @@ class LengthLimits:
             self._between = _with_slopes(free, [(start, end) for (start, end), *_ in rows] + [(None, pin) for pin, *_ in sides])
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return c (M, K) and dc/dx (M, K, P) for vectors (M, P) that begin with the free numbers."""
+        """Return the rows c (M, K), in m, and dc/dx (M, K, P), for vectors (M, P) that begin with the free numbers."""
         slopes, first = np.zeros((len(x), self.count, x.shape[1])), len(self._way)
         if not self.count:
             return np.zeros((len(x), 0)), slopes

@@ -94,7 +94,7 @@ def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarr
 
 
 def _join(problem: DesignProblem, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
-    """Return z (M, N) and its units (N,)."""
+    """Return all unknowns of the trials, z = (x, s) (M, N), and their units (N,)."""
     units = np.ones(problem.unknowns)
     units[: problem.free.count] = problem.sizes
     if not problem.local:

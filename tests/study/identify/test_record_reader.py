@@ -251,6 +251,20 @@ def test_a_dataset_reads_as_a_file_does_and_so_does_its_file(mech, tmp_path):
     assert problems(mech, data.assign(extra=("side", [1.0]))) == ['data, "extra": must be along "time", not along ["side"]']
 
 
+def test_padded_records_keep_the_rows_of_channels_that_are_measured_apart(mech):
+    """Only rows without any value pad a record; a channel may begin or end before another, and share no row with it."""
+    nan = np.nan
+    angle = [[nan, 1.0, nan, 3.0, nan, nan], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]]
+    x = [[nan, nan, 2.0, nan, 4.0, nan], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]]
+    names = "body.crank.angle", "body.rod.x"
+    data = xarray.Dataset({n: (("record", "time"), a) for n, a in zip(names, (angle, x))}, {"time": np.arange(6.0)})
+    apart, whole = records_of(mech, data)
+    assert_allclose(apart.times, [1.0, 2.0, 3.0, 4.0])
+    assert_allclose(apart.values[names[0]], [1.0, nan, 3.0, nan])
+    assert_allclose(apart.values[names[1]], [nan, 2.0, nan, 4.0])
+    assert len(whole.times) == 6
+
+
 def test_what_a_solution_writes_can_be_measured(mech):
     q, v = np.arange(18.0).reshape(2, 3, 3), -np.arange(18.0).reshape(2, 3, 3)
     coords = {"time": [0.0, 0.5], "body": list(mech.body_names), "coordinate": ["x", "y", "angle"]}

@@ -184,7 +184,7 @@ class FrictionElimination:
         yield from self.sharing.share(solve)
 
     def _drag(self, solve: int, v: str, to: str, has_slopes: bool = True, in_part: bool = False) -> ProgramParts:
-        """Compute G(x) - S x on each body, or G(x)."""
+        """Compute on each body the loads of friction G(x) less their linear part S x; G(x) alone without `has_slopes`."""
         yield Reset(to, 0, self.terms.layout.coordinate_count)
         for group in self.terms.layout.rubbing:
 

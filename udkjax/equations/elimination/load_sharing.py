@@ -70,7 +70,7 @@ class LoadSharing:
     # --- at one state
 
     def find_null_space(self) -> ProgramParts:
-        """Compute N with the factors of J C J^T."""
+        """Compute N, which spans the combinations of rows that balance, with the factors of J C J^T."""
         if not self._count:
             return
         terms, eliminated = self.terms, self.terms.layout.eliminated

@@ -101,7 +101,7 @@ class PartitionedSystem(WrappedSystem):
         return jnp.where(is_near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Solve the constraints for the dependent coordinates and velocities."""
+        """Return q and v, the dependent ones solved from the constraints, the others unchanged."""
         return _solve_dependent(self.fix_partition(t, q, v), t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> "PartitionedSystem":

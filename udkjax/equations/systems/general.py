@@ -238,7 +238,7 @@ class GeneralEquations(ConstrainedRows):
         return mobility, self.tangent_part(t, q, v, jnp.zeros_like(q), mobility).dv
 
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
-        """Return v^T M v / 2 and V, zero without a potential."""
+        """Return the kinetic energy v^T M v / 2 and the potential energy V, zero without a potential."""
         potential = self.mechanism.potential
         kinetic = v @ jnp.asarray(self.mechanism.mass(q)) @ v / 2
         return kinetic, jnp.zeros_like(kinetic) if potential is None else jnp.asarray(potential(t, q))
@@ -303,7 +303,7 @@ class GeneralEquations(ConstrainedRows):
         return jnp.asarray(self.mechanism.mass(q)), load(self.mechanism, t, q, v), *self._rows(t, q, v)
 
     def _rows(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"]]:
-        """Return A and c of A a = c."""
+        """Return the rows A = (Psi_q; phi_v) and the right-hand side c of A a = c, the constraints of the accelerations a."""
         rate = lambda t, q: self._psi_dot(t, q, v)  # noqa: E731
         gamma = -jax.jvp(rate, (t, q), (jnp.ones_like(t), v))[1]
         bend = jax.jvp(lambda t, q: self._phi(t, q, v), (t, q), (jnp.ones_like(t), v))[1]
@@ -326,7 +326,7 @@ class GeneralEquations(ConstrainedRows):
         return free, weight, plus, c - slopes @ free
 
     def _plus(self, q: Vector, slopes: Float[Array, "m n"]) -> tuple[Plus, Callable[[Vector], Vector]]:
-        """Return D^+ and x -> L^(-T) x."""
+        """Return D^+ of D = A L^(-T), and the function x -> L^(-T) x, for the mass matrix L L^T."""
         L = jnp.linalg.cholesky(jnp.asarray(self.mechanism.mass(q)))
         D = jax.scipy.linalg.solve_triangular(L, slopes.T, lower=True).T
         return self.method.plus(D), lambda x: jax.scipy.linalg.solve_triangular(L, x, lower=True, trans=1)

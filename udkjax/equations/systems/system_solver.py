@@ -25,7 +25,7 @@ LEAST_MASS_PIVOT = 64 * np.finfo(float).eps
 
 @dataclass(frozen=True)
 class MassFactors:
-    """L, the reciprocals of the pivots p of M, and B = A L^(-T) for rows A."""
+    """The factors of M = L diag(p) L^T: L, the reciprocals of the pivots p, and B = A L^(-T) for rows A."""
 
     mass: SparseLDL
     B: list[SparseRow]
@@ -40,11 +40,11 @@ class MassFactors:
         return self.mass.inverse
 
     def rates(self, u: Sequence[Scalar]) -> list[Scalar]:
-        """Return B u."""
+        """Return B u, the rates of the rows A for the velocities L^(-T) u."""
         return [sum((s * u[k] for k, s in row.items()), u[0].graph.constant(0.0)) for row in self.B]
 
     def combine(self, x: Sequence[Scalar]) -> list[Scalar]:
-        """Return C B^T x."""
+        """Return C B^T x, the change of u by multipliers x, where C has the reciprocals 1 / p on its diagonal."""
         graph = self.compliance[0].graph
         total = [graph.constant(0.0)] * len(self.compliance)
         for row, s in zip(self.B, x, strict=True):

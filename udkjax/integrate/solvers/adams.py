@@ -276,7 +276,7 @@ class Adams(Multistep):
 
 
 def _field(terms: PyTree[diffrax.AbstractTerm], args: PyTree, unravel: Unravel) -> Field:
-    """Return f as a function of time and the state vector."""
+    """Return the right-hand side f of y' = f(t, y), as a function of time and the state vector y."""
     return lambda t, y: vector_field(terms, t, unravel(y), args)
 
 

@@ -117,7 +117,7 @@ def _abstract_eval(*inputs: Any, function: HostFunction) -> list[Any]:
 
 
 def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunction) -> tuple[list[Array], list[int]]:
-    """Bind a batch as more members."""
+    """Bind a batch as more members; return the results and their batch axes."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     members = max(x.shape[0] if axis is None else np.delete(x.shape, axis)[0] for x, axis in zip(inputs, axes, strict=True))
 

@@ -25,7 +25,7 @@ GLOBALS = [f"@{name} = global ptr null" for name in POINTERS]
 
 
 def no_members(f: Function) -> Value:
-    """Return the address of an array of members, one for each lane, with none."""
+    """Return the address of an array of the members of the lanes, all empty (-1)."""
     members = Value(f, f.reserve(INT, f.width), POINTER)
     with f.each(f.width) as k:
         f.store(-1, members, k, base=INT)
@@ -52,7 +52,7 @@ def go_on(module: Memory, f: Function, members: Value):
 
 
 def members_in_lanes(module: Memory, f: Function, s: Lane, present: Value) -> Value:
-    """Return the address of an array of the members in the lanes, with none for lanes that are not `present`."""
+    """Return the address of an array of the members of the lanes, empty (-1) for lanes that are not `present`."""
     members = no_members(f)
     with module.each_lane(f, present) as k:
         f.store(module.to_int(f, f.lane(s.member, k)), members, k, base=INT)

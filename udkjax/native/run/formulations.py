@@ -235,6 +235,8 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
             svd.row("D", row).put(column, value)
         self._method.factor(svd)
         self._method.solve(svd)
+        # The columns of D become the right singular vectors, which span the rows of A. The other columns of Q in their QR
+        # factorization then span the null space.
         with f.each(d.m) as i:
             row = d.row("D", i)
             row.clear()

@@ -240,7 +240,7 @@ class NumpyCurve(AbstractCurve):
         return self.terms.gamma(s, q, v)
 
     def correct(self, X: Any, fixed: Any = False) -> tuple[Any, Any]:
-        """Correct as `Curve` does, a closed point by the pseudoinverse of the step before, from which it differs by rounding."""
+        """Return X corrected as by `Curve`, and whether it is closed. A closed point takes the pseudoinverse of the step before."""
         if not len(self.rows):
             return X, np.True_
         if fixed and (corrected := self._eliminate(X)) is not None:

@@ -227,7 +227,7 @@ class Friction(ForceElement):
         return self.torque * jnp.tanh(rate / self.velocity)
 
     def _coefficient_at(self, speed: Number) -> Number:
-        """Return mu(s)."""
+        """Return the coefficient of friction at a sliding speed (m/s), with the sign of the speed."""
         assert self.coefficient is not None
         if self.sticks:
             total: Number = self.coefficient * self._direction(speed)

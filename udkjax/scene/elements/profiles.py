@@ -85,7 +85,7 @@ class Profile(AbstractProfile):
 
 
 def _dwell(x: Array) -> Array:
-    return 0.0 * x
+    return 0.0 * x  # NaN stays
 
 
 def _cycloidal(x: Array) -> Array:
@@ -163,7 +163,7 @@ class LawProfile(AbstractProfile):
         """Return the distance (m) of the point, or of the flat face, when the cam has turned by this angle (rad)."""
         steps = getattr(self, self.step_field)
         turned, ends, heights = wrap(turn, 0.0, 2 * jnp.pi), jnp.cumsum(self.angle), jnp.cumsum(steps)
-        travel = 0.0 * turned
+        travel = 0.0 * turned  # not zero: an undefined angle gives an undefined travel
         for k, name in enumerate(self.law):
             begin, below = (ends[k - 1], heights[k - 1]) if k else (0.0, 0.0)
             risen = below + steps[k] * LAWS[name]((turned - begin) / self.angle[k])

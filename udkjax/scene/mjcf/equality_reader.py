@@ -93,9 +93,12 @@ class EqualityReader:
     def _couple(
         self, read: AttributeReader, length1: CoupledLength, length2: CoupledLength | None, polynomial: np.ndarray
     ) -> None:
-        """Add the joint that makes one joint coordinate a polynomial of another, both less their values in the file."""
+        """Add the joint that makes one joint coordinate a polynomial of another, both less their values in the file.
+
+        Without a second length, the polynomial is its constant alone.
+        """
         y = self.lengths.between_bodies(length1)
-        x = y if length2 is None else self.lengths.between_bodies(length2)
+        x = y if length2 is None else self.lengths.between_bodies(length2)  # of a constant, x may be any coordinate
         if y is None or x is None:
             read.refuse(
                 "couples one of two hinges of a body, or a slide of a body with oblique slides, or with a hinge between them: "

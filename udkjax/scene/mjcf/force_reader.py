@@ -113,6 +113,8 @@ class ForceReader:
         if length is None or kind not in ACTUATORS:
             return
         gear = read.numbers("gear", (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), fewest=1)[0]
+        # The force gear (gain control + bias0 + bias1 gear x + bias2 gear x_dot) of the length x: with bias1, its constant part
+        # shifts the length of a spring at rest; without, it is a motor's.
         constant, at_rest = gear * (gain * control + bias[0]), 0.0
         if bias[1] and gear:
             constant, at_rest = 0.0, -constant / (bias[1] * gear**2)

@@ -78,7 +78,7 @@ def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = No
 
 
 def _evaluate(exact: BallFunction, m: np.ndarray) -> Ball:
-    """Return F at points, computed in fractions and rounded."""
+    """Return the values F of the equations at points m, computed in fractions and rounded."""
     F = exact(Ball.fractions(m))[0].mid.astype(float)
     return Ball.of(F, EPS * np.abs(F) + SMALLEST)
 

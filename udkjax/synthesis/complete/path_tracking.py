@@ -21,8 +21,8 @@ END_TOL = 1e-12  # bound on the last Newton step, relative to the unknowns: roun
 END_CORRECTIONS = 12  # Newton steps at the end: many more than regular solutions need
 GROWTH = 2.0  # largest growth of a step
 # Near the end of a path to infinity an unknown varies as a power of 1 - t, an integer or a fraction such as 1/3; on a path to a
-# finite point it does not. If the power is within these bounds, at 1 - t below NEAR_END, the path goes to infinity.
-POWERS = (0.1, 3.0)
+# finite point it does not. If the power is between these two, at 1 - t below NEAR_END, the path goes to infinity.
+LEAST_POWER, MOST_POWER = 0.1, 3.0
 NEAR_END = 0.05
 ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3  # codes of the ends of paths
 
@@ -173,8 +173,9 @@ def _ends(p: _Points) -> np.ndarray:
     remaining = 1.0 - p.t
     with np.errstate(invalid="ignore", divide="ignore"):
         power = np.max(np.abs(p.rate) / np.abs(p.z), axis=0) * remaining
-    escapes = (remaining < NEAR_END) & (power > POWERS[0]) & (power < POWERS[1])
-    status = np.where(escapes, INFINITE, np.where((remaining < NEAR_END) & (power <= POWERS[0]), SINGULAR, LOST))
+    is_near_end = remaining < NEAR_END
+    escapes = is_near_end & (power > LEAST_POWER) & (power < MOST_POWER)
+    status = np.where(escapes, INFINITE, np.where(is_near_end & (power <= LEAST_POWER), SINGULAR, LOST))
     return np.where(np.max(np.abs(p.z), axis=0) < LARGEST, status, INFINITE)
 
 

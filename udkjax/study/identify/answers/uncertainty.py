@@ -182,7 +182,10 @@ def estimate_uncertainty(reduced: ReducedGroups, values: UnknownValues, paramete
 def _with_priors(
     prior_rows: np.ndarray, sigma: np.ndarray, vt: np.ndarray, shown: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Add singular values and vectors of the directions that only priors determine; the threshold is relative to the priors."""
+    """Return sigma, vt and `shown` with the directions that only priors determine.
+
+    A direction is determined if its singular value in the rows of the priors exceeds a share of their size.
+    """
     unshown = null_space(vt[shown], 0.5)
     if not len(unshown) or not len(prior_rows):
         return sigma, vt, shown

@@ -240,7 +240,11 @@ def _parts(mechanism: StudyModel, p: Parameter) -> list[_Part]:
 
 
 def _read(mechanism: StudyModel, text: str, scaled: bool) -> tuple[Length | tuple[str, ...], bool]:
-    """Parse the text of a parameter: names or lengths separated by equals signs, or names with a common scale."""
+    """Parse the text of a parameter: names or lengths separated by equals signs, or names with a common scale.
+
+    Returns:
+        The `Length`, or the names of numbers, and whether these have a common scale.
+    """
     text = text.strip()
     if text.startswith("scale(") and text.endswith(")"):
         return tuple(part.strip() for part in text[6:-1].split(",") if part.strip()), True

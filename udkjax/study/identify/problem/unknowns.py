@@ -86,17 +86,17 @@ class Unknowns:
         return cls(names, units, targets, kinds, all(at_scene_value), *np.array(numbers, float))
 
     def values(self, z: Float[NumericArray, "... P"], xp: Any = np) -> Any:
-        """Return x(z), by NumPy or, with `xp` the module `jax.numpy`, by JAX."""
+        """Return the values x of the parameters at the dimensionless unknowns z, by NumPy or, with `xp` `jax.numpy`, by JAX."""
         with np.errstate(over="ignore", invalid="ignore"):
             return self._values(z, xp)[0]
 
     def dx_dz(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """Return dx/dz."""
+        """Return dx/dz, the derivative of each parameter with respect to its own unknown."""
         with np.errstate(over="ignore"):
             return np.exp(self.log_dx_dz(z))
 
     def d2x_dz2(self, z: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """Return d2x/dz2."""
+        """Return d2x/dz2, the second derivative of each parameter with respect to its own unknown."""
         slope = self.dx_dz(z)
         with np.errstate(over="ignore", invalid="ignore"):
             return self._by_kind(slope, slope * (1.0 - 2.0 * self._values(z, np)[1]), np.zeros_like(slope))
@@ -109,7 +109,7 @@ class Unknowns:
         return xp.where(positive, own + z, xp.where(bounded, at_bound, np.log(self.scale)))
 
     def _values(self, z: Any, xp: Any) -> tuple[Any, Any]:
-        """Return x(z), and the part of the way from the lower to the upper bound."""
+        """Return the values x at z, and the part of the way from the lower to the upper bound."""
         positive, bounded, own, low, width = self._safe
         factor = xp.exp(xp.where(positive, z, 0.0))
         part = xp.exp(-xp.logaddexp(0.0, -(xp.where(bounded, z, 0.0) + own)))
@@ -129,7 +129,7 @@ class Unknowns:
 
     @np.errstate(divide="ignore", invalid="ignore")
     def z_of(self, x: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """Return z(x); not finite for a value outside its bounds, or not positive."""
+        """Return the unknowns z of parameters x; not finite for a value outside its bounds, or not positive."""
         width = self.high - self.low
         bounded = logit((x - self.low) / width) - logit((self.guess - self.low) / width)
         return self._by_kind(np.log(x / self.guess), bounded, (x - self.guess) / self.scale)

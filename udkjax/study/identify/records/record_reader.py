@@ -158,8 +158,10 @@ class _TableReader:
         """Return a record of some rows, with the channels that were measured in them."""
         measured = [name for name, x in values.items() if not np.isnan(x[places]).all()]
         if self.table.padded and measured:
-            some = np.flatnonzero(~np.isnan(np.stack([values[name][places] for name in measured])).all(0))
-            places = places[some[0] : some[-1] + 1]
+            # Rows at the ends without any value belong to longer records.
+            is_empty = np.isnan(np.stack([values[name][places] for name in measured])).all(0)
+            filled = np.flatnonzero(~is_empty)
+            places = places[filled[0] : filled[-1] + 1]
         of_rows, sigma = ({name: x[name][places] for name in measured if name in x} for x in (values, noise))
         try:
             yield Record(times[places], of_rows, sigma, name=label)
