@@ -260,7 +260,7 @@ class JointsAtRest(NamedTuple):
             return start
 
         def attempt(state: tuple[_Pivot, Any]) -> tuple[_Pivot, Any]:
-            """Return the pivots after an attempt, which begins with a guess in the masked members, and a mask of those still open."""
+            """Return the pivots after an attempt, with a guess in the masked members, and a mask of members still open."""
             pivot, guesses = state
             improved = lambda: xp.where(is_given, direction, self._guess(respond, direction, xp))  # noqa: E731
             if xp is not np:

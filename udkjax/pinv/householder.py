@@ -32,7 +32,7 @@ class Householder(Orthogonal):
 
 
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Householder's QR; each step uses the column with the largest remaining norm, until that is at most `threshold`."""
+    """Return Householder's QR, in which each step uses the longest remaining column, until that is at most `threshold`."""
     q, r, order, rank = complete_qr(D, threshold)
     significant = jnp.arange(len(order)) < rank
     return PivotedQR(
@@ -41,7 +41,9 @@ def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR
 
 
 def complete_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Householder's QR with the full Q (m, m) and R (m, n); from `rank` on, the columns of Q span the complement of D's range.
+    """Return Householder's QR with the full Q (m, m) and R (m, n).
+
+    From `rank` on, the columns of Q span the complement of D's range.
 
     Columns are not moved; their order is returned. (The pivoted QR of jax.scipy needs MAGMA on a GPU.)
     """

@@ -158,7 +158,7 @@ def _triangular_solve(
     if unit_diagonal:
         a = a * (1 - np.eye(a.shape[-1])) + np.eye(a.shape[-1])
     if not np.all(np.diagonal(a, axis1=-2, axis2=-1)):
-        return NotImplemented
+        return NotImplemented  # NumPy raises an error for a singular matrix, and JAX returns infinite numbers
     a = np.swapaxes(a, -1, -2) if transpose_a else a
     if left_side:
         return np.linalg.solve(a, b)

@@ -117,7 +117,7 @@ class Model(RunModel):
         return units_of(self, name)
 
     def must_be_positive(self, name: str) -> bool:
-        """Return True if a number, or the number that an entry belongs to, must not be negative."""
+        """Return True for a number, or an entry of one, that its type requires to be positive or zero."""
         return must_be_positive(self, name)
 
     def parameters(self) -> dict[str, Array]:

@@ -42,7 +42,7 @@ class SceneWriter:
         self._table = self._terms_of_equations(with_friction) | self._results_of_elimination()
 
     def program(self) -> LoopProgram:
-        """Return the program."""
+        """Return the program of the requested outputs."""
         parts: list[KernelLoop | Reset] = []
         written = set[str]()
 

@@ -60,7 +60,7 @@ class SmoothLoads:
         return self._loads(self.inputs(SmoothLoads.numbers(of), t, q, v, sides))
 
     def condition(self, index: int, of: Any, sides: Any, t: Any, q: Iterable[Any], v: Iterable[Any]) -> Any:
-        """Return a condition."""
+        """Return the value of the condition with this index: the load changes its smooth form where it crosses zero."""
         return self._conditions[index](self.inputs(SmoothLoads.numbers(of), t, q, v, sides))[0]
 
     def state(self, frames: Sequence[Frame]) -> tuple[list[Any], list[Any]]:

@@ -74,7 +74,7 @@ class PythonFunction:
         return used
 
     def compile(self) -> Callable[[Any], Any]:
-        """Return the function."""
+        """Return the function that the written steps define."""
         exec("\n ".join([f"def run({self._argument}):", *self.lines]), self._known)
         return self._known.pop("run")
 

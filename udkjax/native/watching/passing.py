@@ -151,6 +151,7 @@ class PassingRuns(Trajectory):
         row = f.at(record, start + (1 + self.passing.locks))
         f.store(f.lane(s.event, k), row, 0)
         f.store(f.lane(s.sure_t, k), row, 1)
+        # After its index and its time: q, v before it and v after it, then sides and locks.
         places = dict.fromkeys(("sure q", "sure v", "after v"), self.n)
         places |= {"sides": self.passing.sides, "locks": self.passing.joints}
         start = 2
@@ -184,7 +185,7 @@ class PassingRuns(Trajectory):
         for name, value in (kept | times).items():
             self.put_lane_entry(f, name, k, value)
         with f.each(n) as i:
-            for start, x in ((2, "q"), (2 + 2 * n, "v")):
+            for start, x in ((2, "q"), (2 + 2 * n, "v")):  # of the row: q at the event, v after it
                 value = f.load(row, i + start)
                 for to in ("sure", *(f"point{point}" for point in range(POINTS))):
                     self.put_lane_entry(f, f"{to} {x}", k, value, i)

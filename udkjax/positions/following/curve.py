@@ -240,7 +240,7 @@ class NumpyCurve(AbstractCurve):
         return self.terms.gamma(s, q, v)
 
     def correct(self, X: Any, fixed: Any = False) -> tuple[Any, Any]:
-        """Return X corrected as by `Curve`, and whether it is closed. A closed point takes the pseudoinverse of the step before."""
+        """Return X corrected as by `Curve`, and whether it is closed: a closed point by the pseudoinverse of the step before."""
         if not len(self.rows):
             return X, np.True_
         if fixed and (corrected := self._eliminate(X)) is not None:

@@ -91,7 +91,7 @@ def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
 
 
 def must_be_positive(mechanism: Any, name: str) -> bool:
-    """Return True if a number, or the number that an entry belongs to, must not be negative."""
+    """Return True for a number, or an entry of one, that its type requires to be positive or zero."""
     known = mechanism.number_fields()
     field = known[split_index(name, known)[0]]
     if not field.path:

@@ -171,7 +171,7 @@ class CompleteSearch(NamedTuple):
     limits: Mapping[str, Any]
 
     def __call__(self) -> CompleteDesigns:
-        """Return the designs."""
+        """Return the designs for the goal, within the limits."""
         return design_all(self.mechanism, self.goal, self.driver, **self.limits)
 
 

@@ -117,6 +117,8 @@ def classify(bars: FourBars) -> Classification:
     turns = is_grashof & (kind <= 1)
     side = np.sign(bars.transmission)
     angle = _relative_angles(bars, lengths)
+    # A crank that turns has one branch in each of two circuits. A crank of a Grashof linkage that rocks has two, one on each
+    # side of the frame; all other linkages have one circuit. Each of these has two branches.
     circuit = np.where(turns[:, None], side, np.where(is_grashof[:, None], np.sign(angle), 0.0))
     branch = np.where(turns[:, None], circuit, 4.0 * circuit + side)
     circuits, branches = _counted(circuit), _counted(branch)

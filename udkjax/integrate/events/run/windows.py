@@ -179,6 +179,8 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
     has_landed = (arrives & ~returns & ~(is_off & is_ahead)) | is_lost
     is_located = has_landed | (hit.is_found & jumps)
 
+    # The node at which the next window begins: the last one before a crossing or an unclear interval, the first one if the motion
+    # goes back beyond zero, otherwise the end.
     node = xp.where(stays, xp.where(hit.is_coarse, hit.last_sure, place), xp.where(returns, 0, len(nodes) - 1))
     last_good = xp.where(xp.all(good), len(times) - 1, xp.maximum(xp.sum(good) - 1, 0))
     # Where a condition jumps, the event happens at the first time after the jump.
