@@ -210,6 +210,7 @@ def _rates(law: _ImpactLaw, b: Any, least: Any, slides: Any, closed: Any) -> tup
 
     fixed = W, columns, b, known, least, law.friction, rests, closed
     W0, C, b0, known, least0, mu, at_rest, may_press = fixed if xp is np else stop_gradients(fixed)
+    # If a contact that may take part depends on others, all contacts yield a little.
     taking = xp.concatenate([may_press, at_rest])
     _, independent = eliminate(W0, taking, AT_REST.carried * diagonal(W0, xp), xp)
     compliance = COMPLIANCE * xp.any(taking & ~independent)
