@@ -63,12 +63,15 @@ from udkjax.equations.states.quantities import friction_loads as friction_loads
 from udkjax.equations.states.quantities import violation as violation
 from udkjax.equations.states.reactions import reactions as reactions
 from udkjax.equations.states.reactions import unique_reactions as unique_reactions
+from udkjax.equations.states.scene_changes import SceneChanges as SceneChanges
+from udkjax.equations.states.scene_changes import scene_along as scene_along
 from udkjax.equations.states.textbook import TextbookEquations as TextbookEquations
 from udkjax.equations.states.textbook import prepare as prepare
 from udkjax.equations.systems.general import ConstrainedSystem as ConstrainedSystem
 from udkjax.equations.systems.smooth_loads import SmoothLoads as SmoothLoads
 from udkjax.equations.terms import constraints as constraints
 from udkjax.equations.terms import loads as loads
+from udkjax.equations.terms import switches as switches
 from udkjax.equations.terms.element_programs import has_rheonomic_joints as has_rheonomic_joints
 from udkjax.equations.terms.elements import has_pieces as has_pieces
 from udkjax.equations.terms.loads import mass_of as mass_of

@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from udkjax.annotations import Numbers
 from udkjax.arrays import number
 from udkjax.equations.states.quantities import efforts
+from udkjax.equations.states.scene_changes import SceneChanges
 from udkjax.extras import OptionalImport
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
 from udkjax.scene.elements.bodies import COORDINATES, Frame, frame_over_time
@@ -132,6 +133,8 @@ class Solution(PrintsTable):
             infinite if all are located, None if there are none.
         sticking: for each joint with set-valued friction, whether it sticks at the output times, or is held at rest by drivers;
             None without any.
+        scene_changes: the constraints that events release, add or hold, at the output times; None if no event changes any. By
+            these, reactions, accelerations and other quantities of this solution are those of the constraints that hold.
     """
 
     ts: Float[Array, "T"]
@@ -147,12 +150,21 @@ class Solution(PrintsTable):
     events: "Events | None" = None  # `Events` of a run with events
     unlocated: Float[Array, ""] | None = None
     sticking: dict[str, Bool[Array, "T"]] | None = None
+    scene_changes: SceneChanges | None = None
     found_cause: Any = eqx.field(static=True, default=None, repr=False)  # `FoundCause` of a single run that failed
 
     @property
     def settings(self) -> dict[str, str]:
         """The choices of the run, by name: the method, the solver, the engine and the reason for it, ..."""
         return dict(self.choices)
+
+    @property
+    def holds(self) -> dict[str, Bool[Array, "T"]]:
+        """Whether each constraint that events release or add, and each contact that may rest, holds at the output times.
+
+        The contact of an event "floor" is "floor.contact"; after an event, its time is the first at which changes show.
+        """
+        return {} if self.scene_changes is None else self.scene_changes.by_name
 
     @property
     def result(self) -> Any:
@@ -204,7 +216,8 @@ class Solution(PrintsTable):
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
         """Return an xarray Dataset: q and v over time, body and coordinate, units, versions, settings, result and statistics.
 
-        The q and v of a `ConstrainedSystem` are over time and coordinate, without units.
+        The q and v of a `ConstrainedSystem` are over time and coordinate, without units. `holds`, over time and constraint, tells
+        which of the constraints that events change hold at the output times.
 
         If `mechanism` is given, the dataset also has its numbers (the attribute `parameters`, as JSON), its text (`scene`, as
         TOML) and the efforts of its drivers (`effort` over time and driver): torques (N m) and forces (N), by `udkjax.efforts`.
@@ -236,6 +249,7 @@ class Solution(PrintsTable):
             **{f"setting_{k}": v for k, v in self.choices},
             **{f"version_{k}": v for k, v in versions().items()},
         }
+        SceneChanges.write(self.scene_changes, data)
         if mechanism is not None:
             data.attrs["parameters"] = json.dumps({k: np.asarray(v).tolist() for k, v in mechanism.parameters().items()})
             data.attrs["scene"] = scene_text(mechanism)

@@ -13,9 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Numbers
 from udkjax.argument_types import HISTORY
-from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.states.quantities import equations_of
-from udkjax.equations.states.textbook import TextbookEquations
+from udkjax.equations.states.scene_changes import scene_along
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.channels import (
@@ -56,7 +55,8 @@ def measure(
         Values (T, C) in SI units, one column per channel; NaN where the state is NaN, after a run has failed. At a toggle,
         positions, angles and distances are finite, and velocities are NaN. Derivatives of NaN values are zero.
     """
-    motion, placed, reached = _fill(mechanism, solution, TextbookEquations.known_sticking(mechanism, solution))
+    needs_dynamics = any(isinstance(c, Channel) and c.needs != "states" for c in channels)
+    motion, placed, reached = _fill(mechanism, solution, scene_along(mechanism, solution) if needs_dynamics else None)
     filled = eqx.tree_at(lambda s: (s.q, s.v), solution, (motion.q, motion.v))
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
     if not columns:
@@ -95,21 +95,21 @@ def path(
     """
     body, local = locate(mechanism, of, point)
     accelerations = getattr(solution, "a", None)
-    analysis = analyse(mechanism) if derivative == 2 and accelerations is None else None
+    scene = scene_along(mechanism, solution) if derivative == 2 and accelerations is None else None
     motion = jnp.asarray(solution.ts), jnp.asarray(solution.q), jnp.asarray(solution.v)
-    given = accelerations if derivative == 2 else None, TextbookEquations.known_sticking(mechanism, solution)
-    return _path(mechanism.without_origin, analysis, *motion, *given, local, body, derivative)
+    given = accelerations if derivative == 2 else None, scene
+    return _path(mechanism.without_origin, *motion, *given, local, body, derivative)
 
 
 @deferred
 @defined
-def _path(mechanism, analysis, ts, q, v, a, sticking, local, body, derivative):
-    motion, placed, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), sticking, analysis)
+def _path(mechanism, ts, q, v, a, scene, local, body, derivative):
+    motion, placed, reached = _fill(mechanism, SimpleNamespace(ts=ts, q=q, v=v, a=a), scene)
     return jnp.where((reached if derivative else placed)[:, None], jnp.stack(motion.point(body, local, derivative), -1), jnp.nan)
 
 
 def _fill(
-    mechanism: Any, solution: StateHistory | SimpleNamespace, sticking: Any, analysis: Analysis | None = None
+    mechanism: Any, solution: StateHistory | SimpleNamespace, scene: Any
 ) -> tuple["_Motion", Bool[Array, "T"], Bool[Array, "T"]]:
     """Return a motion whose NaN states are replaced, to keep all derivatives finite, and two masks.
 
@@ -126,7 +126,7 @@ def _fill(
     q, v = (jnp.where(jnp.expand_dims(valid, axes), x, jax.lax.stop_gradient(x0)) for valid, x, x0 in filled)
     a = getattr(solution, "a", None)
     a = None if a is None else jnp.where(reached[:, None, None], a, 0.0)
-    return _Motion(mechanism, solution.ts, q, v, a, analysis, sticking), placed, reached
+    return _Motion(mechanism, solution.ts, q, v, a, scene), placed, reached
 
 
 POSITIONS = ("x", "y", "angle", "distance")  # quantities that do not depend on velocities
@@ -151,19 +151,21 @@ class _Motion:
     q: Float[Array, "T bodies 3"]
     v: Float[Array, "T bodies 3"]
     a: Float[Array, "T bodies 3"] | None  # accelerations of the motion, if it has them
-    analysis: Analysis | None
-    sticking: Bool[Array, "T F"] | None  # the joints that are known to stick
+    scene: Any  # `SceneAlong`: the constraints along the motion; None if accelerations are not needed
 
     @cached_property
     def dynamics(self) -> _Dynamics:
         """The solution of the equations of motion, computed only if a channel needs it."""
-        equations = equations_of(self.mechanism, SVD(), analysis=self.analysis)
+        assert self.scene is not None  # a channel that needs it asks for it
+        mechanism, analysis, knowledge, _ = self.scene
+        equations: Any = equations_of(mechanism, SVD(), analysis=analysis)
 
-        def at(t, q, v, sticking):
-            a, multipliers = equations.known_to_stick(sticking).motion(t, q.ravel(), v.ravel())
-            return equations.jacobian(t, q.ravel()).reshape(-1, *q.shape), multipliers, a.reshape(q.shape)
+        def at(t, q, v, known):
+            here = equations.known(known)
+            a, multipliers = here.motion(t, q.ravel(), v.ravel())
+            return here.jacobian(t, q.ravel()).reshape(-1, *q.shape), multipliers, a.reshape(q.shape)
 
-        psi_q, multipliers, a = jax.vmap(at)(self.ts, self.q, self.v, self.sticking)
+        psi_q, multipliers, a = jax.vmap(at)(self.ts, self.q, self.v, knowledge.states(mechanism))
         return _Dynamics(psi_q, multipliers, [name for name, _ in equations.row_names], a)
 
     @cached_property
@@ -181,7 +183,9 @@ class _Motion:
         psi_q, multipliers, owners, _ = self.dynamics
         by_row = -multipliers[..., None, None] * psi_q
         rows_by_owner = {owner: [k for k, name in enumerate(owners) if name == owner] for owner in owners}
-        return {owner: by_row[:, indices[0] : indices[-1] + 1].sum(1) for owner, indices in rows_by_owner.items()}
+        found = {owner: by_row[:, indices[0] : indices[-1] + 1].sum(1) for owner, indices in rows_by_owner.items()}
+        assert self.scene is not None  # as for `dynamics`
+        return {name: sum((found[x] for x in joined), jnp.zeros(())) for name, joined in self.scene.names.items()}
 
     def acceleration(self, body: str) -> list[Array]:
         """Return ax, ay and alpha of a body, each (T,)."""

@@ -18,9 +18,8 @@ from jaxtyping import Array, Float
 from udkjax.argument_types import HISTORY
 from udkjax.equations import constraints, loads
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import analyse
 from udkjax.equations.states.quantities import equations_of
-from udkjax.equations.states.textbook import TextbookEquations
+from udkjax.equations.states.scene_changes import scene_along
 from udkjax.pinv import SVD, Pseudoinverse
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.printing import PrintedTable, format_number, prints_table, units
@@ -98,22 +97,21 @@ def power_balance(
         stabilization: the run's `Baumgarte`, to include its terms.
 
     Returns:
-        The `PowerBalance` (W).
+        The `PowerBalance` (W). Joints that events add, and contacts that may rest, are among its joints.
     """
     ts, flat = jnp.asarray(solution.ts), (len(solution.ts), -1)
     q, v = (jnp.asarray(x).reshape(flat) for x in (solution.q, solution.v))
-    analysis, method = analyse(mechanism), SVD() if method is None else method
-    given = analysis, ts, q, v, TextbookEquations.known_sticking(mechanism, solution), method, stabilization
-    by_row, by_force, by_joint, kinetic, potential = _powers(mechanism.without_origin, *given)
-    owners = [name for name, _ in analysis.row_names]
+    scene, method = scene_along(mechanism, solution), SVD() if method is None else method
+    by_row, by_force, by_joint, kinetic, potential = _powers(*scene[:3], ts, q, v, method, stabilization)
+    analysis, owners = scene.analysis, [name for name, _ in scene.analysis.row_names]
 
     def total(values: Array, name: str) -> Array:
-        return values[:, [k for k, owner in enumerate(owners) if owner == name]].sum(1)
+        return values[:, [k for k, owner in enumerate(owners) if owner in scene.names[name]]].sum(1)
 
     return PowerBalance(
         drivers={name: total(by_row, name) for name in mechanism.driver_names},
-        forces={name: by_force[:, k] for k, name in enumerate(mechanism.force_names)},
-        joints={name: total(by_joint, name) for name in mechanism.joint_names},
+        forces={name: by_force[:, k] for k, name in enumerate(scene.mechanism.force_names)},
+        joints={name: total(by_joint, name) for name in scene.names if name not in mechanism.driver_names},
         kinetic=kinetic,
         potential=potential,
         scale=analysis.mass * analysis.length**2 * analysis.scales.rate**3,
@@ -121,12 +119,13 @@ def power_balance(
 
 
 @deferred
-def _powers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
+def _powers(mechanism, analysis, knowledge, ts, q, v, method, baumgarte):
     equations = equations_of(mechanism, method, baumgarte, analysis=analysis)
 
-    def one(at, t, q, v, sticking):
-        equations, mechanism = at
-        a, multipliers = equations.known_to_stick(sticking).motion(t, q, v)
+    def one(equations, t, q, v, known):
+        equations = equations.known(known)
+        mechanism = equations.mechanism
+        a, multipliers = equations.motion(t, q, v)
         psi_t = jax.jvp(lambda t: constraints.psi(mechanism, t, q), (t,), (jnp.ones_like(t),))[1]
         kinetic = jax.jvp(lambda v: loads.kinetic_energy(mechanism, v), (v,), (a,))[1]
         potential = jax.jvp(lambda t, q: loads.potential_energy(mechanism, t, q, v), (t, q), (jnp.ones_like(t), v))[1]
@@ -134,7 +133,7 @@ def _powers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
         drags = equations.rubbing_powers(t, q, v, multipliers)
         return multipliers * psi_t, _force_powers(mechanism, t, q, v, drags), by_joint, kinetic, potential
 
-    return at_each(one, (equations, mechanism), ts, q, v, sticking)
+    return at_each(one, equations, ts, q, v, knowledge.states(mechanism))
 
 
 def _force_powers(mechanism: Mechanism, t: Array, q: Array, v: Array, drags: dict[str, Array]) -> Float[Array, "forces"]:

@@ -17,6 +17,7 @@ from udkjax.equations.laws import udwadia_kalaba as uk
 from udkjax.equations.rows import determinacy
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.terms import constraints
+from udkjax.equations.terms.switches import switched_friction
 from udkjax.pinv import SVD
 from udkjax.programs.deferred import deferred
 from udkjax.scene.elements.fields import given_number
@@ -67,7 +68,8 @@ class DirectedFriction(Friction):
         forces, joints = list(mechanism._forces), []
         for k, force in enumerate(forces):
             if isinstance(force, Friction) and (force.sticks or every):
-                forces[k] = make_module(DirectedFriction, **vars(force), sides=jnp.zeros(SIDES))
+                cls = switched_friction(DirectedFriction) if hasattr(force, "active") else DirectedFriction
+                forces[k] = make_module(cls, **vars(force), sides=jnp.zeros(SIDES))
                 joints.append((force.joint, k))
         return DirectedMechanism(
             eqx.tree_at(lambda m: m._forces, mechanism, tuple(forces)) if joints else mechanism, tuple(joints)

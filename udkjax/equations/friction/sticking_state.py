@@ -10,6 +10,7 @@ rounding errors in units of the scene; which of the joints at rest stick follows
 a run. Where joints lock each other, the forces of least norm among those that the law allows count.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -143,17 +144,16 @@ def sticking_joints(mechanism: Mechanism) -> tuple[str, ...]:
     return tuple(name for name, _ in DirectedFriction.put_in(mechanism).joints)
 
 
-def known_sticking(mechanism: Any, solution: Any) -> Bool[Array, "T F"] | None:
+def known_sticking(mechanism: Any, sticking: Mapping[str, Any] | None) -> Bool[Array, "T F"] | None:
     """Return which joints stick in a run, if this is known.
 
     Args:
         mechanism: The scene.
-        solution: A `Solution`, or other states over time.
+        sticking: `Solution.sticking`; None: it is not known.
 
     Returns:
         A mask of the joints with set-valued friction, in the order of the forces; None: it is not known, or there are none.
     """
-    sticking = getattr(solution, "sticking", None)
     if not sticking or not mechanism.has_bodies:
         return None
     names = sticking_joints(mechanism)

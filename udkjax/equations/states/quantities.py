@@ -10,11 +10,11 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import NumberLike, Vector
 from udkjax.argument_types import COORDINATES_OF_BODIES, HISTORY
-from udkjax.equations.friction.sticking_state import known_sticking
 from udkjax.equations.laws.abstract_system import AbstractSystem, ConstrainedRows, HistoryLike
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import Analysis, analyse, analysis_of
+from udkjax.equations.rows.analysis import Analysis, analysis_of
+from udkjax.equations.states.scene_changes import SceneChanges, scene_along
 from udkjax.equations.states.state_arrays import by_numpy, history_of, state_arrays
 from udkjax.equations.states.textbook import TextbookEquations, prepare
 from udkjax.equations.systems.general import ConstrainedSystem, prepare_general
@@ -164,12 +164,15 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
 
     Returns:
         Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers. For a `ConstrainedSystem` the
-        rows of Psi, then those of phi.
+        rows of Psi, then those of phi. Rows of a constraint are zero while events of a `Solution` have released it.
     """
+    changes: SceneChanges | None = getattr(solution, "scene_changes", None)
     if by_numpy(mechanism, (solution.ts, solution.q)):
         ts, q = history_of(solution)[:2]
-        return jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
-    return _evaluate_along(mechanism, solution, _residuals)
+        psi = jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
+    else:
+        psi = _evaluate_along(mechanism, solution, _residuals)
+    return psi if changes is None else jnp.where(changes.rows_that_hold(mechanism), psi, 0.0)
 
 
 @checked
@@ -204,19 +207,20 @@ def efforts(
         stabilization: The run's `Baumgarte`, to include its terms.
 
     Returns:
-        For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are NaN.
+        For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are NaN, and
+        zero while an event of a `Solution` has released the driver.
     """
     if not mechanism.driver_names:
         return {}
-    analysis, method = analyse(mechanism), SVD() if method is None else method
-    if by_numpy(mechanism, (solution.ts, solution.q, solution.v, analysis, stabilization), method):
+    scene, method = scene_along(mechanism, solution), SVD() if method is None else method
+    analysis, given = scene.analysis, (solution.ts, solution.q, solution.v, scene.analysis, stabilization)
+    if scene.knowledge.changes is None and by_numpy(mechanism, given, method):
         arrays, (ts, q, v) = state_arrays(mechanism.without_origin), history_of(solution)
         pieces = [arrays.solve(ts[p], q[p], v[p], analysis, method, stabilization) for p in arrays.pieces(len(ts))]
         multipliers = jax.device_put(np.concatenate([piece.multipliers for piece in pieces]))
     else:
         ts, q, v = (jnp.asarray(x) for x in (solution.ts, solution.q, solution.v))
-        sticking = known_sticking(mechanism, solution)
-        multipliers = _multipliers(mechanism.without_origin, analysis, ts, q, v, sticking, method, stabilization)
+        multipliers = _multipliers(*scene[:3], ts, q, v, method, stabilization)
     rows = {owner: k for k, (owner, _) in enumerate(analysis.row_names)}
     return {name: -multipliers[:, rows[name]] for name in mechanism.driver_names}
 
@@ -242,15 +246,18 @@ def friction_loads(
 
     Returns:
         For each friction and each body of its joint the load (T, 3) about the centre of mass: force x, force y (N) and torque
-        (N m).
+        (N m). That of a contact with friction "floor" is named "floor.contact friction".
     """
-    frictions = {name: force for name, force in mechanism.forces.items() if isinstance(force, Friction)}
+    scene = scene_along(mechanism, solution)
+    frictions = {name: force for name, force in scene.mechanism.forces.items() if isinstance(force, Friction)}
     if not frictions:
         return {}
     ts, q, v = (jnp.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
-    given = analyse(mechanism), ts, q, v, known_sticking(mechanism, solution), SVD() if method is None else method
-    by_name, names = _friction_loads(mechanism.without_origin, *given, stabilization), mechanism.body_names
-    bodies = {name: [b for b in dict.fromkeys(mechanism.frames_of(force)) if b != GROUND] for name, force in frictions.items()}
+    by_name = _friction_loads(*scene[:3], ts, q, v, SVD() if method is None else method, stabilization)
+    bodies = {
+        name: [b for b in dict.fromkeys(scene.mechanism.frames_of(force)) if b != GROUND] for name, force in frictions.items()
+    }
+    names = mechanism.body_names
     return {name: {b: by_name[name][:, names.index(b)] for b in bodies[name]} for name in frictions}
 
 
@@ -269,23 +276,23 @@ def _accelerations(mechanism, analysis, t, q, v, method, baumgarte, formulation,
 
 
 @deferred
-def _multipliers(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
-    def of_state(equations, t, q, v, sticking):
-        found = equations.known_to_stick(sticking).multipliers(t, q.ravel(), v.ravel())
+def _multipliers(mechanism, analysis, knowledge, ts, q, v, method, baumgarte):
+    def of_state(equations, t, q, v, known):
+        found = equations.known(known).multipliers(t, q.ravel(), v.ravel())
         return jnp.where(jnp.all(jnp.isfinite(q) & jnp.isfinite(v)), found, jnp.nan)
 
-    return at_each(of_state, prepare(mechanism, method, baumgarte, analysis), ts, q, v, sticking)
+    return at_each(of_state, prepare(mechanism, method, baumgarte, analysis), ts, q, v, knowledge.states(mechanism))
 
 
 @deferred
-def _friction_loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte):
+def _friction_loads(mechanism, analysis, knowledge, ts, q, v, method, baumgarte):
     equations = prepare(mechanism, method, baumgarte, analysis)
 
-    def of_state(equations, t, q, v, sticking):
-        found = equations.known_to_stick(sticking).friction_loads(t, q.ravel(), v.ravel())
+    def of_state(equations, t, q, v, known):
+        found = equations.known(known).friction_loads(t, q.ravel(), v.ravel())
         return {name: load.reshape(q.shape) for name, load in found.items()}
 
-    return at_each(of_state, equations, ts, q, v, sticking)
+    return at_each(of_state, equations, ts, q, v, knowledge.states(mechanism))
 
 
 def _residuals(equations: ConstrainedRows, t: Array, q: Vector, v: Vector) -> Array:

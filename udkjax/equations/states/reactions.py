@@ -17,11 +17,11 @@ from udkjax.annotations import Number, NumberLike
 from udkjax.argument_types import ARRAYS_BY_NAME, HISTORY, NOT_NEGATIVE
 from udkjax.arrays import ArrayLibrary, array_namespace
 from udkjax.equations.friction.compliance import compliance_rows
-from udkjax.equations.friction.sticking_state import known_sticking
 from udkjax.equations.laws.abstract_system import HistoryLike
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
+from udkjax.equations.states.scene_changes import SceneAlong, scene_along
 from udkjax.equations.states.state_arrays import StateArrays, StateArraysOverTime, by_numpy, history_of, state_arrays
 from udkjax.equations.states.textbook import prepare
 from udkjax.equations.systems.general import ConstrainedSystem, prepare_general
@@ -69,8 +69,10 @@ def reactions(
     Returns:
         The load (T, 3): force x, force y (N) and torque (N m), -Psi_q^T lambda of the constraint's rows. With redundant
         constraints only the components marked by `unique_reactions` are determined. The force of friction is not included: see
-        `friction_loads`. Of a `ConstrainedSystem`: for "constraint" and "velocity_constraint" the "load" -A^T lambda on its
-        coordinates (T, n), and the "multipliers" lambda (T, m) of its rows A.
+        `friction_loads`. If events of a `Solution` change the scene, the loads are those of the constraints that hold, contacts
+        ("floor.contact") and joints that events add among them, zero for all others, and NaN if they are not known. Of a
+        `ConstrainedSystem`: for "constraint" and "velocity_constraint" the "load" -A^T lambda on its coordinates (T, n), and the
+        "multipliers" lambda (T, m) of its rows A.
 
     Raises:
         ValueError: a compliance is negative or belongs to an unknown joint, or a joint has the wrong number of compliances.
@@ -80,16 +82,13 @@ def reactions(
             raise ValueError("the coordinates of a ConstrainedSystem have no frame: leave out frame, about and compliances")
         states = _states(solution)
         return _loads_of_rows(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
-    soft = None if compliances is None else compliance_rows(mechanism, compliances)
-    analysis, method, states = analyse(mechanism), SVD() if method is None else method, _states(solution)
-    if soft is None and by_numpy(mechanism, (states, analysis, stabilization), method):
-        loads = _loads_by_numpy(
-            mechanism.without_origin, analysis, history_of(solution), method, stabilization, frame=frame, about=about
-        )
+    scene, method, states = scene_along(mechanism, solution), SVD() if method is None else method, _states(solution)
+    soft = None if compliances is None else compliance_rows(scene.mechanism, compliances)
+    if soft is None and scene.knowledge.changes is None and by_numpy(mechanism, (states, scene.analysis, stabilization), method):
+        loads = _loads_by_numpy(*scene[:2], history_of(solution), method, stabilization, frame=frame, about=about)
     else:
-        sticking = known_sticking(mechanism, solution)
-        loads = _loads(mechanism.without_origin, analysis, *states, sticking, method, stabilization, soft, frame, about)
-    return _name_by_body(mechanism, loads)
+        loads = _loads(*scene[:3], *states, method, stabilization, soft, frame, about)
+    return _name_by_body(scene, loads, jnp.add)
 
 
 @checked
@@ -114,12 +113,12 @@ def unique_reactions(
     Returns:
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
-    analysis, (ts, q, _) = analyse(mechanism), _states(solution)
-    if by_numpy(mechanism, (ts, q, analysis, rank_tol)):
-        marks = _uniqueness_by_numpy(mechanism.without_origin, analysis, history_of(solution)[:2], rank_tol, frame, about)
+    scene, (ts, q, _) = scene_along(mechanism, solution), _states(solution)
+    if scene.knowledge.changes is None and by_numpy(mechanism, (ts, q, scene.analysis, rank_tol)):
+        marks = _uniqueness_by_numpy(*scene[:2], history_of(solution)[:2], rank_tol, frame, about)
     else:
-        marks = _uniqueness_of_loads(mechanism.without_origin, analysis, ts, q, jnp.asarray(rank_tol), frame, about)
-    return _name_by_body(mechanism, marks)
+        marks = _uniqueness_of_loads(*scene[:3], ts, q, jnp.asarray(rank_tol), frame, about)
+    return _name_by_body(scene, marks, jnp.logical_and)
 
 
 @deferred
@@ -133,13 +132,20 @@ def _loads_of_rows(system: Any, ts: Array, q: Array, v: Array, method: Pseudoinv
     }
 
 
-def _name_by_body(mechanism: Mechanism, values: list[list[Array]]) -> ByBody:
-    """Return values by the names of their constraints and bodies, in order; dictionaries would lose the order under `jit`."""
-    bodies = {name: dict.fromkeys(mechanism.frames_of(element)) for name, element in mechanism.constraints.items()}
-    return {
-        name: dict(zip([body for body in bodies[name] if body != GROUND], by_body, strict=True))
-        for name, by_body in zip(bodies, values, strict=True)
-    }
+def _name_by_body(scene: SceneAlong, values: list[list[Array]], join: Callable[[Array, Array], Array]) -> ByBody:
+    """Return values by the names of their constraints and bodies, in order; dictionaries would lose the order under `jit`.
+
+    Constraints of one name, which hold one after another, are joined.
+    """
+    constraints, found = scene.mechanism.constraints, {}
+    bodies = {name: [b for b in dict.fromkeys(scene.mechanism.frames_of(x)) if b != GROUND] for name, x in constraints.items()}
+    by_constraint = {name: dict(zip(bodies[name], x, strict=True)) for name, x in zip(bodies, values, strict=True)}
+    for public, names in scene.names.items():
+        found[public] = dict(by_constraint[names[0]])
+        for name in names[1:]:
+            for body, value in by_constraint[name].items():
+                found[public][body] = join(found[public][body], value) if body in found[public] else value
+    return found
 
 
 def _split_by_body(
@@ -224,15 +230,16 @@ def _states(solution: HistoryLike) -> tuple[Array, Array, Array]:
 
 
 @deferred
-def _loads(mechanism, analysis, ts, q, v, sticking, method, baumgarte, soft, frame, about):
+def _loads(mechanism, analysis, knowledge, ts, q, v, method, baumgarte, soft, frame, about):
     """Compute -Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
     equations = prepare(mechanism, method, baumgarte, analysis).with_compliances(soft)
 
-    def row_loads(equations, t, q, v, sticking):
-        multipliers = equations.known_to_stick(sticking).multipliers(t, q, v)
-        return -equations.jacobian(t, q) * multipliers[:, None]
+    def row_loads(equations, t, q, v, known):
+        equations = equations.known(known)
+        return -equations.jacobian(t, q) * equations.multipliers(t, q, v)[:, None]
 
-    by_row, rows = at_each(row_loads, equations, ts, q, v, sticking), [name for name, _ in analysis.row_names]
+    by_row = at_each(row_loads, equations, ts, q, v, knowledge.states(mechanism))
+    rows = [name for name, _ in analysis.row_names]
     by_body = _split_by_body(mechanism, rows, q, by_row, lambda load: load.sum(0), frame, about)
     return [list(loads.values()) for loads in by_body.values()]
 
@@ -247,19 +254,21 @@ def _is_unique(coefficients: Any, N: Any, unit: Any, xp: ArrayLibrary) -> Any:
 
 
 @deferred
-def _uniqueness_of_loads(mechanism, analysis, ts, q, rank_tol, frame, about):
+def _uniqueness_of_loads(mechanism, analysis, knowledge, ts, q, rank_tol, frame, about):
     """Return whether equilibrium determines each component of `_loads`, from Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
 
-    def terms(t, q):
-        return psi_q(mechanism, t, q), left_null_space(mechanism, t, q, analysis, rank_tol).basis
+    def terms(t, q, known):
+        scene = known.put_in(mechanism)
+        return psi_q(scene, t, q), left_null_space(scene, t, q, analysis, rank_tol).basis
 
-    Psi_q, N = jax.vmap(terms)(ts, q)
+    Psi_q, N = jax.vmap(terms)(ts, q, known := knowledge.states(mechanism))
     rows = [name for name, _ in analysis.row_names]
     unit = jnp.stack([1.0, 1.0, analysis.length])
     unique, rows_of = partial(_is_unique, unit=unit, xp=jnp), _rows_by_owner(rows)
     by_body = _split_by_body(mechanism, rows, q, Psi_q / analysis.row_units[:, None], lambda c: c, frame, about)
+    is_known = jnp.ones((len(ts), 1), bool) if known.unknown is None else ~known.unknown[:, None]
     return [
-        [unique(coefficients, N[:, np.array(rows_of[name])]) for coefficients in loads.values()]
+        [unique(coefficients, N[:, np.array(rows_of[name])]) & is_known for coefficients in loads.values()]
         for name, loads in by_body.items()
     ]
 

@@ -1,7 +1,6 @@
 """The equations of motion of a mechanism in textbook form (udwadia_kalaba.py): any pseudoinverse, derivatives of any order."""
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,13 +11,14 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.annotations import Time, Vector
 from udkjax.equations.friction import rubbing
 from udkjax.equations.friction.loose_friction import LooseFriction, loose_friction
-from udkjax.equations.friction.sticking_state import StickingState, known_sticking
+from udkjax.equations.friction.sticking_state import StickingState
 from udkjax.equations.laws import udwadia_kalaba as uk
-from udkjax.equations.laws.abstract_system import ConstrainedRows, HistoryLike, TangentPart
+from udkjax.equations.laws.abstract_system import ConstrainedRows, TangentPart
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.programs.scene_programs import ScenePrograms, scene_programs
 from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.states.scene_changes import KnownState
 from udkjax.equations.terms import constraints, loads
 from udkjax.equations.terms.scene_layout import LoadShares
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
@@ -105,14 +105,9 @@ class TextbookEquations(ConstrainedRows):
         """Return the equations whose redundant forces are shared by the compliances of the rows."""
         return replace(self, soft=soft)
 
-    @staticmethod
-    def known_sticking(mechanism: Any, solution: HistoryLike) -> Bool[Array, "T F"] | None:
-        """Return which joints stick in a run, for `known_to_stick`; None if it does not tell, or there are none."""
-        return known_sticking(mechanism, solution)
-
-    def known_to_stick(self, sticking: Bool[Array, "F"] | None) -> "TextbookEquations":
-        """Return the equations at states at which these joints are known to stick, in the order of `sticking_joints`."""
-        return replace(self, sticking=sticking)
+    def known(self, state: KnownState) -> "TextbookEquations":
+        """Return the equations at a state of a motion: of the constraints that hold, with the joints that are known to stick."""
+        return replace(self, mechanism=state.put_in(self.mechanism), sticking=state.sticking)
 
     def rubbing_powers(self, t: Time, q: Vector, v: Vector, multipliers: Float[Array, "m"]) -> dict[str, Array]:
         """Return the power (W) of the friction that depends on the loads of joints, by joint."""

@@ -21,6 +21,7 @@ from udkjax.equations.friction.directed_friction import DirectedFriction
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
+from udkjax.integrate.events.instant.changes import scene_changes
 from udkjax.integrate.events.instant.listing import listing, names_of_events
 from udkjax.integrate.events.instant.runs import EventRun
 from udkjax.integrate.events.law.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
@@ -219,6 +220,7 @@ _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
 def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str, ...], xp: ModuleType = jnp) -> Solution:
     """Return the solution with the events that are listed; by jax.numpy, whose count is traced, padded to `max_events`."""
     names = names_of_events(given.events, given.phases)
+    changes = scene_changes(found, given.ts, given.events, given.phases, xp)
     found, kinks, sticking = listing(found, given.ts, given.events, given.phases, given.max_events, xp)
     count = int(found.count) if xp is np else None
     choices, bodies = given.choices, (-1, *mechanism.state_shape())
@@ -275,6 +277,7 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
         events=events if names else None,
         unlocated=None if kinks is None else kinks.unlocated,
         sticking=sticking,
+        scene_changes=changes,
         found_cause=None,
     )
 

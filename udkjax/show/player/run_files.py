@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.equations.states.scene_changes import SceneChanges
 from udkjax.extras import OptionalImport
 from udkjax.integrate.solution import Result
 from udkjax.scene.files import loads
@@ -27,6 +28,7 @@ class RunFile(NamedTuple):
     result: Result | None  # None if it is not in the file
     cause: str  # reason for an early end
     others: dict[str, np.ndarray]  # further numbers over time, by "name (unit)", shown as measures
+    scene_changes: SceneChanges | None = None  # the constraints that hold; None if the run had no events that change any
 
 
 def read_run(path: Path) -> RunFile:
@@ -54,7 +56,8 @@ def read_run(path: Path) -> RunFile:
         others = {_label(data[name]): np.asarray(data[name], float) for name in data.data_vars if data[name].dims == ("time",)}
         ts, q, v = (np.asarray(data[name], float) for name in ("time", "q", "v"))
         result = Result.__members__.get(str(data.attrs.get("result", "")))
-        return RunFile(mechanism, ts, q, v, result, str(data.attrs.get("cause", "")), others)
+        changes = SceneChanges.read(data, had_events="setting_max_events" in data.attrs)
+        return RunFile(mechanism, ts, q, v, result, str(data.attrs.get("cause", "")), others, changes)
 
 
 def _label(variable: "xarray.DataArray") -> str:

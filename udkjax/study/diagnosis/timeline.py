@@ -2,7 +2,7 @@
 
 A singular value that vanishes at t* is proportional to |t - t*| nearby: its samples have a minimum with a kink, which can be
 located to machine precision. Between output times the trajectory is integrated again from the previous one, and interpolated by
-a quintic through q, v and a.
+a quintic through q, v and a; a run with events, which could not be repeated without them, by a cubic through q and v.
 """
 
 from itertools import pairwise
@@ -23,7 +23,9 @@ from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import State
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.programs.deferred import deferred
+from udkjax.requirements import ArgumentError
 from udkjax.study.quantities import StudyModel
+from udkjax.wording import quote
 
 SAMPLES_PER_OUTPUT = 4  # samples per output interval, to look for minima
 PARTS_OF_INTERVAL = 8  # number of parts of an interval that is integrated again
@@ -66,15 +68,22 @@ def timeline(mechanism: StudyModel, solution: StateHistory, rank_tol: float, tol
         rank_tol: singular values up to this fraction of the largest count as zero.
         tol: half-width of the brackets around rank changes (s); by default 1e-9 of the scene's characteristic time.
 
+    Raises:
+        ArgumentError: events have released constraints of the mechanism during the run.
+
     Returns:
-        The `Timeline`. The brackets of rank changes do not account for errors of the trajectory.
+        The `Timeline` of the mechanism's own constraints. Brackets of rank changes do not account for errors of the trajectory.
     """
+    changes = getattr(solution, "scene_changes", None)
+    if changes is not None and np.any(changes.are_released):
+        names = ", ".join(quote(name) for name in changes.names[: changes.of_scene])
+        raise ArgumentError(f"solution: its events release {names}: give a run that ends before, or leave it out")
     analysis = analysis_of(mechanism)
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
     alive = np.isfinite(q).reshape(len(ts), -1).all(1)
     ts, q, v = ts[alive], q[alive].reshape(alive.sum(), -1), v[alive].reshape(alive.sum(), -1)
     tol = _tolerance(analysis, ts) if tol is None else tol
-    path = _Path(mechanism, analysis, ts, q, v)
+    path = _Path(mechanism, analysis, ts, q, v, getattr(solution, "events", None) is None)
     fine = np.unique(np.concatenate([np.linspace(a, b, SAMPLES_PER_OUTPUT + 1) for a, b in pairwise(ts)] or [ts]))
     sampled = path.singular_values(fine)
     output_indices = np.searchsorted(fine, ts)
@@ -127,8 +136,11 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
 def _renew(
     mechanism: StudyModel, analysis: Analysis | None, solution: StateHistory, ts: np.ndarray, low: float, high: float
 ) -> "_Path | None":
-    """Integrate the trajectory between two times again, starting from the output time before these."""
-    if not isinstance(solution, Solution):
+    """Integrate the trajectory between two times again, starting from the output time before these.
+
+    Return None for other trajectories than runs without events: a new run would have none.
+    """
+    if not isinstance(solution, Solution) or solution.events is not None:
         return None
     first = int(np.searchsorted(ts, low, side="right")) - 1
     later = np.linspace(low, high, 2 * PARTS_OF_INTERVAL + 1)
@@ -140,13 +152,15 @@ def _renew(
 
 
 class _Path:
-    """Singular values at any time, by quintics through q, v and a of neighbouring states."""
+    """Singular values at any time, by quintics through q, v and a of neighbouring states; else by cubics through q and v."""
 
-    def __init__(self, mechanism: StudyModel, analysis: Analysis | None, ts: np.ndarray, q: np.ndarray, v: np.ndarray):
+    def __init__(
+        self, mechanism: StudyModel, analysis: Analysis | None, ts: np.ndarray, q: np.ndarray, v: np.ndarray, by_a: bool = True
+    ):
         self.mechanism, self.analysis = mechanism.without_origin.traced(q.shape[1]), analysis
-        a = np.asarray(_accelerations(self.mechanism, analysis, ts, q, v))
+        a = [np.asarray(_accelerations(self.mechanism, analysis, ts, q, v))] if by_a else []
         if len(ts) > 1:
-            self.q = BPoly.from_derivatives(ts, np.stack([q, v, a], 1))
+            self.q = BPoly.from_derivatives(ts, np.stack([q, v, *a], 1))
             self.v = self.q.derivative()
         else:
             self.q, self.v = (lambda times, x=x: np.tile(x, (len(times), 1)) for x in (q, v))

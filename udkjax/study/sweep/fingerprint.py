@@ -13,7 +13,9 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from udkjax.integrate.simulate import simulate
 from udkjax.integrate.solution import Solution, scene_text, versions
+from udkjax.scene.elements.friction import Friction
 from udkjax.scene.model import Model
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn
 from udkjax.study.sweep.measures import Measure
@@ -36,6 +38,7 @@ def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
         "settings": {name: _value(value) for name, value in plan.settings.items()},
         "measures": {f"{k} {measure.name}": _measure(plan, measure) for k, measure in enumerate(plan.measures, 1)},
         "derivatives": list(plan.derivatives),
+        **({"loads of runs with events": "of the constraints that hold"} if "events" in plan.settings else {}),
         "versions": {name: version for name, version in versions().items() if name != "python"},
     }
 
@@ -64,7 +67,11 @@ def _measure(plan: SweepPlan, measure: Measure) -> dict[str, JsonValue]:
 
 
 def _solution(plan: SweepPlan) -> Solution:
-    """Return a solution with the right shapes, for tracing."""
+    """Return a solution with the right shapes, for tracing; with events or friction by which joints stick that of a run."""
+    events = {name: x for name, x in plan.settings.items() if name in ("events", "max_events")}
+    if events or (plan.mechanism.has_bodies and Friction.may_stick(plan.mechanism.forces.values())):
+        shapes = eqx.filter_eval_shape(lambda model: simulate(model, plan.ts, throw=False, **events), plan.mechanism)
+        return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, shapes)
     number, states = np.zeros(()), np.zeros((len(plan.ts), *plan.state_shape_of(plan.groups[0])))
     count, model = np.zeros((), int), plan.mechanism
     stats = dict.fromkeys(STATS, count)

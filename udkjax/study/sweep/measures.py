@@ -14,6 +14,7 @@ from typing_extensions import TypeAliasType
 
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.equations.states.quantities import energy, equations_of, violation
+from udkjax.equations.states.scene_changes import scene_along
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
@@ -264,12 +265,17 @@ def _rank(run: MeasuredRun) -> dict[str, Array]:
     method = method.rank_revealing if isinstance(method, Auto) else method
     if not run.mechanism.has_bodies:
         return {"rank": _ranks_of_rows(run, method)}
-    equations: Any = equations_of(run.mechanism, SVD())
+    scene, analysis, knowledge = scene_along(run.mechanism, run.solution)[:3]
+    equations = equations_of(scene, SVD(), analysis=analysis)
     ts, q = run.solution.ts, run.solution.q.reshape(len(run.solution.ts), -1)
     if method.rank_tol is None:
         method = replace(method, rank_tol=equations.scales.rank_tol)
     reached = jnp.all(jnp.isfinite(q), axis=1)
-    ranks = jax.vmap(lambda t, q: method.rank(equations.weighted_rows(t, q)[0]))(ts, jnp.where(reached[:, None], q, q[0]))
+
+    def rank(t: Array, q: Array, known: Any) -> Array:
+        return method.rank(equations.known(known).weighted_rows(t, q)[0])
+
+    ranks = jax.vmap(rank)(ts, jnp.where(reached[:, None], q, q[0]), knowledge.states(scene))
     return {"rank": jnp.where(reached, ranks, RANK_NOT_REACHED)}
 
 

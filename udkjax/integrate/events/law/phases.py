@@ -2,11 +2,10 @@
 
 A phase is a mask of the *switches*: the constraints that events release or add, and the contacts that are held at rest. A run
 begins with the mechanism of the scene. All other phases share one mechanism with all switches. Its numbers switch the constraints
-on and off (switched.py), so no phase needs its own equations or code.
+on and off (equations/terms/switches.py), so no phase needs its own equations or code.
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from types import ModuleType
@@ -19,13 +18,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool
 
 from udkjax.annotations import Number
-from udkjax.arrays import is_traced, number
+from udkjax.arrays import number
 from udkjax.equations.rows.analysis import Analysis
+from udkjax.equations.terms import switches as switching
 from udkjax.integrate.events.law.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.law.event import Event
 from udkjax.integrate.events.law.kinks import HeldElement, has_sides, sides_in
 from udkjax.integrate.events.law.sticking_joints import StickingJoint, friction_of, line_of, lock_of
-from udkjax.integrate.events.law.switched import switch, switched, with_switched_friction
 from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.elements.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
@@ -92,8 +91,8 @@ class Phases(eqx.Module):
             return mechanism
         for (_, name), joint in zip(self.added_by, joints, strict=True):
             index = mechanism.joint_names.index(name)
-            mechanism = eqx.tree_at(lambda m, index=index: m._joints[index], mechanism, switched(joint))
-        return switch(mechanism, self.switches.names, list(jnp.asarray(phase, float)))
+            mechanism = eqx.tree_at(lambda m, index=index: m._joints[index], mechanism, switching.switched(joint))
+        return switching.switch(mechanism, self.switches.names, list(jnp.asarray(phase, float)))
 
     def first_added(self) -> tuple[Joint, ...]:
         """Return the joints that events add, as they would be at the initial guess."""
@@ -207,21 +206,13 @@ def _switches(mechanism: Mechanism, events: Sequence[Event], sticking: Sequence[
 
 def _with(mechanism: Mechanism, switches: Sequence[_Switch], events: Sequence[Event]) -> Mechanism:
     """Return the mechanism with all switches, switched on, and the friction of contacts."""
-    of_scene: dict[str, Any] = {x.name: switched(x.constraint) for x in switches if x.event < 0}
-    others: dict[str, Any] = {x.name: x.constraint for x in switches if x.event >= 0}
-    is_concrete = mechanism.is_concrete and not is_traced(list(others.values()))
-    with jax.ensure_compile_time_eval() if is_concrete else nullcontext():  # numbers taken from the guess stay concrete
-        joints, drivers = (
-            {k: of_scene.get(k, x) for k, x in elements.items()} for elements in (mechanism.joints, mechanism.drivers)
-        )
-        forces = with_switched_friction(dict(mechanism.forces), list(of_scene))
-        for x in switches:
-            if not x.public and not x.locks and events[x.event].action.friction is not None:
-                name = next(y for k in range(len(forces) + 1) if (y := f"{x.name} friction{' ' * k}") not in forces)
-                forces[name] = friction_of(events[x.event], x.name)
-        whole = Mechanism(mechanism.bodies, joints | others, drivers, forces, mechanism.gravity, mechanism.name).without_origin
-        completed = [switched(whole.joints[name]) for name in others]
-        return eqx.tree_at(lambda m: [m._joints[m.joint_names.index(name)] for name in others], whole, completed)
+    rubbing = [x for x in switches if not x.public and not x.locks and events[x.event].action.friction is not None]
+    return switching.with_switches(
+        mechanism,
+        [x.name for x in switches if x.event < 0],
+        {x.name: x.constraint for x in switches if x.event >= 0},  # pyright: ignore[reportArgumentType]
+        {x.name: friction_of(events[x.event], x.name) for x in rubbing},
+    )
 
 
 class HeldContact(Joint):

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udkjax.equations.terms import switches as switching
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.instant.runs import RunState
 from udkjax.integrate.events.instant.system import StateValues
 from udkjax.integrate.events.law.event_plan import EventPlan
 from udkjax.integrate.events.law.kinks import KinkPlaces, places_of_sides
 from udkjax.integrate.events.law.phases import SWITCHED, Phases, Switches
-from udkjax.integrate.events.law.switched import places_of_switches
 from udkjax.integrate.events.run.added_joints import AddedJoint, places_of_joints
 from udkjax.integrate.events.run.passed_events import NumberPlaces, PassedEvents, passed_events
 from udkjax.integrate.native_engine import integrator_output, run_inputs
@@ -87,7 +87,7 @@ def phase_plan(
     without = replace(conditions, forces=None, force_key="")
     has_forces = any(which == SWITCHED or x.contact < 0 for x in phases.sticking)
     if which == SWITCHED:
-        active, joints = places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, names)
+        active, joints = switching.places_of_switches(mechanism, phases.switches.names), places_of_joints(mechanism, names)
     sides = places_of_sides(mechanism, phases.sided) if phases.sided else ()
     watched = conditions if which == SWITCHED else without  # nothing is held that could let go
     first_mark = run.code.marks.start if run.code.marks_rows else -1

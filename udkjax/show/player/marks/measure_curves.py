@@ -101,10 +101,15 @@ def _energy(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
 
 
 def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
-    """Return the rank of the scaled Jacobian, and the smallest singular value that is nonzero at the largest rank."""
+    """Return the rank of the scaled Jacobian, and the smallest singular value that is nonzero at the largest rank.
+
+    There are none where events have released constraints.
+    """
     positions, q = RankedPositions(mechanism, determinacy.STATIC_RANK_TOL), np.asarray(solution.q, float)
     ts, q = np.asarray(solution.ts, float).tolist(), q.reshape(len(q), -1)
-    found = [positions.at(t, x) if np.isfinite(x).all() else None for t, x in zip(ts, q, strict=True)]
+    changes, holds = getattr(solution, "scene_changes", None), np.isfinite(q).all(1)
+    holds = holds if changes is None else holds & ~np.asarray(changes.are_released)
+    found = [positions.at(t, x) if ok else None for t, x, ok in zip(ts, q, holds, strict=True)]
     full = max((at.rank for at in found if at), default=0)
     curves = [MeasureCurve("rank", "", np.array([at.rank if at else np.nan for at in found], float))]
     if full:

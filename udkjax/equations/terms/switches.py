@@ -4,7 +4,8 @@ A switched element has one more number, `active`: one, or zero, which makes its 
 constraints that events can leave behind are thus one mechanism with different numbers, and share its equations and its code.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from functools import cache
 from typing import Any, TypeVar
 
@@ -14,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.arrays import make_module, number
+from udkjax.arrays import is_traced, make_module, number
 from udkjax.scene.elements.forces import Wrench
 from udkjax.scene.elements.friction import Friction
-from udkjax.scene.elements.joints import Constraint
+from udkjax.scene.elements.joints import Constraint, Joint
 from udkjax.scene.elements.rolling import RollingJoint
 from udkjax.scene.mechanism import Mechanism
 
@@ -27,6 +28,12 @@ AnyConstraint = TypeVar("AnyConstraint", bound=Constraint)
 def switched(constraint: AnyConstraint) -> AnyConstraint:
     """Return a constraint with the number `active`, switched on."""
     return make_module(_switched(type(constraint)), **vars(constraint), active=number(1.0))
+
+
+def unswitched(constraint: Constraint) -> Constraint:
+    """Return a constraint without the number `active`."""
+    plain: Any = type(constraint).__bases__[0]
+    return make_module(plain, **{name: x for name, x in vars(constraint).items() if name != "active"})
 
 
 @cache
@@ -43,9 +50,8 @@ def _switched(cls: type) -> Any:
     if not issubclass(cls, RollingJoint):
         return Switched
 
-    class SwitchedRolling(Switched):
-        def residual(self, t, *frames):
-            return RollingJoint.residual(self, t, *frames)  # zero by structure
+    class SwitchedRolling(cls):
+        active: Float[Array, ""] = eqx.field(default=1.0)
 
         def rates(self, t, *frames):
             return [jnp.where(self.active > 0.5, row, 0.0) for row in super().rates(t, *frames)]
@@ -54,7 +60,7 @@ def _switched(cls: type) -> Any:
 
 
 @cache
-def _switched_friction(cls: type) -> Any:
+def switched_friction(cls: type) -> Any:
     """Return the subclass of a class of friction that is off without its joint."""
 
     class SwitchedFriction(cls):
@@ -66,6 +72,9 @@ def _switched_friction(cls: type) -> Any:
 
         def rubbing_loads(self, joint, multipliers, t, *frames):
             return [self._switched(load) for load in super().rubbing_loads(joint, multipliers, t, *frames)]
+
+        def largest_force(self, joint, multipliers):
+            return self.active * super().largest_force(joint, multipliers)
 
         def _switched(self, load: Wrench) -> Wrench:
             x, y, torque = load
@@ -81,8 +90,35 @@ def with_switched_friction(forces: dict[str, Any], names: Sequence[str]) -> dict
         is_switched = isinstance(force, Friction) and force.joint in names
         result[name] = force
         if is_switched:
-            result[name] = make_module(_switched_friction(type(force)), **vars(force), active=number(1.0))
+            result[name] = make_module(switched_friction(type(force)), **vars(force), active=number(1.0))
     return result
+
+
+def with_switches(
+    mechanism: Mechanism, names: Sequence[str], others: Mapping[str, Joint], friction: Mapping[str, Friction]
+) -> Mechanism:
+    """Return the mechanism with further joints, in which these and some of its own constraints are switched on.
+
+    Args:
+        mechanism: The scene.
+        names: The constraints of the scene that can be switched.
+        others: The further joints by name; numbers that they leave open are taken from the initial guess.
+        friction: The friction of further joints, by joint.
+    """
+    of_scene: dict[str, Any] = {name: switched(x) for name, x in mechanism.constraints.items() if name in names}
+    is_concrete = mechanism.is_concrete and not is_traced((list(others.values()), list(friction.values())))
+    with jax.ensure_compile_time_eval() if is_concrete else nullcontext():  # numbers taken from the guess stay concrete
+        joints, drivers = (
+            {k: of_scene.get(k, x) for k, x in elements.items()} for elements in (mechanism.joints, mechanism.drivers)
+        )
+        forces = with_switched_friction(dict(mechanism.forces), list(of_scene))
+        for joint, force in friction.items():
+            name = next(x for k in range(len(forces) + 1) if (x := f"{joint} friction{' ' * k}") not in forces)
+            forces[name] = force
+        whole = Mechanism(mechanism.bodies, joints | dict(others), drivers, forces, mechanism.gravity, mechanism.name)
+        whole = whole.without_origin
+        completed = [switched(whole.joints[name]) for name in others]
+        return eqx.tree_at(lambda m: [m._joints[m.joint_names.index(name)] for name in others], whole, completed)
 
 
 def switch(mechanism: Mechanism, names: Sequence[str], active: Sequence[Any]) -> Mechanism:

@@ -1,0 +1,271 @@
+"""The constraints that hold at the output times of a run whose events change the scene, and quantities of its states.
+
+Joints that events release, add or lock, and contacts at rest, are switched constraints of one mechanism (terms/switches.py), as
+in the run itself. At each output time they are on or off, and joints that events have added have the numbers of the state at
+which they were added. Reactions and accelerations along a `Solution` are those of this mechanism.
+"""
+
+import pickle
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udkjax.arrays import number
+from udkjax.equations.friction import rubbing
+from udkjax.equations.friction.sticking_state import known_sticking
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.terms.switches import switch, switched, with_switches
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
+from udkjax.requirements import ArgumentError
+from udkjax.scene.elements.friction import Friction
+from udkjax.scene.elements.joints import Constraint, Joint
+from udkjax.scene.mechanism import Mechanism
+
+OF_SCENE = "constraints_of_the_scene"  # attribute of datasets: how many constraints of `holds`, the first ones; -1: none changes
+
+
+def is_array(x: object) -> bool:
+    """Return whether a leaf is an array, of JAX or NumPy."""
+    return isinstance(x, jax.Array | np.ndarray)
+
+
+class SceneChanges(eqx.Module):
+    """Which constraints hold at the output times (T) of a run, and the joints that its events have added.
+
+    The constraints (C) are first those of the scene that events release, then the joints that events add, A, then contacts.
+    If the joints are unknown, as in a run that was read from a dataset, or pickled with a function that cannot be pickled, no
+    loads are known while one of them holds.
+    """
+
+    holds: Bool[Array | np.ndarray, "T C"]
+    places: Float[Array | np.ndarray, "T A n"]  # coordinates at which each added joint was added last
+    numbers: Any  # arrays of the added joints, the contacts, and the friction of contacts; None: unknown
+    rest: Any = eqx.field(static=True)  # what is not an array of these
+    names: tuple[str, ...] = eqx.field(static=True)  # the constraints in the mechanism with all of them
+    public: tuple[str, ...] = eqx.field(static=True)  # the names by which results list them
+    of_scene: int = eqx.field(static=True)  # how many of them belong to the scene
+    sticking: tuple[str, ...] = eqx.field(static=True, default=())  # the names of contacts with friction in `Solution.sticking`
+
+    @classmethod
+    def of(
+        cls,
+        holds: Bool[Array, "T C"],
+        places: Float[Array, "T A n"],
+        of_scene: Sequence[str],
+        others: Sequence[tuple[str, str, Constraint]],
+        friction: Mapping[str, tuple[str, Friction]],
+    ) -> "SceneChanges":
+        """Return the changes of a run.
+
+        Args:
+            holds: Which constraints hold at the output times.
+            places: The coordinates at which each added joint was added last.
+            of_scene: The constraints of the scene that events release.
+            others: The joints that events add, and contacts: name, public name, and the joint without numbers of the state.
+            friction: The friction of contacts, by the name of their joint, with their names in `Solution.sticking`.
+        """
+        elements = [x for _, _, x in others], {name: force for name, (_, force) in friction.items()}
+        numbers, rest = eqx.partition(elements, is_array)
+        names, public = zip(*((name, name) for name in of_scene), *((name, listed) for name, listed, _ in others), strict=True)
+        return cls(holds, places, numbers, _Rest(rest), names, public, len(of_scene), tuple(x for x, _ in friction.values()))
+
+    @property
+    def by_name(self) -> dict[str, Bool[Array, "T"]]:
+        """Whether each constraint holds at the output times."""
+        found: dict[str, Any] = {}
+        for k, name in enumerate(self.public):
+            found[name] = found[name] | self.holds[..., k] if name in found else self.holds[..., k]
+        return found
+
+    @property
+    def elements(self) -> tuple[list[Any], dict[str, Friction]]:
+        """The joints that events add and contacts, and the friction of contacts."""
+        return ([], {}) if self.rest.elements is None else eqx.combine(self.numbers, self.rest.elements)
+
+    @property
+    def is_known(self) -> bool:
+        """True if the joints that events add, and contacts, are known."""
+        return self.rest.elements is not None
+
+    def __getstate__(self) -> dict[str, Any]:
+        try:
+            pickle.dumps((self.numbers, self.rest.elements))
+        except Exception:  # a lambda expression in a condition, or anything in users' classes
+            return vars(self) | {"numbers": None, "rest": _Rest(None)}
+        return dict(vars(self))
+
+    @staticmethod
+    def write(changes: "SceneChanges | None", data: Any) -> None:
+        """Add `holds`, over time and constraint, to an xarray Dataset; None: its run has not changed the scene."""
+        data.attrs[OF_SCENE] = -1 if changes is None else changes.of_scene
+        if changes is not None:
+            data["holds"] = ("time", "constraint"), np.asarray(changes.holds).astype(np.int8)
+            data.coords["constraint"] = list(changes.public)
+            data["holds"].attrs = {"long_name": "1 where a constraint that events change holds"}
+
+    @classmethod
+    def read(cls, data: Any, had_events: bool) -> "SceneChanges | None":
+        """Read what `write` has added to a dataset; joints that events have added are unknown.
+
+        Args:
+            data: The dataset. If `write` has added nothing, an older version has written it.
+            had_events: Whether its run had events.
+        """
+        of_scene, times = int(data.attrs.get(OF_SCENE, 0 if had_events else -1)), len(data["time"])
+        if of_scene < 0:
+            return None
+        holds, names = np.ones((times, 1), bool), ("",)  # something has changed
+        if "holds" in data.variables:
+            holds, names = np.asarray(data["holds"]) > 0, tuple(map(str, data["constraint"].values))
+        return cls(holds, np.zeros((times, 0, 0)), None, _Rest(None), names, names, of_scene)
+
+    def scene(self, mechanism: Mechanism) -> Mechanism:
+        """Return a mechanism with all constraints of the run."""
+        joints, friction = self.elements
+        known = [name for name in self.names[: self.of_scene] if name in mechanism.constraints]
+        others = dict(zip(self.names[self.of_scene :], joints, strict=False))
+        if is_concrete(mechanism, *joints, *friction.values()):
+            return _concrete_scene(mechanism, tuple(known), tuple(others), tuple(friction), *joints, *friction.values())
+        return with_switches(mechanism, known, others, friction)
+
+    def constraints_of(self, mechanism: Mechanism) -> dict[str, list[str]]:
+        """Return the constraints of `scene` by the name by which results list them, those of the mechanism first."""
+        found = {name: [name] for name in mechanism.constraints}
+        for name, public in list(zip(self.names, self.public, strict=True))[self.of_scene :]:
+            found.setdefault(public, []).append(name)
+        return found
+
+    def rows_that_hold(self, mechanism: Any) -> Bool[Array, "T m"]:
+        """Return a mask of the rows of a mechanism whose constraints hold."""
+        own = self.names[: self.of_scene]
+        owners = [name for name, _ in analyse(mechanism).row_names]
+        places = np.array([own.index(name) if name in own else self.of_scene for name in owners], int)
+        always = jnp.ones((len(self.holds), 1), bool)
+        return jnp.concatenate([self.holds[:, : self.of_scene], always], axis=1)[:, places]
+
+    @property
+    def are_released(self) -> Bool[Array, "T"]:
+        """Whether events have released a constraint of the scene."""
+        return ~jnp.all(self.holds[:, : self.of_scene], axis=1)
+
+    @property
+    def is_unknown(self) -> Bool[Array, "T"]:
+        """Whether constraints hold that are not known."""
+        return jnp.any(self.holds[:, self.of_scene :], axis=1) & (not self.is_known)
+
+
+class _Rest:
+    """The part of added joints and contacts that is not an array, compared by value."""
+
+    def __init__(self, elements: Any):
+        self.elements = elements
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Rest) and bool(eqx.tree_equal(self.elements, other.elements))
+
+    def __hash__(self) -> int:
+        return hash(tuple(jax.tree.leaves(self.elements)))
+
+
+@cached_by_identity
+def _concrete_scene(
+    mechanism: Mechanism, of_scene: tuple[str, ...], names: tuple[str, ...], rubbing_names: tuple[str, ...], *elements: Any
+) -> Mechanism:
+    others = dict(zip(names, elements, strict=False))
+    return with_switches(mechanism, of_scene, others, dict(zip(rubbing_names, elements[len(names) :], strict=True)))
+
+
+class KnownState(eqx.Module):
+    """What a run tells about the scene at one of its output times, or, with a leading axis T, at all of them."""
+
+    sticking: Bool[Array, "F"] | None = None  # the joints that stick, in the order of `sticking_joints`; None: the law decides
+    active: Float[Array, "C"] | None = None  # whether each switched constraint holds; None: the scene does not change
+    added: tuple[tuple[Array, ...], ...] = ()  # the numbers of the joints that events have added
+    unknown: Bool[Array, ""] | None = None  # whether the constraints that hold are not known
+    names: tuple[str, ...] = eqx.field(static=True, default=())  # the switched constraints
+    names_added: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def put_in(self, mechanism: Mechanism) -> Mechanism:
+        """Return the scene of this state; its loads are NaN if it is not known."""
+        if self.active is None:
+            return mechanism
+        for name, numbers in zip(self.names_added, self.added, strict=True):
+            index = mechanism.joint_names.index(name)
+            arrays, rest = eqx.partition(mechanism._joints[index], is_array)
+            joint = eqx.combine(jax.tree.unflatten(jax.tree.structure(arrays), numbers), rest)
+            mechanism = eqx.tree_at(lambda m, index=index: m._joints[index], mechanism, joint)
+        mechanism = switch(mechanism, self.names, list(self.active))
+        if self.unknown is None:
+            return mechanism
+        gravity = jnp.where(self.unknown, jnp.nan, mechanism.gravity)
+        return eqx.tree_at(lambda m: m._source.gravity, mechanism, gravity)
+
+
+class Knowledge(eqx.Module):
+    """What a motion tells about the scene at its times T."""
+
+    sticking: Bool[Array, "T F"] | None
+    changes: SceneChanges | None
+
+    def states(self, mechanism: Mechanism) -> KnownState:
+        """Return what is known at each time, of the mechanism with all constraints of the run."""
+        changes = self.changes
+        if changes is None:
+            return KnownState(self.sticking)
+        known = [k for k, name in enumerate(changes.names) if name in mechanism.constraints]
+        count = changes.places.shape[1] if changes.is_known else 0
+        joints, names = changes.elements[0][:count], changes.names[changes.of_scene :][:count]
+
+        def numbers(joint: Joint, q: Array) -> tuple[Array, ...]:
+            frames = rubbing.frames(mechanism, q, jnp.zeros_like(q))
+            completed = switched(jax.tree.map(number, joint.complete(*(frames[name] for name in joint.frame_names))))
+            return tuple(jax.tree.leaves(eqx.filter(completed, is_array)))
+
+        return KnownState(
+            sticking=self.sticking,
+            active=jnp.asarray(changes.holds)[:, np.array(known, int)].astype(float),
+            added=tuple(jax.vmap(lambda q, x=x: numbers(x, q))(changes.places[:, k]) for k, x in enumerate(joints)),
+            unknown=None if changes.is_known else changes.is_unknown,
+            names=tuple(changes.names[k] for k in known),
+            names_added=names,
+        )
+
+
+class SceneAlong(NamedTuple):
+    """A mechanism with all constraints that hold along a motion, its analysis, and which of them hold when."""
+
+    mechanism: Mechanism
+    analysis: Analysis
+    knowledge: Knowledge
+    names: Mapping[str, Sequence[str]]  # its constraints by the name by which results list them
+
+
+def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
+    """Return the mechanism in which the states of a motion are evaluated.
+
+    Args:
+        mechanism: The scene.
+        solution: A `Solution`, whose events may have changed the scene, or other states over time.
+
+    Raises:
+        ArgumentError: the solution's times do not belong to its `scene_changes`.
+    """
+    analysis = analyse(mechanism)
+    changes: SceneChanges | None = getattr(solution, "scene_changes", None)
+    if changes is None:
+        known = Knowledge(known_sticking(mechanism, getattr(solution, "sticking", None)), None)
+        return SceneAlong(mechanism.without_origin, analysis, known, {name: [name] for name in mechanism.constraints})
+    if len(changes.holds) != len(solution.ts):
+        count = f"{len(solution.ts)} times, and its scene_changes {len(changes.holds)}"
+        raise ArgumentError(f"solution: it has {count}: select times of all fields, or leave scene_changes out")
+    whole = changes.scene(mechanism)
+    contacts = dict(zip(changes.elements[1], changes.sticking, strict=False))
+    sticking = getattr(solution, "sticking", None) or {}
+    sticking = sticking | {joint: sticking[name] for joint, name in contacts.items() if name in sticking}
+    knowledge = Knowledge(known_sticking(whole, sticking), changes)
+    return SceneAlong(whole, analysis.with_rows_of(whole), knowledge, changes.constraints_of(mechanism))
