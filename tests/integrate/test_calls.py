@@ -146,7 +146,7 @@ def test_a_repeated_run_with_events_visits_no_number_of_the_scene(friction, even
     run = lambda: udk.simulate(mechanism, 5.0 * TS, events=events)  # noqa: E731
     assert visited(run)["Body"]  # a new mechanism is visited
     seen = visited(run)
-    assert seen.keys() <= {"Solution", "Events", "Auto", "Projection", "device_put"}
+    assert seen.keys() <= {"Solution", "Events", "SceneChanges", "Auto", "Projection", "device_put"}
     assert seen["device_put"] <= 1  # all results at once
 
 

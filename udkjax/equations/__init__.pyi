@@ -64,6 +64,7 @@ from udkjax.equations.states.quantities import violation as violation
 from udkjax.equations.states.reactions import reactions as reactions
 from udkjax.equations.states.reactions import unique_reactions as unique_reactions
 from udkjax.equations.states.scene_changes import SceneChanges as SceneChanges
+from udkjax.equations.states.scene_changes import numbers_and_form as numbers_and_form
 from udkjax.equations.states.scene_changes import scene_along as scene_along
 from udkjax.equations.states.textbook import TextbookEquations as TextbookEquations
 from udkjax.equations.states.textbook import prepare as prepare

@@ -184,8 +184,10 @@ class _Motion:
         by_row = -multipliers[..., None, None] * psi_q
         rows_by_owner = {owner: [k for k, name in enumerate(owners) if name == owner] for owner in owners}
         found = {owner: by_row[:, indices[0] : indices[-1] + 1].sum(1) for owner, indices in rows_by_owner.items()}
-        assert self.scene is not None  # as for `dynamics`
-        return {name: sum((found[x] for x in joined), jnp.zeros(())) for name, joined in self.scene.names.items()}
+        names = self.scene.names  # it is known, as for `dynamics`
+        return (
+            found if names is None else {name: sum((found[x] for x in joined), jnp.zeros(())) for name, joined in names.items()}
+        )
 
     def acceleration(self, body: str) -> list[Array]:
         """Return ax, ay and alpha of a body, each (T,)."""

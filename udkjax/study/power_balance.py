@@ -104,14 +104,15 @@ def power_balance(
     scene, method = scene_along(mechanism, solution), SVD() if method is None else method
     by_row, by_force, by_joint, kinetic, potential = _powers(*scene[:3], ts, q, v, method, stabilization)
     analysis, owners = scene.analysis, [name for name, _ in scene.analysis.row_names]
+    names = {name: (name,) for name in mechanism.constraints} if scene.names is None else scene.names
 
     def total(values: Array, name: str) -> Array:
-        return values[:, [k for k, owner in enumerate(owners) if owner in scene.names[name]]].sum(1)
+        return values[:, [k for k, owner in enumerate(owners) if owner in names[name]]].sum(1)
 
     return PowerBalance(
         drivers={name: total(by_row, name) for name in mechanism.driver_names},
         forces={name: by_force[:, k] for k, name in enumerate(scene.mechanism.force_names)},
-        joints={name: total(by_joint, name) for name in scene.names if name not in mechanism.driver_names},
+        joints={name: total(by_joint, name) for name in names if name not in mechanism.driver_names},
         kinetic=kinetic,
         potential=potential,
         scale=analysis.mass * analysis.length**2 * analysis.scales.rate**3,

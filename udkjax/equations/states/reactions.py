@@ -140,6 +140,8 @@ def _name_by_body(scene: SceneAlong, values: list[list[Array]], join: Callable[[
     constraints, found = scene.mechanism.constraints, {}
     bodies = {name: [b for b in dict.fromkeys(scene.mechanism.frames_of(x)) if b != GROUND] for name, x in constraints.items()}
     by_constraint = {name: dict(zip(bodies[name], x, strict=True)) for name, x in zip(bodies, values, strict=True)}
+    if scene.names is None:
+        return by_constraint
     for public, names in scene.names.items():
         found[public] = dict(by_constraint[names[0]])
         for name in names[1:]:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udkjax.annotations import TreeDef
 from udkjax.arrays import number
 from udkjax.equations.friction import rubbing
 from udkjax.equations.friction.sticking_state import known_sticking
@@ -44,35 +45,12 @@ class SceneChanges(eqx.Module):
 
     holds: Bool[Array | np.ndarray, "T C"]
     places: Float[Array | np.ndarray, "T A n"]  # coordinates at which each added joint was added last
-    numbers: Any  # arrays of the added joints, the contacts, and the friction of contacts; None: unknown
-    rest: Any = eqx.field(static=True)  # what is not an array of these
+    numbers: tuple[Array, ...]  # of the added joints, the contacts, and the friction of contacts
+    form: "_Form | None" = eqx.field(static=True)  # their structure; None: they are unknown
     names: tuple[str, ...] = eqx.field(static=True)  # the constraints in the mechanism with all of them
     public: tuple[str, ...] = eqx.field(static=True)  # the names by which results list them
     of_scene: int = eqx.field(static=True)  # how many of them belong to the scene
     sticking: tuple[str, ...] = eqx.field(static=True, default=())  # the names of contacts with friction in `Solution.sticking`
-
-    @classmethod
-    def of(
-        cls,
-        holds: Bool[Array, "T C"],
-        places: Float[Array, "T A n"],
-        of_scene: Sequence[str],
-        others: Sequence[tuple[str, str, Constraint]],
-        friction: Mapping[str, tuple[str, Friction]],
-    ) -> "SceneChanges":
-        """Return the changes of a run.
-
-        Args:
-            holds: Which constraints hold at the output times.
-            places: The coordinates at which each added joint was added last.
-            of_scene: The constraints of the scene that events release.
-            others: The joints that events add, and contacts: name, public name, and the joint without numbers of the state.
-            friction: The friction of contacts, by the name of their joint, with their names in `Solution.sticking`.
-        """
-        elements = [x for _, _, x in others], {name: force for name, (_, force) in friction.items()}
-        numbers, rest = eqx.partition(elements, is_array)
-        names, public = zip(*((name, name) for name in of_scene), *((name, listed) for name, listed, _ in others), strict=True)
-        return cls(holds, places, numbers, _Rest(rest), names, public, len(of_scene), tuple(x for x, _ in friction.values()))
 
     @property
     def by_name(self) -> dict[str, Bool[Array, "T"]]:
@@ -85,19 +63,26 @@ class SceneChanges(eqx.Module):
     @property
     def elements(self) -> tuple[list[Any], dict[str, Friction]]:
         """The joints that events add and contacts, and the friction of contacts."""
-        return ([], {}) if self.rest.elements is None else eqx.combine(self.numbers, self.rest.elements)
+        return ([], {}) if self.form is None else self.form.put(self.numbers)
 
     @property
     def is_known(self) -> bool:
         """True if the joints that events add, and contacts, are known."""
-        return self.rest.elements is not None
+        return self.form is not None
 
     def __getstate__(self) -> dict[str, Any]:
+        elements = self.elements if self.is_known else None
         try:
-            pickle.dumps((self.numbers, self.rest.elements))
+            pickle.dumps(elements)
         except Exception:  # a lambda expression in a condition, or anything in users' classes
-            return vars(self) | {"numbers": None, "rest": _Rest(None)}
-        return dict(vars(self))
+            elements = None
+        return vars(self) | {"numbers": (), "form": None, "elements": elements}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        elements = state.pop("elements")
+        numbers, form = ((), None) if elements is None else numbers_and_form(*elements)
+        for name, value in (state | {"numbers": numbers, "form": form}).items():
+            object.__setattr__(self, name, value)
 
     @staticmethod
     def write(changes: "SceneChanges | None", data: Any) -> None:
@@ -122,7 +107,7 @@ class SceneChanges(eqx.Module):
         holds, names = np.ones((times, 1), bool), ("",)  # something has changed
         if "holds" in data.variables:
             holds, names = np.asarray(data["holds"]) > 0, tuple(map(str, data["constraint"].values))
-        return cls(holds, np.zeros((times, 0, 0)), None, _Rest(None), names, names, of_scene)
+        return cls(holds, np.zeros((times, 0, 0)), (), None, names, names, of_scene)
 
     def scene(self, mechanism: Mechanism) -> Mechanism:
         """Return a mechanism with all constraints of the run."""
@@ -159,17 +144,27 @@ class SceneChanges(eqx.Module):
         return jnp.any(self.holds[:, self.of_scene :], axis=1) & (not self.is_known)
 
 
-class _Rest:
-    """The part of added joints and contacts that is not an array, compared by value."""
+class _Form(NamedTuple):
+    """The structure of added joints and contacts, and their leaves that are no arrays; hashable."""
 
-    def __init__(self, elements: Any):
-        self.elements = elements
+    tree: TreeDef
+    others: tuple[Any, ...]  # None in place of arrays
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Rest) and bool(eqx.tree_equal(self.elements, other.elements))
+    def put(self, numbers: Sequence[Array]) -> tuple[list[Any], dict[str, Friction]]:
+        """Return the joints, and the friction, with these numbers."""
+        following = iter(numbers)
+        return jax.tree.unflatten(self.tree, [next(following) if x is None else x for x in self.others])
 
-    def __hash__(self) -> int:
-        return hash(tuple(jax.tree.leaves(self.elements)))
+
+def numbers_and_form(joints: Sequence[Constraint], friction: Mapping[str, Friction]) -> tuple[tuple[Array, ...], _Form]:
+    """Return the fields `numbers` and `form` of `SceneChanges`.
+
+    Args:
+        joints: The joints that events add, without numbers of the state, and contacts.
+        friction: The friction of contacts, by the name of their joint.
+    """
+    leaves, tree = jax.tree.flatten((list(joints), dict(friction)))
+    return tuple(x for x in leaves if is_array(x)), _Form(tree, tuple(None if is_array(x) else x for x in leaves))
 
 
 @cached_by_identity
@@ -206,7 +201,7 @@ class KnownState(eqx.Module):
         return eqx.tree_at(lambda m: m._source.gravity, mechanism, gravity)
 
 
-class Knowledge(eqx.Module):
+class Knowledge(NamedTuple):
     """What a motion tells about the scene at its times T."""
 
     sticking: Bool[Array, "T F"] | None
@@ -242,7 +237,7 @@ class SceneAlong(NamedTuple):
     mechanism: Mechanism
     analysis: Analysis
     knowledge: Knowledge
-    names: Mapping[str, Sequence[str]]  # its constraints by the name by which results list them
+    names: Mapping[str, Sequence[str]] | None  # its constraints by the name by which results list them; None: by their own
 
 
 def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
@@ -258,8 +253,9 @@ def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
     analysis = analyse(mechanism)
     changes: SceneChanges | None = getattr(solution, "scene_changes", None)
     if changes is None:
-        known = Knowledge(known_sticking(mechanism, getattr(solution, "sticking", None)), None)
-        return SceneAlong(mechanism.without_origin, analysis, known, {name: [name] for name in mechanism.constraints})
+        sticking = getattr(solution, "sticking", None)
+        known = known_sticking(mechanism, sticking) if sticking else None
+        return SceneAlong(mechanism.without_origin, analysis, Knowledge(known, None), None)
     if len(changes.holds) != len(solution.ts):
         count = f"{len(solution.ts)} times, and its scene_changes {len(changes.holds)}"
         raise ArgumentError(f"solution: it has {count}: select times of all fields, or leave scene_changes out")

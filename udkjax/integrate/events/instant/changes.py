@@ -2,16 +2,19 @@
 
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.equations.states.scene_changes import SceneChanges
+from udkjax.arrays import make_module
+from udkjax.equations.states.scene_changes import SceneChanges, numbers_and_form
 from udkjax.equations.terms import switches as switching
 from udkjax.integrate.events.instant.runs import EventRun
 from udkjax.integrate.events.law.event import Event
 from udkjax.integrate.events.law.phases import SCENE, SWITCHED, Phases
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.joints import Constraint
 
@@ -28,34 +31,64 @@ def scene_changes(
         phases: The phases.
         xp: jax.numpy, or NumPy.
     """
-    switches = phases.switches
-    locks = {switches.contacts[x.event] for x in phases.sticking}
-    own = [k for k in range(len(switches.names)) if k not in locks]
-    if not own:
+    if not phases.switches.names:
+        return None
+    changing = (_concrete_scene if is_concrete(phases, *events) else _changing_scene)(phases, *events)
+    if not changing.switches:
         return None
     k = xp.arange(len(found.event_index))
     last = xp.searchsorted(xp.where(k < found.count, found.event_time, xp.inf), ts, side="right") - 1
     phase = xp.where((last >= 0)[:, None], found.event_phase[xp.maximum(last, 0)], found.first_phase)
-    scene, places, others = phases.mechanisms[SCENE], [], []
-    guess = xp.asarray(scene.q0).reshape(1, -1)
-    for (event, name), joint in zip(phases.added_by, phases.added, strict=True):
-        if switches.names.index(name) in locks:
-            continue
-        addition = events[event].action.addition(scene, events[event].name)
-        assert addition is not None  # it has added the joint
-        others.append((name, addition[0], joint))
+    guess, places = xp.asarray(changing.guess), []
+    for event in changing.adding:
         added = (found.event_index == event) & (k < found.count) & (k <= last[:, None])
         latest = xp.max(xp.where(added, k, -1), axis=1)
         places.append(xp.where((latest >= 0)[:, None], found.event_q[xp.maximum(latest, 0), 1], guess))
-    contacts = _contacts(events, phases)
-    friction = {x.contact: x.name for x in phases.sticking if x.contact >= 0}
-    return SceneChanges.of(
-        phase[:, np.array(own, int)],
-        xp.stack(places, axis=1) if places else xp.zeros((len(ts), 0, guess.size)),
-        [switches.names[k] for k in own if switches.first[k]],
-        [*others, *((name, name, joint) for name, joint in contacts.values())],
-        {contacts[event][0]: (name, _friction(events[event], contacts[event][0])) for event, name in friction.items()},
+    return make_module(
+        SceneChanges,
+        holds=phase[:, np.array(changing.switches, int)],
+        places=xp.stack(places, axis=1) if places else xp.zeros((len(ts), 0, guess.size)),
+        **changing.fields,
     )
+
+
+class _ChangingScene(NamedTuple):
+    """The part of `SceneChanges` that does not depend on the run."""
+
+    switches: tuple[int, ...]  # those without the locks of joints that stick
+    adding: tuple[int, ...]  # the events of the joints that events add
+    guess: Float[Any, "1 n"]  # of the scene
+    fields: dict[str, Any]  # of `SceneChanges`
+
+
+def _changing_scene(phases: Phases, *events: Event) -> _ChangingScene:
+    switches, scene = phases.switches, phases.mechanisms[SCENE]
+    locks = {switches.contacts[x.event] for x in phases.sticking}
+    own = tuple(k for k in range(len(switches.names)) if k not in locks)
+    names = [switches.names[k] for k in own if switches.first[k]]
+    public, of_scene, adding, joints = list(names), len(names), [], []
+    for (event, name), joint in zip(phases.added_by, phases.added, strict=True):
+        if switches.names.index(name) not in locks:
+            addition = events[event].action.addition(scene, events[event].name)
+            assert addition is not None  # it adds the joint
+            adding.append(event)
+            names.append(name)
+            public.append(addition[0])
+            joints.append(joint)
+    contacts = _contacts(events, phases)
+    names, public = ([*x, *(name for name, _ in contacts.values())] for x in (names, public))
+    rubbing = {contacts[x.contact][0]: x for x in phases.sticking if x.contact >= 0}
+    friction = {name: _friction(events[x.contact], name) for name, x in rubbing.items()}
+    numbers, form = numbers_and_form([*joints, *(joint for _, joint in contacts.values())], friction)
+    fields = {"numbers": numbers, "form": form, "names": tuple(names), "public": tuple(public), "of_scene": of_scene}
+    fields["sticking"] = tuple(x.name for x in rubbing.values())
+    return _ChangingScene(own, tuple(adding), scene.q0.reshape(1, -1), fields)
+
+
+@cached_by_identity
+def _concrete_scene(phases: Phases, *events: Event) -> _ChangingScene:
+    with jax.ensure_compile_time_eval():
+        return _changing_scene(phases, *events)
 
 
 def _contacts(events: Sequence[Event], phases: Phases) -> dict[int, tuple[str, Constraint]]:
