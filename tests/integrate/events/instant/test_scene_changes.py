@@ -227,7 +227,7 @@ def test_derivatives_of_loads_after_an_event():
 
 def test_an_attached_joint_takes_the_name_of_another():
     """It has its own numbers from the state at its event, and the name of the released joint."""
-    rod = udk.Mechanism({"rod": udk.Body(1.0, 0.1, angle=0.2)}, {"hold": udk.Weld(("ground", "rod"), [[0.5, 0], [0.5, 0]])})
+    rod = udk.Mechanism({"rod": udk.Body(1.0, 0.1)}, {"hold": udk.Weld(("ground", "rod"), [[0.5, 0], [0.5, 0]])})
     events = [
         udk.Event(lambda t, at: t - 0.2, udk.Release("hold"), name="fall"),
         udk.Event(lambda t, at: t - 0.6, udk.Attach(udk.Distance(("ground", "rod"), [[0, 1], [-0.2, 0]]), "hold")),
