@@ -23,6 +23,10 @@ from udkjax.scene.elements.bodies import Frame as Frame
 from udkjax.scene.elements.bodies import Point as Point
 from udkjax.scene.elements.bodies import between as between
 from udkjax.scene.elements.bodies import frame_over_time as frame_over_time
+from udkjax.scene.elements.couplings import Coupling as Coupling
+from udkjax.scene.elements.couplings import Gear as Gear
+from udkjax.scene.elements.couplings import Rack as Rack
+from udkjax.scene.elements.couplings import Screw as Screw
 from udkjax.scene.elements.drivers import Driver as Driver
 from udkjax.scene.elements.drivers import Motion as Motion
 from udkjax.scene.elements.drivers import Polynomial as Polynomial
@@ -47,14 +51,10 @@ from udkjax.scene.elements.held import with_row as with_row
 from udkjax.scene.elements.joints import Angle as Angle
 from udkjax.scene.elements.joints import Cam as Cam
 from udkjax.scene.elements.joints import Constraint as Constraint
-from udkjax.scene.elements.joints import Coupling as Coupling
 from udkjax.scene.elements.joints import Distance as Distance
-from udkjax.scene.elements.joints import Gear as Gear
 from udkjax.scene.elements.joints import Joint as Joint
 from udkjax.scene.elements.joints import Prismatic as Prismatic
-from udkjax.scene.elements.joints import Rack as Rack
 from udkjax.scene.elements.joints import Revolute as Revolute
-from udkjax.scene.elements.joints import Screw as Screw
 from udkjax.scene.elements.joints import Slot as Slot
 from udkjax.scene.elements.joints import Weld as Weld
 from udkjax.scene.elements.joints import fill as fill

@@ -15,9 +15,10 @@ from udkjax.positions.assembling.assembly import assemble
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_forces import shift_motion
 from udkjax.scene.elements.bodies import GROUND, Body
+from udkjax.scene.elements.couplings import Gear
 from udkjax.scene.elements.drivers import Driver, Polynomial
 from udkjax.scene.elements.forces import ForceElement, Spring, Torque, TorsionSpring
-from udkjax.scene.elements.joints import Distance, Gear, Joint, Prismatic, Revolute, Slot
+from udkjax.scene.elements.joints import Distance, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.files import dumps
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError

@@ -7,7 +7,8 @@ import pytest
 import udkjax as udk
 from udkjax.equations.rows.position_rows import PositionRows
 from udkjax.equations.rows.redundancy import kinematic_rows
-from udkjax.scene.elements.joints import Gear, Revolute
+from udkjax.scene.elements.couplings import Gear
+from udkjax.scene.elements.joints import Revolute
 from udkjax.study.identify.problem import loop_consistency
 from udkjax.study.identify.problem.loop_consistency import loop_problems, tie_text
 

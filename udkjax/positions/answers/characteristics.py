@@ -19,7 +19,8 @@ from udkjax.printing import PrintedTable, PrintsTable, format_number
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
-from udkjax.scene.elements.joints import Cam, Gear, Prismatic, Revolute, Slot
+from udkjax.scene.elements.couplings import Gear
+from udkjax.scene.elements.joints import Cam, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
 ALIKE = 1e-9  # relative to the fastest: speeds of mirrored positions, which rounding separates

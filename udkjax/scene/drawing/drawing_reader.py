@@ -16,9 +16,10 @@ from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mist
 from udkjax.scene.drawing.pin_forms import AbstractPin, PointArray, lowest_of_stack, places_of
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.elements.bodies import GROUND, Body, Frame
+from udkjax.scene.elements.couplings import Coupling
 from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.elements.forces import ForceElement
-from udkjax.scene.elements.joints import Coupling, Joint, Revolute
+from udkjax.scene.elements.joints import Joint, Revolute
 from udkjax.scene.tables.checks import SceneEntry, check_table, gravity_mistakes, name_mistake
 from udkjax.scene.tables.element_setup import as_leaves
 from udkjax.scene.tables.schema import build

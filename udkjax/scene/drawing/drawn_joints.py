@@ -20,8 +20,9 @@ from udkjax.scene.drawing.placement import (
     pair_mistakes,
 )
 from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.couplings import Gear, Screw
 from udkjax.scene.elements.fields import LINK, PIN, POSITIVE, SLIDE, given_direction, given_names, given_number, given_or_none
-from udkjax.scene.elements.joints import Cam, Gear, Prismatic, Screw, Slot
+from udkjax.scene.elements.joints import Cam, Prismatic, Slot
 from udkjax.scene.elements.profiles import AbstractProfile, LawProfile, SwingProfile, as_profile
 from udkjax.wording import quote
 

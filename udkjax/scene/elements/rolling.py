@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
 from udkjax.scene.elements.bodies import Frame, Point
+from udkjax.scene.elements.couplings import mistakes_of_pair
 from udkjax.scene.elements.fields import BODY, POSITIVE, given_direction, given_names, given_number
-from udkjax.scene.elements.joints import Joint, mistakes_of_pair
+from udkjax.scene.elements.joints import Joint
 
 
 class RollingJoint(Joint):

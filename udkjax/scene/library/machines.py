@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.scene.elements.bodies import GROUND
-from udkjax.scene.elements.joints import Gear, Joint, Revolute
+from udkjax.scene.elements.couplings import Gear
+from udkjax.scene.elements.joints import Joint, Revolute
 from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,

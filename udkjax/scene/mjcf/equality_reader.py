@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from udkjax.scene.elements.joints import Angle, Coupling, Distance, Gear, Joint, Revolute, Weld
+from udkjax.scene.elements.couplings import Coupling, Gear
+from udkjax.scene.elements.joints import Angle, Distance, Joint, Revolute, Weld
 from udkjax.scene.mjcf.body_tree import unique_name
 from udkjax.scene.mjcf.coupled_lengths import CoupledLength, CoupledLengths
 from udkjax.scene.mjcf.model_settings import merge_parts

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME, Body
-from udkjax.scene.elements.joints import Angle, Distance, Gear, Joint, Prismatic, Revolute, Slot
+from udkjax.scene.elements.couplings import Gear
+from udkjax.scene.elements.joints import Angle, Distance, Joint, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import is_xml
 from udkjax.scene.mjcf.body_tree import BodyTree, TreeJoint, unique_name

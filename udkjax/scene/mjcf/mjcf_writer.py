@@ -12,22 +12,11 @@ from udkjax.annotations import Number
 from udkjax.scene.arguments import checked
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME_AT_REST, Point, between
+from udkjax.scene.elements.couplings import Coupling, Gear, Screw, coordinate_of
 from udkjax.scene.elements.forces import Spring, Torque, TorsionSpring
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.held import Held
-from udkjax.scene.elements.joints import (
-    Angle,
-    Constraint,
-    Coupling,
-    Distance,
-    Gear,
-    Prismatic,
-    Revolute,
-    Screw,
-    Slot,
-    Weld,
-    coordinate_of,
-)
+from udkjax.scene.elements.joints import Angle, Constraint, Distance, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name

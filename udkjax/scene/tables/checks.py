@@ -17,10 +17,11 @@ from jaxtyping import Array, Bool
 from udkjax.annotations import TomlTable
 from udkjax.arrays import is_traced
 from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.couplings import Coupling, Screw
 from udkjax.scene.elements.fields import FieldMetadata, Requirement, StaticValue
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.held import Held
-from udkjax.scene.elements.joints import Cam, Coupling, Prismatic, Revolute, Screw, Slot
+from udkjax.scene.elements.joints import Cam, Prismatic, Revolute, Slot
 from udkjax.scene.elements.profiles import AbstractProfile, LawProfile, profile_class
 from udkjax.scene.elements.rolling import Wheel
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of

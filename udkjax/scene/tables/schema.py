@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Union, cast, get_args, get_origin
 import equinox as eqx
 import jax
 
-from udkjax.scene.elements import drivers, forces, friction, joints, rolling
+from udkjax.scene.elements import couplings, drivers, forces, friction, joints, rolling
 from udkjax.scene.elements.bodies import Body
 from udkjax.scene.elements.fields import FieldMetadata
 from udkjax.scene.elements.held import Held
@@ -40,7 +40,7 @@ def _by_type(module: types.ModuleType, base: type) -> dict[str, type]:
 
 
 CLASSES_BY_TYPE: dict[str, dict[str, type]] = {
-    "joint": _by_type(joints, joints.Joint) | _by_type(rolling, rolling.RollingJoint),
+    "joint": _by_type(joints, joints.Joint) | _by_type(couplings, joints.Joint) | _by_type(rolling, rolling.RollingJoint),
     "force": _by_type(forces, forces.ForceElement) | _by_type(friction, forces.ForceElement),
     "motion": _by_type(drivers, drivers.Motion),
 }

@@ -13,11 +13,12 @@ from jaxtyping import Float
 from udkjax.annotations import JsonObject, Numbers
 from udkjax.integrate.events.law.conditions import Gap
 from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.couplings import Coupling, Gear, Rack, Screw
 from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.elements.forces import Force, ForceElement, Spring, Torque, TorsionSpring
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.held import Held
-from udkjax.scene.elements.joints import Cam, Coupling, Distance, Gear, Joint, Prismatic, Rack, Revolute, Screw, Slot, Weld
+from udkjax.scene.elements.joints import Cam, Distance, Joint, Prismatic, Revolute, Slot, Weld
 from udkjax.scene.elements.rolling import KnifeEdge, Wheel
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.marks.mark_kinds import MarkKind

@@ -21,7 +21,7 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.integrate.portable import drawn_points
 from udkjax.scene.elements.bodies import GROUND
-from udkjax.scene.elements.joints import Gear, Rack
+from udkjax.scene.elements.couplings import Gear, Rack
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.marks.mark_kinds import MarkKind
 
