@@ -8,11 +8,10 @@ How the code of a run is made, and where to look:
    function of LLVM's text, with the values, branches and loops of `ir`. A function serves one member, or W members in the lanes
    of vectors. `layout` defines the memory of a run, and `module` writes all functions that use this memory. `machine` compiles
    the text or finds its code on disk; `ffi` writes the entry point that XLA calls.
-3. run/ integrates. `trajectory` has the algorithm: `runge_kutta` (stages and errors of a step), `manifold` (projection),
-   `controller` (accept or reject, and the next step), `singular` and `fallback` (steps near singular configurations),
-   `breakpoints` and `pieces` (where the motion is not smooth), `dense_output` (states between steps), `members` (loading lanes).
-   `dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination; `formulations` has
-   alternatives to the Udwadia-Kalaba equation; `state_functions` evaluates single states, and `row_marks` finds independent rows.
+3. parts/ has what runs differ in: how accelerations are computed, how states are projected, and how steps are taken near singular
+   configurations. run/ integrates. `trajectory` has the algorithm: `runge_kutta` (stages and errors of a step), `controller`
+   (accept or reject, and the next step), `breakpoints` and `pieces` (where the motion is not smooth), `dense_output` (states
+   between steps), `members` (loading lanes). `state_functions` evaluates single states, and `row_marks` finds independent rows.
 4. derivatives/ adds `tangents` and `second_tangents` (forward mode), and `backpropagation` (reverse mode) along a `record`.
 5. watching/ ends runs at zero crossings of conditions, the events of `udkjax.integrate`.
 6. closing/ computes positions: `closing` assembles a mechanism, with derivatives, `marching` follows its positions, and

@@ -21,8 +21,8 @@ from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.native.module.layout import FORMULATION_SETTINGS, INPUTS, OUTPUTS, SETTINGS, SHARE
 from udkjax.native.module.memory import Memory
 from udkjax.native.module.module import Module
+from udkjax.native.parts.formulations import FormulationCode
 from udkjax.native.pseudoinverses.dense import DenseMethod
-from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.row_marks import RowMarks
 from udkjax.native.run.state_functions import ScaleCode, StateAccelerations, StateFunction, StateProjection, StateTangentPart
 from udkjax.native.watching.conditions import Conditions

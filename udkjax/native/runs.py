@@ -12,8 +12,8 @@ from udkjax.native.module.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
 from udkjax.native.module.module import Module
 from udkjax.native.module.tableau import KVAERNO5, Method
 from udkjax.native.operations import Accelerate, Operation
+from udkjax.native.parts.formulations import FormulationCode
 from udkjax.native.pseudoinverses.dense import DenseMethod
-from udkjax.native.run.formulations import FormulationCode
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import Conditions
 from udkjax.native.watching.passed_events import Passing, SlideLock, Sliding, Turning

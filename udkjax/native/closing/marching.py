@@ -20,9 +20,9 @@ from udkjax.native.language.program import PointerPlace
 from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.module import Module
 from udkjax.native.module.tableau import EULER
+from udkjax.native.parts.manifold import largest_violation
 from udkjax.native.pseudoinverses.lu import LUCode
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
-from udkjax.native.run.manifold import largest_violation
 from udkjax.native.run.members import write_begin
 
 CORRECTIONS = 2

@@ -4,7 +4,6 @@ from udkjax.native.language.ir import Function
 from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.program_derivative import ProgramDerivative
 from udkjax.native.module.programs import DIFFERENTIATED
-from udkjax.native.run.manifold import with_loads_of_fallback
 from udkjax.native.run.trajectory import Trajectory
 
 
@@ -36,21 +35,14 @@ class Differentiated(Trajectory):
     def evaluate_settled(self, f: Function, out: str, stored: str):
         """Compute accelerations at `state`, with settled friction, and the intermediate results of their derivatives."""
 
+        def settle():
+            self.settle(f, out)
+
         def evaluate():
             f.call("evaluation", f.given["work"], self.address(f, out), self.address(f, stored))
 
-        self.settle(f, out)
-        if not (self.settles and self.falls_back):
-            evaluate()
-            return
-        unsafe = Lane(f, self.places).safe < 0.5
-
-        def settle_and_evaluate():
-            with f.if_(f.any_of(unsafe)):
-                self.settle(f, out)
-            evaluate()
-
-        with_loads_of_fallback(self, f, settle_and_evaluate, unsafe)
+        settle()
+        self.fallback.evaluate_settled(f, Lane(f, self.places), settle, evaluate)
 
     def _evaluate_solved(self, f: Function, i: int):
         """Evaluate what derivatives need at the state of a solved stage of an implicit method, and factorize its matrix there."""

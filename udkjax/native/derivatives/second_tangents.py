@@ -37,8 +37,7 @@ class ForwardTwice(Forward):
 
     def _finish_change(self, f: Function, s: Lane, accept: Value):
         lost = f.const(False, BOOL, f.width)
-        if self.settles and self.falls_back:
-            lost = lost | (accept & (s.fallback > 0.5))
+        lost = self.fallback.with_lost_loads(s, accept, lost)
         if self.finds_edges and "t" in self.code.of(*self.programs["accelerations"].outputs).arrays:
             lost = lost | (accept & s.crosses.is_(ACROSS_EDGE))
         if self.settles:

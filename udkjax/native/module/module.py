@@ -1,6 +1,7 @@
 """One module of machine code: its functions, and the arrays in the memory of a run."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.programs.unrolled import Unrolled, UnrolledProgram
@@ -9,6 +10,7 @@ from udkjax.native.language.ir import BOOL, POINTER, Function, Value
 from udkjax.native.language.loops import LoopWriter
 from udkjax.native.language.program import PointerPlace, consecutive, write
 from udkjax.native.module.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Lane, Layout, Plan
+from udkjax.native.module.parts import Fallback
 from udkjax.native.module.programs import DIFFERENTIATED, FURTHER, OUT, PROGRAMS
 from udkjax.native.module.running import Running
 from udkjax.native.module.settling import AT_END, SETTLING, write_settle_end, write_settle_state
@@ -50,6 +52,7 @@ class Module(Running):
         active: For each number of the scene, whether derivatives with respect to it are needed.
     """
 
+    fallback: Fallback = Fallback()
     mode = FORWARD  # mode of differentiation
     closes = False  # whether the module returns states to the constraints, by the formulation if that does so
     shares_constants = False  # whether the members of a block of threads have the same constants, in its shared memory
@@ -64,18 +67,14 @@ class Module(Running):
         if plan.formulation is not None:
             self.settings = (*self.settings, *FORMULATION_SETTINGS)
         self.partitions = self.closes and plan.formulation is not None and plan.formulation.closes and m > 0
-        self.falls_back = plan.steps and code.policy.reports and m > 0 and not self.partitions  # pivots may be too small
         self.is_dense = plan.pseudoinverse is not None and m > 0 and not self.partitions
         self.is_formulated = plan.formulation is not None and m > 0
         self.takes_dense_rows = self.is_dense or self.is_formulated
-        # Small scenes, and those whose redundant rows share loads, fall back to singular values.
-        self.eliminates_all_rows = self.falls_back and not plan.unrolled and not code.weighs_rows
-        # Rows of phi make errors of q errors of v; elimination adds these in the program `tangent_part`.
-        self.adds_drift_of_rates = code.position_rows < m and (self.is_dense or self.falls_back)
         self.measures_drift = plan.steps and m > 0 and not plan.projected
         self.drops_rows = plan.steps and m > 0 and plan.projected and not code.policy.reports and not self.partitions
         self.pieces = code.piece_count if plan.breaks else 0
         self.finds_edges = self.pieces > 0 and code.first_edge < self.pieces
+        self.choose_parts()
         names = self.program_names()
         self.settles = code.rubs and any(name in SETTLING for name in names)  # friction may need further rounds
         self.programs = {name: PROGRAMS[name] for name in (*names, *((FURTHER,) if self.settles else ()))}
@@ -91,6 +90,17 @@ class Module(Running):
         self.loops = LoopWriter(plan.width, cold=plan.unrolled)
         self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, self.stages))]
         self.rowcount = -(-n * plan.width // plan.vector)
+
+    def choose_parts(self):
+        """Hook: chooses the parts of the module."""
+
+    @cached_property
+    def shared(self) -> set[str]:
+        """The arrays that parts share: of M if it is not diagonal, and of rows of phi, which make errors of q errors of v."""
+        takes = {*self.fallback.shared, *(("couplings", "rates") if self.is_dense else ())}
+        takes |= {"couplings"} if self.is_formulated else set()
+        has = {"couplings": self.code.couples, "rates": self.code.position_rows < self.m}
+        return {name for name in takes if has[name]}
 
     def _unroll(self, differentiated: Sequence[str], active: Sequence[bool]) -> Unrolled:
         asked = [program.outputs for program in self.programs.values()]
@@ -140,11 +150,11 @@ class Module(Running):
             p.add("numbers", -(-code.number_count // plan.width))
         if not self.unrolled:
             self._add_arrays("", code.scratch)
-        if code.couples and (self.takes_dense_rows or self.falls_back):
+        if "couplings" in self.shared:
             self._add_arrays("", {"couplings": code.scratch["couplings"], "change": n})
         if self.takes_dense_rows and "root" not in p.places:
             self._add_arrays("", {"root": n} | ({"psi_q": code.scratch["psi_q"]} if self.unrolled else {}))
-        if self.adds_drift_of_rates:
+        if "rates" in self.shared:
             self._add_arrays("", {"drift": m, "saved state dq": n})
         if self.is_formulated or self.settles or self.drops_rows:
             p.add("saved v", n)
@@ -152,26 +162,13 @@ class Module(Running):
             self._add_arrays("", {"further a": n} | ({"settled": code.scratch["settled"]} if self.unrolled else {}))
             p.add("settled before", code.scratch["settled"] if plan.width > 1 else 0)
             p.add("settled kept", code.scratch["settled"])
-        if self.falls_back:
-            self._add_arrays("fallback ", dict.fromkeys(("a", "q", "v", "dq", "dv"), n))
-            if not self.eliminates_all_rows:
-                entries = {"psi_q": code.scratch["psi_q"]} if self.unrolled else {}
-                self._add_arrays("", {**entries, "psi_dot": m, "root": n})
-            else:
-                self._add_arrays("fallback ", code.with_all_rows.scratch | {"constants": len(code.constants)})
+        self.fallback.reserve()
 
     @property
     def drop_tol_place(self) -> int | None:
         """The offset of the threshold of pivots; None if it is not used."""
         place = (self.unrolled or self.code).drop_tol_index
         return None if place is None else self.places["constants"] + place
-
-    @property
-    def safe_tol_place(self) -> int:
-        """The offset of the threshold of safe pivots in a module with friction that `settles` and falls back."""
-        place = (self.unrolled or self.code).safe_tol_index
-        assert place is not None  # its accelerations report whether pivots are safe
-        return self.places["constants"] + place
 
     def _add_arrays(self, prefix: str, sizes: Mapping[str, int]):
         for name, count in sizes.items():
@@ -200,9 +197,8 @@ class Module(Running):
             names.append("dense_accelerations")
         if self.measures_drift:
             names.append("drift" if self.takes_dense_rows else "accelerations_and_drift")
-        if self.falls_back and not self.eliminates_all_rows:
-            names.append("rows_and_loads")
-        if self.adds_drift_of_rates:
+        names += self.fallback.programs
+        if "rates" in self.shared:
             names.append("drift_of_rates")
         return names
 
@@ -224,16 +220,12 @@ class Module(Running):
         }
         if not self.unrolled:
             named |= {x: x for x in self.code.scratch}
-        if self.falls_back and not self.eliminates_all_rows:
-            named |= {x: x for x in ("psi_q", "psi_dot", "root")}
+        named |= {x: x for x in self.fallback.arrays}
         if self.takes_dense_rows:
             named |= {x: x for x in ("psi_q", "root")}
         if self.settles:
             named |= {x: x for x in RunPrograms.BEGINS}
-        if self.adds_drift_of_rates:
-            named["drift"] = "drift"
-        if "couplings" in self.places.places:
-            named["couplings"] = "couplings"
+        named |= {x: x for x in ("drift", "couplings") if x in self.places.places}
         return {x: ("work", self.places[place]) for x, place in named.items()}
 
     def write_programs(self):

@@ -53,13 +53,7 @@ def write_enter(module: Module):
         module.put_lane_entry(f, "constants", lane, f.load(constants, i), i)
         if module.shares_constants:  # all threads write the same
             f.store(f.load(constants, i), f.given["block_memory"], i)
-    if module.eliminates_all_rows:
-        count = len(module.code.constants)
-        all_constants, tol = Value(f, f.reserve(DOUBLE, count), POINTER), module.lane_entry(f, "fallback_tol", lane)
-        f.call("fallback_prologue", numbers, all_constants)
-        f.store(tol * tol, all_constants, module.code.drop_tol_index)
-        with f.each(count) as i:
-            module.put_lane_entry(f, "fallback constants", lane, f.load(all_constants, i), i)
+    module.fallback.enter(f, lane, numbers)
     module.begin_row(f, lane, member, numbers, constants)
 
 

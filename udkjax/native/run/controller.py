@@ -23,26 +23,21 @@ from udkjax.native.module.steps import (
     CLEARLY,
     CLOSED_TOL,
     CORRECTIONS,
-    EXPECTED,
     FACTORS,
     GAP,
     LIMIT,
     LOST_TOL,
-    NEAREST_STAGE,
     PATIENCE,
     POINTS,
     RESTART_FACTOR,
-    RETRIES,
-    ROUNDING_GROWTH,
     SLOPE,
     SLOPE_IN_LANES,
     STABLE,
     STRETCH,
-    SURE,
     UNPAID,
     Status,
 )
-from udkjax.native.run.manifold import largest_violation, velocity_tolerance
+from udkjax.native.parts.manifold import largest_violation, velocity_tolerance
 from udkjax.pinv.auto import NEAREST
 
 
@@ -53,11 +48,8 @@ def write_decide(module: Module):
     stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
     failed = stepping & ~(error < np.inf)
     tries = stepping & (s.trial > 0.0) if module.plan.stiff else None
-    shortens, repeats, time_left = f.const(False, BOOL, f.width), f.const(False, BOOL, f.width), inf
-    if module.falls_back:
-        stepping, shortens, time_left = _retry_or_fall_back(module, f, s, failed, tries)
-    else:
-        s.fallback_due = f.const(0.0, DOUBLE, f.width)
+    stepping, shortens, time_left = module.fallback.retry(f, s, stepping, failed, tries)
+    repeats = f.const(False, BOOL, f.width)
     tried = where(stepping, s.tried + 1.0, s.tried)
     if module.pieces:
         s.again = where(stepping, yes, 0.0)
@@ -72,8 +64,7 @@ def write_decide(module: Module):
     factor, rate = _step_factor(module, f, s, accept, step, tries)
     h = where(stepping, step * where(shortens, f.const(FACTORS.safety, DOUBLE, f.width), factor), s.h)
     h = where(repeats, s.h, h)
-    if module.falls_back:
-        h = where(stepping & ~accept & stepped & ~repeats, step_around(module, f, s, time_left, step, h), h)
+    h = module.fallback.step_around(f, s, lambda: stepping & ~accept & stepped & ~repeats, time_left, step, h)
     if tries is not None:  # a trial that fails leaves no trace
         h = where(tries & ~accept, s.h, h)
     chosen = f.variable(h)
@@ -150,29 +141,6 @@ def gain(module: Module) -> float:
     assert module.plan.stiff is not None
     slopes = module.n * (SLOPE_IN_LANES if module.plan.unrolled else SLOPE)
     return (CORRECTIONS * (module.plan.stiff.stages - 1) + slopes) / module.method.stages
-
-
-def _retry_or_fall_back(module: Module, f: Function, s: Lane, failed: Value, tries: Value | None) -> tuple[Value, Value, Value]:
-    """Shorten a step that encountered a pivot too small for elimination, or leave it to the fallback.
-
-    Returns:
-        Masks of the lanes whose attempt is complete, and of lanes that shorten it; and the time to the singular configuration.
-    """
-    where, stepping, fallback, error = f.select, s.stepping > 0.5, s.fallback > 0.5, s.error
-    fallback_due = failed & ~fallback
-    was_clear = is_clear(module, f, s, s.distance2)
-    is_near = stepping & ~fallback & (error < 1.0) & ~is_clear(module, f, s, s.distance) & (s.last < 0.5)
-    time_left = time_to_singularity(module, f, s)
-    has_passed = (
-        (time_left > 0.0) & (time_left < s.h * SURE) & (s.distance * time_left > s.distance2 * EXPECTED * (s.h - time_left))
-    )
-    is_near = is_near & ~(has_passed & (s.distance > NEAREST_STAGE))
-    shortens = (fallback_due | is_near) & was_clear & (s.retries < float(RETRIES)) & (s.begin < 0.5)
-    retries = where(shortens, s.retries + 1.0, where(error < 1.0, 0.0, s.retries))
-    s.where(stepping if tries is None else stepping & ~tries, retries=retries)
-    fallback_due = fallback_due & ~shortens
-    s.fallback_due = where(fallback_due, f.const(1.0, DOUBLE, f.width), 0.0)
-    return stepping & ~fallback_due, shortens, time_left
 
 
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value, tries: Value | None) -> tuple[Value, Value]:
@@ -310,25 +278,3 @@ def first_step(module: Module, f: Function, s: Lane) -> Value:
     ordinary = f.is_finite(rate) & (rate > 0.0)
     chosen = f.select(ordinary, f.min(size / f.select(ordinary, rate, 1.0) * 0.01, span), span * 1e-4)
     return f.select(s.first > 0.0, f.min(s.first, span), chosen)
-
-
-def is_clear(module: Module, f: Function, s: Lane, distance: Value) -> Value:
-    """Return whether a step of the current length may begin at a distance from singular configurations."""
-    return (distance > NEAREST_STAGE) & (distance * distance * distance * s.tolerance > s.h * s.omega * ROUNDING_GROWTH)
-
-
-def time_to_singularity(module: Module, f: Function, s: Lane) -> Value:
-    """Return the time until a singular configuration, a root of the parabola through three distances."""
-    t2, t1, t0, d2, d1, d0 = s.point1_t, s.point2_t, s.point3_t, s.distance0, s.distance1, s.distance2
-    slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
-    curve = (slope - before) / (t0 - t2)
-    slope = slope + curve * (t0 - t1)
-    return -d0 / (slope - curve * (d0 / slope))
-
-
-def step_around(module: Module, f: Function, s: Lane, time_left: Value, step: Value, otherwise: Value) -> Value:
-    """Return a step to replace a failed one: the singular configuration is then in the middle of a wide gap between its nodes."""
-    low, high = (float(x) for x in module.method.clearings)
-    share = time_left / step
-    candidate = time_left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
-    return f.select((candidate > step * FACTORS.shrink) & (candidate < step * FACTORS.safety), candidate, otherwise)

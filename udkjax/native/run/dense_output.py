@@ -4,7 +4,7 @@ from udkjax.native.language.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.module.layout import Lane, Layout
 from udkjax.native.module.module import Module
 from udkjax.native.module.steps import POINTS, SHORT_STEP, STRETCH
-from udkjax.native.run.manifold import project_output
+from udkjax.native.parts.manifold import project_output
 
 
 def write_differences(module: Module, name: str = "differences", to: tuple[str, Layout] | None = None):

@@ -9,7 +9,7 @@ from udkjax.native.module.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.samples import enter_first_row, write_enter
 from udkjax.native.module.steps import LOOK_AHEAD, PATIENCE, POINTS, Status
-from udkjax.native.run.manifold import largest_violation, project_output
+from udkjax.native.parts.manifold import largest_violation, project_output
 
 
 def write_begin(module: Module):

@@ -8,12 +8,12 @@ from udkjax.equations.programs.scales import Scales
 from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.module.layout import FORMULATION_SETTINGS
+from udkjax.native.parts.formulations import AugmentedCode, FormulationCode, NullSpaceCode
+from udkjax.native.parts.partitioning import PartitioningCode
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.pseudoinverses.lu import LUCode
 from udkjax.native.pseudoinverses.one_of import OneOfCode
-from udkjax.native.run.formulations import AugmentedCode, FormulationCode, NullSpaceCode
-from udkjax.native.run.partitioning import PartitioningCode
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 
 

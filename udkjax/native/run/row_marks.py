@@ -18,7 +18,7 @@ from udkjax.native.language.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.module import Module
 from udkjax.native.module.tableau import EULER
-from udkjax.native.run.manifold import iterate_newton, largest_violation
+from udkjax.native.parts.manifold import iterate_newton, largest_violation
 from udkjax.native.run.members import write_begin
 
 ASIDE = CLOSURE.aside

@@ -7,8 +7,8 @@ from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
 from udkjax.native.module.tableau import Method
-from udkjax.native.run.manifold import newton, with_threshold
-from udkjax.native.run.partitioning import begin_step, close, close_end, judge_independent
+from udkjax.native.parts.manifold import newton, with_threshold
+from udkjax.native.parts.partitioning import begin_step, close, close_end, judge_independent
 
 
 def write_attempt(module: Module):
@@ -85,18 +85,12 @@ def write_attempt(module: Module):
         module.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
         module.accelerate_end(f)
         unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
-        if module.falls_back:
-            s.where(unsafe, ok=0.0)
+        module.fallback.note_unsafe(s, unsafe)
         if method.ends:
             _estimate_errors(module, f, s, "result a", "state dq", "state dv")
             threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
             with_threshold(f, module.drop_tol_place, threshold, lambda: module.invoke(f, "tangent_part"))
-        if module.falls_back:
-            by_fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
-            with f.if_(f.any_of(by_fallback)):
-                module.invoke(f, "finish_by_fallback")
-                module.accelerate_end(f)
-                s.where(by_fallback, ok=1.0)
+        module.fallback.finish_step(f, s)
     if module.implicit:
         with f.if_(f.any_of(implicit)):
             module.copy(f, f"stage{module.implicit.stages - 1} a", "result a", implicit)
@@ -214,15 +208,8 @@ def stage_state(
 
 def check_pivots(module: Module, f: Function, s: Lane, name: str):
     """If pivots are too small, compute accelerations by the fallback or abandon the attempt."""
-    if not module.falls_back or module.is_formulated:
-        return
-    unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
-    with f.if_(f.any_of(unsafe)):
-        f.choose(
-            f.any_of(unsafe & (s.fallback > 0.5)),
-            lambda: module.invoke(f, "accelerate_by_fallback", name),
-            lambda: s.where(unsafe, ok=0.0),
-        )
+    if not module.is_formulated:
+        module.fallback.check_pivots(f, s, name)
 
 
 def _estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):

@@ -17,12 +17,11 @@ from udkjax.native.language.loops import LoopWriter
 from udkjax.native.language.text import ALLOCATION, text_of_module
 from udkjax.native.module.layout import Lane, Layout, Plan
 from udkjax.native.module.memory import Memory, ThreadCode
-from udkjax.native.module.steps import NEAREST_STAGE, ROUNDING_PIVOT
+from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.module.tableau import EULER
+from udkjax.native.parts.formulations import FormulationCode
+from udkjax.native.parts.manifold import project_output, with_threshold
 from udkjax.native.pseudoinverses.dense import DenseMethod
-from udkjax.native.run.fallback import write_fallback
-from udkjax.native.run.formulations import FormulationCode
-from udkjax.native.run.manifold import project_output, with_threshold
 from udkjax.native.run.members import write_begin
 from udkjax.native.run.trajectory import Trajectory
 
@@ -55,8 +54,7 @@ class StateFunction(Trajectory):
 
     def write_functions(self):
         self.write_programs()
-        if self.falls_back:
-            write_fallback(self)
+        self.fallback.write()
         write_begin(self)
         f, s = self.function("evaluate_states", [(POINTER, "work"), (POINTER, "call")])
         with f.each(self.n) as i:
@@ -95,12 +93,8 @@ class StateAccelerations(StateFunction):
 
     def _evaluate(self, f: Function, s: Lane):
         self.accelerate(f, "result a")
-        if not self.falls_back or self.formulated:
-            return
-        s.stepping = s.active
-        s.fallback = s.active
-        with f.if_(f.any_of((s.active > 0.5) & (s.safe < 0.5))):
-            self.invoke(f, "accelerate_by_fallback", "result a")
+        if not self.formulated:
+            self.fallback.accelerate_state(f, s)
 
 
 class StateProjection(StateFunction):
@@ -138,14 +132,7 @@ class StateTangentPart(StateFunction):
     def _evaluate(self, f: Function, s: Lane):
         threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
         with_threshold(f, self.drop_tol_place, threshold, lambda: self.invoke(f, "tangent_part"))
-        if not self.falls_back:
-            return
-        is_near = (s.active > 0.5) & ~(s.distance > NEAREST_STAGE)
-        with f.if_(f.any_of(is_near)):
-            s.wanted = f.select(is_near, f.const(1.0, DOUBLE, f.width), 0.0)
-            self.invoke(f, "fallback_tangent_part")
-            for x in ("dq", "dv"):
-                self.copy(f, f"fallback {x}", f"result {x}", is_near)
+        self.fallback.find_tangent_part(f, s)
 
 
 INPUTS = ("t", "q", "v")

@@ -14,7 +14,7 @@ are projected as well. Where the motion is not smooth, a step ends and the run b
 
 W members run in the lanes of vectors, each with its own time, step and result. A lane with a completed member loads the next one.
 If elimination encounters a pivot that is too small, the step is shortened slightly; if that does not help, it is repeated by a
-rank-revealing fallback (fallback.py).
+rank-revealing fallback (parts/fallback.py).
 
 All functions of a module work on one block of memory (`Layout`): `run` loads members and calls `attempt` (one step), `decide`
 (acceptance and the next step) and `outputs` (states between steps).
@@ -27,12 +27,12 @@ from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.module import Module
 from udkjax.native.module.samples import enter_first_row, write_next_breakpoint
 from udkjax.native.module.steps import Status
+from udkjax.native.parts.all_rows import fallback_of
+from udkjax.native.parts.dense_equations import DenseEquations
+from udkjax.native.parts.formulations import FORMULATE
 from udkjax.native.run.breakpoints import aim
 from udkjax.native.run.controller import write_decide
-from udkjax.native.run.dense_equations import DenseEquations
 from udkjax.native.run.dense_output import write_between, write_differences, write_outputs
-from udkjax.native.run.fallback import write_fallback
-from udkjax.native.run.formulations import FORMULATE
 from udkjax.native.run.members import write_begin, write_finish
 from udkjax.native.run.pieces import write_end_piece
 from udkjax.native.run.runge_kutta import write_attempt
@@ -50,6 +50,9 @@ class Trajectory(Module):
         self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
         self.stage_equations: StageEquations | None = None
         self._is_differentiated = bool(differentiated)
+
+    def choose_parts(self):
+        self.fallback = fallback_of(self)
 
     @property
     def solving(self) -> list[str]:
@@ -102,8 +105,7 @@ class Trajectory(Module):
 
     def write_functions(self):
         self.write_programs()
-        if self.falls_back:
-            write_fallback(self)
+        self.fallback.write()
         if self.plan.steps and self.plan.implicit:
             self._write_stage_equations()
         write_attempt(self)
@@ -132,11 +134,7 @@ class Trajectory(Module):
         yes = f.const(1.0, DOUBLE, width)
         due_for_fallback = s.fallback_due > 0.5
         fallback = f.any_of(due_for_fallback)
-        if self.falls_back:
-            s.fallback = f.select(fallback, f.const(1.0, DOUBLE, width), 0.0)
-            s.stepping = f.select(fallback, f.select(due_for_fallback, yes, 0.0), s.active)
-        else:
-            s.stepping = s.active
+        self.fallback.choose_lanes(f, s, due_for_fallback, fallback)
         aim(self, f, s)
         self.before_step(f, s)
         f.call("attempt", work)

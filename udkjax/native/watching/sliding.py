@@ -14,7 +14,7 @@ from collections.abc import Callable
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.language.program import write
 from udkjax.native.module.layout import Lane
-from udkjax.native.run.manifold import project_output
+from udkjax.native.parts.manifold import project_output
 from udkjax.native.watching.conditions import LAST_CHANGE
 from udkjax.native.watching.passed_events import Sliding
 from udkjax.native.watching.passing import PassingRuns
@@ -188,7 +188,7 @@ class _Modes:
         with f.each(module.n) as i:  # NaN if the loads of joints have not settled
             total.value = f.fma(self._entry("result a", i), 0.0, total.value)
         is_known = total.value.is_(0.0)
-        return (is_known & (s.safe > 0.5) if module.falls_back else is_known), largest.value
+        return module.fallback.if_safe(s, is_known), largest.value
 
     def _acceleration(self, j: Value) -> Value:
         return self._entry("condition rate", j * 2 + self._slides.first)
@@ -275,7 +275,8 @@ class _Choice(_Modes):
 
     def _choose(self, stops, leaves, sign):
         f, module = self._f, self._module
-        can_stick = module.plan.projected and module.falls_back  # otherwise locks that depend on others would not show
+        # Otherwise locks that depend on others would not show.
+        can_stick = module.plan.projected and module.fallback.finds_dependent_rows
         alone = stops & ~self._several_stop() if can_stick else f.const(False, BOOL, f.width)
         found = self._pivot_modes(alone, leaves, sign)
         turns = f.variable(stops & ~found, BOOL)

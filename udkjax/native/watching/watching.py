@@ -14,7 +14,7 @@ from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Value
 from udkjax.native.language.program import write
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.steps import POINTS, Status
-from udkjax.native.run.manifold import project_output
+from udkjax.native.parts.manifold import project_output
 from udkjax.native.watching.condition_intervals import write_classification
 from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, LAST_CHANGE, MIDDLE, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from udkjax.native.language.ir import DOUBLE, INT, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import NEWTON_STEPS, NEWTON_TOL, OPEN_OUTPUT, OUTPUT_PIVOT_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
+from udkjax.native.module.steps import NEWTON_STEPS, NEWTON_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
 
 
 def newton(module: Module, f: Function, s: Lane):
@@ -60,22 +60,6 @@ def with_threshold(f: Function, place: int | None, threshold: Value, do: Callabl
     f.store(before, f.given["work"], place * f.width, f.width)
 
 
-def with_loads_of_fallback(module: Module, f: Function, do: Callable[[], None], lanes: Value | None = None):
-    """Run `do` with the loads that friction has where the fallback takes a step; `lanes`: where only some pivots are unsafe.
-
-    Towards a singular configuration the loads of joints may grow without bounds, and friction by them may jam the mechanism in a
-    range that a step crosses. Rows without a safe pivot carry none of these loads, in runs and in their derivatives.
-    """
-    if not (module.settles and module.falls_back):
-        do()
-        return
-    safe_tol = f.load(f.given["work"], module.safe_tol_place * f.width, f.width)
-    place = module.drop_tol_place
-    if lanes is not None and place is not None:
-        safe_tol = f.select(lanes, safe_tol, f.load(f.given["work"], place * f.width, f.width))
-    with_threshold(f, place, safe_tol, do)
-
-
 def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value:
     """Return the tolerance of the fastest velocity, in its unit."""
     fastest = module.largest(f, lambda r: [f.abs(module.vector(f, name, r)) * module.vector(f, "inverse unit", r)])
@@ -101,11 +85,7 @@ def project_output(module: Module, f: Function, s: Lane, which: str):
             with f.each(module.rowcount) as r:
                 module.put(f, "result v", r, f.select(is_far, module.vector(f, "result v", r), module.vector(f, "result dv", r)))
             s.where(is_far, violated=largest_violation(module, f))
-        if module.falls_back:  # rows with small pivots are left out and may be violated
-            s.open = f.select(mask & (s.violated > OPEN_OUTPUT), f.const(1.0, DOUBLE, f.width), 0.0)
-            with f.if_(f.any_of(s.open > 0.5)):
-                f.call("close_output", f.given["work"])
-                s.where(s.open > 0.5, violated=largest_violation(module, f))
+        module.fallback.close_output(f, s, mask)
 
     if module.partitions:
         f.call("choose_partition", f.given["work"])
@@ -116,8 +96,7 @@ def project_output(module: Module, f: Function, s: Lane, which: str):
         s.violated = largest_violation(module, f)
         return
     if module.plan.projected:
-        threshold = f.const(OUTPUT_PIVOT_TOL, DOUBLE, f.width)
-        with_threshold(f, module.drop_tol_place if module.falls_back else None, threshold, project)
+        module.fallback.keeping_rows(f, project)
         return
     module.invoke(f, "psi")
     with f.each(module.rowcount) as r:

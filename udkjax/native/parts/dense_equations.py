@@ -136,7 +136,7 @@ class DenseEquations:
                 module.invoke(f, "gather", "change")
             rates = rows.solve_rates(f, "change" if module.code.couples else change, of_positions=x == "dq")
             rows.correct(f, rates, change, f"result {x}")
-        if module.adds_drift_of_rates:
+        if "rates" in module.shared:
             self._at(f, "state dq", "result dq", lambda: module.invoke(f, "drift_of_rates"))
             self._factor(f)
             rows.correct(f, rows.solve(f, "drift"), "result dv", "result dv")

@@ -19,10 +19,10 @@ from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.module.layout import FORMULATION_SETTINGS, Lane
 from udkjax.native.module.module import Module
+from udkjax.native.parts.formulations import FORMULATE, FormulatedAccelerations, FormulationCode
+from udkjax.native.parts.manifold import iterate_newton, take_newton_step
 from udkjax.native.pseudoinverses.householder import HouseholderCode
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
-from udkjax.native.run.formulations import FORMULATE, FormulatedAccelerations, FormulationCode
-from udkjax.native.run.manifold import iterate_newton, take_newton_step
 
 LAST_CHANGE = PARTITION_NEWTON.last_change(np.float64)
 
