@@ -29,14 +29,13 @@ class Differentiated(Trajectory):
     def evaluate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i with the intermediate results that derivatives need."""
         self.evaluate_settled(f, f"stage{i} a", f"stage{i} linearization")
-        if self.dense or self.formulated:
-            self.accelerate(f, f"stage{i} a")  # derivatives are the same for all methods; values depend on the method
+        self.accelerations.accelerate_exactly(f, f"stage{i} a")  # derivatives are the same for all methods
 
     def evaluate_settled(self, f: Function, out: str, stored: str):
         """Compute accelerations at `state`, with settled friction, and the intermediate results of their derivatives."""
 
         def settle():
-            self.settle(f, out)
+            self.friction.settle(f, out)
 
         def evaluate():
             f.call("evaluation", f.given["work"], self.address(f, out), self.address(f, stored))
@@ -77,7 +76,7 @@ class Differentiated(Trajectory):
     @property
     def _shares_factors(self) -> bool:
         """True if the programs of the end of a step share a factorization: friction may leave out more rows than a projection."""
-        return bool(self.unrolled and self.of_projection) and not self.settles
+        return bool(self.unrolled and self.of_projection) and not self.friction.settles
 
     def _evaluate_end(self, f: Function):
         """Evaluate accelerations and a projection at the end of a step for their derivatives."""

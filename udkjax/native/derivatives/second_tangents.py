@@ -38,9 +38,9 @@ class ForwardTwice(Forward):
     def _finish_change(self, f: Function, s: Lane, accept: Value):
         lost = f.const(False, BOOL, f.width)
         lost = self.fallback.with_lost_loads(s, accept, lost)
-        if self.finds_edges and "t" in self.code.of(*self.programs["accelerations"].outputs).arrays:
+        if self.edges and "t" in self.code.of(*self.programs["accelerations"].outputs).arrays:
             lost = lost | (accept & s.crosses.is_(ACROSS_EDGE))
-        if self.settles:
+        if self.friction.settles:
             with f.if_(f.any_of(lost)):
                 self._lose(f, lost)
         if self.pieces:

@@ -61,6 +61,10 @@ class Memory:
         """Write the functions of a thread of a GPU."""
         raise NotImplementedError
 
+    def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
+        """Add a function of all lanes; return it with the numbers of its lanes."""
+        raise NotImplementedError
+
     def layout(self, pointer: str) -> Layout:
         """Return the layout of the memory at a pointer."""
         return self.places if pointer == "work" else self.tangents

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
-from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value
+from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value, Variable
 from udkjax.native.module.layout import Lane
 
 Shortened = tuple[Value, Value, Value]  # lanes whose attempt is complete, lanes that shorten it, time to a singular configuration
@@ -18,7 +18,8 @@ class Part:
     """A part that needs nothing."""
 
     shared: Collection[str] = ()
-    """Arrays that parts share (`Module.SHARED`)."""
+    """Arrays that it shares with other parts: `couplings`, if M is not diagonal; `rows`, Psi_q and M^(-1/2); `rates`, if rows of
+    phi make errors of q errors of v; and `velocities`, a copy of those of the state."""
     programs: Sequence[str] = ()
     """The names of its programs."""
     arrays: Sequence[str] = ()
@@ -31,7 +32,83 @@ class Part:
         """Write its functions."""
 
 
-class Fallback(Part):
+class AccelerationPart(Part):
+    """The accelerations of states and the systems of their projection."""
+
+    has_cold_functions = True  # whether the rarely called functions are compiled as such
+
+    def accelerate(self, f: Function, to: str):
+        """Compute the accelerations at `state`."""
+
+    def accelerate_exactly(self, f: Function, to: str):
+        """Compute accelerations again that programs of derivatives have computed, if they depend on the method."""
+
+    def accelerate_and_measure(self, f: Function):
+        """Compute the accelerations `result a` at the end of a step that is not projected, with its `psi` and `distance`."""
+
+    def accelerate_end(self, f: Function):
+        """Complete `result a` of `state q` and `result v`, the end of a step after its projection."""
+
+    def check_pivots(self, f: Function, s: Lane, name: str):
+        """If pivots are too small, compute the accelerations `name` by the fallback, or abandon the attempt."""
+
+    def highest_rank(self, s: Lane) -> Value | None:
+        """Return the largest rank of the rows in the attempted step; None if the method does not find one."""
+        return None
+
+    def nearest(self, f: Function, s: Lane) -> Value:
+        """Return the distance from singular configurations below which the method leaves rows out."""
+        raise NotImplementedError
+
+    def add_numbers(self, f: Function, total: Variable):
+        """Make `total` NaN if the accelerations at `state` are not finite; those by elimination follow from the terms."""
+
+    def accelerate_state(self, f: Function, s: Lane):
+        """Compute `result a`."""
+
+
+class ProjectionPart(Part):
+    """The projection of states onto the constraints; a module without it has no steps."""
+
+    @property
+    def solving(self) -> list[str]:
+        """The names of the functions that solve linear systems: programs by elimination, or dense equations."""
+        return []
+
+    @property
+    def checks(self) -> list[str]:
+        """The names of further programs, which check the projection."""
+        return []
+
+    def begin_step(self, f: Function, s: Lane):
+        """Prepare a step from point 3."""
+
+    def close_stage(self, f: Function, s: Lane):
+        """Close the state of a stage."""
+
+    def end_step(self, f: Function, s: Lane):
+        """Compute `state q`, `result v` and `result a` at the end of a step, and estimate its errors."""
+
+    def project_output(self, f: Function, s: Lane, mask: Value):
+        """Project the state of `due` lanes to `state q` and `result v`; set `violated` to the largest violation of Psi."""
+
+    def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
+        """Set `lost` to the status of lanes whose new point ends their run."""
+
+
+class FrictionPart(Part):
+    """The loads of joints with friction; this one needs no further rounds."""
+
+    settles = False
+
+    def settle_after(self, f: Function, name: str, out: str | None):
+        """Settle the loads after a call of the program `name`."""
+
+    def settle(self, f: Function, out: str):
+        """Settle the loads at `state`, with which programs of derivatives begin; `out` changes."""
+
+
+class FallbackPart(Part):
     """The steps that elimination cannot take; this one leaves all steps to the solver."""
 
     finds_dependent_rows = False  # whether rows that depend on others show by their pivots

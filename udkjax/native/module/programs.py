@@ -49,3 +49,25 @@ PROGRAMS = {
     "mobility": CalledProgram(("dv1 without rows",)),
 }
 DIFFERENTIATED = {"accelerations": ("a",), "projection": ("q1", "v1 at q1"), "newton_q": ("q1",), "newton_v": ("v1",)}
+
+# Rarely called functions: once per run, near singular configurations, where a piece may end, or once in an implicit step.
+COLD = (
+    "end_piece",
+    "along_motion",
+    "jump",
+    "finish_members",
+    "begin",
+    "rows_and_loads",
+    "fallback",
+    "fallback_tangent_part",
+    "finish_by_fallback",
+    "close_output",
+    "accelerate_by_fallback",
+    "equation_terms",
+    "newton_v_and_psi",
+    "evaluation_slopes",
+    "measure_speed",
+    FURTHER,
+    "settle_state",
+    "settle_end",
+)

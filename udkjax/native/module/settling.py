@@ -10,18 +10,61 @@ one of these fails. A solution with negative pivots counts at the end of such a 
     settle_end(work, out)      the same at `result v`, the velocities at the end of a step
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from udkjax.equations.programs.run_programs import RunPrograms
-from udkjax.native.language.ir import DOUBLE, INT, Function, Value
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.memory import Memory
+from udkjax.native.module.parts import FrictionPart
 from udkjax.native.module.programs import FURTHER
 from udkjax.native.module.steps import SETTLING_ROUNDS, STAGE_ROUNDS
 
 AT_STATE = ("accelerations", "accelerations_and_drift")
 AT_END = ("project_and_accelerate", "end_of_step")
 SETTLING = (*AT_STATE, *AT_END)
+
+
+class LoadFriction(FrictionPart):
+    """The loads of joints, which may need further rounds."""
+
+    settles = True
+    programs = (FURTHER,)
+    shared = ("velocities",)
+    arrays = RunPrograms.BEGINS
+
+    def __init__(self, module: Memory, at_end: bool):
+        """`at_end`: whether the module has programs of the end of a step."""
+        self._in, self._at_end = module, at_end
+
+    def reserve(self):
+        module, count = self._in, self._in.plan.code.scratch["settled"]
+        module.places.add("further a", module.n)
+        if module.plan.unrolled:
+            module.places.add("settled", count)
+        module.places.add("settled before", count if module.plan.width > 1 else 0)
+        module.places.add("settled kept", count)
+
+    def write(self):
+        module, arguments = self._in, [(POINTER, "work"), (POINTER, "out")]
+        write_settle_state(module, *module.function("settle_state", arguments))
+        if self._at_end:
+            write_settle_end(module, module.function("settle_end", arguments)[0])
+
+    def settle_after(self, f: Function, name: str, out: str | None):
+        if name in SETTLING:
+            with f.if_(f.any_of(Lane(f, self._in.places).unsettled > 0.5)):
+                address = self._in.address(f, out or "result a")
+                f.call("settle_end" if name in AT_END else "settle_state", f.given["work"], address)
+
+    def settle(self, f: Function, out: str):
+        self._in.invoke(f, "accelerations", out)
+
+
+def friction_of(module: Memory, names: Sequence[str]) -> FrictionPart:
+    """Return the friction of a module with programs of these names."""
+    needs = module.plan.code.rubs and any(name in SETTLING for name in names)
+    return LoadFriction(module, any(name in AT_END for name in names)) if needs else FrictionPart()
 
 
 def write_settle_state(module: Memory, f: Function, s: Lane):

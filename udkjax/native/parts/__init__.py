@@ -1,7 +1,7 @@
 """The parts of a module that runs, each with the programs and memory that it needs, and the functions that it writes.
 
 `fallback` takes steps whose pivots are too small for elimination, by one of the methods of `all_rows`; `singular` says when.
-`dense_equations` solves by a pseudoinverse of all rows (pseudoinverses/) instead of elimination; `formulations` has alternatives
-to the Udwadia-Kalaba equation, `partitioning` one that integrates independent coordinates alone. `manifold` projects states onto
-the constraints.
+`elimination` computes accelerations, `dense_equations` by a pseudoinverse of all rows (pseudoinverses/) instead; `formulations`
+has alternatives to the Udwadia-Kalaba equation, `partitioning` one that integrates independent coordinates alone. `projection`
+ends steps on the constraints, by Newton's method (`manifold`), or as they are.
 """

@@ -9,7 +9,7 @@ import numpy as np
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.parts import Fallback
+from udkjax.native.module.parts import FallbackPart
 from udkjax.native.module.programs import PROGRAMS
 from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.parts.fallback import RankRevealing
@@ -19,10 +19,10 @@ from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
 
-def fallback_of(module: Module) -> Fallback:
+def fallback_of(module: Module) -> FallbackPart:
     """Return the fallback of a module: for small scenes, and if redundant rows share loads, singular values."""
-    if not (module.code.policy.reports and module.m) or module.partitions:
-        return Fallback()
+    if not (module.code.policy.reports and module.m):
+        return FallbackPart()
     return (BySingularValues if module.plan.unrolled or module.code.weighs_rows else ByElimination)(module)
 
 

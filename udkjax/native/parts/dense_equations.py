@@ -11,20 +11,36 @@ systems at one state share a factorization.
 
 from collections.abc import Callable
 
-from udkjax.native.language.ir import DOUBLE, POINTER, Function
+from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
+from udkjax.native.parts.elimination import ByRows
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
 
-class DenseEquations:
+class DenseEquations(ByRows):
     """The functions of a module with a dense method."""
 
+    shared = ("couplings", "rows", "rates")
+    has_cold_functions = False
+
     def __init__(self, module: Module, method: DenseMethod):
-        self._in, self._rows = module, WeightedRows(module, method)
+        super().__init__(module)
+        self._method = method
+
+    @property
+    def programs(self) -> list[str]:
+        of_projection = ["dense_newton_q", "dense_newton_v", "psi_dot"]
+        return ["dense_accelerations", *(of_projection if self._in.plan.projected else [])]
+
+    def reserve(self):
+        self._rows = WeightedRows(self._in, self._method)
         for name in ("state q", "state v"):
-            module.places.add(f"saved {name}", module.n)
+            self._in.places.add(f"saved {name}", self._in.n)
+
+    def highest_rank(self, s: Lane) -> Value | None:
+        return s.highest_rank
 
     def write(self):
         """Write the functions that the module calls instead of programs."""

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.parts import Fallback, Shortened
+from udkjax.native.module.parts import FallbackPart, Shortened
 from udkjax.native.module.steps import NEAREST_STAGE, OPEN_OUTPUT, OUTPUT_PIVOT_TOL
 from udkjax.native.parts.manifold import iterate_newton, largest_violation, with_threshold
 from udkjax.native.parts.singular import retry_or_fall_back, step_around
@@ -22,7 +22,7 @@ from udkjax.native.parts.singular import retry_or_fall_back, step_around
 RESULTS = ("a", "q", "v", "dq", "dv")  # of the fallback
 
 
-class RankRevealing(Fallback):
+class RankRevealing(FallbackPart):
     """Steps by a rank-revealing method."""
 
     finds_dependent_rows = True
@@ -103,7 +103,7 @@ class RankRevealing(Fallback):
         by_fallback = (s.stepping > 0.5) & (s.fallback > 0.5)
         with f.if_(f.any_of(by_fallback)):
             self._in.invoke(f, "finish_by_fallback")
-            self._in.accelerate_end(f)
+            self._in.accelerations.accelerate_end(f)
             s.where(by_fallback, ok=1.0)
 
     def retry(self, f: Function, s: Lane, stepping: Value, failed: Value, tries: Value | None) -> Shortened:
@@ -134,7 +134,7 @@ class RankRevealing(Fallback):
         in a range that a step crosses. Rows without a safe pivot carry none of these loads, in runs and in their derivatives.
         """
         module = self._in
-        if not module.settles:
+        if not module.friction.settles:
             do()
             return
         safe = (module.unrolled or module.code).safe_tol_index
@@ -146,7 +146,7 @@ class RankRevealing(Fallback):
         with_threshold(f, place, safe_tol, do)
 
     def evaluate_settled(self, f: Function, s: Lane, settle: Callable[[], None], evaluate: Callable[[], None]):
-        if not self._in.settles:
+        if not self._in.friction.settles:
             evaluate()
             return
         unsafe = s.safe < 0.5
@@ -159,7 +159,7 @@ class RankRevealing(Fallback):
         self.with_loads(f, settle_and_evaluate, unsafe)
 
     def with_lost_loads(self, s: Lane, accept: Value, lost: Value) -> Value:
-        return lost | (accept & (s.fallback > 0.5)) if self._in.settles else lost
+        return lost | (accept & (s.fallback > 0.5)) if self._in.friction.settles else lost
 
     # --- single states
 

@@ -14,9 +14,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from udkjax.native.language.ir import INT, POINTER, Function, Operand, Value
-from udkjax.native.module.layout import FORMULATION_SETTINGS
+from udkjax.native.language.ir import INT, POINTER, Function, Operand, Value, Variable
+from udkjax.native.module.layout import FORMULATION_SETTINGS, Lane
 from udkjax.native.module.module import Module
+from udkjax.native.parts.elimination import ByRows, EliminatedAccelerations
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, DenseMethod, MatrixRow
 from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
 from udkjax.native.pseudoinverses.svd import SVDCode
@@ -43,6 +44,52 @@ class FormulatedAccelerations(ABC):
     @abstractmethod
     def write(self):
         """Write `formulate(work, out)`: the accelerations of the state."""
+
+
+class Formulated(ByRows):
+    """Accelerations by a formulation; the systems of the projection are those of a `solver`."""
+
+    def __init__(self, module: Module, solver: EliminatedAccelerations, code: FormulationCode):
+        super().__init__(module)
+        self._solver, self._code = solver, code
+        self.has_cold_functions = solver.has_cold_functions
+        self.shared = {*solver.shared, "couplings", "rows", "velocities"}
+
+    @property
+    def programs(self) -> list[str]:
+        return list(dict.fromkeys([*self._solver.programs, "dense_accelerations"]))
+
+    def reserve(self):
+        self._solver.reserve()
+        self.formulation = self._code.prepare(self._in)
+
+    def write(self):
+        self._solver.write()
+        self.formulation.write()
+
+    def accelerate(self, f: Function, to: str):
+        self._in.invoke(f, FORMULATE, to)
+
+    def accelerate_end(self, f: Function):
+        module = self._in
+        module.copy(f, "state v", "saved v")
+        module.copy(f, "result v", "state v")
+        self.accelerate(f, "result a")
+        module.copy(f, "saved v", "state v")
+
+    def check_pivots(self, f: Function, s: Lane, name: str):
+        """Do nothing: a formulation has no pivots."""
+
+    def highest_rank(self, s: Lane) -> Value | None:
+        return self._solver.highest_rank(s)
+
+    def add_numbers(self, f: Function, total: Variable):
+        self.accelerate(f, "result a")
+        with f.each(self._in.n) as i:
+            total.value = f.fma(self._in.entry(f, "result a", i), 0.0, total.value)
+
+    def accelerate_state(self, f: Function, s: Lane):
+        self.accelerate(f, "result a")
 
 
 class ScaledAccelerations(FormulatedAccelerations):

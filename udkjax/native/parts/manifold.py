@@ -5,7 +5,7 @@ from collections.abc import Callable
 from udkjax.native.language.ir import DOUBLE, INT, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import NEWTON_STEPS, NEWTON_TOL, OUTPUT_STEPS, SINGLE_STEP_TOL
+from udkjax.native.module.steps import NEWTON_STEPS, NEWTON_TOL
 
 
 def newton(module: Module, f: Function, s: Lane):
@@ -64,44 +64,6 @@ def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value
     """Return the tolerance of the fastest velocity, in its unit."""
     fastest = module.largest(f, lambda r: [f.abs(module.vector(f, name, r)) * module.vector(f, "inverse unit", r)])
     return f.fma(s.rtol, fastest / s.omega, s.atol)
-
-
-def project_output(module: Module, f: Function, s: Lane, which: str):
-    """Project the state to `state q` and `result v`; set `violated` to the largest violation of Psi."""
-    mask = getattr(s, which) > 0.5
-
-    def iterate(lanes: Value):
-        iterate_newton(module, f, s, lanes, lambda _: module.invoke(f, "newton_q"), OUTPUT_STEPS)
-        module.invoke(f, "newton_v_and_psi")
-
-    def project():
-        module.invoke(f, "project")
-        s.violated = largest_violation(module, f)
-        is_far = mask & ~(take_newton_step(module, f, mask) <= SINGLE_STEP_TOL)
-        with f.if_(f.any_of(is_far)):
-            with f.each(module.rowcount) as r:  # other lanes keep their states
-                module.put(f, "result dv", r, module.vector(f, "result v", r))
-            iterate(is_far)
-            with f.each(module.rowcount) as r:
-                module.put(f, "result v", r, f.select(is_far, module.vector(f, "result v", r), module.vector(f, "result dv", r)))
-            s.where(is_far, violated=largest_violation(module, f))
-        module.fallback.close_output(f, s, mask)
-
-    if module.partitions:
-        f.call("choose_partition", f.given["work"])
-        s.closing = getattr(s, which)
-        f.call("close_state", f.given["work"])
-        module.copy(f, "state v", "result v", mask)
-        module.invoke(f, "psi")
-        s.violated = largest_violation(module, f)
-        return
-    if module.plan.projected:
-        module.fallback.keeping_rows(f, project)
-        return
-    module.invoke(f, "psi")
-    with f.each(module.rowcount) as r:
-        module.put(f, "result v", r, module.vector(f, "state v", r))
-    s.violated = largest_violation(module, f)
 
 
 def largest_violation(module: Module, f: Function) -> Value:

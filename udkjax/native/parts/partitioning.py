@@ -16,11 +16,13 @@ import numpy as np
 
 from udkjax.equations.laws.partitioning import PARTITION_NEWTON
 from udkjax.equations.rows.position_closure import CLOSURE
-from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value, Variable
 from udkjax.native.module.layout import FORMULATION_SETTINGS, Lane
 from udkjax.native.module.module import Module
-from udkjax.native.parts.formulations import FORMULATE, FormulatedAccelerations, FormulationCode
-from udkjax.native.parts.manifold import iterate_newton, take_newton_step
+from udkjax.native.module.parts import ProjectionPart
+from udkjax.native.parts.formulations import FORMULATE, Formulated, FormulatedAccelerations, FormulationCode
+from udkjax.native.parts.manifold import iterate_newton, largest_violation, take_newton_step
+from udkjax.native.parts.projection import estimate_errors, lost_in
 from udkjax.native.pseudoinverses.householder import HouseholderCode
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
@@ -41,22 +43,78 @@ class PartitionedAccelerations(FormulatedAccelerations):
 
     def __init__(self, module: Module):
         self._in = module
-        self._rows = WeightedRows(module, HouseholderCode(relative=True), prefix="partition", tol=FORMULATION_SETTINGS[0])
-        if module.partitions:
-            module.places.add("closing")
-            for name in ("dependent q", "dependent v", "predicted q"):
-                module.places.add(name, module.n)
+        self.rows = WeightedRows(module, HouseholderCode(relative=True), prefix="partition", tol=FORMULATION_SETTINGS[0])
 
     def write(self):
-        module, rows = self._in, self._rows
+        module, rows = self._in, self.rows
         rows.write()
         f, _ = module.function(FORMULATE, [(POINTER, "work"), (POINTER, "out")])
         module.invoke(f, "dense_accelerations")
         rows.factor(f)
         rows.correct(f, rows.solve(f, "terms", module.n), "terms", "out", 1.0)
-        if module.partitions:
-            self._write_choice()
-            self._write_closure()
+
+
+class ByPartition(ProjectionPart):
+    """States are closed by their dependent coordinates and velocities, also at the stages of a step."""
+
+    programs = ("rows_of_positions", "rows_of_velocities")
+
+    def __init__(self, module: Module, accelerations: Formulated):
+        self._in, self._accelerations = module, accelerations
+
+    @property
+    def _rows(self) -> WeightedRows:
+        formulation = self._accelerations.formulation
+        assert isinstance(formulation, PartitionedAccelerations)  # the only formulation that closes states
+        return formulation.rows
+
+    def reserve(self):
+        places = self._in.places
+        places.add("closing")
+        for name in ("dependent q", "dependent v", "predicted q"):
+            places.add(name, self._in.n)
+
+    def write(self):
+        self._write_choice()
+        self._write_closure()
+
+    def begin_step(self, f: Function, s: Lane):
+        """Choose the partition of a step, at point 3."""
+        module = self._in
+        setattr(s, "state t", s.point3_t)
+        with f.each(module.rowcount) as r:
+            for x in "qv":
+                module.put(f, f"state {x}", r, module.vector(f, f"point3 {x}", r))
+        f.call("choose_partition", f.given["work"])
+
+    def close_stage(self, f: Function, s: Lane):
+        s.closing = f.select(s.stepping > 0.5, f.const(1.0, DOUBLE, f.width), 0.0)
+        f.call("close_state", f.given["work"])
+
+    def end_step(self, f: Function, s: Lane):
+        """Close the end of a step, with its accelerations; dependent coordinates, which are not integrated, have no errors."""
+        module = self._in
+        self.close_stage(f, s)
+        module.copy(f, "state v", "result v")
+        module.invoke(f, FORMULATE, "result a")
+        estimate_errors(module, f, s, "result a" if module.method.ends else None, "state dq", "state dv")
+        with f.each(module.rowcount) as r:
+            for x in "qv":
+                error = module.vector(f, f"state d{x}", r) * (1.0 - module.vector(f, f"dependent {x}", r))
+                for name in ("state", "result"):
+                    module.put(f, f"{name} d{x}", r, error)
+
+    def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
+        lost.value = lost_in(self._in, f, s, accept)
+
+    def project_output(self, f: Function, s: Lane, mask: Value):
+        module = self._in
+        f.call("choose_partition", f.given["work"])
+        s.closing = s.due
+        f.call("close_state", f.given["work"])
+        module.copy(f, "state v", "result v", mask)
+        module.invoke(f, "psi")
+        s.violated = largest_violation(module, f)
 
     def _write_choice(self):
         """Write `choose_partition(work)`."""
@@ -117,34 +175,3 @@ class PartitionedAccelerations(FormulatedAccelerations):
         with f.each(module.n) as i:
             step = module.entry(f, "root", i) * module.entry(f, columns, i) * change.entry(i)
             module.put_entry(f, to, i, module.entry(f, f"state {x}", i) - step)
-
-
-def begin_step(module: Module, f: Function, s: Lane):
-    """Choose the partition of a step, at point 3."""
-    setattr(s, "state t", s.point3_t)
-    with f.each(module.rowcount) as r:
-        for x in "qv":
-            module.put(f, f"state {x}", r, module.vector(f, f"point3 {x}", r))
-    f.call("choose_partition", f.given["work"])
-
-
-def close(f: Function, s: Lane, mask: Value):
-    """Close the state in some lanes."""
-    s.closing = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
-    f.call("close_state", f.given["work"])
-
-
-def close_end(module: Module, f: Function, s: Lane):
-    """Close the end of a step, with its accelerations."""
-    close(f, s, s.stepping > 0.5)
-    module.copy(f, "state v", "result v")
-    module.invoke(f, FORMULATE, "result a")
-
-
-def judge_independent(module: Module, f: Function):
-    """Make the estimated errors of dependent coordinates and velocities zero, as they are not integrated."""
-    with f.each(module.rowcount) as r:
-        for x in "qv":
-            error = module.vector(f, f"state d{x}", r) * (1.0 - module.vector(f, f"dependent {x}", r))
-            for name in ("state", "result"):
-                module.put(f, f"{name} d{x}", r, error)

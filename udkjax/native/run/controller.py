@@ -21,12 +21,10 @@ from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.steps import (
     CLEARLY,
-    CLOSED_TOL,
     CORRECTIONS,
     FACTORS,
     GAP,
     LIMIT,
-    LOST_TOL,
     PATIENCE,
     POINTS,
     RESTART_FACTOR,
@@ -37,8 +35,7 @@ from udkjax.native.module.steps import (
     UNPAID,
     Status,
 )
-from udkjax.native.parts.manifold import largest_violation, velocity_tolerance
-from udkjax.pinv.auto import NEAREST
+from udkjax.native.parts.manifold import velocity_tolerance
 
 
 def write_decide(module: Module):
@@ -56,8 +53,8 @@ def write_decide(module: Module):
         f.call("end_piece", f.given["work"])
         repeats = s.again > 0.5
     accept = stepping & (error < 1.0) & ~shortens & ~repeats
-    if module.finds_edges:
-        with f.each(module.pieces - module.code.first_edge) as k:
+    if module.edges:
+        with f.each(module.edges) as k:
             new, old = (module.entry(f, name, k) for name in ("edges", "edges before"))
             module.put_entry(f, "edges before", k, where(accept, new, old))
     stepped, begun, step = ~begin, stepping & begin, s.t1 - s.point3_t
@@ -184,17 +181,8 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
         s.where(accept, distance0=s.distance1)
         s.where(accept, distance1=s.distance2)
         s.where(accept, distance2=s.distance)
-        if module.m and module.plan.projected:
-            module.invoke(f, "psi")
-            bound = f.min(f.const(LOST_TOL, DOUBLE, f.width), f.max(s.open_tol, (s.rtol + s.atol) * CLOSED_TOL))
-            is_lost = accept & (largest_violation(module, f) > bound)
-            lost.value = f.select(is_lost, f.const(Status.LOST, DOUBLE, f.width), 0.0)
-        if module.drops_rows:
-            misses = accept & lost.value.is_(0.0) & _misses_rows(module, f, s)
-            lost.value = f.select(misses, f.const(Status.MISSING_RANK, DOUBLE, f.width), lost.value)
-        if module.measures_drift:
-            lost.value = _judge_drift(module, f, s, accept)
-        rank = module.highest_rank(s)
+        module.projection.judge(f, s, accept, lost)
+        rank = module.accelerations.highest_rank(s)
         if rank is not None:
             # Rows that depend on others along the whole motion are independent where these are violated, or by rounding, unless
             # the threshold of the rank is larger: they then hold back what is free to move.
@@ -204,39 +192,6 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
             s.where(accept, tolerance=velocity_tolerance(module, f, s, "point3 v"))
         module.record_step(f, s, accept)
     return lost.value
-
-
-def _misses_rows(module: Module, f: Function, s: Lane) -> Value:
-    """Return whether the projected velocities of the new point violate Psi_dot so that such a step would open Psi too far.
-
-    Psi_dot is linear in the velocities: a row stays violated only if it was left out as dependent, although it is not. The motion
-    then has more freedom than the mechanism, and when the row counts again, projection takes away what it gained.
-    """
-    module.copy(f, "state v", "saved v")
-    module.copy(f, "result v", "state v")
-    module.invoke(f, "psi_dot")
-    module.copy(f, "saved v", "state v")
-    return largest_violation(module, f) * s.step > f.max(s.drift_tol, s.rtol + s.atol)
-
-
-def _judge_drift(module: Module, f: Function, s: Lane, accept: Value) -> Value:
-    """Return `LOST` or `SINGULAR` in lanes whose new point, which is not projected, has drifted too far, else zero.
-
-    Where the distance from singular configurations is d, a violation x of Psi moves the state by x / d and turns its velocity by
-    x / d^2: near the intersection of two branches, the curves of constant Psi are hyperbolas, and lead from one branch to the
-    other. Therefore the bound of x is `drift_tol` times d^2, with d relative to the largest distance of the run. Steps that
-    are short beside d follow such a curve, and a longer one passes: d is the distance of the farther end of the step. A distance
-    below which the method leaves rows out counts as this distance: `NEAREST` for elimination, else the threshold of the rank.
-    """
-    nearest = f.const(NEAREST, DOUBLE, f.width)
-    if module.takes_dense_rows:
-        nearest = f.min(nearest, s.fallback_tol)
-    s.where(accept, farthest=f.max(s.farthest, s.distance))
-    farther = f.max(s.distance, f.select(s.distance1 < np.inf, s.distance1, 0.0))
-    nearness = f.max(farther, nearest) / f.max(s.farthest, nearest)
-    violated, status = largest_violation(module, f), lambda code: f.const(float(code), DOUBLE, f.width)
-    is_turned = accept & (violated > s.drift_tol * (nearness * nearness))
-    return f.select(is_turned, f.select(violated > s.drift_tol, status(Status.LOST), status(Status.SINGULAR)), 0.0)
 
 
 def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value) -> Value:

@@ -4,7 +4,6 @@ from udkjax.native.language.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.module.layout import Lane, Layout
 from udkjax.native.module.module import Module
 from udkjax.native.module.steps import POINTS, SHORT_STEP, STRETCH
-from udkjax.native.parts.manifold import project_output
 
 
 def write_differences(module: Module, name: str = "differences", to: tuple[str, Layout] | None = None):
@@ -133,7 +132,7 @@ def write_outputs(module: Module):
         f.call("differences", f.given["work"])
         with f.while_(due):
             f.call("between", f.given["work"])
-            project_output(module, f, s, "due")
+            module.projection.project_output(f, s, s.due > 0.5)
             module.record_output(f, s)
             with module.each_lane(f, s.due) as k:
                 number = module.to_int(f, f.lane(s.written, k)) + 1

@@ -9,7 +9,7 @@ from udkjax.native.module.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.samples import enter_first_row, write_enter
 from udkjax.native.module.steps import LOOK_AHEAD, PATIENCE, POINTS, Status
-from udkjax.native.parts.manifold import largest_violation, project_output
+from udkjax.native.parts.manifold import largest_violation
 
 
 def write_begin(module: Module):
@@ -100,7 +100,7 @@ def write_finish(module: Module):
         for x in "qv":
             module.put(f, f"state {x}", r, module.vector(f, f"point3 {x}", r))
     setattr(s, "state t", s.point3_t)
-    project_output(module, f, s, "due")
+    module.projection.project_output(f, s, s.due > 0.5)
     with module.each_lane(f, s.due) as k:
         member = module.to_int(f, f.lane(s.member, k))
         with f.if_(f.lane(s.code, k).is_(float(Status.DONE))):
@@ -152,10 +152,7 @@ def _find_cause(module: Module, f: Function, s: Lane):
             total = f.variable(0.0)
             with f.each(module.code.term_count) as i:
                 total.value = f.fma(module.entry(f, "terms", i), 0.0, total.value)
-            if module.is_formulated:
-                module.accelerate(f, "result a")
-                with f.each(module.n) as i:
-                    total.value = f.fma(module.entry(f, "result a", i), 0.0, total.value)
+            module.accelerations.add_numbers(f, total)
             s.where(stopped & total.value.is_not(0.0), code=Status.NOT_FINITE)
 
 

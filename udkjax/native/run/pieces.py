@@ -34,14 +34,14 @@ def write_end_piece(module: Module):
     """
     f, s = module.function("end_piece")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
-    first_edge = module.code.first_edge if module.finds_edges else module.pieces
+    first_edge = module.pieces - module.edges
     goes_across, per_unit = s.aim.is_(float(AIM_ACROSS)), module.entry(f, "inverse unit", f.const(0, INT))
     loaded = s.tolerance * NO_LOAD * s.omega / ((s.t1 - s.point3_t) * per_unit)  # (m/s^2)
 
     def look():
-        if module.finds_edges:
+        if module.edges:
             distance, safe = s.distance, s.safe
-            module.settle(f, "piece a")
+            module.friction.settle(f, "piece a")
             s.distance, s.safe = distance, safe
         module.invoke(f, "pieces")
 
@@ -53,9 +53,9 @@ def write_end_piece(module: Module):
 
     def any_edge(meets: Callable[[Value, Value], Value]) -> Value:
         found = f.variable(f.const(False, BOOL, f.width), BOOL)
-        if not module.finds_edges:
+        if not module.edges:
             return found.value
-        with f.each(module.pieces - first_edge) as k:
+        with f.each(module.edges) as k:
             found.value = found.value | meets(module.entry(f, "pieces", k + first_edge), module.entry(f, "edges before", k))
         return found.value
 
@@ -71,8 +71,8 @@ def write_end_piece(module: Module):
     def least_load() -> Value:
         """Return the smallest load of an edge that counts, relative to that at the start of the step; infinite if none does."""
         least = f.variable(inf)
-        if module.finds_edges:
-            with f.each(module.pieces - first_edge) as k:
+        if module.edges:
+            with f.each(module.edges) as k:
                 current, previous = module.entry(f, "pieces", k + first_edge), module.entry(f, "edges before", k)
                 least.value = f.min(least.value, where(f.abs(previous) > loaded, current / previous, inf))
         return least.value
@@ -86,9 +86,9 @@ def write_end_piece(module: Module):
 
     with f.each(module.rowcount) as r:
         module.put(f, "corrected q", r, module.vector(f, "state q", r))
-    if module.finds_edges:
+    if module.edges:
         module.invoke(f, "pieces")  # the loads at the end of the step have settled last
-        with f.each(module.pieces - first_edge) as k:
+        with f.each(module.edges) as k:
             module.put_entry(f, "edges", k, module.entry(f, "pieces", k + first_edge))
     if first_edge:
         find_pieces(s.point3_t, lambda r: (module.vector(f, "point3 q", r), module.vector(f, "point3 v", r)))
@@ -103,7 +103,7 @@ def write_end_piece(module: Module):
             look()
             strays.value = strays.value | (moved() & lanes)
 
-    if module.finds_edges:
+    if module.edges:
         is_near = any_edge(lambda current, previous: f.abs(current) < f.abs(previous) * NEAR_ZERO)
         lanes = (s.again > 0.5) & (is_near | f.const(first_edge > 0, BOOL, f.width))
         with f.if_(f.any_of(lanes)):
@@ -113,8 +113,8 @@ def write_end_piece(module: Module):
     find_pieces(s.t1, lambda r: (module.vector(f, "corrected q", r), module.vector(f, "result v", r)))
     if first_edge:
         module.invoke(f, "pieces")
-    if module.finds_edges:
-        with f.each(module.pieces - first_edge) as k:
+    if module.edges:
+        with f.each(module.edges) as k:
             module.put_entry(f, "pieces", k + first_edge, module.entry(f, "edges", k))
     stepping, step = s.again > 0.5, s.t1 - s.point3_t
     # The polynomial of a step is no motion where its error is so large that the controller shortens it as far as it may.

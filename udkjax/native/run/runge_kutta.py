@@ -5,10 +5,8 @@ import numpy as np
 from udkjax.native.language.ir import DOUBLE, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import FACTORS, NORMAL_ERROR_WEIGHT, ROUNDING_PIVOT, STAGE_SHRINK
+from udkjax.native.module.steps import FACTORS, NORMAL_ERROR_WEIGHT, STAGE_SHRINK
 from udkjax.native.module.tableau import Method
-from udkjax.native.parts.manifold import newton, with_threshold
-from udkjax.native.parts.partitioning import begin_step, close, close_end, judge_independent
 
 
 def write_attempt(module: Module):
@@ -23,17 +21,16 @@ def write_attempt(module: Module):
     ones = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
     s.ok = ones()
     s.distance = f.const(np.inf, DOUBLE, f.width)
-    if module.highest_rank(s) is not None:
+    if module.accelerations.highest_rank(s) is not None:
         s.highest_rank = f.const(0.0, DOUBLE, f.width)
     begins = f.all_of((s.begin > 0.5) | (s.stepping < 0.5))
 
     def take_stages():
         for i in range(1, stages):
             stage_state(module, f, s, i)
-            if module.partitions:
-                close(f, s, s.stepping > 0.5)
+            module.projection.close_stage(f, s)
             module.accelerate_stage(f, i)
-            check_pivots(module, f, s, f"stage{i} a")
+            module.accelerations.check_pivots(f, s, f"stage{i} a")
             module.record_stage(f, s, i)
         if module.plan.measures_speed:
             _watch_speed(module, f, s)
@@ -59,38 +56,12 @@ def write_attempt(module: Module):
                 module.put(f, f"stage{i} a", r, f.const(0.0, DOUBLE, module.plan.vector))
 
     implicit = s.begin < -0.5
-    if module.partitions:
-        begin_step(module, f, s)
+    module.projection.begin_step(f, s)
     f.choose(begins, clear_stages, take_stages_by_method)
     for each_method, mask in module.methods(f, s):
         stage_state(module, f, s, each_method.stages, method=each_method, mask=mask)
     setattr(s, "state t", s.t1)
-    if module.partitions:
-        close_end(module, f, s)
-        _estimate_errors(module, f, s, "result a" if method.ends else None, "state dq", "state dv")
-        judge_independent(module, f)
-    elif not module.plan.projected:
-        module.accelerate_and_measure(f)
-        check_pivots(module, f, s, "result a")
-        with f.each(module.rowcount) as r:
-            module.put(f, "result v", r, module.vector(f, "state v", r))
-        _estimate_errors(module, f, s, "result a", "result dq", "result dv")
-        with f.each(module.rowcount) as r:
-            for d in ("dq", "dv"):
-                module.put(f, f"state {d}", r, module.vector(f, f"result {d}", r))
-    else:
-        if not method.ends:
-            _estimate_errors(module, f, s, None, "state dq", "state dv")
-        newton(module, f, s)
-        module.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
-        module.accelerate_end(f)
-        unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
-        module.fallback.note_unsafe(s, unsafe)
-        if method.ends:
-            _estimate_errors(module, f, s, "result a", "state dq", "state dv")
-            threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
-            with_threshold(f, module.drop_tol_place, threshold, lambda: module.invoke(f, "tangent_part"))
-        module.fallback.finish_step(f, s)
+    module.projection.end_step(f, s)
     if module.implicit:
         with f.if_(f.any_of(implicit)):
             module.copy(f, f"stage{module.implicit.stages - 1} a", "result a", implicit)
@@ -145,7 +116,7 @@ def write_measure_speed(module: Module):
         for x, change in (("state q", in_v), ("state v", in_a)):
             scaled = module.broadcast(f, s.speed) * module.vector(f, change, r)
             module.put(f, x, r, module.vector(f, x, r) + scaled)
-    module.accelerate(f, "result a")
+    module.accelerations.accelerate(f, "result a")
     with f.each(module.rowcount) as r:
         change = module.vector(f, "result a", r) - module.vector(f, end, r)
         module.put(f, "result a", r, change / module.broadcast(f, s.speed))
@@ -204,29 +175,6 @@ def stage_state(
         for x, new in (("q", f.fma(h, slope, q)), ("v", v if sum_v is None else f.fma(h, sum_v, v))):
             old = None if mask is None else module.vector(f, f"state {x}", r)
             module.put(f, f"state {x}", r, new if mask is None or old is None else f.select(mask, new, old))
-
-
-def check_pivots(module: Module, f: Function, s: Lane, name: str):
-    """If pivots are too small, compute accelerations by the fallback or abandon the attempt."""
-    if not module.is_formulated:
-        module.fallback.check_pivots(f, s, name)
-
-
-def _estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
-    """Estimate the errors of q and v from the accelerations of all stages; `end` names those of the last stage."""
-    h, zero = module.broadcast(f, s.step), f.const(0.0, DOUBLE, module.plan.vector)
-    for method, mask in module.methods(f, s):
-        names = list(module.stage_accelerations)
-        if method.ends and end:
-            names[-1] = end
-        with f.each(module.rowcount) as r:
-            error_q, error_v = (module.weighted_sum(f, weights, r, names) for weights in (method.error_q, method.error_v))
-            new_q = zero if error_q is None else h * (h * error_q)
-            for to, new in ((to_q, new_q), (to_v, zero if error_v is None else h * error_v)):
-                module.put(f, to, r, new if mask is None else f.select(mask, new, module.vector(f, to, r)))
-    if module.plan.stiff:
-        with f.if_(f.any_of((s.stepping > 0.5) & (s.trial > 0.0))):
-            f.call("smooth_error", f.given["work"])
 
 
 def error_of_velocities(module: Module) -> str:

@@ -27,7 +27,7 @@ from udkjax.native.module.program_derivative import SLOPES, ProgramDerivative
 from udkjax.native.module.steps import DIVERGING, EAGER, FADING, RENEWALS, SLOW, STAGE_ITERATIONS, STAGE_TOL
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 from udkjax.native.pseudoinverses.lu import OrderedLUCode
-from udkjax.native.run.runge_kutta import check_pivots, error_of_velocities, stage_state
+from udkjax.native.run.runge_kutta import error_of_velocities, stage_state
 
 
 class StageEquations:
@@ -100,7 +100,7 @@ class StageEquations:
         f, s = module.function(name)
         work, d, lanes = f.given["work"], DenseMatrices(layout, f), self._tangent.width
         tangent = f.given["tangent"] = module.address(f, "slope tangent")
-        module.settle(f, "residual a")
+        module.friction.settle(f, "residual a")
         f.call(f"evaluation_{SLOPES}", work, module.address(f, "residual a"), module.address(f, "slopes linearization"))
         hg = s.step * self._method.diagonal
         of_v = hg if module.plan.width > 1 else f.repeat(hg, lanes) if lanes > 1 else hg
@@ -179,8 +179,8 @@ class StageEquations:
         s.iterating, s.size, s.renewals = s.stepping, f.const(np.inf, DOUBLE, width), f.const(0.0, DOUBLE, width)
         k = f.variable(0, INT, 1)
         with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < STAGE_ITERATIONS)):
-            module.accelerate(f, "residual a")
-            check_pivots(module, f, s, "residual a")
+            module.accelerations.accelerate(f, "residual a")
+            module.accelerations.check_pivots(f, s, "residual a")
             self._correct(f, d)
             active, hg = s.iterating > 0.5, module.broadcast(f, s.step * diagonal)
 

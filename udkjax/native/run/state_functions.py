@@ -20,7 +20,7 @@ from udkjax.native.module.memory import Memory, ThreadCode
 from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.module.tableau import EULER
 from udkjax.native.parts.formulations import FormulationCode
-from udkjax.native.parts.manifold import project_output, with_threshold
+from udkjax.native.parts.manifold import with_threshold
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.members import write_begin
 from udkjax.native.run.trajectory import Trajectory
@@ -92,9 +92,7 @@ class StateAccelerations(StateFunction):
         return ["accelerations"]
 
     def _evaluate(self, f: Function, s: Lane):
-        self.accelerate(f, "result a")
-        if not self.formulated:
-            self.fallback.accelerate_state(f, s)
+        self.accelerations.accelerate_state(f, s)
 
 
 class StateProjection(StateFunction):
@@ -106,11 +104,11 @@ class StateProjection(StateFunction):
 
     @property
     def solving(self) -> list[str]:
-        return [] if self.partitions else ["newton_q", "newton_v_and_psi", "project"]
+        return [name for name in super().solving if name in ("newton_q", "newton_v_and_psi", "project")]
 
     def _evaluate(self, f: Function, s: Lane):
         s.due = s.active
-        project_output(self, f, s, "due")
+        self.projection.project_output(f, s, s.due > 0.5)
 
 
 class StateTangentPart(StateFunction):

@@ -29,7 +29,10 @@ from udkjax.native.module.samples import enter_first_row, write_next_breakpoint
 from udkjax.native.module.steps import Status
 from udkjax.native.parts.all_rows import fallback_of
 from udkjax.native.parts.dense_equations import DenseEquations
-from udkjax.native.parts.formulations import FORMULATE
+from udkjax.native.parts.elimination import EliminatedAccelerations
+from udkjax.native.parts.formulations import Formulated
+from udkjax.native.parts.partitioning import ByPartition
+from udkjax.native.parts.projection import Projected, Unprojected
 from udkjax.native.run.breakpoints import aim
 from udkjax.native.run.controller import write_decide
 from udkjax.native.run.dense_output import write_between, write_differences, write_outputs
@@ -46,49 +49,25 @@ class Trajectory(Module):
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
         super().__init__(plan, differentiated, active)
-        self.dense = DenseEquations(self, plan.pseudoinverse) if self.is_dense else None
-        self.formulated = plan.formulation.prepare(self) if self.is_formulated else None
         self.stage_equations: StageEquations | None = None
         self._is_differentiated = bool(differentiated)
 
     def choose_parts(self):
+        plan = self.plan
+        formulation, method = (plan.formulation, plan.pseudoinverse) if self.m else (None, None)
+        if formulation and formulation.closes and self.closes:
+            self.accelerations = Formulated(self, EliminatedAccelerations(self), formulation)
+            self.projection = ByPartition(self, self.accelerations)
+            return
+        solver = DenseEquations(self, method) if method else EliminatedAccelerations(self)
+        self.accelerations = Formulated(self, solver, formulation) if formulation else solver
+        self.projection = Projected(self) if plan.projected else Unprojected(self, self.accelerations)
         self.fallback = fallback_of(self)
-
-    @property
-    def solving(self) -> list[str]:
-        return [] if self.partitions else super().solving
-
-    def program_names(self) -> list[str]:
-        return [*super().program_names(), *(("rows_of_positions", "rows_of_velocities") if self.partitions else ())]
 
     def write_programs(self):
         super().write_programs()
-        if self.dense:
-            self.dense.write()
-        if self.formulated:
-            self.formulated.write()
-
-    def accelerate(self, f: Function, to: str):
-        self.invoke(f, FORMULATE if self.formulated else "accelerations", to)
-
-    def accelerate_and_measure(self, f: Function):
-        """Compute the accelerations `result a` at the end of a step that is not projected, with its `psi` and `distance`."""
-        if self.measures_drift and not self.takes_dense_rows:
-            self.invoke(f, "accelerations_and_drift", "result a")
-            return
-        self.accelerate(f, "result a")
-        if self.measures_drift:
-            self.invoke(f, "drift")
-
-    def highest_rank(self, s: Lane) -> Value | None:
-        return s.highest_rank if self.dense else None
-
-    def accelerate_end(self, f: Function):
-        if self.formulated:
-            self.copy(f, "state v", "saved v")
-            self.copy(f, "result v", "state v")
-            self.invoke(f, FORMULATE, "result a")
-            self.copy(f, "saved v", "state v")
+        self.accelerations.write()
+        self.projection.write()
 
     def enter_start(self, f: Function, lane: Value, member: Value):
         if self.plan.sampled:

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.language.program import write
 from udkjax.native.module.layout import Lane
-from udkjax.native.parts.manifold import project_output
 from udkjax.native.watching.conditions import LAST_CHANGE
 from udkjax.native.watching.passed_events import Sliding
 from udkjax.native.watching.passing import PassingRuns
@@ -170,7 +169,7 @@ class _Modes:
         module.copy(f, "sure q", "state q")
         module.copy(f, v, "state v")
         module.copy(f, v, "result v")
-        module.accelerate(f, "result a")
+        module.accelerations.accelerate(f, "result a")
         module.copy(f, "result a", "node a")
 
     def _respond(self) -> tuple[Value, Value]:
@@ -364,5 +363,5 @@ class _Choice(_Modes):
         module.copy(f, "sure q", "state q")
         module.copy(f, "sure v", "state v")
         s.due = f.select(mask, self._one, self._zero)
-        project_output(module, f, s, "due")
+        module.projection.project_output(f, s, s.due > 0.5)
         module.copy(f, "result v", "after v", mask)

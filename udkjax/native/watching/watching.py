@@ -14,7 +14,6 @@ from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Value
 from udkjax.native.language.program import write
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.steps import POINTS, Status
-from udkjax.native.parts.manifold import project_output
 from udkjax.native.watching.condition_intervals import write_classification
 from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, LAST_CHANGE, MIDDLE, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate
@@ -97,7 +96,7 @@ class Watching(WatchMemory):
         step, before = f.const(FORCE_STEP, DOUBLE, f.width) / s.omega, getattr(s, "state t")
         ahead, nan = self.broadcast(f, step), f.const(float("nan"), DOUBLE, f.width)
         for name in ("g", "rate"):
-            self.settle(f, "result a")
+            self.friction.settle(f, "result a")
             self.invoke(f, "multipliers_of_settled")
             f.call("own_forces", f.given["work"])
             for k in range(self.conditions.force_count):
@@ -133,7 +132,7 @@ class Watching(WatchMemory):
                 if accelerates:
                     self.copy(f, f"point{k} a", "node a", is_point)
         s.next = following
-        project_output(self, f, s, "due")
+        self.projection.project_output(f, s, s.due > 0.5)
         f.call("conditions", work)
         s.where((s.due > 0.5) & ~(s.violated <= s.worst), worst=s.violated)
 

@@ -1,0 +1,168 @@
+"""The end of a step, and outputs: projected onto the constraints, or as they are."""
+
+import numpy as np
+
+from udkjax.native.language.ir import DOUBLE, Function, Value, Variable
+from udkjax.native.module.layout import Lane
+from udkjax.native.module.module import Module
+from udkjax.native.module.parts import ProjectionPart
+from udkjax.native.module.steps import CLOSED_TOL, LOST_TOL, OUTPUT_STEPS, ROUNDING_PIVOT, SINGLE_STEP_TOL, Status
+from udkjax.native.parts.elimination import EliminatedAccelerations
+from udkjax.native.parts.manifold import iterate_newton, largest_violation, newton, take_newton_step, with_threshold
+
+
+class Unprojected(ProjectionPart):
+    """States are as the method computes them; runs that drift too far end."""
+
+    def __init__(self, module: Module, accelerations: EliminatedAccelerations):
+        self._in, self._accelerations = module, accelerations
+        self.programs = [accelerations.measured] if module.m else []
+
+    @property
+    def solving(self) -> list[str]:
+        return ["accelerations"]
+
+    def end_step(self, f: Function, s: Lane):
+        module, accelerations = self._in, self._accelerations
+        if module.m:
+            accelerations.accelerate_and_measure(f)
+        else:
+            accelerations.accelerate(f, "result a")
+        accelerations.check_pivots(f, s, "result a")
+        with f.each(module.rowcount) as r:
+            module.put(f, "result v", r, module.vector(f, "state v", r))
+        estimate_errors(module, f, s, "result a", "result dq", "result dv")
+        with f.each(module.rowcount) as r:
+            for d in ("dq", "dv"):
+                module.put(f, f"state {d}", r, module.vector(f, f"result {d}", r))
+
+    def project_output(self, f: Function, s: Lane, mask: Value):
+        module = self._in
+        module.invoke(f, "psi")
+        with f.each(module.rowcount) as r:
+            module.put(f, "result v", r, module.vector(f, "state v", r))
+        s.violated = largest_violation(module, f)
+
+    def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
+        if self._in.m:
+            lost.value = self._drifted(f, s, accept)
+
+    def _drifted(self, f: Function, s: Lane, accept: Value) -> Value:
+        """Return `LOST` or `SINGULAR` in lanes whose new point, which is not projected, has drifted too far, else zero.
+
+        Where the distance from singular configurations is d, a violation x of Psi moves the state by x / d and turns its velocity
+        by x / d^2: near the intersection of two branches, the curves of constant Psi are hyperbolas, and lead from one branch to
+        the other. Therefore the bound of x is `drift_tol` times d^2, with d relative to the largest distance of the run. Steps
+        that are short beside d follow such a curve, and a longer one passes: d is the distance of the farther end of the step. A
+        distance below which the method leaves rows out counts as this distance.
+        """
+        module = self._in
+        nearest = module.accelerations.nearest(f, s)
+        s.where(accept, farthest=f.max(s.farthest, s.distance))
+        farther = f.max(s.distance, f.select(s.distance1 < np.inf, s.distance1, 0.0))
+        nearness = f.max(farther, nearest) / f.max(s.farthest, nearest)
+        violated, status = largest_violation(module, f), lambda code: f.const(float(code), DOUBLE, f.width)
+        is_turned = accept & (violated > s.drift_tol * (nearness * nearness))
+        return f.select(is_turned, f.select(violated > s.drift_tol, status(Status.LOST), status(Status.SINGULAR)), 0.0)
+
+
+class Projected(ProjectionPart):
+    """States are projected by Newton's method."""
+
+    def __init__(self, module: Module):
+        self._in = module
+        self._drops_rows = module.m > 0 and not module.code.policy.reports  # without a check of their pivots
+        self.shared = ("velocities",) if self._drops_rows else ()
+
+    @property
+    def solving(self) -> list[str]:
+        of_step = ["project_and_accelerate", "tangent_part"] if self._in.method.ends else ["end_of_step"]
+        return ["accelerations", "newton_q", *of_step, "newton_v_and_psi", "project"]
+
+    @property
+    def checks(self) -> list[str]:
+        return ["psi_dot"] if self._drops_rows else []
+
+    def end_step(self, f: Function, s: Lane):
+        module, method = self._in, self._in.method
+        if not method.ends:
+            estimate_errors(module, f, s, None, "state dq", "state dv")
+        newton(module, f, s)
+        module.invoke(f, "project_and_accelerate" if method.ends else "end_of_step")
+        module.accelerations.accelerate_end(f)
+        unsafe = (s.stepping > 0.5) & (s.safe < 0.5)
+        module.fallback.note_unsafe(s, unsafe)
+        if method.ends:
+            estimate_errors(module, f, s, "result a", "state dq", "state dv")
+            threshold = f.const(ROUNDING_PIVOT, DOUBLE, f.width)
+            with_threshold(f, module.drop_tol_place, threshold, lambda: module.invoke(f, "tangent_part"))
+        module.fallback.finish_step(f, s)
+
+    def project_output(self, f: Function, s: Lane, mask: Value):
+        module = self._in
+
+        def iterate(lanes: Value):
+            iterate_newton(module, f, s, lanes, lambda _: module.invoke(f, "newton_q"), OUTPUT_STEPS)
+            module.invoke(f, "newton_v_and_psi")
+
+        def project():
+            module.invoke(f, "project")
+            s.violated = largest_violation(module, f)
+            is_far = mask & ~(take_newton_step(module, f, mask) <= SINGLE_STEP_TOL)
+            with f.if_(f.any_of(is_far)):
+                with f.each(module.rowcount) as r:  # other lanes keep their states
+                    module.put(f, "result dv", r, module.vector(f, "result v", r))
+                iterate(is_far)
+                with f.each(module.rowcount) as r:
+                    new, old = (module.vector(f, x, r) for x in ("result v", "result dv"))
+                    module.put(f, "result v", r, f.select(is_far, new, old))
+                s.where(is_far, violated=largest_violation(module, f))
+            module.fallback.close_output(f, s, mask)
+
+        module.fallback.keeping_rows(f, project)
+
+    def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
+        module = self._in
+        if module.m:
+            lost.value = lost_in(module, f, s, accept)
+        if self._drops_rows:
+            misses = accept & lost.value.is_(0.0) & self._misses_rows(f, s)
+            lost.value = f.select(misses, f.const(Status.MISSING_RANK, DOUBLE, f.width), lost.value)
+
+    def _misses_rows(self, f: Function, s: Lane) -> Value:
+        """Return whether the projected velocities of the new point violate Psi_dot so that such a step would open Psi too far.
+
+        Psi_dot is linear in the velocities: a row stays violated only if it was left out as dependent, although it is not. The
+        motion then has more freedom than the mechanism, and when the row counts again, projection takes away what it gained.
+        """
+        module = self._in
+        module.copy(f, "state v", "saved v")
+        module.copy(f, "result v", "state v")
+        module.invoke(f, "psi_dot")
+        module.copy(f, "saved v", "state v")
+        return largest_violation(module, f) * s.step > f.max(s.drift_tol, s.rtol + s.atol)
+
+
+def lost_in(module: Module, f: Function, s: Lane, accept: Value) -> Value:
+    """Return `LOST` in lanes whose projected new point violates Psi, else zero."""
+    module.invoke(f, "psi")
+    bound = f.min(f.const(LOST_TOL, DOUBLE, f.width), f.max(s.open_tol, (s.rtol + s.atol) * CLOSED_TOL))
+    is_lost = accept & (largest_violation(module, f) > bound)
+    return f.select(is_lost, f.const(Status.LOST, DOUBLE, f.width), 0.0)
+
+
+def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
+    """Estimate the errors of q and v from the accelerations of all stages; `end` names those of the last stage."""
+    h, zero = module.broadcast(f, s.step), f.const(0.0, DOUBLE, module.plan.vector)
+    for method, mask in module.methods(f, s):
+        names = list(module.stage_accelerations)
+        if method.ends and end:
+            names[-1] = end
+        with f.each(module.rowcount) as r:
+            error_q, error_v = (module.weighted_sum(f, weights, r, names) for weights in (method.error_q, method.error_v))
+            new_q = zero if error_q is None else h * (h * error_q)
+            for to, new in ((to_q, new_q), (to_v, zero if error_v is None else h * error_v)):
+                module.put(f, to, r, new if mask is None else f.select(mask, new, module.vector(f, to, r)))
+    if module.plan.stiff:
+        with f.if_(f.any_of((s.stepping > 0.5) & (s.trial > 0.0))):
+            f.call("smooth_error", f.given["work"])
