@@ -1,7 +1,7 @@
 """Names, values and counts in the sentences of errors, reports and pages."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 
 from jax.core import Tracer
 
@@ -58,3 +58,15 @@ def join_names(names: Sequence[str]) -> str:
 def article(noun: str) -> str:
     """Return "a" or "an", as required by a noun."""
     return "an" if noun[0].lower() in "aeiou" else "a"
+
+
+def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
+    """Return texts by title, numbered if there is more than one."""
+    return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """Return a free name: `name` with as many primes as needed."""
+    while name in taken:
+        name += "'"
+    return name

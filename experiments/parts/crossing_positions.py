@@ -6,7 +6,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.parts.crossing_case import TS, Case, WrongError, agree, by_twin, claim
-from udkjax.positions.answers.counting import count_of
+from udkjax.positions.answers.counting import Count
 
 
 def bodies_of(m: Any) -> tuple[str, ...]:
@@ -180,7 +180,7 @@ def pin_motion(case: Case) -> str:
 def motion_at(case: Case) -> str:
     m = case.model
     value = case.values(1)[0]
-    at = value if case.is_system else count_of(m, case.driver).text(value)
+    at = value if case.is_system else Count.of(m, case.driver).text(value)
     found = udk.motion_at(m, at, case.driver, held=case.held)
     agree(np.ravel(found.values), np.array([value]), "the value asked for", 1e-4)
     motion = udk.kinematics(m, case.driver, found.values, held=case.held, rate=found.rate)

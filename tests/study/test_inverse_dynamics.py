@@ -8,7 +8,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from tests.elements import DRIVERS
-from udkjax.positions.assembling.coordinates import Coordinate, coordinate_value
+from udkjax.positions.assembling.coordinates import Coordinate
 
 SCENES = {"driven pendulum": udk.library.driven_pendulum, "slider crank": lambda: udk.library.slider_crank(0.3, 4.0)}
 
@@ -31,7 +31,7 @@ def test_what_is_fed_forward_reproduces_the_motion(name):
 def test_the_coordinate_of_a_driver_is_what_its_row_holds(name):
     driver, frames = DRIVERS[name].complete(), (udk.Frame.at([0.3, -0.2], 0.4), udk.Frame.at([1.1, 0.7], -0.9))
     row = driver.residual(0.6, *frames)[0] + driver.motion(0.6)
-    np.testing.assert_allclose(coordinate_value(Coordinate.of(driver), *frames), row, rtol=1e-14)
+    np.testing.assert_allclose(Coordinate.of(driver).value(*frames), row, rtol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, np.pi / 2, -2.0])

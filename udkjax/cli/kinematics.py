@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from udkjax.cli.common import Json, Scene, channels_of, choose_driver, fail, measure_channels, refuse, show
 from udkjax.cli.datasets import load_to_write, write
@@ -63,18 +63,17 @@ def kinematics(
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.answers.counting import count_of, nearest_turn, read_number
-    from udkjax.positions.answers.pin_motion import of_kinematics, rate_text, usual_rate
+    from udkjax.positions.answers.counting import Count
+    from udkjax.positions.answers.pin_motion import usual_rate
     from udkjax.positions.assembling.coordinates import value_of
     from udkjax.printing import text_table
     from udkjax.show.summary import table
 
-    counted, travel = count_of(mech, driver), udk.travel(mech, driver)
-    speed = usual_rate(mech, driver) if rate is None else read_number(rate, counted.rate_unit, "--rate", counted.units)
+    counted, travel = Count.of(mech, driver), udk.travel(mech, driver)
+    speed = usual_rate(mech, driver) if rate is None else counted.read_rate(rate, "--rate")
     drawn = float(value_of(mech, driver)(udk.assemble(mech).q))
     if at is not None:
-        value = counted.read(at, "--at")
-        values = np.array([nearest_turn(value, drawn) if counted.is_angle else value])
+        values = np.array([counted.nearest(counted.read(at, "--at"), drawn)])
     else:
         start = _default(None if first is None else counted.read(first, "--from"), float(travel.lower), drawn)
         turn = start + (2 * math.pi if counted.is_angle else float(udk.analyse(mech).length))
@@ -92,7 +91,7 @@ def kinematics(
         "values count": counted.words,
         "travel": "unlimited" if free else f"{_end(travel, 0, counted)} to {_end(travel, 1, counted)}",
         "reached": f"{reached} of {number} values from {counted.text(values[0])} to {counted.text(values[-1])}",
-        "velocities": f"{rate_text(speed, counted)} of {driver}",
+        "velocities": f"{counted.rate_text(speed)} of {driver}",
     }
     if math.isfinite(float(motion.limit)):
         lines["toggle at"] = counted.text(float(motion.limit))
@@ -104,7 +103,7 @@ def kinematics(
     lines |= {title: words for title, words in found.lines().items() if title != "driver"}
     said = table(f"{mech.name or 'mechanism'}, driven by {driver}", lines)
     if at is not None or count is not None:
-        tables = of_kinematics(mech, motion, counted).tables()
+        tables = udk.pin_motion(mech, motion).counted(counted).tables()
         said = "\n\n".join([said, *(text_table(one, 10**9) for one in tables)])
     if at is not None and reached:
         said += "\n\n" + _centres(mech, motion, counted)
@@ -167,7 +166,6 @@ def _centres(mech: "Mechanism", motion: "Kinematics", counted: "Count") -> str:
     import numpy as np
 
     import udkjax as udk
-    from udkjax.positions.answers.counting import direction_text
     from udkjax.printing import PrintedTable, format_number, text_table
 
     rows, unit, size = [], counted.units.shown("m"), counted.units.size("m")
@@ -175,8 +173,15 @@ def _centres(mech: "Mechanism", motion: "Kinematics", counted: "Count") -> str:
     largest = max((float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity), default=0.0)
     for pair, (place, at_infinity) in centres.items():
         x, y = (format_number(z / size, scale=largest / size) for z in place)
-        rows.append([" and ".join(pair), *((x, y) if not at_infinity else ("at infinity", direction_text(place)))])
+        rows.append([" and ".join(pair), *((x, y) if not at_infinity else ("at infinity", _direction(place)))])
     return text_table(PrintedTable("instant centres", rows, ("links", f"x ({unit})", f"y ({unit})")), 10**9)
+
+
+def _direction(vector: "Any") -> str:
+    """Return the direction of a vector as text, an angle from the x axis."""
+    from udkjax.printing import format_number
+
+    return format_number(math.degrees(math.atan2(vector[1], vector[0])), "deg", 360.0)
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:

@@ -8,17 +8,17 @@ from jaxtyping import ArrayLike
 from udkjax.equations.states.quantities import efforts
 from udkjax.integrate import Solution
 from udkjax.integrate.solution import format_work
-from udkjax.positions.answers.scene_check import Check, check_lines, numbered
+from udkjax.positions.answers.scene_check import Check
 from udkjax.printing import align_columns, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.accuracy import Accuracy
 from udkjax.study.report import row_label
-from udkjax.wording import join_names, plural
+from udkjax.wording import join_names, numbered, plural
 
 
 def check_summary(mech: Mechanism, check: Check) -> str:
     """Describe the findings of `udkjax.positions.answers.scene_check.check` about a mechanism."""
-    lines = check_lines(check)
+    lines = check.lines()
     lines["constraint equations"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
     lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in check.redundant) or "none"
     lengths = {} if mech.drawing is None or mech.departs_from_drawing else mech.drawing.length_texts()

@@ -8,7 +8,7 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.integrate import SimulationError
 from udkjax.integrate.causes.find import cause_of_standstill
-from udkjax.positions.answers.counting import count_of
+from udkjax.positions.answers.counting import Count
 from udkjax.positions.assembling.assembly import AssemblyError, assemble
 from udkjax.positions.following.continuation import Reached
 from udkjax.positions.following.kinematics import travel
@@ -150,7 +150,7 @@ def motor_travel(mechanism: Mechanism) -> JsonObject:
             range_of_motor = travel(mechanism, name)
         except SceneError:
             continue  # this motor does not determine the positions
-        counted, ends = count_of(mechanism, name), []
+        counted, ends = Count.of(mechanism, name), []
         for limit, q in ((range_of_motor.lower, range_of_motor.lower_q), (range_of_motor.upper, range_of_motor.upper_q)):
             if np.isfinite(float(limit)):
                 ends.append({"value": float(limit) + counted.offset, "in_line": pins_in_line(mechanism, np.asarray(q))})

@@ -10,7 +10,7 @@ from udkjax.annotations import JsonObject
 from udkjax.equations.rows.analysis import analyse
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.language.program import UnsupportedError
-from udkjax.positions.answers.counting import count_of
+from udkjax.positions.answers.counting import Count
 from udkjax.scene import library
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.files import loads
@@ -179,7 +179,7 @@ def turning_of(mechanism: Mechanism, name: str) -> JsonObject:
         return {}
     names = list(mechanism.bodies)
     pair = [names.index(body) if body in names else -1 for body in driver.bodies]
-    return {"pair": pair, "offset": float(count_of(mechanism, name).offset)}
+    return {"pair": pair, "offset": float(Count.of(mechanism, name).offset)}
 
 
 def diagnose_drawing(text: str, about: str = "structure", end: JsonObject | None = None) -> JsonObject:

@@ -19,9 +19,7 @@ from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.channels import (
     LOADS,
-    POINT_UNITS,
     Channel,
-    LocalPoint,
     Quantity,
     StateHistory,
     locate,
@@ -193,7 +191,7 @@ class _Motion:
         """Return ax, ay and alpha of a body, each (T,)."""
         return self._entries(self.q if body == GROUND else self.dynamics.a if self.a is None else self.a, body)
 
-    def point(self, body: str, local: Float[Array, "2"] | LocalPoint, derivative: int) -> Point:
+    def point(self, body: str, local: Float[Array, "2"] | tuple[float, float], derivative: int) -> Point:
         """Return the position, velocity or acceleration of a point of a body, x and y each (T,)."""
         frame = self.frames[body]
         if derivative == 0:
@@ -229,7 +227,7 @@ def _measure_body(channel: Channel, motion: _Motion) -> Array:
     return _component(motion, name, point, quantity)
 
 
-def _component(motion: _Motion, body: str, point: Float[Array, "2"] | LocalPoint, quantity: str) -> Array:
+def _component(motion: _Motion, body: str, point: Float[Array, "2"] | tuple[float, float], quantity: str) -> Array:
     """Return x or y of the position, velocity (vx, vy) or acceleration (ax, ay) of a point."""
     values = motion.point(body, point, DERIVATIVE[quantity[:-1]])
     return jnp.broadcast_to(getattr(values, quantity[-1]), motion.ts.shape)
@@ -242,7 +240,7 @@ def _measure_pin(channel: Channel, motion: _Motion) -> Array:
 def _measure_joint(channel: Channel, motion: _Motion) -> Array:
     if channel.needs == "reactions":
         return motion.load(channel.owner, channel.bodies[0])[list(LOADS).index(channel.quantity)]
-    if channel.quantity in POINT_UNITS:
+    if channel.is_of_point:
         return _measure_pin(channel, motion)
     if channel.quantity == "alpha":
         first, second = (motion.acceleration(body)[2] for body in channel.bodies)

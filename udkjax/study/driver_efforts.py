@@ -16,7 +16,7 @@ from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.states.effort_arrays import efforts_by_numpy
 from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.pinv import SVD
-from udkjax.positions.assembling.coordinates import Coordinate, constant_motion, element_of, slopes_of, value_of
+from udkjax.positions.assembling.coordinates import Coordinate, element_of, slopes_of, value_of
 from udkjax.positions.following.drive import with_drivers
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
@@ -115,6 +115,6 @@ def elements_of(mechanism: Mechanism, *drivers: str | Coordinate) -> tuple[Coord
     elements = tuple(element_of(mechanism, driver) for driver in drivers)
     if not all(isinstance(driver, str) for driver in drivers):
         with jax.ensure_compile_time_eval():  # a mechanism checks coordinates, however they are given
-            rows = {f"value{k + 1}": element.driver(constant_motion(0.0)) for k, element in enumerate(elements)}
+            rows = {f"value{k + 1}": element.driver() for k, element in enumerate(elements)}
             with_drivers(mechanism, rows)
     return elements

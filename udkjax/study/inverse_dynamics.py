@@ -30,7 +30,7 @@ from udkjax.argument_types import HISTORY, NUMBERS_BY_NAME, TIMES, ArgumentRequi
 from udkjax.arrays import is_traced, is_within_jit, library_for, make_module, number, number_called, put_arrays
 from udkjax.equations.rows.analysis import analyse
 from udkjax.positions.assembling.channels import StateHistory
-from udkjax.positions.assembling.coordinates import Coordinate, choose_name, coordinate_value, element_of
+from udkjax.positions.assembling.coordinates import Coordinate, element_of
 from udkjax.positions.following.drive import without_drivers
 from udkjax.positions.following.kinematics import Kinematics, motion_in_time
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
@@ -41,7 +41,7 @@ from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.driver_efforts import driver_efforts, elements_of
-from udkjax.wording import quote
+from udkjax.wording import free_name, quote
 
 
 class InverseDynamics(PrintsTable):
@@ -134,7 +134,7 @@ class Effort(ForceElement):
     axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
 
     def potential(self, t, *frames):
-        return -self.law(t) * coordinate_value(Coordinate(self.bodies, self.coordinate, self.points, self.axis), *frames)
+        return -self.law(t) * Coordinate(self.bodies, self.coordinate, self.points, self.axis).value(*frames)
 
     @property
     def breakpoints(self):
@@ -242,5 +242,5 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     forces = dict(mechanism.forces)
     for name, effort in found.efforts.items():
         e = elements[name]
-        forces[choose_name(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points, e.axis)
+        forces[free_name(f"{name} effort", forces)] = Effort(e.bodies, e.coordinate, Spline(found.ts, effort), e.points, e.axis)
     return without_drivers(mechanism, forces)

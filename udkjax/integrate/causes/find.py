@@ -14,8 +14,9 @@ from udkjax.integrate.causes.reach import explain_reach
 from udkjax.integrate.causes.system_causes import cause_in_functions
 from udkjax.integrate.solution import Result, Solution
 from udkjax.integrate.solvers import is_explicit
-from udkjax.positions.assembling.open_rows import MOST_NAMED, explain_open, name_not_finite
+from udkjax.positions.assembling.open_rows import explain_open, name_not_finite
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import MOST_LISTED
 
 NEAR_REACH = 1e-2  # fraction of the span by which a run may end before a dead point
 SINGULAR = 1e-4  # bound on singular values of D, with rows of length one, relative to the largest
@@ -227,7 +228,7 @@ def _nearest_singular(run: FailedRun) -> tuple[str, float] | None:
     u, sigma = run.decomposed(t, q)
     involved = np.abs(u[:, rank - 1]) > 0.1 * np.abs(u[:, rank - 1]).max()
     names = list(dict.fromkeys(name for (name, _), is_involved in zip(run.rows.names, involved, strict=True) if is_involved))
-    return ", ".join(names[:MOST_NAMED]), float(sigma[rank - 1] / sigma[0])
+    return ", ".join(names[:MOST_LISTED]), float(sigma[rank - 1] / sigma[0])
 
 
 def _rank(run: FailedRun) -> int:

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float
 
 from udkjax.argument_types import COORDINATES_OF_BODIES
 from udkjax.arrays import ROUNDING
-from udkjax.positions.answers.counting import Count, count_of
+from udkjax.positions.answers.counting import Count
 from udkjax.positions.answers.linkage_type import FourBarType, Mobility, four_bars, mobility, transmission_pins
 from udkjax.positions.answers.pressure import pressure_angles
 from udkjax.positions.answers.turning_points import Combination, Cycle, TurningPoint
@@ -166,7 +166,7 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
     pressures = _pressure_angles(mechanism, driver, cycle) if cycle.is_known else {}
     ratios = _ratios(mechanism, cycle, element) if has_gears and cycle.is_known else {}
     bars = four_bars(mechanism, element)
-    count = count_of(mechanism, driver)
+    count = Count.of(mechanism, driver)
     return Characteristics(mobility(mechanism), bars, cycle.turns, limits, outputs, angles, pressures, ratios, count)
 
 

@@ -35,6 +35,32 @@ class Count(NamedTuple):
     words: str
     units: Units
 
+    @classmethod
+    def of(cls, mechanism: Mechanism, driver: str | Coordinate) -> "Count":
+        """Return the count of the values of a driver or coordinate; numbers of the mechanism are concrete.
+
+        The angle of a drawn link on the ground is that of the line from its pin on the ground to its first other pin; the angles
+        of other links are those of their bodies. Lengths are in the unit of the drawing, coordinates of slides from the drawn
+        position.
+        """
+        units, element = units_of_drawing(mechanism), element_of(mechanism, driver)
+        first, second = element.bodies
+        if element.coordinate != "angle":
+            return cls(0.0, units.size("m"), units.shown("m"), _words_of_length(mechanism, driver, element), units)
+        size = math.pi / 180
+        if first != GROUND or not isinstance(mechanism.drawing, Drawing) or second not in mechanism.drawing.links:
+            of = f"the angle of {second}" if first == GROUND else f"the angle of {second} from {first}"
+            return cls(0.0, size, "deg", of, units)
+        drawing = mechanism.drawing
+        pins, places = drawing.links[second].pins, {name: np.asarray(place) for name, place in drawing.pins.items()}
+        if len(pins) < 2:
+            return cls(0.0, size, "deg", f"the angle of {second}, from the drawn position", units)
+        start = next((pin for pin in pins if pin in drawing.ground), pins[0])
+        end = next(pin for pin in pins if pin != start)
+        drawn, of_frame = places[end] - places[start], places[pins[1]] - places[pins[0]]
+        offset = math.atan2(of_frame[0] * drawn[1] - of_frame[1] * drawn[0], of_frame @ drawn)
+        return cls(offset, size, "deg", f"the angle of {start}-{end} from the x axis", units)
+
     @property
     def is_angle(self) -> bool:
         """True if the driver is an angle."""
@@ -68,23 +94,31 @@ class Count(NamedTuple):
         Raises:
             SceneError: it is not a number, or the unit does not fit; the message begins with `name`.
         """
-        return read_number(given, "rad" if self.is_angle else "m", name, self.units) - self.offset
+        return self._number(given, "rad" if self.is_angle else "m", name) - self.offset
 
+    def read_rate(self, given: object, name: str, order: int = 1) -> float:
+        """Return a rate of the driver (rad/s, m/s), or its acceleration if `order` is 2, as `read` does for a value."""
+        return self._number(given, self.rate_unit + (str(order) if order > 1 else ""), name)
 
-def read_number(given: object, unit: str, name: str, units: Units) -> float:
-    """Return a number in an SI unit, from a number in the unit of the drawing or a text with its unit."""
-    problems: list[str] = []
-    with suppress(ValueError):  # a text with a unit
-        given = float(given) if isinstance(given, str) else given
-    found = units.convert(name, given, unit, problems)
-    if problems or not isinstance(found, int | float | np.number):
-        raise SceneError(problems or [f"{name}: must be a number, or a text with a number and its unit"])
-    return float(found)
+    def rate_text(self, rate: float) -> str:
+        """Return a rate of the driver (rad/s, m/s) as text."""
+        if self.is_angle:
+            return f"at {format_number(rate, 'rad/s')} ({format_number(rate * 30 / np.pi, 'rpm')})"
+        return f"at {format_number(rate / self.size, self.unit)}/s"
 
+    def nearest(self, value: float, start: float) -> float:
+        """Return the driver's value (rad, m); an angle by whole turns as near to `start` as possible."""
+        return value - FULL_TURN * round((value - start) / FULL_TURN) if self.is_angle else value
 
-def direction_text(vector: np.ndarray) -> str:
-    """Return the direction of a vector as text, an angle from the x axis."""
-    return format_number(math.degrees(math.atan2(vector[1], vector[0])), "deg", 360.0)
+    def _number(self, given: object, unit: str, name: str) -> float:
+        """Return a number in an SI unit, from a number in the unit of the drawing or a text with its unit."""
+        problems: list[str] = []
+        with suppress(ValueError):  # a text with a unit
+            given = float(given) if isinstance(given, str) else given
+        found = self.units.convert(name, given, unit, problems)
+        if problems or not isinstance(found, int | float | np.number):
+            raise SceneError(problems or [f"{name}: must be a number, or a text with a number and its unit"])
+        return float(found)
 
 
 def units_of_drawing(mechanism: Mechanism) -> Units:
@@ -92,38 +126,12 @@ def units_of_drawing(mechanism: Mechanism) -> Units:
     return Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
 
 
-def count_of(mechanism: Mechanism, driver: str | Coordinate) -> Count:
-    """Return the count of the values of a driver or coordinate; numbers of the mechanism are concrete.
-
-    The angle of a drawn link on the ground is that of the line from its pin on the ground to its first other pin; the angles of
-    other links are those of their bodies. Lengths are in the unit of the drawing, coordinates of slides from the drawn position.
-    """
-    units, element = units_of_drawing(mechanism), element_of(mechanism, driver)
+def _words_of_length(mechanism: Mechanism, driver: str | Coordinate, element: Coordinate) -> str:
+    """Return in words which length a driver or coordinate is, and its zero."""
     first, second = element.bodies
-    if element.coordinate != "angle":
-        motors = mechanism.drawing.groups["motor"] if isinstance(mechanism.drawing, Drawing) else {}
-        motor = motors.get(driver) if isinstance(driver, str) else None
-        if motor is not None:
-            words = "the distance " + "-".join(motor.between) if motor.between else f"the way of {second} from the drawn position"
-        else:
-            what = "the distance" if element.coordinate == "distance" else f"the displacement along {element.coordinate}"
-            words = f"{what} of {second} from {first}"
-        return Count(0.0, units.size("m"), units.shown("m"), words, units)
-    size = math.pi / 180
-    if first != GROUND or not isinstance(mechanism.drawing, Drawing) or second not in mechanism.drawing.links:
-        of = f"the angle of {second}" if first == GROUND else f"the angle of {second} from {first}"
-        return Count(0.0, size, "deg", of, units)
-    drawing = mechanism.drawing
-    pins, places = drawing.links[second].pins, {name: np.asarray(place) for name, place in drawing.pins.items()}
-    if len(pins) < 2:
-        return Count(0.0, size, "deg", f"the angle of {second}, from the drawn position", units)
-    start = next((pin for pin in pins if pin in drawing.ground), pins[0])
-    end = next(pin for pin in pins if pin != start)
-    drawn, of_frame = places[end] - places[start], places[pins[1]] - places[pins[0]]
-    offset = math.atan2(of_frame[0] * drawn[1] - of_frame[1] * drawn[0], of_frame @ drawn)
-    return Count(offset, size, "deg", f"the angle of {start}-{end} from the x axis", units)
-
-
-def nearest_turn(value: float, start: float) -> float:
-    """Return the angle (rad) that differs from `value` by whole turns and is nearest to `start`."""
-    return value - FULL_TURN * round((value - start) / FULL_TURN)
+    motors = mechanism.drawing.groups["motor"] if isinstance(mechanism.drawing, Drawing) else {}
+    motor = motors.get(driver) if isinstance(driver, str) else None
+    if motor is not None:
+        return "the distance " + "-".join(motor.between) if motor.between else f"the way of {second} from the drawn position"
+    what = "the distance" if element.coordinate == "distance" else f"the displacement along {element.coordinate}"
+    return f"{what} of {second} from {first}"

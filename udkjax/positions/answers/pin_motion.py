@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import NumberLike
 from udkjax.argument_types import HISTORY, NUMBERS_BY_NAME, ArgumentRequirement
 from udkjax.arrays import by_numpy, library_for
-from udkjax.positions.answers.counting import Count, count_of, nearest_turn, read_number
+from udkjax.positions.answers.counting import Count
 from udkjax.positions.assembling.channels import pins_of, point_of_pin
 from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.drive import Drive, constant_speed, only_driver
@@ -78,13 +78,17 @@ class PinMotion(PrintsTable):
             link_rows = {name: np.column_stack([rows, ratios[name]]) for name, rows in link_rows.items()}
         return [self._rows(count, self.title(), heads, pin_rows), self._rows(count, "", links, link_rows)]
 
+    def counted(self, count: Count) -> "PinMotion":
+        """Return the same motion, shown as values are counted."""
+        return dataclasses.replace(self, count=count)
+
     def title(self) -> str:
         """Return as text where the driver is, from which zero it counts, and how fast it moves."""
         count = self.count
         assert count is not None
         ends = [count.text(float(x)) for x in (self.values[0], self.values[-1])]
         at = f"at {ends[0]}" if len(self.values) == 1 else f"from {ends[0]} to {ends[1]}"
-        return f"{at}, {count.words}; {rate_text(float(self.rate[0]), count)}"
+        return f"{at}, {count.words}; {count.rate_text(float(self.rate[0]))}"
 
     def _rows(self, count: Count, title: str, heads: list[str], rows: Mapping[str, TableRows]) -> PrintedTable:
         """Return a table with a row for each name and value; the driver's values are a column if there are several."""
@@ -117,13 +121,6 @@ def _cell(x: float, scale: float) -> str:
     return format_number(x, scale=scale)
 
 
-def rate_text(rate: float, count: Count) -> str:
-    """Return the rate of a driver as text."""
-    if count.is_angle:
-        return f"at {format_number(rate, 'rad/s')} ({format_number(rate * 30 / np.pi, 'rpm')})"
-    return f"at {format_number(rate / count.size, count.unit)}/s"
-
-
 def _require_finite_or_text(name: str, value: Any, given: GivenArguments) -> None:
     if not isinstance(value, str):
         require_finite(name, value)
@@ -154,11 +151,6 @@ def pin_motion(mechanism: Mechanism, motion: Annotated[Kinematics, HISTORY]) -> 
     xp = library_for(parts)
     links = {name: xp.stack([x[:, k, 2] for x in parts], 1) for k, name in enumerate(motion.bodies)}
     return PinMotion(motion.values, pins, links, motion.rate)
-
-
-def of_kinematics(mechanism: Mechanism, motion: Kinematics, count: Count) -> PinMotion:
-    """Return the motion of pins and links, shown as values are counted."""
-    return dataclasses.replace(pin_motion(mechanism, motion), count=count)
 
 
 def _point_motion(motion: Kinematics, body: str, local: Array) -> Float[Array, "T 3 2"]:
@@ -204,16 +196,15 @@ def motion_at(
         SceneError: there is no such driver, positions do not follow from it, or a value cannot be read.
     """
     driver = only_driver(mechanism) if driver is None else driver
-    count = count_of(mechanism, driver)
+    count = Count.of(mechanism, driver)
     given = list(at) if isinstance(at, list | tuple) else np.atleast_1d(at).tolist()
     values = np.array([count.read(value, "at") for value in given])
-    if len(values) == 1 and count.is_angle:
-        values[0] = nearest_turn(values[0], float(value_of(mechanism, driver)(mechanism.q0)))
-    unit = count.rate_unit
-    rate = usual_rate(mechanism, driver) if rate is None else read_number(rate, unit, "rate", count.units)
-    second = 0.0 if acceleration == 0.0 else read_number(acceleration, f"{unit}2", "acceleration", count.units)
+    if len(values) == 1:
+        values[0] = count.nearest(values[0], float(value_of(mechanism, driver)(mechanism.q0)))
+    rate = usual_rate(mechanism, driver) if rate is None else count.read_rate(rate, "rate")
+    second = 0.0 if acceleration == 0.0 else count.read_rate(acceleration, "acceleration", 2)
     motion = kinematics(mechanism, driver, values, rate=rate, acceleration=second, held=held)
-    return of_kinematics(mechanism, motion, count)
+    return pin_motion(mechanism, motion).counted(count)
 
 
 def usual_rate(mechanism: Mechanism, driver: Drive) -> float:

@@ -1,6 +1,5 @@
 """Check of a mechanism: rows, rank, degrees of freedom, closure of the initial guess, and likely mistakes."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.suspicions import suspicions
+from udkjax.wording import numbered
 
 
 @prints_table
@@ -37,8 +37,26 @@ class Check(NamedTuple):
     moved: tuple[str, ...] = ()  # bodies moved far by assembly, relative to their sizes
     suspicious: tuple[str, ...] = ()  # likely mistakes
 
+    def lines(self) -> dict[str, str]:
+        """Return the findings as texts by title."""
+        lines = {
+            "bodies": f"{self.bodies}",
+            "coordinates": f"{self.coordinates}",
+            "constraint equations": f"{self.rows}",
+            "rank": f"{self.rank}",
+            "degrees of freedom": f"{self.degrees_of_freedom}",
+            "redundant constraints": ", ".join(f"{name} (equation {row + 1})" for name, row in self.redundant) or "none",
+        }
+        if self.dependent:
+            lines["depend on each other"] = ", ".join(self.dependent)
+        lines["length, time, mass"] = f"{self.length:.3g} m, {self.time:.3g} s, {self.mass:.3g} kg"
+        before, after = (format_number(x, "m or rad", self.length) for x in (self.residual_before, self.residual_after))
+        lines |= {"closure, as given": before, "closure, assembled": after + ("" if self.closed else ": it does not close")}
+        more = [text.removeprefix("assembly ") for text in self.moved]
+        return lines | numbered("assembly", more) | numbered("likely a mistake", list(self.suspicious))
+
     def _table(self) -> PrintedTable:
-        return PrintedTable("mechanism, checked", list(check_lines(self).items()))
+        return PrintedTable("mechanism, checked", list(self.lines().items()))
 
 
 @checked
@@ -78,27 +96,3 @@ def check(mechanism: Mechanism) -> Check:
         moved=moves_of_assembly(mechanism, closure.state.q) if closed else (),
         suspicious=tuple(suspicions(mechanism)),
     )
-
-
-def check_lines(found: Check) -> dict[str, str]:
-    """Return the findings of `check` as texts by title."""
-    lines = {
-        "bodies": f"{found.bodies}",
-        "coordinates": f"{found.coordinates}",
-        "constraint equations": f"{found.rows}",
-        "rank": f"{found.rank}",
-        "degrees of freedom": f"{found.degrees_of_freedom}",
-        "redundant constraints": ", ".join(f"{name} (equation {row + 1})" for name, row in found.redundant) or "none",
-    }
-    if found.dependent:
-        lines["depend on each other"] = ", ".join(found.dependent)
-    lines["length, time, mass"] = f"{found.length:.3g} m, {found.time:.3g} s, {found.mass:.3g} kg"
-    before, after = (format_number(x, "m or rad", found.length) for x in (found.residual_before, found.residual_after))
-    lines |= {"closure, as given": before, "closure, assembled": after + ("" if found.closed else ": it does not close")}
-    more = [text.removeprefix("assembly ") for text in found.moved]
-    return lines | numbered("assembly", more) | numbered("likely a mistake", list(found.suspicious))
-
-
-def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
-    """Return texts by title, numbered if there is more than one."""
-    return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}

@@ -66,6 +66,11 @@ class Channel:
     points: tuple[LocalPoint, ...] = ()  # a point of each body
     quantity: str = ""
 
+    @property
+    def is_of_point(self) -> bool:
+        """True if it is a component of the motion of a point."""
+        return self.quantity in POINT_UNITS
+
 
 @dataclass(frozen=True, eq=False)
 class Quantity:

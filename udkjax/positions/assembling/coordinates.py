@@ -1,6 +1,6 @@
 """Coordinates that can be driven, by the name of a driver, by the name of a channel, or as objects."""
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, cast, get_args
 
 import equinox as eqx
@@ -21,7 +21,7 @@ from udkjax.scene.elements.drivers import Driver, Motion, Polynomial, effort_uni
 from udkjax.scene.elements.fields import names
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
-from udkjax.wording import quote, suggestion
+from udkjax.wording import free_name, quote, suggestion
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
 DRIVEN = get_args(CoordinateName)
@@ -59,9 +59,16 @@ class Coordinate(PrintsLine):
         """Return the coordinate that a driver prescribes."""
         return cls(driver.bodies, driver.coordinate, driver.points, driver.axis)
 
-    def driver(self, motion: Motion) -> Driver:
-        """Return the driver that prescribes this coordinate."""
-        return Driver(self.bodies, self.coordinate, motion, self.points, self.axis)
+    def driver(self, motion: Motion | None = None) -> Driver:
+        """Return the driver that prescribes this coordinate; by default at zero."""
+        return Driver(self.bodies, self.coordinate, constant_motion(0.0) if motion is None else motion, self.points, self.axis)
+
+    def value(self, *frames: Frame) -> Float[Array, ""]:
+        """Return the value (rad, m) of the coordinate, from the frames of its bodies."""
+        driver = self.driver().complete()
+        if is_traced((driver, frames)):
+            return jnp.asarray(driver.residual(0.0, *frames)[0])
+        return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
 
     @property
     def effort_unit(self) -> str:
@@ -76,17 +83,9 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
 
     def value(q: Float[Array, "bodies 3"]) -> Float[Array, ""]:
         rows: Any = q if isinstance(q, Tracer) else np.asarray(q)  # JAX would compile a program to take a row
-        return coordinate_value(element, *(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
+        return element.value(*(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
 
     return value
-
-
-def coordinate_value(element: Coordinate, *frames: Frame) -> Float[Array, ""]:
-    """Return the value (rad, m) of a coordinate, from the frames of its bodies."""
-    driver = element.driver(constant_motion(0.0)).complete()
-    if is_traced((driver, frames)):
-        return jnp.asarray(driver.residual(0.0, *frames)[0])
-    return number(np.asarray(jax.tree.map(np.asarray, driver).residual(0.0, *frames)[0]))
 
 
 def slopes_of(elements: Sequence[Coordinate], body_names: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
@@ -138,7 +137,7 @@ def named_element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, 
     if isinstance(driver, str) and driver in mechanism.drivers:
         return driver, Coordinate.of(mechanism.drivers[driver])
     element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
-    return choose_name("value", mechanism.constraints), element
+    return free_name("value", mechanism.constraints), element
 
 
 def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
@@ -162,13 +161,6 @@ def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
             body, point = point_of_pin(mechanism, channel.owner)
             return Coordinate((GROUND, body), kind, [(0.0, 0.0), point])
         return Coordinate((GROUND, *channel.bodies), kind, [(0.0, 0.0), *channel.points])
-
-
-def choose_name(name: str, taken: Container[str]) -> str:
-    """Return a free name: `name` with as many primes as needed."""
-    while name in taken:
-        name += "'"
-    return name
 
 
 def constant_motion(value: Numbers) -> Polynomial:

@@ -8,8 +8,7 @@ from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.equations.rows.redundancy import holders_of_driver, kinematic_rows
 from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
-
-MOST_NAMED = 8  # constraints named in one sentence
+from udkjax.wording import MOST_LISTED
 
 
 def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarray, tol: float) -> str:
@@ -19,15 +18,15 @@ def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarra
         if not size / unit <= tol:  # also NaN
             worst[name] = max(worst.get(name, (0.0, 0.0)), (float(np.nan_to_num(size / unit, nan=np.inf)), float(size)))
     listed = sorted(worst, key=lambda name: -worst[name][0])
-    text = ", ".join(f'"{name}" ({worst[name][1]:.2g})' for name in listed[:MOST_NAMED])
-    return text + (", ..." if len(listed) > MOST_NAMED else "")
+    text = ", ".join(f'"{name}" ({worst[name][1]:.2g})' for name in listed[:MOST_LISTED])
+    return text + (", ..." if len(listed) > MOST_LISTED else "")
 
 
 def name_not_finite(mechanism: Mechanism, x: np.ndarray, labels: Sequence[str] = COORDINATES) -> str:
     """Return the names of the non-finite entries of q or v (n,), as one string."""
     bad = [(body, label) for body in mechanism.body_names for label in labels]
     named = [f'{label} of "{body}"' for (body, label), value in zip(bad, x, strict=True) if not np.isfinite(value)]
-    return ", ".join(named[:MOST_NAMED]) + (", ..." if len(named) > MOST_NAMED else "")
+    return ", ".join(named[:MOST_LISTED]) + (", ..." if len(named) > MOST_LISTED else "")
 
 
 def explain_open(

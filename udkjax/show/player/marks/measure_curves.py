@@ -11,7 +11,7 @@ from udkjax.equations import determinacy
 from udkjax.equations.rows.analysis import analyse
 from udkjax.equations.states.quantities import efforts, energy, violation
 from udkjax.equations.states.reactions import reactions, unique_reactions
-from udkjax.positions import StateHistory
+from udkjax.positions.assembling.channels import StateHistory
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
