@@ -150,7 +150,8 @@ class _Steps:
         leaves, self._form = jax.tree.flatten((mechanism, analysis))
         leaves = [np.asarray(x) for x in leaves]
         self._kinds = tuple((x.shape, x.dtype) for x in leaves)
-        self._numbers = stored(np.concatenate([x.ravel().astype(float_type()) for x in leaves]))
+        parts = [np.zeros(0, float_type()), *(x.ravel().astype(float_type()) for x in leaves)]  # a system may have no numbers
+        self._numbers = stored(np.concatenate(parts))
         self._programs: dict[Hashable, Callable[..., tuple[Array, Array]]] = {}
 
     def program(
@@ -204,5 +205,5 @@ def _program(
 
 def split_array(array: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
     """Return parts of a vector, one after another, in these shapes."""
-    ends = np.cumsum([math.prod(shape) for shape in shapes])
-    return [x.reshape(shape) for x, shape in zip(jnp.split(array, ends[:-1]), shapes, strict=True)]
+    ends = np.cumsum([math.prod(shape) for shape in shapes], dtype=int)
+    return [x.reshape(shape) for x, shape in zip(jnp.split(array, ends)[:-1], shapes, strict=True)]

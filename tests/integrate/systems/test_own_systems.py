@@ -269,6 +269,30 @@ def test_assembly():
         udk.assemble(pendulum())
 
 
+def test_a_system_without_numbers():
+    """A harmonic oscillator, whose functions hold no number: each function of a system takes it, at once and within JAX's own."""
+    system = udk.ConstrainedSystem(lambda q: jnp.eye(1), lambda t, q, v: -q)
+    start, ts = udk.State(np.array([1.0]), np.array([0.5])), np.array([0.0, 0.4])
+    exact = start.q * np.cos(0.4) + start.v * np.sin(0.4), np.array([[np.cos(0.4), np.sin(0.4)]])
+
+    def ends(q, v):
+        stepped = udk.step(system, udk.State(q, v), None, 0.4, **TIGHT).q
+        return jnp.stack([stepped, udk.simulate(system, ts, udk.State(q, v), **TIGHT).q[-1]])
+
+    given = jnp.asarray(start.q), jnp.asarray(start.v)
+    assert_allclose(ends(start.q, start.v), [exact[0]] * 2, atol=1e-9)
+    assert_allclose(jax.jit(ends)(*given), [exact[0]] * 2, atol=1e-9)
+    assert_allclose(jax.vmap(ends)(*(jnp.stack([x, 2 * x]) for x in given)), [[exact[0]] * 2, [2 * exact[0]] * 2], atol=1e-9)
+    slopes = jnp.concatenate(jax.jacrev(ends, (0, 1))(*given), axis=-1)
+    assert_allclose(slopes, [exact[1]] * 2, atol=1e-9)
+    run = udk.simulate(system, ts, start, events=udk.Event(lambda t, q, v: v[0], udk.Log(), name="turns"), **TIGHT)
+    assert int(run.events.count) == 0 and udk.violation(system, run).shape == (2, 0) and not udk.reactions(system, run)
+    assert_allclose(udk.accelerations(system, 0.0, start.q, start.v), -start.q, atol=1e-14)
+    assert udk.diagnose(system, start).degrees_of_freedom == 1 and system.parameters() == {}
+    data = udk.sweep(system, {"rtol": [1e-8, 1e-10]}, ts, state=start, atol=1e-10)
+    assert_allclose(data["q_end"], [exact[0]] * 2, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_control_intervals():
     """Four intervals are one run; a gradient through a loop of them, whose systems hold the inputs."""
