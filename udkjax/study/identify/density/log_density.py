@@ -36,13 +36,18 @@ LEAST_NOISE = 1e-9  # least noise at the start, relative to the channel's scale,
 class InferenceProblem:
     """The posterior density of parameters, as a function of an unconstrained vector x, which is zero at the start.
 
+    Args:
+        problem: records, parameters and normal priors, as a problem of least squares; usually made by `udkjax.inference`.
+        functions: the other priors, functions of JAX that return the log density, by name.
+        tol: tolerances of the integration, relative and absolute.
+        z: unknowns of the problem, at whose residuals the noise that is not given starts; by default those of the start.
+
     Attributes:
         names: names of the unknowns: parameters, changes of initial states, and standard deviations of noise that is not given
             ("noise of body.crank.angle"), which is one more number for each channel.
         units: their units.
         start: the vector (K,) of the scene's own numbers.
         max_steps: largest number of steps of a run; beyond, the density is zero.
-        tol: tolerances of the integration.
     """
 
     def __init__(
@@ -52,7 +57,6 @@ class InferenceProblem:
         tol: TolerancePair,
         z: Float[np.ndarray, "K"] | None = None,
     ):
-        """Take records, parameters and normal priors from a problem of least squares, near its unknowns z, and other priors."""
         self.fit_problem, self.tol = problem, tol
         z = np.zeros(problem.K) if z is None else z
         self.groups = problem.noise_groups()[: len(problem.index)]
