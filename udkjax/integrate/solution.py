@@ -160,7 +160,7 @@ class Solution(PrintsTable):
 
     @property
     def holds(self) -> dict[str, Bool[Array, "T"]]:
-        """Whether each constraint that events release or add, and each contact that may rest, holds at the output times.
+        """Masks of the output times at which constraints that events release or add, and contacts that may rest, hold.
 
         The contact of an event "floor" is "floor.contact"; after an event, its time is the first at which changes show.
         """

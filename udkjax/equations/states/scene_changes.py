@@ -36,7 +36,7 @@ def is_array(x: object) -> bool:
 
 
 class SceneChanges(eqx.Module):
-    """Which constraints hold at the output times (T) of a run, and the joints that its events have added.
+    """The constraints that hold at the output times (T) of a run, and the joints that its events have added.
 
     The constraints (C) are first those of the scene that events release, then the joints that events add, A, then contacts.
     If the joints are unknown, as in a run that was read from a dataset, or pickled with a function that cannot be pickled, no
@@ -49,12 +49,12 @@ class SceneChanges(eqx.Module):
     form: "_Form | None" = eqx.field(static=True)  # their structure; None: they are unknown
     names: tuple[str, ...] = eqx.field(static=True)  # the constraints in the mechanism with all of them
     public: tuple[str, ...] = eqx.field(static=True)  # the names by which results list them
-    of_scene: int = eqx.field(static=True)  # how many of them belong to the scene
+    of_scene: int = eqx.field(static=True)  # number of those of the scene
     sticking: tuple[str, ...] = eqx.field(static=True, default=())  # the names of contacts with friction in `Solution.sticking`
 
     @property
     def by_name(self) -> dict[str, Bool[Array, "T"]]:
-        """Whether each constraint holds at the output times."""
+        """Masks of the output times at which each constraint holds."""
         found: dict[str, Any] = {}
         for k, name in enumerate(self.public):
             found[name] = found[name] | self.holds[..., k] if name in found else self.holds[..., k]
@@ -99,7 +99,7 @@ class SceneChanges(eqx.Module):
 
         Args:
             data: The dataset. If `write` has added nothing, an older version has written it.
-            had_events: Whether its run had events.
+            had_events: True if its run had events.
         """
         of_scene, times = int(data.attrs.get(OF_SCENE, 0 if had_events else -1)), len(data["time"])
         if of_scene < 0:
@@ -135,12 +135,12 @@ class SceneChanges(eqx.Module):
 
     @property
     def are_released(self) -> Bool[Array, "T"]:
-        """Whether events have released a constraint of the scene."""
+        """True if events have released a constraint of the scene."""
         return ~jnp.all(self.holds[:, : self.of_scene], axis=1)
 
     @property
     def is_unknown(self) -> Bool[Array, "T"]:
-        """Whether constraints hold that are not known."""
+        """True where constraints hold that are not known."""
         return jnp.any(self.holds[:, self.of_scene :], axis=1) & (not self.is_known)
 
 
@@ -176,7 +176,7 @@ def _concrete_scene(
 
 
 class KnownState(eqx.Module):
-    """What a run tells about the scene at one of its output times, or, with a leading axis T, at all of them."""
+    """The constraints of a run at one of its output times, or, with a leading axis T, at all of them."""
 
     sticking: Bool[Array, "F"] | None = None  # the joints that stick, in the order of `sticking_joints`; None: the law decides
     active: Float[Array, "C"] | None = None  # whether each switched constraint holds; None: the scene does not change
@@ -202,13 +202,13 @@ class KnownState(eqx.Module):
 
 
 class Knowledge(NamedTuple):
-    """What a motion tells about the scene at its times T."""
+    """The constraints along a motion, at its times T."""
 
     sticking: Bool[Array, "T F"] | None
     changes: SceneChanges | None
 
     def states(self, mechanism: Mechanism) -> KnownState:
-        """Return what is known at each time, of the mechanism with all constraints of the run."""
+        """Return the constraints at each time, for the mechanism with all constraints of the run."""
         changes = self.changes
         if changes is None:
             return KnownState(self.sticking)

@@ -55,7 +55,7 @@ def scene_changes(
 class _ChangingScene(NamedTuple):
     """The part of `SceneChanges` that does not depend on the run."""
 
-    switches: tuple[int, ...]  # those without the locks of joints that stick
+    switches: tuple[int, ...]  # without locks of joints that stick
     adding: tuple[int, ...]  # the events of the joints that events add
     guess: Float[Any, "1 n"]  # of the scene
     fields: dict[str, Any]  # of `SceneChanges`
