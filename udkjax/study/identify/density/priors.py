@@ -28,7 +28,7 @@ LogDensityOfNumber: TypeAlias = Callable[[Array], Any]
 
 
 def _require_priors(name: str, value: Any, given: GivenArguments) -> None:
-    if value is not None and not isinstance(value, Mapping):
+    if value is not None and not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
         example = '{"body.link1.mass": (1.0, 0.1)}'
         raise ArgumentTypeError(f"{name} must map names of parameters to priors, such as {example}, {describe(value)}")
 
