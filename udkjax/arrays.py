@@ -32,6 +32,11 @@ def array_namespace(*numbers: ArrayLike | Sequence[ArrayLike]) -> ModuleType:
     return jnp if any(isinstance(x, jax.Array) for x in jax.tree.leaves(numbers)) else np
 
 
+def is_array(x: object) -> bool:
+    """Return whether a leaf is an array, of JAX or NumPy."""
+    return isinstance(x, jax.Array | np.ndarray)
+
+
 def is_traced(tree: Any) -> bool:
     """Return True if any number in a tree is traced."""
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))

@@ -177,7 +177,7 @@ def _centres(mech: "Mechanism", motion: "Kinematics", counted: "Count") -> str:
     return text_table(PrintedTable("instant centres", rows, ("links", f"x ({unit})", f"y ({unit})")), 10**9)
 
 
-def _direction(vector: "Any") -> str:
+def _direction(vector: Any) -> str:
     """Return the direction of a vector as text, an angle from the x axis."""
     from udkjax.printing import format_number
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import TreeDef
-from udkjax.arrays import number
+from udkjax.arrays import is_array, number
 from udkjax.equations.friction import rubbing
 from udkjax.equations.friction.sticking_state import known_sticking
 from udkjax.equations.rows.analysis import Analysis, analyse
@@ -28,11 +28,6 @@ from udkjax.scene.elements.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
 
 OF_SCENE = "constraints_of_the_scene"  # attribute of datasets: how many constraints of `holds`, the first ones; -1: none changes
-
-
-def is_array(x: object) -> bool:
-    """Return whether a leaf is an array, of JAX or NumPy."""
-    return isinstance(x, jax.Array | np.ndarray)
 
 
 class SceneChanges(eqx.Module):

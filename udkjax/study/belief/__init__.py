@@ -1,4 +1,4 @@
-"""Posteriors of parameters: from a mechanism, records and priors to a density and samples of it.
+"""Posteriors of parameters: from a mechanism, records and priors to a density.
 
 inference   the public function that returns the density
 """

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from udkjax.annotations import TreeDef
+from udkjax.arrays import is_array
 from udkjax.integrate.compiled_mechanism import CompiledMechanism
 from udkjax.integrate.events.instant.loop import run_loop
 from udkjax.integrate.events.instant.runs import EventRun, RunState, results, runs_before, shapes_of_run
@@ -68,8 +69,8 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
     problems = [hybrid.problem(k, hybrid.ts, start) for k in range(len(hybrid.plans))]
     plan = machine_plan(hybrid.plan, hybrid.phases, hybrid.events, [problem.compiled for problem in problems], conditions)
     leaves, tree = jax.tree.flatten(hybrid)
-    arrays = [jnp.asarray(x) for x in leaves if isinstance(x, jax.Array | np.ndarray)]
-    others = tuple(None if isinstance(x, jax.Array | np.ndarray) else x for x in leaves)
+    arrays = [jnp.asarray(x) for x in leaves if is_array(x)]
+    others = tuple(None if is_array(x) else x for x in leaves)
     plain = PlainForm(tree, others, tuple((x.shape, np.dtype(x.dtype)) for x in arrays))
     inputs = [
         *event_arrays(plan, hybrid.events, hybrid.phases, problems, hybrid.code, hybrid.drift_tol),

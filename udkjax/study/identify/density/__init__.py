@@ -1,4 +1,4 @@
-"""The posterior density of unknowns: priors, the likelihood of records as a function of JAX, and its normal approximation.
+"""The posterior density of unknowns: priors, and the likelihood of records as a function of JAX.
 
 The predictions, residuals and transforms are those of `problem`.
 """

@@ -158,12 +158,6 @@ class InferenceProblem:
         return value, jnp.dot(jnp.where(jnp.isfinite(value), slopes, 0.0), tangents[0])
 
     @cached_property
-    def prior_curvature(self) -> Any:
-        """A compiled function that returns `log_prior`, its gradient and its second derivatives."""
-        gradient = jax.grad(self.log_prior)
-        return jax.jit(lambda x: (self.log_prior(x), gradient(x), jax.jacfwd(gradient)(x)))
-
-    @cached_property
     def log_densities(self) -> Any:
         """A compiled function that returns `log_density` of several vectors (B, K)."""
         return jax.jit(jax.vmap(self.log_density))
