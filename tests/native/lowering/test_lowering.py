@@ -1,0 +1,198 @@
+"""JAX functions of one member as machine code: each primitive, loops and branches equal JAX in every lane."""
+
+import ctypes
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend import core
+from numpy.testing import assert_allclose
+
+from udkjax.native.code import machine, processor
+from udkjax.native.language.program import UnsupportedError
+from udkjax.native.language.text import text_of_module
+from udkjax.native.lowering.arrays import Stored, base_of
+from udkjax.native.lowering.lowering import LoweredFunction, Lowering
+from udkjax.native.lowering.rules import CONTROL, ELEMENTWISE, RULES, lower
+from udkjax.native.lowering.varying import inlined
+
+A, B = (np.random.default_rng(k).standard_normal((9, 4, 5)) for k in (0, 1))
+P = np.abs(A) / 4  # within the domain of all functions
+INDEX = np.arange(9) % 7 - 1  # an index for each member, some outside
+
+
+def write(function, given, width):
+    """Write `lowered(inputs..., outputs..., scratch)`; return it, and the shapes and types of the outputs."""
+    closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in given))
+    outs = [v.aval for v in closed.jaxpr.outvars]
+    names = [*(f"in{k}" for k in range(len(given))), *(f"out{k}" for k in range(len(outs)))]
+    f = LoweredFunction("lowered", [*names, "scratch"], width)
+    to = Lowering(f, f.given["scratch"], lower)
+    arrays = [Stored(f.given[f"in{k}"], x.shape[1:], base_of(x.dtype), True) for k, x in enumerate(given)]
+    for k, x in enumerate(to.closed(closed, arrays)):
+        to.fill(Stored(f.given[f"out{k}"], x.shape, x.base, True), x)
+    return f, [(x.shape, np.float64 if x.dtype == np.float64 else np.int64) for x in outs], to.size
+
+
+def lowered(function, given, width):
+    """Return the outputs for all members; memory that was never written holds NaN."""
+    f, outs, size = write(function, given, width)
+    library = machine.library(text_of_module([f, *f.evaluated.values()]), ["lowered"])
+    call, found = machine.function(library["lowered"], *[ctypes.c_void_p] * (len(given) + len(outs) + 1)), []
+    count = len(given[0])
+    for k in range(0, count, width):
+        chosen = np.minimum(np.arange(k, k + width), count - 1)
+        kinds = [np.float64 if x.dtype == np.float64 else np.int64 for x in given]
+        ins = [np.ascontiguousarray(np.moveaxis(x[chosen].astype(t), 0, -1)) for x, t in zip(given, kinds, strict=True)]
+        results = [np.zeros((*shape, width), t) for shape, t in outs]
+        scratch = np.full(size * width + 8, np.nan)
+        call(*(x.ctypes.data for x in (*ins, *results, scratch)))
+        found.append([np.moveaxis(x, -1, 0) for x in results])
+    return [np.concatenate([x[j] for x in found])[:count] for j in range(len(outs))]
+
+
+def unary(*names):
+    return lambda p: tuple(getattr(jnp, name)(p) for name in names)
+
+
+def fibonacci(a, count):
+    """A loop whose states are exchanged, with a count for each lane."""
+    x, y, k = lax.while_loop(lambda s: s[2] < count, lambda s: (s[1], s[0] + 0.5 * s[1], s[2] + 1), (a, a + 1.0, 0))
+    return x, y, k
+
+
+def rows(a, b):
+    total, found = lax.scan(lambda s, r: (s + r[0] * r[1], s.sum()), jnp.zeros(5), (a, b), reverse=True)
+    return total, found
+
+
+def gauss(a):
+    """Elimination in place, with the pivot of each lane."""
+
+    def step(k, m):
+        p = jnp.argmax(jnp.where(jnp.arange(4) >= k, jnp.abs(m[:, k]), -1.0))
+        m = m.at[k].set(m[p]).at[p].set(m[k])
+        factor = jnp.where(jnp.arange(4) > k, m[:, k] / m[k, k], 0.0)
+        return m - factor[:, None] * m[k]
+
+    return lax.fori_loop(0, 4, step, a)
+
+
+CASES = {
+    "arithmetic": (
+        lambda a, b: (a + b, a - b, a * b, a / b, -a, jnp.abs(a), a**3, a**2, jnp.square(a), a % b, lax.sign(a)),
+        (A, B),
+    ),
+    "comparisons": (
+        lambda a, b: (a < b, a <= b, a > b, a >= b, a == b, a != b, jnp.isfinite(a), ~((a < b) & (a > 0) | (b > 1) ^ (a > 1))),
+        (A, B),
+    ),
+    "extremes": (lambda a, b: (jnp.maximum(a, b), jnp.minimum(a, b), lax.clamp(-0.5, a, 0.5), jnp.where(a < b, a, b)), (A, B)),
+    "rounded": (
+        lambda a: (jnp.floor(a), jnp.ceil(a), jnp.round(a), (3 * a).astype(int), lax.stop_gradient(a), lax.copy_p.bind(a)),
+        (A,),
+    ),
+    "roots": (lambda p: (jnp.sqrt(p), lax.rsqrt(p), jnp.power(p, 0.3), p**-2), (P,)),
+    "angles": (unary("sin", "cos", "tan", "arcsin", "arccos", "arctan"), (P,)),
+    "angle": (jnp.arctan2, (A, B)),
+    "powers": (unary("exp", "exp2", "expm1", "log", "log1p", "sinh", "cosh", "tanh"), (P,)),
+    "logistic": (jax.nn.sigmoid, (A,)),
+    "views": (lambda a: (a.T, a.reshape(2, 10), a[1:3, ::2], jnp.flip(a, 1), a[None], a[:, None, :2], jnp.squeeze(a[:1])), (A,)),
+    "parts": (lambda a: tuple(jnp.split(a, (1, 3), axis=1)), (A,)),
+    "joined": (
+        lambda a, b: (jnp.concatenate([a, b * 2], 1), jnp.stack([a[0], b[1]]), jnp.stack([a, b], -1), *jnp.unstack(a, axis=1)),
+        (A, B),
+    ),
+    "tables": (lambda a: (a + np.arange(20.0).reshape(4, 5) ** 2, a @ np.eye(5)[::-1], jnp.arange(5) * a), (A,)),
+    "at an index": (
+        lambda a, i: (lax.dynamic_slice(a, (i, i), (2, 2)), a[i], a.at[i, 1].get(mode="fill"), a[jnp.array([2, 0])]),
+        (A, INDEX),
+    ),
+    "put": (lambda a, i: (a.at[i].set(1.5), a.at[:, i].add(a[:, 0]), a.at[i, 2].set(a[0, 0])), (A, INDEX)),
+    "put slices": (lambda a, b, i: lax.dynamic_update_slice(a, b[:2, :3], (i, i)), (A, B, INDEX)),
+    "put several": (lambda a, b: a.at[jnp.array([2, 0])].add(b[:2]), (A, B)),
+    "sums": (
+        lambda a: (
+            a.sum(),
+            a.sum(0),
+            a.sum(1),
+            a[:3, :2].prod(),
+            jnp.any(a > 2, 1),
+            jnp.all(a > -2, 0),
+            (a > 0).astype(int).sum(),
+        ),
+        (A,),
+    ),
+    "largest": (
+        lambda a: (a.max(1), a.min(0), jnp.argmax(a, 1), jnp.argmin(a, 0), jnp.argmax(a > 1, 1), (5 * a).astype(int).max(0)),
+        (A,),
+    ),
+    "largest of NaN": (lambda a: (jnp.argmax(jnp.where(a > 1, jnp.nan, a), 1), jnp.where(a > 1, jnp.nan, a).max()), (A,)),
+    "products": (lambda a, b: (a @ b.T, a.T @ b, a[0] @ b[1], jnp.outer(a[0], b[1]), jnp.einsum("ij,ij->i", a, b)), (A, B)),
+    "derivative": (lambda a, b: jax.jvp(lambda x: jnp.sum(jnp.sin(x) * x, 0), (a,), (b,)), (A, B)),
+    "scan": (rows, (A, B)),
+    "unequal loops": (fibonacci, (A, np.arange(9))),
+    "exchanged": (lambda a, b: lax.fori_loop(0, 3, lambda _, s: (s[1], s[0]), (a, b)), (A, B)),
+    "branch by lane": (lambda a, b: lax.cond(a[0, 0] > 0, lambda: (a * b, a[0, 0]), lambda: (a - b, b[0, 0])), (A, B)),
+    "one branch of three": (lambda a, i: lax.switch(i, [lambda: a, lambda: 2 * a, lambda: a[::-1]]), (A, INDEX)),
+    "shared branch": (lambda a: lax.fori_loop(0, 4, lambda k, x: lax.cond(k % 2 == 0, lambda: x + k, lambda: -x), a), (A,)),
+    "elimination": (gauss, (A,)),
+}
+
+
+@pytest.mark.parametrize("width", [1, processor.lanes()])
+@pytest.mark.parametrize("name", CASES)
+def test_equals_jax(name, width):
+    function, given = CASES[name]
+    want = jax.tree.leaves(jax.jit(jax.vmap(function))(*given))
+    for x, y in zip(lowered(function, given, width), want, strict=True):
+        assert_allclose(x, np.asarray(y, float), rtol=1e-12, atol=1e-12)
+
+
+def names_in(jaxpr):
+    """Return the names of the primitives of a jaxpr."""
+    found = set()
+    for e in jaxpr.eqns:
+        inner = [x for p in e.params.values() for x in (p if isinstance(p, tuple | list) else [p])]
+        inner = [getattr(x, "jaxpr", x) for x in inner if isinstance(getattr(x, "jaxpr", x), core.Jaxpr)]
+        found |= set() if inlined(e) else {e.primitive.name}
+        found = found.union(*(names_in(x) for x in inner))
+    return found
+
+
+def test_each_rule_has_a_case():
+    """Primitives come and go with JAX's releases: some views are made by some of them only."""
+    shapes = lambda given: [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in given]  # noqa: E731
+    seen = set().union(*(names_in(jax.make_jaxpr(f)(*shapes(given)).jaxpr) for f, given in CASES.values()))
+    of_some_releases = {"expand_dims", "stack", "unstack"}
+    assert {*ELEMENTWISE, *RULES, *CONTROL} - seen <= of_some_releases
+    assert seen <= {*ELEMENTWISE, *RULES, *CONTROL}
+
+
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [
+        (jnp.linalg.cholesky, "cholesky"),
+        (jnp.sort, "sort"),
+        (lambda a: a.astype(np.float32), "float32"),
+        (lambda a: a * 1j, "complex128"),
+    ],
+)
+def test_what_is_missing_is_named(function, name):
+    with pytest.raises(UnsupportedError, match=name):
+        write(function, (A[:, :, :4],), 1)
+
+
+def test_webassembly():
+    """The same text, without imports."""
+    from tests.wasm_host import Host
+    from udkjax.native.wasm.target import compile_wasm
+
+    f, outs, size = write(gauss, (A,), 1)
+    linked = compile_wasm(text_of_module([f]), ("lowered",))
+    host = Host(linked.code, linked.data_end)
+    result = host.put(np.zeros(outs[0][0]))
+    host.call("lowered", host.put(A[0]), result, host.put(np.full(size, np.nan)))
+    assert_allclose(host.numbers(result, 20).reshape(4, 5), jax.jit(gauss)(A[0]), rtol=1e-12, atol=1e-12)

@@ -1,0 +1,233 @@
+"""The lowering of jaxprs into one function: memory, loops and branches.
+
+Loops that run equally long in all lanes are loops; in others a lane that has ended keeps its state. Of a branch that lanes take
+differently, each result is selected; a branch that no lane takes is not run.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend import core
+
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, Variable
+from udkjax.native.lowering.arrays import Array, Constant, Index, Lazy, SingleNumber, Stored, base_of, fit
+from udkjax.native.lowering.varying import states_of_while, varying, varying_states, without_constants
+
+UNROLLED = 16  # loops over at most this many elements are unrolled
+LONGEST = 40  # an array whose elements take more operations is stored, so that the text of one loop stays short
+
+
+Rule = Callable[["Lowering", Any, list[Array]], list[Array]]
+
+
+class LoweredFunction(Function):
+    """A function with its constant tables."""
+
+    def __init__(self, name: str, pointers: Sequence[str], width: int):
+        super().__init__(name, [(POINTER, x) for x in pointers], width)
+        self.tables: list[str] = []
+        self.noinline = True
+
+    def text(self, local: Any = None) -> str:
+        return "".join(f"{line.replace('@table', f'@{self.name}.table')}\n" for line in self.tables) + super().text(
+            local
+        ).replace("@table", f"@{self.name}.table")
+
+
+class Lowering:
+    """The lowering of jaxprs into one function.
+
+    Args:
+        f: The function.
+        scratch: The address of its memory; `size` is the number of elements that it takes, each in all lanes.
+        lower: Lowers one equation (`rules.lower`).
+    """
+
+    def __init__(self, f: LoweredFunction, scratch: Value, lower: "Rule"):
+        self.f, self._scratch, self._lower, self.size = f, scratch, lower, 0
+        self._tables: dict[tuple[bytes, str], Value] = {}
+
+    # --- arrays
+
+    def constant(self, numbers: Any) -> Constant:
+        return Constant(numbers, self._table)
+
+    def _table(self, numbers: np.ndarray) -> Stored:
+        """Return numbers as constant memory of the module."""
+        base, key = base_of(numbers.dtype), (numbers.tobytes(), str(numbers.dtype))
+        if key not in self._tables:
+            name, stored = f"@table{len(self._tables)}", DOUBLE if base == DOUBLE else INT
+            texts = ", ".join(f"{stored} {self.f.const(x, stored).name}" for x in numbers.ravel())
+            self.f.tables.append(f"{name} = private constant [{numbers.size} x {stored}] [{texts}], align 64")
+            self._tables[key] = Value(self.f, name, POINTER)
+        return Stored(self._tables[key], numbers.shape, base, False)
+
+    def new(self, shape: Sequence[int], base: str, varies: bool) -> Stored:
+        """Return memory for an array."""
+        address = self.f.at(self._scratch, self.size * self.f.width)
+        self.size += int(np.prod(shape))
+        return Stored(address, shape, base, varies)
+
+    def stored(self, x: Array) -> Array:
+        """Return an array whose elements are computed."""
+        if isinstance(x, SingleNumber | Stored | Constant):
+            return x
+        return self.copied(x)
+
+    def copied(self, x: Array) -> Array:
+        """Return an array in memory of its own."""
+        if not x.shape:
+            return SingleNumber(fit(self.f, x.read(self.f, ()), x.varies), x.varies)
+        to = self.new(x.shape, x.base, x.varies)
+        self.fill(to, x)
+        return to
+
+    def fill(self, to: Stored, x: Array):
+        """Compute all elements."""
+        self.each(x.shape, lambda index: to.write(self.f, index, x.read(self.f, index)))
+
+    def each(self, shape: Sequence[int], do: Callable[[Index], None], index: Index = ()):
+        """Run `do` for all indices."""
+        if not shape:
+            do(index)
+        elif int(np.prod(shape)) <= UNROLLED:
+            for rest in np.ndindex(*shape):
+                do((*index, *rest))
+        else:
+            with self.f.each(shape[0]) as i:
+                self.each(shape[1:], do, (*index, i))
+
+    # --- jaxprs
+
+    def closed(self, closed: Any, given: Sequence[Array]) -> list[Array]:
+        """Lower a jaxpr with its constants."""
+        return self.run(without_constants(closed), [self.constant(c) for c in getattr(closed, "consts", ())], given)
+
+    def run(self, jaxpr: Any, constants: Sequence[Array], given: Sequence[Array]) -> list[Array]:
+        uses = Counter(a for e in jaxpr.eqns for a in e.invars if not isinstance(a, core.Literal))
+        uses.update(a for a in jaxpr.outvars if not isinstance(a, core.Literal))
+        values: dict[Any, Array] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *given), strict=True))
+
+        def value(a: Any) -> Array:
+            aval: Any = a.aval
+            return self.constant(np.asarray(a.val, aval.dtype)) if isinstance(a, core.Literal) else values[a]
+
+        for equation in jaxpr.eqns:
+            found = self._lower(self, equation, [value(a) for a in equation.invars])
+            for variable, x in zip(equation.outvars, found, strict=True):
+                is_dear = (uses[variable] > 1 and x.cost > 0) or x.cost > LONGEST or not x.shape
+                values[variable] = self.stored(x) if is_dear and variable in uses else x
+        return [value(a) for a in jaxpr.outvars]
+
+    # --- loops and branches
+
+    def scan(
+        self, body: Any, constants: Sequence[Array], start: Sequence[Array], rows: Sequence[Array], length: int, reverse: bool
+    ) -> list[Array]:
+        """Run a loop over the rows of arrays."""
+        f = self.f
+        constants, rows = [self.stored(x) for x in constants], [self.stored(x) for x in rows]
+        of_constants, of_rows = [x.varies for x in constants], [x.varies for x in rows]
+        flags = varying_states(body, of_constants, [x.varies for x in start], of_rows)
+        states = [LoopState(self, x.shape, x.base, flag, x) for x, flag in zip(start, flags, strict=True)]
+        everywhere = varying(body, [*of_constants, *flags, *of_rows])[len(states) :]
+        avals = [v.aval for v in without_constants(body).outvars[len(states) :]]
+        found = [self.new((length, *v.shape), base_of(v.dtype), flag) for v, flag in zip(avals, everywhere, strict=True)]
+        with f.each(length) as k:
+            i = (length - 1) - k if reverse else k
+            outs = self.closed(body, [*constants, *(s.value() for s in states), *(row_of(f, x, i) for x in rows)])
+            for to, x in zip(found, outs[len(states) :], strict=True):
+                self.each(x.shape, lambda index, to=to, x=x: to.write(f, (i, *index), x.read(f, index)))
+            self.move(states, outs[: len(states)])
+        return [*(s.value() for s in states), *found]
+
+    def while_(
+        self, test: Any, body: Any, of_test: Sequence[Array], of_body: Sequence[Array], start: Sequence[Array]
+    ) -> list[Array]:
+        """Run a loop while a condition holds in any lane."""
+        f = self.f
+        of_test, of_body = [self.stored(x) for x in of_test], [self.stored(x) for x in of_body]
+        given = [x.varies for x in of_test], [x.varies for x in of_body], [x.varies for x in start]
+        flags = states_of_while(test, body, *given)
+        parts = varying(test, [*given[0], *flags])[0]
+        states = [LoopState(self, x.shape, x.base, flag, x) for x, flag in zip(start, flags, strict=True)]
+        active: list[Value] = []
+
+        def goes_on() -> Value:
+            active.append(fit(f, self.closed(test, [*of_test, *(s.value() for s in states)])[0].read(f, ()), parts))
+            return f.any_of(active[0])
+
+        with f.while_(goes_on):
+            outs = self.closed(body, [*of_body, *(s.value() for s in states)])
+            self.move(states, outs, active[0] if parts else None)
+        return [s.value() for s in states]
+
+    def cond(self, which: Array, branches: Sequence[Any], operands: Sequence[Array]) -> list[Array]:
+        """Run the branches that lanes take."""
+        f, index, last = self.f, which.read(self.f, ()), len(branches) - 1
+        operands = [self.stored(x) for x in operands]
+        flags = [varying(branch, [x.varies for x in operands]) for branch in branches]
+        avals = [v.aval for v in without_constants(branches[0]).outvars]
+        states = [
+            LoopState(self, v.shape, base_of(v.dtype), which.varies or any(x))
+            for v, x in zip(avals, zip(*flags, strict=True), strict=True)
+        ]
+        for k, branch in enumerate(branches):
+            if index.base == BOOL:
+                chosen = index if k else ~index
+            else:
+                chosen = index <= 0 if k == 0 else index >= k if k == last else index.is_(k)
+            with f.if_(f.any_of(chosen)):
+                self.move(states, self.closed(branch, operands), chosen if which.varies else None)
+        return [s.value() for s in states]
+
+    def move(self, states: Sequence["LoopState"], nodes: Sequence[Array], mask: Value | None = None):
+        """Assign new values to all states together, in the lanes of a mask."""
+        places = {s.memory.pointer.name for s in states if s.memory is not None}
+        known = []
+        for x in nodes:
+            is_state = isinstance(x, Stored) and x.pointer.name in places
+            known.append(self.copied(x) if is_state else self.stored(x))
+        for s, x in zip(states, known, strict=True):
+            s.assign(x, mask)
+
+
+class LoopState:
+    """An array that a loop or a branch changes: a variable for a single number, or memory."""
+
+    def __init__(self, to: Lowering, shape: Sequence[int], base: str, varies: bool, start: Array | None = None):
+        self._in, self.shape, self.base, self.varies = to, tuple(shape), base, varies
+        self.memory: Stored | None = None
+        f, nothing = to.f, {DOUBLE: 0.0, INT: 0, BOOL: False}[base]
+        if not self.shape:
+            first = nothing if start is None else fit(f, start.read(f, ()), varies)
+            self._variable: Variable = f.variable(first, base, f.width if varies else 1)
+            return
+        self.memory = to.new(shape, base, varies)
+        if start is not None:
+            to.fill(self.memory, start)
+
+    def value(self) -> Array:
+        """Return the present value."""
+        return SingleNumber(self._variable.value, self.varies) if self.memory is None else self.memory
+
+    def assign(self, x: Array, mask: Value | None = None):
+        """Set the value, in the lanes of a mask."""
+        f, memory = self._in.f, self.memory
+        if memory is None:
+            new = fit(f, x.read(f, ()), self.varies)
+            self._variable.value = new if mask is None else f.select(mask, new, self._variable.value)
+            return
+
+        def put(index: Index):
+            new = x.read(f, index)
+            memory.write(f, index, new if mask is None else f.select(mask, new, memory.read(f, index)))
+
+        self._in.each(self.shape, put)
+
+
+def row_of(f: Function, x: Array, i: Value) -> Array:
+    """Return one row of an array."""
+    return Lazy(x.shape[1:], x.base, [x], lambda index: x.read(f, (i, *index)))

@@ -1,0 +1,111 @@
+"""Reductions of arrays, computed at once: sums, products of matrices, extremes."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, Operand, Value
+from udkjax.native.language.program import UnsupportedError
+from udkjax.native.lowering.arrays import Array, Index, Lazy, fit
+from udkjax.native.lowering.lowering import Lowering
+
+
+def _reduced(
+    to: Lowering,
+    x: Array,
+    shape: Sequence[int],
+    terms: Sequence[int],
+    term: Callable[[Index, Index], Value],
+    start: Any,
+    join: Callable[[Value, Value], Value],
+) -> Array:
+    """Join terms, for each element of a result."""
+    f, lanes = to.f, to.f.width if x.varies else 1
+
+    def read(index: Index) -> Value:
+        total = f.variable(start, x.base, lanes)
+
+        def add(over: Index):
+            total.value = join(total.value, fit(f, term(index, over), x.varies))
+
+        to.each(terms, add)
+        return total.value
+
+    return to.copied(Lazy(shape, x.base, [x], read))
+
+
+def reduce_axes(start: Any, join: Any, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    """Join the elements along some axes."""
+    x, axes = inputs[0], p["axes"]
+    kept = [a for a in range(len(x.shape)) if a not in axes]
+
+    def term(index: Index, over: Index) -> Value:
+        full: list[Any] = [0] * len(x.shape)
+        for a, i in (*zip(kept, index, strict=True), *zip(axes, over, strict=True)):
+            full[a] = i
+        return x.read(to.f, tuple(full))
+
+    first = start[x.base] if isinstance(start, dict) else start
+    return _reduced(to, x, out.shape, [x.shape[a] for a in axes], term, first, join)
+
+
+def extreme(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    """Return the largest or smallest elements; NaN stays."""
+    f, sign = to.f, -1 if name == "max" else 1
+
+    def join(a: Value, b: Value) -> Value:
+        if a.base == INT:
+            return f.select(f.compare("gt" if name == "max" else "lt", a, b), a, b)
+        return f.intrinsic(f"{name}imum", a, b)
+
+    whole = np.iinfo(out.dtype) if out.dtype.kind == "i" else None
+    start = {DOUBLE: sign * np.inf, INT: 0 if whole is None else int(whole.min if sign < 0 else whole.max)}
+    return reduce_axes(start, join, to, inputs, p, out)
+
+
+def argument(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    """Return the index of the first extreme element; a NaN counts as one."""
+    f, x, (axis,) = to.f, to.stored(inputs[0]), p["axes"]
+    lanes, base = f.width if x.varies else 1, INT if x.base == BOOL else x.base
+
+    def read(index: Index) -> Value:
+        def element(k: Operand) -> Value:
+            return fit(f, f.like(y := x.read(f, (*index[:axis], k, *index[axis:])), base, y.width), x.varies)
+
+        best, place = f.variable(element(0), base, lanes), f.variable(0, INT, lanes)
+        with f.each(x.shape[axis], 1) as k:
+            new, old = element(k), best.value
+            takes = f.compare("gt" if name == "max" else "lt", new, old)
+            if base == DOUBLE:
+                takes = (takes | new.is_not(new)) & old.is_(old)
+            best.where(takes, new)
+            place.where(takes, k)
+        return place.value
+
+    return to.copied(Lazy(out.shape, INT, [x], read))
+
+
+def dot(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    """Multiply two arrays, and sum over some of their axes."""
+    (over_a, over_b), (batch_a, batch_b) = p["dimension_numbers"]
+    f, a, b = to.f, to.stored(inputs[0]), to.stored(inputs[1])
+    if a.base != DOUBLE or b.base != DOUBLE:
+        raise UnsupportedError("dot_general of integers")
+    free_a = [k for k in range(len(a.shape)) if k not in (*over_a, *batch_a)]
+    free_b = [k for k in range(len(b.shape)) if k not in (*over_b, *batch_b)]
+    count = len(batch_a)
+
+    def term(index: Index, over: Index) -> Value:
+        of_a: list[Any] = [0] * len(a.shape)
+        of_b: list[Any] = [0] * len(b.shape)
+        for j in range(count):
+            of_a[batch_a[j]] = of_b[batch_b[j]] = index[j]
+        for k, i in zip((*free_a, *over_a), (*index[count : count + len(free_a)], *over), strict=True):
+            of_a[k] = i
+        for k, i in zip((*free_b, *over_b), (*index[count + len(free_a) :], *over), strict=True):
+            of_b[k] = i
+        return a.read(f, tuple(of_a)) * b.read(f, tuple(of_b))
+
+    both = Lazy((), DOUBLE, [a, b], lambda index: f.const(0.0))
+    return _reduced(to, both, out.shape, [a.shape[k] for k in over_a], term, 0.0, lambda total, x: total + x)

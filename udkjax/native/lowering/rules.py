@@ -1,0 +1,122 @@
+"""The rules of JAX's primitives: views and elementwise operations are evaluated where they are read, all others at once."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from udkjax.native.language.ir import BOOL, DOUBLE, INT, Value
+from udkjax.native.language.program import UnsupportedError, apply, sincos
+from udkjax.native.lowering.arrays import Array, Index, Lazy, base_of, fit
+from udkjax.native.lowering.lowering import Lowering
+from udkjax.native.lowering.reductions import argument, dot, extreme, reduce_axes
+from udkjax.native.lowering.updates import dynamic_update_slice, scatter
+from udkjax.native.lowering.varying import counts_of_scan, inlined
+from udkjax.native.lowering.views import (
+    broadcast,
+    concatenate,
+    dynamic_slice,
+    gather,
+    iota,
+    reshape,
+    reverse,
+    split,
+    stack,
+    take_slice,
+    transpose,
+    unstack,
+)
+
+ELEMENTWISE = frozenset(
+    """abs acos add add_any and asin atan atan2 ceil clamp convert_element_type copy cos cosh div eq exp exp2 expm1 floor ge gt
+    integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow rem round rsqrt select_n sign sin sinh sqrt
+    square stop_gradient sub tan tanh xor""".split()
+)
+ArrayRule = Callable[[Lowering, list[Array], dict[str, Any], Any], Array]
+
+
+def lower(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    """Lower one equation of a jaxpr.
+
+    Raises:
+        UnsupportedError: it has no rule; the message names it.
+    """
+    name, p = equation.primitive.name, equation.params
+    inner = inlined(equation)
+    if inner is not None:
+        return to.closed(inner, inputs)
+    for v in equation.outvars:
+        base_of(v.aval.dtype)
+    if name in CONTROL:
+        return CONTROL[name](to, equation, inputs)
+    out = equation.outvars[0].aval
+    if name in ELEMENTWISE:
+        return [_elementwise(to, name, inputs, p, out)]
+    if name not in RULES:
+        raise UnsupportedError(name)
+    return [RULES[name](to, inputs, p, out)]
+
+
+def _elementwise(to: Lowering, name: str, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    f, base = to.f, base_of(out.dtype)
+    varies = any(x.varies for x in inputs)
+    shared = name in ("sin", "cos")
+    operation = "add" if name == "add_any" else name
+
+    def read(index: Index) -> Value:
+        a = [x.read(f, index if x.shape else ()) for x in inputs]
+        if operation in ("add", "sub", "mul", "div") and base == DOUBLE:
+            return fit(f, f.arithmetic(operation, *a), varies)
+        return fit(f, apply(f, operation, p, a, partial(sincos, f)), varies)
+
+    if name == "select_n" and (len(inputs) != 3 or inputs[0].base != BOOL):
+        raise UnsupportedError("select_n of several")
+    return Lazy(out.shape, base, inputs, read, 8 if shared else 1)
+
+
+RULES: dict[str, ArrayRule] = {
+    "broadcast_in_dim": broadcast,
+    "transpose": transpose,
+    "reshape": reshape,
+    "squeeze": reshape,
+    "expand_dims": reshape,
+    "slice": take_slice,
+    "rev": reverse,
+    "dynamic_slice": dynamic_slice,
+    "gather": gather,
+    "concatenate": concatenate,
+    "stack": stack,
+    "reduce_sum": partial(reduce_axes, {DOUBLE: 0.0, INT: 0}, lambda a, b: a + b),
+    "reduce_prod": partial(reduce_axes, {DOUBLE: 1.0, INT: 1}, lambda a, b: a * b),
+    "reduce_and": partial(reduce_axes, True, lambda a, b: a & b),
+    "reduce_or": partial(reduce_axes, False, lambda a, b: a | b),
+    "reduce_max": partial(extreme, "max"),
+    "reduce_min": partial(extreme, "min"),
+    "argmax": partial(argument, "max"),
+    "argmin": partial(argument, "min"),
+    "dot_general": dot,
+    "iota": iota,
+    "scatter": partial(scatter, False),
+    "scatter-add": partial(scatter, True),
+    "dynamic_update_slice": dynamic_update_slice,
+}
+
+
+# --- loops and branches
+
+
+def _scan(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    p, (a, b) = equation.params, counts_of_scan(equation)
+    return to.scan(p["jaxpr"], inputs[:a], inputs[a : a + b], inputs[a + b :], p["length"], p["reverse"])
+
+
+def _while(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    p = equation.params
+    a, b = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+    return to.while_(p["cond_jaxpr"], p["body_jaxpr"], inputs[:a], inputs[a:b], inputs[b:])
+
+
+def _cond(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    return to.cond(inputs[0], equation.params["branches"], inputs[1:])
+
+
+CONTROL = {"scan": _scan, "while": _while, "cond": _cond, "split": split, "unstack": unstack}
