@@ -42,6 +42,55 @@ def test_a_pseudoinverse():
     assert_allclose(slope, reference, atol=1e-9)
 
 
+def angles(mass, method, **choices: Any):
+    """The end of a run of a parallelogram, whose rows are redundant."""
+    linkage = udk.library.parallelogram().with_parameters({"body.link1.mass": mass})
+    return udk.simulate(linkage, [0.0, 0.3], method=method, rtol=1e-9, atol=1e-9, **choices).q[-1]
+
+
+def test_a_pseudoinverse_in_machine_code():
+    """Redundant rows, in lanes and alone, as with a method of the package."""
+    masses = jnp.linspace(1.0, 2.0, 9)
+    found = jax.jit(jax.vmap(lambda mass: angles(mass, BenIsrael(), engine="native")))(masses)
+    for k in (0, 8):
+        assert_allclose(found[k], angles(masses[k], udk.Greville()), atol=1e-8)
+    assert_allclose(found[3], angles(masses[3], BenIsrael(), engine="native"), atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, lambda of: jax.jacfwd(jax.jacfwd(of))])
+def test_derivatives_of_a_pseudoinverse_in_machine_code(derivative):
+    own, other = (derivative(lambda mass, method=method: angles(mass, method))(1.2) for method in (BenIsrael(), udk.Greville()))
+    assert_allclose(own, other, rtol=1e-5, atol=1e-7)
+
+
+class OfSingularValues(udk.MatrixPseudoinverse):
+    def matrix(self, D):
+        return jnp.linalg.pinv(D)
+
+
+class WithArray(BenIsrael):
+    scale: Any = None
+
+
+class OfOneShape(udk.MatrixPseudoinverse):
+    def matrix(self, D):
+        return jnp.linalg.pinv(D) @ jnp.eye(12)
+
+
+@pytest.mark.parametrize(
+    ("method", "reason"),
+    [
+        (OfSingularValues(), "the operation svd of the pseudoinverse OfSingularValues"),
+        (WithArray(scale=jnp.array(2.0)), "arrays of the pseudoinverse WithArray"),
+        (OfOneShape(), "OfOneShape"),
+    ],
+)
+def test_a_pseudoinverse_without_machine_code(method, reason):
+    with pytest.raises(ValueError, match=reason):
+        angles(1.0, method, engine="native")
+
+
 class ThreeTimes(udk.PointwiseFormulation):
     """Accelerations by block elimination, for independent rows."""
 
@@ -85,7 +134,7 @@ CONSTANT = {"stepsize_controller": diffrax.ConstantStepSize()}
 def test_runs(choices, error, gap):
     """The exact conical motion, and the length of the rod."""
     found = run(**choices)
-    assert found.settings["engine"].startswith("diffrax")
+    assert found.settings["engine"].startswith("native" if "method" in choices else "diffrax")
     assert_allclose(found.q, EXACT, atol=error)
     assert_allclose(udk.violation(pendulum(), found), 0.0, atol=gap)
 

@@ -2,7 +2,7 @@
 
 `dense` stores matrices in the memory of a run, one for each lane, as rows that fill whole registers, and has the operations on
 rows that all methods use. A method defines its matrices, the factorization and the solution. Each lane has its own pivots and
-rank: lanes differ by `select`, as everywhere in machine code.
+rank: lanes differ by `select`, as everywhere in machine code. `own` compiles a user-defined method, by a lowering of its text.
 """
 
 from udkjax import pinv
@@ -11,6 +11,7 @@ from udkjax.native.pseudoinverses.gram_schmidt import GramSchmidtCode
 from udkjax.native.pseudoinverses.greville import GrevilleCode
 from udkjax.native.pseudoinverses.householder import HouseholderCode
 from udkjax.native.pseudoinverses.one_of import OneOfCode
+from udkjax.native.pseudoinverses.own import OwnCode
 from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.pseudoinverses.varga import VargaCode
 
@@ -24,7 +25,13 @@ METHODS: dict[type[pinv.Pseudoinverse], type[DenseMethod]] = {
 
 
 def dense_method(method: pinv.Pseudoinverse) -> DenseMethod | None:
-    """Return the machine code of a pseudoinverse; None if there is none."""
+    """Return the machine code of a pseudoinverse; None if there is none.
+
+    Raises:
+        UnsupportedError: a user-defined method uses an operation without machine code.
+    """
+    if isinstance(method, pinv.MatrixPseudoinverse):
+        return OwnCode.of(method)
     if isinstance(method, pinv.OneOf):
         choices = [dense_method(choice) for choice in method.choices]
         codes = tuple(code for code in choices if code is not None)
