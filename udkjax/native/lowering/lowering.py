@@ -19,7 +19,7 @@ UNROLLED = 16  # loops over at most this many elements are unrolled
 LONGEST = 40  # an array whose elements take more operations is stored, so that the text of one loop stays short
 
 
-Rule = Callable[["Lowering", Any, list[Array]], list[Array]]
+EquationRule = Callable[["Lowering", Any, list[Array]], list[Array]]
 
 
 class LoweredFunction(Function):
@@ -45,7 +45,7 @@ class Lowering:
         lower: Lowers one equation (`rules.lower`).
     """
 
-    def __init__(self, f: LoweredFunction, scratch: Value, lower: "Rule"):
+    def __init__(self, f: LoweredFunction, scratch: Value, lower: EquationRule):
         self.f, self._scratch, self._lower, self.size = f, scratch, lower, 0
         self._tables: dict[tuple[bytes, str], Value] = {}
 

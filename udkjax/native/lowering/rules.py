@@ -31,7 +31,7 @@ ELEMENTWISE = frozenset(
     integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow rem round rsqrt select_n sign sin sinh sqrt
     square stop_gradient sub tan tanh xor""".split()
 )
-ArrayRule = Callable[[Lowering, list[Array], dict[str, Any], Any], Array]
+LoweringRule = Callable[[Lowering, list[Array], dict[str, Any], Any], Array]
 
 
 def lower(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
@@ -73,7 +73,7 @@ def _elementwise(to: Lowering, name: str, inputs: list[Array], p: dict[str, Any]
     return Lazy(out.shape, base, inputs, read, 8 if shared else 1)
 
 
-RULES: dict[str, ArrayRule] = {
+RULES: dict[str, LoweringRule] = {
     "broadcast_in_dim": broadcast,
     "transpose": transpose,
     "reshape": reshape,
