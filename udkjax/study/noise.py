@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import chdtrc, ndtri
 
+NOISE_FLOOR = 1e-6  # least noise of measurements, relative to the scale of their channel; records may fit exactly
 GAUSSIAN_RATIO = 1.4826  # ratio of standard deviation to median absolute value of Gaussian noise
 MOST_TOGETHER = 5  # largest number of consecutive outliers; longer series are not errors of a sensor
 SIGNIFICANCE = 1e-3  # p-value below which residuals are reported as not white

@@ -16,7 +16,7 @@ from udkjax.scene.arguments import checked
 from udkjax.study.identify.answers.estimate import Estimate
 from udkjax.study.identify.answers.uncertainty import UnknownValues, estimate_uncertainty
 from udkjax.study.identify.problem.fit_problem import FitProblem, Strategy, build_problem
-from udkjax.study.identify.problem.outliers import NOISE_FLOOR, find_outlier_rows, list_outliers
+from udkjax.study.identify.problem.outliers import find_outlier_rows, list_outliers
 from udkjax.study.identify.problem.parameters import ParametersLike
 from udkjax.study.identify.problem.prediction import LOOSE_TOL, TIGHT_TOL, TolerancePair
 from udkjax.study.identify.problem.residuals import Residuals, reduce_groups, residual_vector
@@ -35,7 +35,7 @@ from udkjax.study.identify.search.optimizer import (
     weighted_residuals,
 )
 from udkjax.study.identify.search.search import N_STARTS, SearchResult, search
-from udkjax.study.noise import Whiteness, whiteness_of
+from udkjax.study.noise import NOISE_FLOOR, Whiteness, whiteness_of
 from udkjax.study.quantities import StudyModel
 
 MOST_REWEIGHTINGS = 2  # number of further fits, each weighted by the residuals of the previous one

@@ -18,10 +18,12 @@ from udkjax.scene.arguments import checked
 from udkjax.study.identify.answers.gradient_check import GradientCheck, compare_gradients
 from udkjax.study.identify.answers.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
 from udkjax.study.identify.answers.uncertainty import Uncertainty
+from udkjax.study.identify.density.laplace import Laplace, approximate
+from udkjax.study.identify.density.log_density import InferenceProblem
 from udkjax.study.identify.problem.directions import Directions
 from udkjax.study.identify.problem.fit_problem import FitProblem
 from udkjax.study.identify.problem.outliers import Outlier, outlier_sentences
-from udkjax.study.identify.problem.prediction import TolerancePair
+from udkjax.study.identify.problem.prediction import LOOSE_TOL, TolerancePair
 from udkjax.study.identify.problem.unknowns import apply_values
 from udkjax.study.identify.records.records import IdentificationError, dataset_of_fit, label_prefixes
 from udkjax.study.identify.search.optimizer import Loss, squares, weighted_residuals
@@ -173,6 +175,33 @@ class Estimate:
             directions: changes of unknowns by name, by the name of the direction, as of `udkjax.check_gradients`.
         """
         return compare_gradients(self.problem, self.z, self.tol, order=order, directions=directions)
+
+    def laplace(self, seed: int = 0) -> Laplace:
+        """Return the normal approximation of the posterior density near the estimate, and whether it may be trusted.
+
+        Parameters without a prior are uniform, and noise that is not given is one more unknown for each channel: see
+        `udkjax.inference`.
+
+        Args:
+            seed: seed of the importance weights, which give the verdict.
+
+        Raises:
+            IdentificationError: the records were fitted with another loss, or in pieces; or something is undetermined.
+        """
+        return approximate(self._posterior, self._unconstrained, int(seed))
+
+    @cached_property
+    def _posterior(self) -> InferenceProblem:
+        if self.loss is not squares or self.problem.constrained:
+            what = "the records were fitted in pieces" if self.problem.constrained else "the loss is no log density"
+            raise IdentificationError([f"laplace: {what}: give the records and parameters to udkjax.inference"])
+        tol = max(self.tol[0], LOOSE_TOL), max(self.tol[1], LOOSE_TOL)
+        return InferenceProblem(self.problem, {}, tol, self.z)
+
+    @property
+    def _unconstrained(self) -> Float[np.ndarray, "K"]:
+        """The unconstrained vector of the estimate: z, and the noise of the residuals."""
+        return np.append(self.z, np.zeros(len(self._posterior.names) - len(self.z)))
 
     # --- as a table
 

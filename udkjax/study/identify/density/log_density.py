@@ -26,11 +26,11 @@ from udkjax.study.identify.problem.prediction import Predictor, TolerancePair
 from udkjax.study.identify.problem.residuals import reduce_groups
 from udkjax.study.identify.problem.unknowns import Target, Unknown, Unknowns
 from udkjax.study.identify.records.records import IdentificationError
+from udkjax.study.noise import NOISE_FLOOR
 
 # Largest number of steps of a run, relative to those at the start. With numbers far from the start, such as masses times 1e13, a
 # run could take minutes, and all other chains of a batch would wait for it.
 MOST_STEPS = 20
-LEAST_NOISE = 1e-9  # least noise at the start, relative to the channel's scale, where records fit exactly
 
 
 class InferenceProblem:
@@ -87,7 +87,7 @@ class InferenceProblem:
         scales = np.ones(len(sizes))
         for g, size in enumerate(sizes):
             row = int(np.argmax(self.groups == g))
-            scales[g] = max(size, LEAST_NOISE * problem.channel_scale[problem.index[row, 2]] / problem.sigma[row])
+            scales[g] = max(size, NOISE_FLOOR * problem.channel_scale[problem.index[row, 2]] / problem.sigma[row])
         self.factors = scales
         self.sigma = problem.sigma * np.append(scales, 1.0)[self.groups]
         self.scales = {
@@ -156,6 +156,12 @@ class InferenceProblem:
     def _slope(self, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
         value, slopes = jax.value_and_grad(self._log_density)(primals[0])
         return value, jnp.dot(jnp.where(jnp.isfinite(value), slopes, 0.0), tangents[0])
+
+    @cached_property
+    def prior_curvature(self) -> Any:
+        """A compiled function that returns `log_prior`, its gradient and its second derivatives."""
+        gradient = jax.grad(self.log_prior)
+        return jax.jit(lambda x: (self.log_prior(x), gradient(x), jax.jacfwd(gradient)(x)))
 
     @cached_property
     def log_densities(self) -> Any:

@@ -8,10 +8,9 @@ from jaxtyping import Bool, Float
 
 from udkjax.study.identify.problem.fit_problem import FitProblem
 from udkjax.study.identify.records.records import label_prefixes, output_times
-from udkjax.study.noise import outlier_rows
+from udkjax.study.noise import NOISE_FLOOR, outlier_rows
 from udkjax.wording import plural
 
-NOISE_FLOOR = 1e-6  # least noise of measurements, relative to a channel's scale
 MOST_OUTLIERS_NAMED = 5  # number of listed outliers per channel, the largest; the others are counted
 
 
