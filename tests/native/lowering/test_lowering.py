@@ -68,6 +68,12 @@ def rows(a, b):
     return total, found
 
 
+def long_rows(a):
+    """Reductions whose results and terms are in loops, with a remainder."""
+    x = jnp.outer(a.ravel(), jnp.cos(a).ravel())
+    return x @ x[:, :19], x.sum(0), x.max(1), x[:, 0] @ x, x[0] @ x[1]
+
+
 def gauss(a):
     """Elimination in place, with the pivot of each lane."""
 
@@ -131,6 +137,7 @@ CASES = {
     ),
     "largest of NaN": (lambda a: (jnp.argmax(jnp.where(a > 1, jnp.nan, a), 1), jnp.where(a > 1, jnp.nan, a).max()), (A,)),
     "products": (lambda a, b: (a @ b.T, a.T @ b, a[0] @ b[1], jnp.outer(a[0], b[1]), jnp.einsum("ij,ij->i", a, b)), (A, B)),
+    "long rows": (long_rows, (A,)),
     "derivative": (lambda a, b: jax.jvp(lambda x: jnp.sum(jnp.sin(x) * x, 0), (a,), (b,)), (A, B)),
     "scan": (rows, (A, B)),
     "unequal loops": (fibonacci, (A, np.arange(9))),

@@ -143,3 +143,10 @@ def fit(f: Function, x: Value, varies: bool) -> Value:
     if varies:
         return f.like(x, x.base, f.width)
     return x if x.width == 1 else f.lane(x, f.const(0, INT))
+
+
+def plus(a: Operand, b: Operand) -> Operand:
+    """Add two indices."""
+    if isinstance(a, int) and a == 0:
+        return b
+    return a if isinstance(b, int) and b == 0 else a + b

@@ -88,16 +88,16 @@ class Lowering:
         """Compute all elements."""
         self.each(x.shape, lambda index: to.write(self.f, index, x.read(self.f, index)))
 
-    def each(self, shape: Sequence[int], do: Callable[[Index], None], index: Index = ()):
-        """Run `do` for all indices."""
+    def each(self, shape: Sequence[int], do: Callable[[Index], None], index: Index = (), most: int = UNROLLED):
+        """Run `do` for all indices, at most `most` times in the text of a loop."""
         if not shape:
             do(index)
-        elif int(np.prod(shape)) <= UNROLLED:
+        elif int(np.prod(shape)) <= most:
             for rest in np.ndindex(*shape):
                 do((*index, *rest))
         else:
             with self.f.each(shape[0]) as i:
-                self.each(shape[1:], do, (*index, i))
+                self.each(shape[1:], do, (*index, i), most)
 
     # --- jaxprs
 

@@ -7,8 +7,10 @@ import numpy as np
 
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, Operand, Value
 from udkjax.native.language.program import UnsupportedError
-from udkjax.native.lowering.arrays import Array, Index, Lazy, fit
-from udkjax.native.lowering.lowering import Lowering
+from udkjax.native.lowering.arrays import Array, Index, Lazy, SingleNumber, fit, plus
+from udkjax.native.lowering.lowering import UNROLLED, Lowering
+
+MOST, BLOCK = 12, 8  # results in registers at once: a short row, or a part of a longer one
 
 
 def _reduced(
@@ -20,19 +22,42 @@ def _reduced(
     start: Any,
     join: Callable[[Value, Value], Value],
 ) -> Array:
-    """Join terms, for each element of a result."""
+    """Join terms, for each element of a result: for those of a block at once, each in a register."""
     f, lanes = to.f, to.f.width if x.varies else 1
 
-    def read(index: Index) -> Value:
-        total = f.variable(start, x.base, lanes)
+    def block(indices: Sequence[Index]) -> list[Value]:
+        if len(indices) * int(np.prod(terms)) <= UNROLLED:
+            found = [f.const(start, x.base, lanes) for _ in indices]
+            for over in np.ndindex(*terms):
+                found = [join(total, fit(f, term(i, over), x.varies)) for total, i in zip(found, indices, strict=True)]
+            return found
+        totals = [f.variable(start, x.base, lanes) for _ in indices]
 
         def add(over: Index):
-            total.value = join(total.value, fit(f, term(index, over), x.varies))
+            for total, i in zip(totals, indices, strict=True):
+                total.value = join(total.value, fit(f, term(i, over), x.varies))
 
-        to.each(terms, add)
-        return total.value
+        to.each(terms, add, most=max(1, UNROLLED // len(indices)))
+        return [total.value for total in totals]
 
-    return to.copied(Lazy(shape, x.base, [x], read))
+    if not shape:
+        return SingleNumber(block([()])[0], x.varies)
+    whole, (*outer, count) = to.new(shape, x.base, x.varies), shape
+
+    def blocks(index: Index, first: Operand, size: int):
+        places = [(*index, plus(first, k)) for k in range(size)]
+        for place, value in zip(places, block(places), strict=True):
+            whole.write(f, place, value)
+
+    def row(index: Index):
+        if count <= MOST:
+            return blocks(index, 0, count)
+        with f.each(count // BLOCK) as k:
+            blocks(index, k * BLOCK, BLOCK)
+        return blocks(index, count - count % BLOCK, count % BLOCK)
+
+    to.each(outer, row, most=1)
+    return whole
 
 
 def reduce_axes(start: Any, join: Any, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:

@@ -3,9 +3,9 @@
 from typing import Any
 
 from udkjax.native.language.program import UnsupportedError
-from udkjax.native.lowering.arrays import Array, Index, base_of
+from udkjax.native.lowering.arrays import Array, Index, base_of, plus
 from udkjax.native.lowering.lowering import Lowering
-from udkjax.native.lowering.views import clamped, index_of, plus
+from udkjax.native.lowering.views import clamped, index_of
 
 
 def scatter(adds: bool, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:

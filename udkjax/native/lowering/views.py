@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Operand, Value
-from udkjax.native.lowering.arrays import Array, Constant, Index, Lazy, Stored, base_of
+from udkjax.native.lowering.arrays import Array, Constant, Index, Lazy, Stored, base_of, plus
 from udkjax.native.lowering.lowering import Lowering
 
 
@@ -79,13 +79,6 @@ def dynamic_slice(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any
     )
     found.cost = 0
     return found
-
-
-def plus(a: Operand, b: Operand) -> Operand:
-    """Add two indices."""
-    if isinstance(a, int) and a == 0:
-        return b
-    return a if isinstance(b, int) and b == 0 else a + b
 
 
 def gather(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 
 from udkjax import pinv
+from udkjax.native.code import processor
 from udkjax.native.language.ir import DOUBLE
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.arrays import Stored, fit
@@ -51,7 +52,7 @@ class OwnCode(DenseMethod):
             raise UnsupportedError(f"arrays of the pseudoinverse {name}, which has numbers other than rank_tol")
         code = cls(method.relative, structure, tuple(leaves))
         try:
-            _written(code, *_TRIAL, 1, _TRIAL[1])
+            code.written(*_TRIAL)
         except UnsupportedError as error:
             raise UnsupportedError(f"the operation {error} of the pseudoinverse {name}") from error
         except Exception as error:  # text of a user may raise any error
@@ -63,8 +64,12 @@ class OwnCode(DenseMethod):
         method = jax.tree.unflatten(self.structure, [tol if x is _TOL else x for x in self.leaves])
         return tuple(method.factor(D))
 
+    def written(self, m: int, n: int) -> Written:
+        """Return the function for one lane; a member alone runs it, its rows of D filling registers."""
+        return _written(self, m, n, 1, -(-n // processor.lanes()) * processor.lanes())
+
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
-        size = _written(self, m, n, 1, n).size
+        size = self.written(m, n).size
         return {"plus": (n, m), "rank": (1, 1), "tol": (1, 1), "scratch": (1, max(size, 1))}
 
     def factor(self, d: DenseMatrices):
@@ -95,6 +100,12 @@ class OwnCode(DenseMethod):
 
 
 @lru_cache(maxsize=64)
+def _traced(code: OwnCode, m: int, n: int) -> Any:
+    """Return the jaxpr of `factors`."""
+    return jax.make_jaxpr(code.factors)(jax.ShapeDtypeStruct((m, n), float), jax.ShapeDtypeStruct((), float))
+
+
+@lru_cache(maxsize=64)
 def _written(code: OwnCode, m: int, n: int, width: int, stride: int) -> Written:
     """Write `name(D, tol, scratch, rank)`; D^+ is at the beginning of `scratch`, `stride` is the length of a row of D."""
     f = LoweredFunction("own", ("D", "tol", "scratch", "rank"), width)
@@ -102,8 +113,7 @@ def _written(code: OwnCode, m: int, n: int, width: int, stride: int) -> Written:
     plus = to.new((n, m), DOUBLE, True)
     D = Stored(f.given["D"], (m, n), DOUBLE, True, strides=(stride, 1))
     tol = Stored(f.given["tol"], (), DOUBLE, True)
-    closed = jax.make_jaxpr(code.factors)(jax.ShapeDtypeStruct((m, n), float), jax.ShapeDtypeStruct((), float))
-    found, rank = to.closed(closed, [D, tol])
+    found, rank = to.closed(_traced(code, m, n), [D, tol])
     if found.shape != (n, m):
         raise ValueError(f"matrix(D) must have the shape {(n, m)}, not {found.shape}")
     to.fill(plus, found)
