@@ -42,7 +42,7 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 WORTH = 700  # evaluations by NumPy (2 to 3 us per operation) that take as long as compilation (2 ms per operation)
-MOST = 400_000  # operations evaluated by NumPy before any program is compiled: about a second
+MOST = 2_000_000  # operations evaluated by NumPy before any program is compiled: ten seconds, as long as the longest compilation
 _SPENT: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # operations evaluated by NumPy so far, by program
 
 

@@ -210,7 +210,7 @@ def settle(
     Returns:
         lambda (m,), with derivatives of any order.
     """
-    friction, root = partial(rubbing_loads, mechanism, t, q, v), jax.lax.stop_gradient(uk.inverse_sqrt_mass(mechanism))
+    friction, root = jax.jit(partial(rubbing_loads, mechanism, t, q, v)), jax.lax.stop_gradient(uk.inverse_sqrt_mass(mechanism))
 
     def remainder(x: Array, share: Array | float = 1.0) -> Array:
         return x - multipliers(share * friction(x))
@@ -244,10 +244,9 @@ def settle(
             stage = jnp.where(fails, jnp.minimum(state.stage / 2, longest), state.stage)
             return _Growth(x, reached, stage, (reached < 1 - shortest / 2) & (stage > 0.75 * shortest))
 
-        found, fails, negative = attempt(start, jnp.ones(()), jnp.asarray(True))
-        fails = fails | (negative > 0)
-        grown = jax.lax.while_loop(lambda x: x.goes_on, grow, _Growth(start, jnp.zeros(()), jnp.asarray(longest), fails))
-        return jnp.where(fails, jnp.where(grown.reached < 1 - shortest / 2, jnp.nan, grown.x), found)
+        at_once = _Growth(start, jnp.zeros(()), jnp.ones(()), jnp.asarray(True))
+        grown = jax.lax.while_loop(lambda x: x.goes_on, grow, at_once)
+        return jnp.where(grown.reached < 1 - shortest / 2, jnp.nan, grown.x)
 
     def solve_for_tangent(linear: Callable[[Array], Array], y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(y), y)

@@ -64,7 +64,8 @@ class StickingState(eqx.Module):
     def loads(self, t: Time, q: Vector, v: Vector) -> StickingLoads:
         """Return the multipliers and the friction at a state; NaN where friction admits no motion."""
         modes, failed = self.modes(t, q, v)
-        found, _ = self._respond(DirectedFriction.put_in(self.mechanism), modes, t, q, v)
+        directed = DirectedFriction.put_in(self.mechanism)
+        found, _ = self._respond(directed, modes, self._rows(directed, t, q, v), t, q, v)
         return jax.tree.map(lambda x: jnp.where(failed, jnp.nan, x), found)
 
     def modes(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
@@ -73,7 +74,8 @@ class StickingState(eqx.Module):
 
     def _decide(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
         directed = DirectedFriction.put_in(self.mechanism)
-        unit, (speed, A, _) = directed.units(self.scales.length), self._rows(directed, q, v)
+        unit, rows = directed.units(self.scales.length), self._rows(directed, t, q, v)
+        speed, A = rows.speeds, rows.slopes[len(self.w) :]
         sticking = jnp.zeros(len(unit), bool) if self.sticking is None else self.sticking
         rest = sticking | (jnp.abs(speed) <= AT_REST.closed * unit * self.scales.rate)
         D, root = uk.D(self.mechanism, t, q, self.w), uk.inverse_sqrt_mass(self.mechanism)
@@ -83,7 +85,7 @@ class StickingState(eqx.Module):
         rest = rest & jnp.all(jnp.isfinite(u))
         none = jnp.zeros_like(rest)
         joints = JointsAtRest.of(rest, jnp.sign(speed), u @ u.T, mobility, sticking, none, accelerations, jnp)
-        respond = lambda modes: self._respond(directed, modes, t, q, v)[1]  # noqa: E731
+        respond = jax.jit(lambda modes: self._respond(directed, modes, rows, t, q, v)[1])
         found, failed, _ = joints.decide(respond, jnp.zeros(len(unit)), none, none, jnp)
         if self.sticking is None:
             return found, failed
@@ -91,34 +93,28 @@ class StickingState(eqx.Module):
         return jax.tree.map(lambda x, y: jnp.where(failed, x, y), known, found), jnp.asarray(False)
 
     def _respond(
-        self, directed: DirectedMechanism, modes: FrictionModes, t: Time, q: Vector, v: Vector
+        self, directed: DirectedMechanism, modes: FrictionModes, rows: "_Rows", t: Time, q: Vector, v: Vector
     ) -> tuple[StickingLoads, Response]:
         """Return the loads in given modes, and the motion of the joints."""
-        mechanism = directed.with_sides(modes.sides(jnp))
-        _, A, rate = self._rows(directed, q, v)
-        length = self.scales.length
-        held = jnp.where(modes.locked, length / directed.units(length), 0.0)  # weights as in `Scales`
-        root, rows, w = uk.inverse_sqrt_mass(mechanism), len(self.w), jnp.concatenate([self.w, held])
-        D = w[:, None] * jnp.concatenate([constraints.psi_q(mechanism, t, q), A]) * root
+        mechanism, root, count = directed.with_sides(modes.sides(jnp)), uk.inverse_sqrt_mass(self.mechanism), len(self.w)
+        held = jnp.where(modes.locked, self.scales.length / directed.units(self.scales.length), 0.0)  # weights as in `Scales`
+        w, free = jnp.concatenate([self.w, held]), uk.a_F(mechanism, t, q, v)
+        D, b = w[:, None] * rows.slopes * root, w * (rows.drift - rows.slopes @ free)
         plus, share = uk.pseudoinverse(self.method, D), sharing(D, self.soft, w)
 
-        def b(friction: Array) -> Array:
-            of_locks = -rate - A @ uk.a_F(mechanism, t, q, v, friction)
-            return w * jnp.concatenate([uk.b(mechanism, t, q, v, self.baumgarte, None, friction), of_locks])
-
         def multipliers(friction: Array) -> Array:
-            return share(-w * (plus.T @ (plus @ b(friction))))
+            return share(-w * (plus.T @ (plus @ (b - D @ (root * friction)))))
 
         found = rubbing.settle(multipliers, mechanism, t, q, v)
         friction = rubbing.rubbing_loads(mechanism, t, q, v, found)
-        a = uk.a_F(mechanism, t, q, v, friction) + root * (plus @ b(friction))
-        total = loads.force(mechanism, t, q, v) + friction - A.T @ found[rows:]
-        limits, of_locks = self._limits(directed, found), found[rows:]
-        response = Response(A @ a + rate, limits - of_locks, limits + of_locks)
+        a = free + root * (root * friction + plus @ (b - D @ (root * friction)))
+        limits, of_locks, A = self._limits(directed, found), found[count:], rows.slopes[count:]
+        total = loads.force(mechanism, t, q, v) + friction - A.T @ of_locks
+        response = Response(A @ a - rows.drift[count:], limits - of_locks, limits + of_locks)
         by_name = rubbing.loads_of_friction(mechanism, t, q, v, found)
         for (_, k), row, multiplier in zip(directed.joints, A, of_locks, strict=True):
             by_name[mechanism.force_names[k]] = by_name[mechanism.force_names[k]] - row * multiplier
-        return StickingLoads(found[:rows], total - loads.force(self.mechanism, t, q, v), by_name), response
+        return StickingLoads(found[:count], total - loads.force(self.mechanism, t, q, v), by_name), response
 
     def _limits(self, directed: DirectedMechanism, multipliers: Float[Array, "k"]) -> Float[Array, "F"]:
         """Return the largest forces by which the joints stick."""
@@ -130,13 +126,19 @@ class StickingState(eqx.Module):
             found.append(friction.largest_force(self.mechanism.joints[name], own))
         return jnp.stack([jnp.asarray(x, float) for x in found])
 
-    def _rows(
-        self, directed: DirectedMechanism, q: Vector, v: Vector
-    ) -> tuple[Float[Array, "F"], Float[Array, "F n"], Float[Array, "F"]]:
-        """Return the speeds of the joints, A, and (d A / dt) v."""
+    def _rows(self, directed: DirectedMechanism, t: Time, q: Vector, v: Vector) -> "_Rows":
         speeds = directed.sliding_speeds
         s, rate = jax.jvp(lambda q: speeds(q, v), (q,), (v,))
-        return s, jax.jacfwd(speeds, 1)(q, v), rate
+        slopes = jnp.concatenate([constraints.psi_q(self.mechanism, t, q), jax.jacfwd(speeds, 1)(q, v)])
+        return _Rows(s, slopes, jnp.concatenate([uk.drift(self.mechanism, t, q, v, self.baumgarte), -rate]))
+
+
+class _Rows(NamedTuple):
+    """The constraints, and the locks of all joints with set-valued friction: slopes a = drift."""
+
+    speeds: Float[Array, "F"]  # of the joints, A v
+    slopes: Float[Array, "m+F n"]  # Psi_q, and A
+    drift: Float[Array, "m+F"]  # gamma - 2 alpha Psi_dot - beta^2 Psi, and -(d A / dt) v
 
 
 def sticking_joints(mechanism: Mechanism) -> tuple[str, ...]:

@@ -80,11 +80,19 @@ def b(
     friction: Loads = None,
 ) -> Float[Array, "m"]:
     """Return b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy."""
-    b = constraints.gamma(mechanism, t, q, v) - constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v, friction)
+    free = constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v, friction)
+    return weigh(w, drift(mechanism, t, q, v, baumgarte) - free)
+
+
+def drift(
+    mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, baumgarte: Baumgarte | None = None
+) -> Float[Array, "m"]:
+    """Return gamma - 2 alpha Psi_dot - beta^2 Psi, which Psi_q a is to be."""
+    found = constraints.gamma(mechanism, t, q, v)
     if baumgarte is not None:
-        b = b - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
-        b = b - baumgarte.beta**2 * constraints.psi(mechanism, t, q)
-    return weigh(w, b)
+        found = found - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
+        found = found - baumgarte.beta**2 * constraints.psi(mechanism, t, q)
+    return found
 
 
 def accelerations(
