@@ -92,6 +92,19 @@ def test_failed_runs_have_no_density_and_no_slope_beside_others_in_lanes(problem
     assert np.abs(slopes[0]).min() > 0.0
 
 
+@pytest.mark.parametrize(("samples", "members"), [(20, 300), (5000, 1)])
+def test_sums_of_many_residuals_are_those_of_numpy(samples, members):
+    ts = np.linspace(0.0, 1.0, samples)
+    problem = udk.inference(pendulum(0.4), record(None, ts), NAMES[:1])
+    x = points(problem, count=members)
+    predicted = np.asarray(jax.jit(jax.vmap(problem.predicted))(x))
+    sigma = problem.parameters(x)[f"noise of {ANGLE}"][:, None]
+    each = -0.5 * ((predicted - problem.fit_problem.measured) / sigma) ** 2 - np.log(sigma * np.sqrt(2.0 * np.pi))
+    prior = np.asarray(jax.vmap(problem.log_prior)(x))
+    assert_allclose(problem.log_densities(x), each.sum(1) + prior, rtol=1e-10)
+    assert_allclose(jax.jit(jax.vmap(lambda x: jnp.sum(problem.log_likelihoods(x))))(x), each.sum(1), rtol=1e-10)
+
+
 def test_steps_are_bounded_by_those_at_the_start(problem):
     runs = np.arange(2)
     taken = problem.fit_problem.predictor(problem.fit_problem.members(np.zeros((1, problem.fit_problem.K)), runs), problem.tol)

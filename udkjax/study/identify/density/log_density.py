@@ -146,7 +146,8 @@ class InferenceProblem:
         predicted, code = self._predict(x)
         sigma = self.sigma * jnp.exp(jnp.append(x[self.fit_problem.K :], 0.0))[self.groups]
         r = weighted(predicted, self.fit_problem.measured, sigma)
-        return -0.5 * r**2 - jnp.log(sigma * np.sqrt(2.0 * np.pi)), code
+        # Without the barrier, XLA's CPU compiler (jaxlib 0.12.0) loses the terms of r in sums of more than 4096 of these.
+        return jax.lax.optimization_barrier(-0.5 * r**2 - jnp.log(sigma * np.sqrt(2.0 * np.pi))), code
 
     def _log_density(self, x: Array) -> Array:
         each, code = self._likelihoods(x)
