@@ -1,10 +1,13 @@
 """Trajectories compared with exact solutions, with the default settings."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tomlkit
 from numpy.testing import assert_allclose
 from scipy.optimize import root_scalar
 
@@ -112,6 +115,42 @@ def test_crossing_keeps_energy_where_no_row_is_redundant_before_and_after(tol):
         mech = udk.library.peaucellier(np.deg2rad(angle), 3.0)
         energy = udk.energy(mech, udk.simulate(mech, np.linspace(0.0, 10.0, 101), rtol=tol, atol=tol)).total
         assert_allclose(energy, energy[0], atol=2e-5)
+
+
+def free_scissor_lift(stages: int, angle: float, scale: float = 1.0) -> udk.Mechanism:
+    """Return a scissor lift without redundant rows: it collapses and, where its links are vertical, loses up to three ranks."""
+    width, height = scale * np.cos(angle), scale * np.sin(angle)
+    left = ["foot", *(f"left{i}" for i in range(1, stages)), "head"]
+    right = ["slide", *(f"right{i}" for i in range(1, stages)), "top"]
+    pins = {name: (0.0, i * height) for i, name in enumerate(left)} | {name: (width, i * height) for i, name in enumerate(right)}
+    pins |= {f"middle{i}": (0.5 * width, (i + 0.5) * height) for i in range(stages)} | {"end": (1.2 * scale, stages * height)}
+    links = [(f"rising{i}", [left[i], f"middle{i}", right[i + 1]]) for i in range(stages)]
+    links += [(f"falling{i}", [left[i + 1], f"middle{i}", right[i]]) for i in range(stages)]
+    drawing: dict[str, Any] = {
+        "format": 2,
+        "gravity": [0.0, -9.81 * scale],
+        "ground": ["foot"],
+        "pins": {name: [float(x) for x in place] for name, place in pins.items()},
+        "link": [{"name": name, "pins": on, "width": 0.0, "mass": 1.0} for name, on in links]
+        + [{"name": "platform", "pins": ["head", "end"], "mass": 5.0}],
+        "slot": [
+            {"name": "rail", "pin": "slide", "direction": 0.0, "on": "ground"},
+            {"name": "bed", "pin": "top", "along": ["head", "end"], "on": "platform"},
+        ],
+    }
+    return udk.loads(tomlkit.dumps(drawing))
+
+
+@pytest.mark.parametrize(("stages", "scale"), [(1, 1.0), (2, 1e-6), pytest.param(2, 1e3, marks=pytest.mark.slow), (3, 1.0)])
+def test_crossing_with_several_small_singular_values_keeps_energy(stages, scale):
+    """Up to a thousandth of it is lost if nodes of steps meet the configurations, or independent rows are left out for longer."""
+    for angle in (0.52, 0.524, 0.55):
+        mech = free_scissor_lift(stages, angle, scale)
+        for tol in (1e-6, 1e-8, 1e-9, 1e-10, 1e-12):
+            sol = udk.simulate(mech, np.linspace(0.0, 0.85, 18), rtol=tol, atol=tol)
+            energy = udk.energy(mech, sol)
+            assert np.ptp(energy.total) < 100 * tol * np.max(energy.kinetic), (angle, tol)
+            assert sol.stats["steps"] < 140  # by ever shorter steps, 300 and more at 1e-10
 
 
 def test_outputs_beside_singular_configurations():

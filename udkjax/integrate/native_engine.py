@@ -27,10 +27,10 @@ from udkjax.scene.mechanism import Mechanism
 
 # Rank threshold of fallback steps, relative to that of other steps. Only steps near singular configurations use it; if states are
 # projected, they start on the constraint manifold. An independent row that is treated as redundant causes errors in velocities as
-# large as the threshold; rounding errors are eps over its square. The best threshold is thus about eps^(1/3). With a threshold
-# three times larger, linkages that turn back in singular configurations need up to a quarter fewer steps, but Peaucellier's may
-# cross with energy errors of 1e-5 at any tolerance; with one three times smaller they need up to two fifths more steps.
-FALLBACK_RANK_SHARE = 0.2
+# large as the threshold; rounding errors are eps over its square. The best threshold is thus eps^(1/3), this share of the usual
+# threshold. With one three times larger, more linkages lose energy that no tolerance reduces; one three times smaller gains
+# nothing.
+FALLBACK_RANK_SHARE = 0.06
 
 
 def packed(problem: Problem) -> list[np.ndarray]:

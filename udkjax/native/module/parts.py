@@ -134,10 +134,14 @@ class FallbackPart(Part):
         s.fallback_due = f.const(0.0, DOUBLE, f.width)
         return stepping, f.const(False, BOOL, f.width), f.const(np.inf, DOUBLE, f.width)
 
+    def limit_of_error(self, f: Function, s: Lane, time_left: Value) -> Value | float:
+        """Return the error, relative to the tolerance, up to which a step is accepted."""
+        return 1.0
+
     def step_around(
-        self, f: Function, s: Lane, failed: Callable[[], Value], time_left: Value, step: Value, otherwise: Value
+        self, f: Function, s: Lane, accept: Value, lanes: Callable[[], Value], time_left: Value, step: Value, otherwise: Value
     ) -> Value:
-        """Return the next step: one around a singular configuration in lanes that `failed`."""
+        """Return the next step, after one that is accepted or repeated: in `lanes` one around a singular configuration."""
         return otherwise
 
     def close_output(self, f: Function, s: Lane, mask: Value):

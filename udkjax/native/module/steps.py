@@ -27,6 +27,8 @@ RESTART_FACTOR = 0.5
 RETRIES = 3  # attempts to avoid a pivot that is too small for elimination, before the fallback takes the step
 # Smallest distance at the stages of a step: elimination is not used below 1e-3 (`BRANCH_TOL`).
 NEAREST_STAGE = 1.5e-3
+# Distance beyond which no step is planned around a singular configuration: rows that meet at a larger angle are well conditioned.
+NEAR = 0.1
 # The rounding error of accelerations, in the scene's own units, is this number divided by the cube of the distance. Its
 # contribution to the velocity in a step must be less than the tolerance.
 ROUNDING_GROWTH = 3e-14

@@ -69,10 +69,20 @@ class Method:
     @property
     def clearings(self) -> tuple[float, float]:
         """Fractions of a step far from all nodes: the middles of the widest gap between nodes, and of the widest gap before."""
-        nodes = np.unique(self.nodes[self.nodes <= 1])
-        middles, gaps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
+        middles, gaps = self._gaps
         widest = np.argmax(gaps)
         return middles[np.argmax(gaps[: max(widest, 1)])], middles[widest]
+
+    @property
+    def clearance(self) -> float:
+        """The distance between the middle of the widest gap and its ends, as a fraction of a step."""
+        return float(np.max(self._gaps[1])) / 2
+
+    @property
+    def _gaps(self) -> tuple[np.ndarray, np.ndarray]:
+        """The middles and the lengths of the gaps between nodes."""
+        nodes = np.unique(self.nodes[self.nodes <= 1])
+        return (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
 
 
 def _product(a: Any, b: np.ndarray) -> np.ndarray:

@@ -15,9 +15,9 @@ from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.parts import FallbackPart, Shortened
-from udkjax.native.module.steps import NEAREST_STAGE, OPEN_OUTPUT, OUTPUT_PIVOT_TOL
+from udkjax.native.module.steps import FACTORS, NEAREST_STAGE, OPEN_OUTPUT, OUTPUT_PIVOT_TOL
 from udkjax.native.parts.manifold import iterate_newton, largest_violation, with_threshold
-from udkjax.native.parts.singular import retry_or_fall_back, step_around
+from udkjax.native.parts.singular import limit_of_error, retry_or_fall_back, step_across, step_around, time_to_singularity
 
 RESULTS = ("a", "q", "v", "dq", "dv")  # of the fallback
 
@@ -109,10 +109,25 @@ class RankRevealing(FallbackPart):
     def retry(self, f: Function, s: Lane, stepping: Value, failed: Value, tries: Value | None) -> Shortened:
         return retry_or_fall_back(f, s, failed, tries)
 
+    @property
+    def _plans(self) -> bool:
+        # Friction by loads that grow without bounds needs nodes near a singular configuration: its errors are no rounding errors.
+        return not self._in.friction.settles
+
+    def limit_of_error(self, f: Function, s: Lane, time_left: Value) -> Value | float:
+        return limit_of_error(f, s, self._in.method, time_left) if self._plans else 1.0
+
     def step_around(
-        self, f: Function, s: Lane, failed: Callable[[], Value], time_left: Value, step: Value, otherwise: Value
+        self, f: Function, s: Lane, accept: Value, lanes: Callable[[], Value], time_left: Value, step: Value, otherwise: Value
     ) -> Value:
-        return f.select(failed(), step_around(f, self._in.method, time_left, step, otherwise), otherwise)
+        method = self._in.method
+        if not self._plans:
+            across = step_across(f, method, time_left, step)
+            is_similar = (across > step * FACTORS.shrink) & (across < step * FACTORS.safety)
+            return f.select(lanes() & ~accept & is_similar, across, otherwise)
+        start = f.select(accept, s.distance, s.distance2)
+        ahead = f.select(accept, time_to_singularity(s, accepted=True), time_left)
+        return f.select(lanes(), step_around(f, s, method, start, ahead, otherwise), otherwise)
 
     # --- outputs
 

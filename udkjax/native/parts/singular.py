@@ -3,7 +3,16 @@
 from udkjax.native.language.ir import DOUBLE, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.parts import Shortened
-from udkjax.native.module.steps import EXPECTED, FACTORS, NEAREST_STAGE, RETRIES, ROUNDING_GROWTH, SURE
+from udkjax.native.module.steps import (
+    EXPECTED,
+    FACTORS,
+    NEAR,
+    NEAREST_STAGE,
+    RETRIES,
+    ROUNDING_GROWTH,
+    SHORTEST_LAST,
+    SURE,
+)
 from udkjax.native.module.tableau import Method
 
 
@@ -17,7 +26,7 @@ def retry_or_fall_back(f: Function, s: Lane, failed: Value, tries: Value | None)
     fallback_due = failed & ~fallback
     was_clear = is_clear(f, s, s.distance2)
     is_near = stepping & ~fallback & (error < 1.0) & ~is_clear(f, s, s.distance) & (s.last < 0.5)
-    time_left = time_to_singularity(f, s)
+    time_left = time_to_singularity(s)
     has_passed = (
         (time_left > 0.0) & (time_left < s.h * SURE) & (s.distance * time_left > s.distance2 * EXPECTED * (s.h - time_left))
     )
@@ -30,23 +39,60 @@ def retry_or_fall_back(f: Function, s: Lane, failed: Value, tries: Value | None)
     return stepping & ~fallback_due, shortens, time_left
 
 
-def is_clear(f: Function, s: Lane, distance: Value) -> Value:
-    """Return whether a step of the current length may begin at a distance from singular configurations."""
-    return (distance > NEAREST_STAGE) & (distance * distance * distance * s.tolerance > s.h * s.omega * ROUNDING_GROWTH)
+def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value) -> Value:
+    """Return the error up to which a step is accepted: one or, across a singular configuration, its rounding error if larger.
+
+    A shorter step across the singular configuration would have a larger rounding error, as its nodes are nearer to it. The run
+    would creep there by ever shorter steps, whose errors add up to much more, and leave out rows that are independent. This only
+    holds if the singular configuration is certain to be in a gap between nodes: a parabola and a straight line through the
+    latest distances predict it there. They do not where the mechanism turns back nearby, and shorter steps are needed.
+    """
+    straight = s.distance2 * (s.point3_t - s.point2_t) / (s.distance1 - s.distance2)
+    is_certain = f.abs(straight - time_left) < s.step * method.clearance
+    crosses = (s.fallback > 0.5) & (s.begin < 0.5) & (time_left > 0.0) & (time_left < s.step) & is_certain
+    nearest = s.distance2 * (s.step * method.clearance / f.select(crosses, time_left, 1.0))
+    rounding = s.step * s.omega * ROUNDING_GROWTH / (nearest * nearest * nearest * s.tolerance)
+    return f.select(crosses, f.max(rounding, 1.0), 1.0)
 
 
-def time_to_singularity(f: Function, s: Lane) -> Value:
-    """Return the time until a singular configuration, a root of the parabola through three distances."""
+def is_clear(f: Function, s: Lane, distance: Value, h: Value | None = None) -> Value:
+    """Return whether a step h, by default of the current length, may begin at a distance from singular configurations."""
+    h = s.h if h is None else h
+    return (distance > NEAREST_STAGE) & (distance * distance * distance * s.tolerance > h * s.omega * ROUNDING_GROWTH)
+
+
+def time_to_singularity(s: Lane, accepted: bool = False) -> Value:
+    """Return the time until a singular configuration, a root of the parabola through three distances.
+
+    They are those of the latest accepted states or, if the attempt is `accepted`, of its end and the two states before.
+    """
     t2, t1, t0, d2, d1, d0 = s.point1_t, s.point2_t, s.point3_t, s.distance0, s.distance1, s.distance2
+    if accepted:
+        t2, t1, t0, d2, d1, d0 = t1, t0, s.t1, d1, d0, s.distance
     slope, before = (d0 - d1) / (t0 - t1), (d1 - d2) / (t1 - t2)
     curve = (slope - before) / (t0 - t2)
     slope = slope + curve * (t0 - t1)
     return -d0 / (slope - curve * (d0 / slope))
 
 
-def step_around(f: Function, method: Method, time_left: Value, step: Value, otherwise: Value) -> Value:
-    """Return a step to replace a failed one: the singular configuration is then in the middle of a wide gap between its nodes."""
+def step_across(f: Function, method: Method, time_left: Value, h: Value) -> Value:
+    """Return a step like h that has a singular configuration ahead in the middle of a wide gap between its nodes."""
     low, high = (float(x) for x in method.clearings)
-    share = time_left / step
-    candidate = time_left / f.select(share < low, f.const(low, DOUBLE, f.width), high)
-    return f.select((candidate > step * FACTORS.shrink) & (candidate < step * FACTORS.safety), candidate, otherwise)
+    return time_left / f.select(time_left / h < low, f.const(low, DOUBLE, f.width), high)
+
+
+def step_around(f: Function, s: Lane, method: Method, distance: Value, time_left: Value, h: Value) -> Value:
+    """Return a step of about h at most, planned around a singular configuration ahead; `distance` is that of its start.
+
+    Rounding errors are largest at the nodes of a step that are next to the singular configuration, and shorter steps have larger
+    ones. Therefore the step that crosses it has it in the middle of a wide gap between its nodes, and the step before ends where
+    the crossing step can begin. Steps whose nodes are clear anyway are not planned.
+    """
+    high = float(method.clearings[1])
+    share, reach = time_left / h, high * FACTORS.safety  # the step after an approach may turn out shorter than h
+    nearest = distance * (h * method.clearance / time_left)
+    is_ahead = (time_left > 0.0) & (share < 1.0 + reach) & (distance < NEAR) & ~is_clear(f, s, nearest, h)
+    across = step_across(f, method, time_left, h)
+    approach = time_left - h * reach
+    approach = f.select(approach < h * SHORTEST_LAST, time_left * (1.0 / (1.0 + 2.0 * reach)), approach)
+    return f.select(is_ahead, f.select(share * FACTORS.safety <= high, across, approach), h)

@@ -52,7 +52,7 @@ def write_decide(module: Module):
         s.again = where(stepping, yes, 0.0)
         f.call("end_piece", f.given["work"])
         repeats = s.again > 0.5
-    accept = stepping & (error < 1.0) & ~shortens & ~repeats
+    accept = stepping & (error < module.fallback.limit_of_error(f, s, time_left)) & ~shortens & ~repeats
     if module.edges:
         with f.each(module.edges) as k:
             new, old = (module.entry(f, name, k) for name in ("edges", "edges before"))
@@ -61,7 +61,7 @@ def write_decide(module: Module):
     factor, rate = _step_factor(module, f, s, accept, step, tries)
     h = where(stepping, step * where(shortens, f.const(FACTORS.safety, DOUBLE, f.width), factor), s.h)
     h = where(repeats, s.h, h)
-    h = module.fallback.step_around(f, s, lambda: stepping & ~accept & stepped & ~repeats, time_left, step, h)
+    h = module.fallback.step_around(f, s, accept, lambda: stepping & stepped & ~repeats, time_left, step, h)
     if tries is not None:  # a trial that fails leaves no trace
         h = where(tries & ~accept, s.h, h)
     chosen = f.variable(h)
