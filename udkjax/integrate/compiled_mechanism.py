@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from udkjax.equations.laws.abstract_system import AbstractSystem
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.states.quantities import equations_of
 from udkjax.equations.states.textbook import TextbookEquations
@@ -135,7 +134,7 @@ def compile_mechanism(
         textbook = equations.textbook
         most_rank = len(textbook.scales.rows) - len(textbook.redundant or ())
         rows = most_rank if eliminates(textbook.method) else len(textbook.scales.rows)
-        why = _reason_for_programs(operation.code)
+        why = _reason_for_programs(operation)
     elif engine != "jax":
         evaluation = evaluation_of(equations)
     if engine == "native" and why:
@@ -214,10 +213,13 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
     return ""
 
 
-def _reason_for_programs(code: RunPrograms) -> str:
-    """Return why machine code cannot be written for programs; empty if it can."""
+def _reason_for_programs(operation: RunStates | Accelerate) -> str:
+    """Return why machine code cannot be written for the programs of an operation; empty if it can."""
+    code, formulation = operation.code, operation.formulation
     if code.excess:
         return code.excess
+    if formulation is not None and formulation.needs_diagonal_mass and code.couples:
+        return "it does not know a formulation of your own for a mass matrix that is not diagonal"
     missing = unsupported(code)
     return f"{code.owner} uses {missing}, which is not arithmetic on numbers" if missing else ""
 
@@ -257,4 +259,4 @@ def evaluation_of(equations: AbstractSystem) -> Accelerate | None:
         return None
     inner = equations.textbook
     operation = Accelerate(inner.programs, *_method_code(equations))
-    return None if _reason_for_programs(operation.code) else operation
+    return None if _reason_for_programs(operation) else operation

@@ -18,7 +18,7 @@ from jaxtyping import ArrayLike
 
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.terms.structure import numbers_as_vector
-from udkjax.native.module.layout import FORMULATION_SETTINGS, INPUTS, OUTPUTS, SETTINGS, SHARE
+from udkjax.native.module.layout import INPUTS, OUTPUTS, SETTINGS, SHARE
 from udkjax.native.module.memory import Memory
 from udkjax.native.module.module import Module
 from udkjax.native.parts.formulations import FormulationCode
@@ -128,7 +128,7 @@ class StateOperation(Operation):
 
     @property
     def all_settings(self) -> tuple[str, ...]:
-        return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
+        return (*self.settings, *(self.formulation.settings if self.formulation else ()))
 
     @property
     def projection(self) -> "ProjectStates":

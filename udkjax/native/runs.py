@@ -8,7 +8,7 @@ from udkjax.native.derivatives import record
 from udkjax.native.derivatives.backpropagation import Reverse
 from udkjax.native.derivatives.second_tangents import ForwardTwice
 from udkjax.native.derivatives.tangents import Forward
-from udkjax.native.module.layout import FORMULATION_SETTINGS, INFO, INPUTS, Plan
+from udkjax.native.module.layout import INFO, INPUTS, Plan
 from udkjax.native.module.module import Module
 from udkjax.native.module.tableau import KVAERNO5, Method
 from udkjax.native.operations import Accelerate, Operation
@@ -37,7 +37,7 @@ class RunStates(Operation):
 
     @property
     def all_settings(self) -> tuple[str, ...]:
-        return (*self.settings, *(FORMULATION_SETTINGS if self.formulation else ()))
+        return (*self.settings, *(self.formulation.settings if self.formulation else ()))
 
     @property
     def closes(self) -> bool:

@@ -64,6 +64,119 @@ def test_derivatives_of_a_pseudoinverse_in_machine_code(derivative):
     assert_allclose(own, other, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
+def test_a_pseudoinverse_as_one_of_several():
+    """In lanes with another method, and for the matrix of a formulation."""
+    run = lambda number: angles(1.2, udk.OneOf(methods=(BenIsrael(), udk.SVD()), number=number), engine="native")  # noqa: E731
+    own, other = jax.jit(jax.vmap(run))(jnp.arange(2.0))
+    assert_allclose(own, other, atol=1e-8)
+    linkage = udk.library.parallelogram()
+    runs = [udk.simulate(linkage, [0.0, 0.3], formulation=udk.Augmented(method)) for method in (BenIsrael(), udk.SVD())]
+    assert_allclose(runs[0].q, runs[1].q, atol=1e-8)
+    assert runs[0].settings["engine"] == "native"
+
+
+class Together(udk.PointwiseFormulation):
+    """`Augmented`, written by hand."""
+
+    def solve(self, M, F, A, c):
+        matrix = jnp.block([[M, A.T], [A, jnp.zeros((len(A), len(A)))]])
+        return jnp.linalg.solve(matrix, jnp.concatenate([F, c]))[: len(F)]
+
+
+class Penalty(udk.PointwiseFormulation):
+    """Stiff springs instead of constraints; the common stiffness of all, and a number for each row."""
+
+    stiffness: Any
+    weights: Any
+
+    def solve(self, M, F, A, c):
+        spring = A.T * (self.stiffness * self.weights[: len(A)])
+        return jnp.linalg.solve(M + spring @ A, F + spring @ c)
+
+
+class AlongNullSpace(udk.NullSpaceQR):
+    """Derived from a formulation of the package, but with accelerations of its own."""
+
+    def solve(self, M, F, A, c):
+        return Together().solve(M, F, A, c)
+
+
+def corners(mass, formulation, **choices: Any):
+    """The end of a run of a four-bar."""
+    linkage = udk.library.four_bar()
+    linkage = linkage.with_parameters({f"body.{linkage.body_names[0]}.mass": mass})
+    return udk.simulate(linkage, [0.0, 0.5], formulation=formulation, rtol=1e-9, atol=1e-9, **choices).q[-1]
+
+
+def test_a_formulation_in_machine_code():
+    """In lanes and alone, as the formulation of the package that it copies."""
+    masses = jnp.linspace(1.0, 2.0, 9)
+    found = jax.jit(jax.vmap(lambda mass: corners(mass, Together(), engine="native")))(masses)
+    for k in (0, 8):
+        assert_allclose(found[k], corners(masses[k], udk.Augmented()), atol=1e-10)
+    assert_allclose(found[3], corners(masses[3], Together(), engine="native"), atol=1e-10)
+    assert_allclose(found[3], corners(masses[3], AlongNullSpace(), engine="native"), atol=1e-10)
+
+
+def softly(stiffness, engine="native"):
+    """The end of a run by penalties, which is not projected."""
+    return corners(1.0, Penalty(stiffness, jnp.arange(1.0, 21.0)), engine=engine, stabilization=None)
+
+
+def test_numbers_of_a_formulation_in_machine_code():
+    """They differ between members, which share the code; a stiffer penalty is closer to the constraints."""
+    found = jax.jit(jax.vmap(softly))(jnp.array([1e4, 1e6]))
+    errors = np.abs(found - corners(1.0, None)).max(axis=(1, 2))
+    assert errors[1] < 0.1 * errors[0]
+
+
+@pytest.mark.slow
+def test_an_inexact_formulation_is_the_same_in_machine_code():
+    assert_allclose(softly(jnp.array(1e4)), softly(jnp.array(1e4), engine="jax"), atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, lambda of: jax.jacfwd(jax.jacfwd(of))])
+def test_derivatives_of_a_formulation_in_machine_code(derivative):
+    own, other = (derivative(lambda mass, f=f: corners(mass, f))(1.2) for f in (Together(), udk.Augmented()))
+    assert_allclose(own, other, rtol=1e-9, atol=1e-9)
+
+
+class ByEigenvalues(udk.PointwiseFormulation):
+    power: Any = None
+
+    def solve(self, M, F, A, c):
+        return jnp.linalg.eigh(M)[1] @ F
+
+
+class OfWrongShape(udk.PointwiseFormulation):
+    def solve(self, M, F, A, c):
+        return c
+
+
+@pytest.mark.parametrize(
+    ("formulation", "reason"),
+    [
+        (ByEigenvalues(), "the operation eigh of the formulation ByEigenvalues"),
+        (ByEigenvalues(np.arange(2)), "arrays of type int64 of the formulation ByEigenvalues"),
+        (OfWrongShape(), "the formulation OfWrongShape"),
+    ],
+)
+def test_a_formulation_without_machine_code(formulation, reason):
+    with pytest.raises(ValueError, match=reason):
+        corners(1.0, formulation, engine="native")
+
+
+def test_a_formulation_of_a_system_whose_masses_couple():
+    """It receives M itself, and not the coordinates in which M is diagonal."""
+    mass = jnp.array([[2.0, 1.0], [1.0, 3.0]])
+    system = udk.ConstrainedSystem(lambda q: mass, force=lambda t, q, v: -q, constraint=lambda t, q: q @ q - 2.0)
+    runs = [udk.simulate(system, TS, udk.State([1.0, 1.0], [-0.5, 0.5]), formulation=f) for f in (Together(), None)]
+    assert "a mass matrix that is not diagonal" in runs[0].settings["engine"]
+    assert_allclose(runs[0].q, runs[1].q, atol=1e-6)
+
+
 class OfSingularValues(udk.MatrixPseudoinverse):
     def matrix(self, D):
         return jnp.linalg.pinv(D)
@@ -82,7 +195,7 @@ class OfOneShape(udk.MatrixPseudoinverse):
     ("method", "reason"),
     [
         (OfSingularValues(), "the operation svd of the pseudoinverse OfSingularValues"),
-        (WithArray(scale=jnp.array(2.0)), "arrays of the pseudoinverse WithArray"),
+        (WithArray(scale=jnp.array(2.0)), "arrays other than rank_tol of the pseudoinverse WithArray"),
         (OfOneShape(), "OfOneShape"),
     ],
 )
@@ -134,7 +247,7 @@ CONSTANT = {"stepsize_controller": diffrax.ConstantStepSize()}
 def test_runs(choices, error, gap):
     """The exact conical motion, and the length of the rod."""
     found = run(**choices)
-    assert found.settings["engine"].startswith("native" if "method" in choices else "diffrax")
+    assert found.settings["engine"].startswith("native" if {*choices} & {"method", "formulation"} else "diffrax")
     assert_allclose(found.q, EXACT, atol=error)
     assert_allclose(udk.violation(pendulum(), found), 0.0, atol=gap)
 

@@ -15,6 +15,7 @@ from jax.interpreters import mlir
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
+from tests.integrate.systems.test_own_methods import BenIsrael, Together
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import primitive, records
@@ -67,6 +68,8 @@ RUNS = {
     "elementary functions": last(STONE, "force.wind.strength", 3),
     "Tsit5": last(LINKAGE, "body.coupler.mass", solver=diffrax.Tsit5()),
     "SVD": last(LINKAGE, "body.coupler.mass", method=udk.SVD()),
+    "own pseudoinverse": last(LINKAGE, "body.coupler.mass", method=BenIsrael()),
+    "own formulation": last(FOUR_BAR, "pin.B[0]", 3, formulation=Together()),
     "tangent": with_tangent(last(PENDULUM, "body.rod.mass", 4)),
     "two tangents": jax.jacfwd(lambda x: last(FOUR_BAR, "pin.B", 3)(jnp.stack([x, 1.0]))),
     "gradient": with_gradient(last(PENDULUM, "body.rod.mass", 4)),
@@ -336,7 +339,7 @@ def test_kernels_are_assembled(name):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None or platform.machine() != "x86_64", reason="no C compiler for this processor")
-@pytest.mark.parametrize("name", ["redundant", "elementary functions", "tangent", "gradient"])
+@pytest.mark.parametrize("name", ["redundant", "elementary functions", "own formulation", "tangent", "gradient"])
 def test_ptx_computes_what_the_engine_computes(name, tmp_path):
     """LLVM's PTX, transliterated to C, is bitwise right, and so are the address spaces of its pointers."""
     programs = {}

@@ -1,6 +1,7 @@
 """JAX functions of one member as machine code: each primitive, loops and branches equal JAX in every lane."""
 
 import ctypes
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 from jax.extend import core
+from jax.scipy.linalg import cho_factor, cho_solve
 from numpy.testing import assert_allclose
 
 from udkjax.native.code import machine, processor
@@ -86,6 +88,27 @@ def gauss(a):
     return lax.fori_loop(0, 4, step, a)
 
 
+def systems(a, b):
+    square = a[:, :4].at[1].set(0.0).at[1, 1].set(1.0)  # pivots are exchanged
+    return jnp.linalg.solve(square, b), jnp.linalg.solve(square, b[:, 0]), jnp.linalg.inv(square), *lax.linalg.lu(a)
+
+
+def triangular(a, b):
+    square = a[:, :4] + 3 * jnp.eye(4)
+    solve = lax.linalg.triangular_solve
+    kinds = itertools.product((True, False), repeat=4)
+    return tuple(
+        solve(square, b if left else b.T, left_side=left, lower=lower, transpose_a=transpose, unit_diagonal=unit)
+        for left, lower, transpose, unit in kinds
+    )
+
+
+def definite(a, b):
+    """Cholesky's factors and their solutions; the second matrix is not definite."""
+    square = a @ a.T + jnp.eye(4)
+    return jnp.linalg.cholesky(square), jnp.linalg.cholesky(a[:, :4] + a[:, :4].T), cho_solve(cho_factor(square), b)
+
+
 CASES = {
     "arithmetic": (
         lambda a, b: (a + b, a - b, a * b, a / b, -a, jnp.abs(a), a**3, a**2, jnp.square(a), a % b, lax.sign(a)),
@@ -139,6 +162,10 @@ CASES = {
     "products": (lambda a, b: (a @ b.T, a.T @ b, a[0] @ b[1], jnp.outer(a[0], b[1]), jnp.einsum("ij,ij->i", a, b)), (A, B)),
     "long rows": (long_rows, (A,)),
     "derivative": (lambda a, b: jax.jvp(lambda x: jnp.sum(jnp.sin(x) * x, 0), (a,), (b,)), (A, B)),
+    "systems": (systems, (A, B)),
+    "triangular systems": (triangular, (A, B)),
+    "definite systems": (definite, (A, B)),
+    "padded": (lambda a: (jnp.diag(a[0]), lax.pad(a, 2.0, ((1, 0, 1), (0, 2, 0)))), (A,)),
     "scan": (rows, (A, B)),
     "unequal loops": (fibonacci, (A, np.arange(9))),
     "exchanged": (lambda a, b: lax.fori_loop(0, 3, lambda _, s: (s[1], s[0]), (a, b)), (A, B)),
@@ -162,7 +189,9 @@ def names_in(jaxpr):
     """Return the names of the primitives of a jaxpr."""
     found = set()
     for e in jaxpr.eqns:
-        inner = [x for p in e.params.values() for x in (p if isinstance(p, tuple | list) else [p])]
+        solves = e.primitive.name == "custom_linear_solve"  # its other functions are for derivatives
+        params = [e.params["jaxprs"].solve] if solves else e.params.values()
+        inner = [x for p in params for x in (p if isinstance(p, tuple | list) else [p])]
         inner = [getattr(x, "jaxpr", x) for x in inner if isinstance(getattr(x, "jaxpr", x), core.Jaxpr)]
         found |= set() if inlined(e) else {e.primitive.name}
         found = found.union(*(names_in(x) for x in inner))
@@ -181,7 +210,7 @@ def test_each_rule_has_a_case():
 @pytest.mark.parametrize(
     ("function", "name"),
     [
-        (jnp.linalg.cholesky, "cholesky"),
+        (lambda a: jnp.linalg.eigh(a)[0], "eigh"),
         (jnp.sort, "sort"),
         (lambda a: a.astype(np.float32), "float32"),
         (lambda a: a * 1j, "complex128"),

@@ -36,7 +36,12 @@ class Formulation(PrintsLine):
 
 
 class PointwiseFormulation(Formulation):
-    """A formulation that only changes how a is computed at a given state."""
+    """Base of formulations of your own, which only change how a is computed at a given state: override `solve`.
+
+    It is written in jax.numpy, and never differentiated. Arithmetic, products, reductions, indexing, linear systems, loops and
+    branches become machine code, also with arrays as fields, if M is diagonal. With other operations, such as
+    `jnp.linalg.eigh`, runs are integrated by diffrax, with the equations in plain JAX.
+    """
 
     def formulate(self, equations: AbstractSystem) -> "FormulatedSystem":
         return FormulatedSystem(equations, self)

@@ -35,6 +35,11 @@ class LoweredFunction(Function):
             local
         ).replace("@table", f"@{self.name}.table")
 
+    def call_in(self, f: Function, *arguments: Value):
+        """Write a call of this function in another, whose module has to define it."""
+        f.evaluated |= self.evaluated | {self.name: self}
+        f.call(self.name, *arguments)
+
 
 class Lowering:
     """The lowering of jaxprs into one function.

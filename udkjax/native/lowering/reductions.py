@@ -116,7 +116,7 @@ def dot(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array
     (over_a, over_b), (batch_a, batch_b) = p["dimension_numbers"]
     f, a, b = to.f, to.stored(inputs[0]), to.stored(inputs[1])
     if a.base != DOUBLE or b.base != DOUBLE:
-        raise UnsupportedError("dot_general of integers")
+        raise UnsupportedError("the operation dot_general of integers")
     free_a = [k for k in range(len(a.shape)) if k not in (*over_a, *batch_a)]
     free_b = [k for k in range(len(b.shape)) if k not in (*over_b, *batch_b)]
     count = len(batch_a)

@@ -9,6 +9,7 @@ from udkjax.native.language.program import UnsupportedError, apply, sincos
 from udkjax.native.lowering.arrays import Array, Index, Lazy, base_of, fit
 from udkjax.native.lowering.lowering import Lowering
 from udkjax.native.lowering.reductions import argument, dot, extreme, reduce_axes
+from udkjax.native.lowering.solving import cholesky, linear_solve, lu, triangular_solve
 from udkjax.native.lowering.updates import dynamic_update_slice, scatter
 from udkjax.native.lowering.varying import counts_of_scan, inlined
 from udkjax.native.lowering.views import (
@@ -17,6 +18,7 @@ from udkjax.native.lowering.views import (
     dynamic_slice,
     gather,
     iota,
+    pad,
     reshape,
     reverse,
     split,
@@ -52,7 +54,7 @@ def lower(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
     if name in ELEMENTWISE:
         return [_elementwise(to, name, inputs, p, out)]
     if name not in RULES:
-        raise UnsupportedError(name)
+        raise UnsupportedError(f"the operation {name}")
     return [RULES[name](to, inputs, p, out)]
 
 
@@ -69,7 +71,7 @@ def _elementwise(to: Lowering, name: str, inputs: list[Array], p: dict[str, Any]
         return fit(f, apply(f, operation, p, a, partial(sincos, f)), varies)
 
     if name == "select_n" and (len(inputs) != 3 or inputs[0].base != BOOL):
-        raise UnsupportedError("select_n of several")
+        raise UnsupportedError("the operation select_n of several")
     return Lazy(out.shape, base, inputs, read, 8 if shared else 1)
 
 
@@ -94,6 +96,7 @@ RULES: dict[str, LoweringRule] = {
     "argmax": partial(argument, "max"),
     "argmin": partial(argument, "min"),
     "dot_general": dot,
+    "pad": pad,
     "iota": iota,
     "scatter": partial(scatter, False),
     "scatter-add": partial(scatter, True),
@@ -101,7 +104,7 @@ RULES: dict[str, LoweringRule] = {
 }
 
 
-# --- loops and branches
+# --- loops, branches, and equations with several results
 
 
 def _scan(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
@@ -119,4 +122,14 @@ def _cond(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
     return to.cond(inputs[0], equation.params["branches"], inputs[1:])
 
 
-CONTROL = {"scan": _scan, "while": _while, "cond": _cond, "split": split, "unstack": unstack}
+CONTROL = {
+    "scan": _scan,
+    "while": _while,
+    "cond": _cond,
+    "split": split,
+    "unstack": unstack,
+    "lu": lu,
+    "cholesky": cholesky,
+    "triangular_solve": triangular_solve,
+    "custom_linear_solve": linear_solve,
+}

@@ -13,7 +13,7 @@ def scatter(adds: bool, to: Lowering, inputs: list[Array], p: dict[str, Any], ou
     x, places, change = to.stored(inputs[0]), to.stored(inputs[1]), to.stored(inputs[2])
     d, f = p["dimension_numbers"], to.f
     if d.operand_batching_dims:
-        raise UnsupportedError("scatter of batches")
+        raise UnsupportedError("the operation scatter of batches")
     whole = to.new(out.shape, base_of(out.dtype), any(a.varies for a in inputs))
     to.fill(whole, x)
     axes = [a for a in range(len(x.shape)) if a not in d.inserted_window_dims]

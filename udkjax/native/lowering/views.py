@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Operand, Value
+from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.arrays import Array, Constant, Index, Lazy, Stored, base_of, plus
 from udkjax.native.lowering.lowering import Lowering
 
@@ -120,6 +121,22 @@ def concatenate(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) 
 
         to.each(x.shape, put)
         start += x.shape[axis]
+    return whole
+
+
+def pad(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    """Surround the elements of an array, or separate them, by equal numbers."""
+    (x, number), f, config = inputs, to.f, p["padding_config"]
+    if any(low < 0 or high < 0 for low, high, _ in config):
+        raise UnsupportedError("the operation pad that removes elements")
+    whole = to.new(out.shape, base_of(out.dtype), x.varies or number.varies)
+    to.each(out.shape, lambda index: whole.write(f, index, number.read(f, ())))
+
+    def put(index: Index):
+        places = tuple(i * (between + 1) + low for i, (low, _, between) in zip(index, config, strict=True))
+        whole.write(f, places, x.read(f, index))
+
+    to.each(x.shape, put)
     return whole
 
 

@@ -6,7 +6,7 @@ from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.programs.unrolled import Unrolled
 from udkjax.native.language.ir import Function, Value
 from udkjax.native.language.program import PointerPlace
-from udkjax.native.module.layout import FORMULATION_SETTINGS, LANE_NUMBERS, Layout
+from udkjax.native.module.layout import LANE_NUMBERS, Layout
 from udkjax.native.module.parts import AccelerationPart, FallbackPart, FrictionPart, ProjectionPart
 from udkjax.native.module.running import Running
 from udkjax.native.module.steps import POINTS
@@ -37,7 +37,7 @@ class RunArrays(Running):
         """Reserve memory for all arrays; layout.py describes them."""
         plan, code, n, m = self.plan, self.code, self.n, self.m
         p = self.places = Layout(plan.width, plan.vector)
-        for name in (*LANE_NUMBERS, *(FORMULATION_SETTINGS if plan.formulation else ())):
+        for name in (*LANE_NUMBERS, *(plan.formulation.settings if plan.formulation else ())):
             p.add(name)
         p.add("constants", -(-self.constants // SPARE) * SPARE)
         p.add("state t")

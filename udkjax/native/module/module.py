@@ -8,7 +8,7 @@ from udkjax.native.language.ir import BOOL, POINTER, Function, Value
 from udkjax.native.language.loops import LoopWriter
 from udkjax.native.language.program import PointerPlace, consecutive, write
 from udkjax.native.module.arrays import RunArrays
-from udkjax.native.module.layout import FORMULATION_SETTINGS, Lane, Layout, Plan
+from udkjax.native.module.layout import Lane, Layout, Plan
 from udkjax.native.module.programs import COLD, DIFFERENTIATED, OUT, PROGRAMS
 from udkjax.native.module.settling import friction_of
 from udkjax.native.module.steps import AIM_ACROSS
@@ -36,7 +36,7 @@ class Module(RunArrays):
         if plan.sampled:
             self.inputs = ("samples", *self.inputs)
         if plan.formulation is not None:
-            self.settings = (*self.settings, *FORMULATION_SETTINGS)
+            self.settings = (*self.settings, *plan.formulation.settings)
         self.pieces = code.piece_count if plan.breaks else 0
         self.edges = max(self.pieces - code.first_edge, 0) if self.pieces else 0  # pieces that end where a load changes its sign
         self.choose_parts()

@@ -32,6 +32,12 @@ class FormulationCode(ABC):
     """A formulation as machine code."""
 
     closes: ClassVar[bool] = False  # whether the constraints are satisfied wherever a run evaluates accelerations
+    needs_diagonal_mass: ClassVar[bool] = False  # whether it receives M itself, which must be diagonal
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The names of its settings."""
+        return FORMULATION_SETTINGS
 
     @abstractmethod
     def prepare(self, module: Module) -> "FormulatedAccelerations":

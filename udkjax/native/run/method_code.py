@@ -7,8 +7,10 @@ from udkjax.equations.laws.partitioning import CoordinatePartitioning
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.native.language.program import UnsupportedError
+from udkjax.native.lowering.own_objects import numbers_of
 from udkjax.native.module.layout import FORMULATION_SETTINGS
-from udkjax.native.parts.formulations import AugmentedCode, FormulationCode, NullSpaceCode
+from udkjax.native.parts.formulations import MASS, AugmentedCode, FormulationCode, NullSpaceCode
+from udkjax.native.parts.own_formulation import OwnFormulationCode, number_names
 from udkjax.native.parts.partitioning import PartitioningCode
 from udkjax.native.pseudoinverses import dense_method
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -17,14 +19,19 @@ from udkjax.native.pseudoinverses.one_of import OneOfCode
 from udkjax.pinv import Auto, Elimination, Pseudoinverse
 
 
-def formulation_code(formulation: Formulation | None) -> FormulationCode | None:
-    """Return the machine code of a formulation; None if it has none."""
+def formulation_code(formulation: Formulation) -> FormulationCode | None:
+    """Return the machine code of a formulation; None if it has none.
+
+    Raises:
+        UnsupportedError: a user-defined formulation uses an operation without machine code.
+    """
     if isinstance(formulation, CoordinatePartitioning):
         return PartitioningCode()
-    if isinstance(formulation, NullSpaceQR | NullSpaceSVD):
-        return NullSpaceCode(isinstance(formulation, NullSpaceSVD))
-    if not isinstance(formulation, Augmented):
-        return None
+    if type(formulation) in (NullSpaceQR, NullSpaceSVD):  # classes derived from these have a `solve` of their own
+        return NullSpaceCode(type(formulation) is NullSpaceSVD)
+    if type(formulation) is not Augmented:
+        is_pointwise = type(formulation).formulate is Augmented.formulate  # it only solves for a at a given state
+        return OwnFormulationCode.of(formulation) if is_pointwise else None
     method = LUCode(relative=True, refuses_singular=True) if formulation.method is None else dense_method(formulation.method)
     return None if method is None or isinstance(method, OneOfCode) else AugmentedCode(method)  # lanes have one method number
 
@@ -51,7 +58,10 @@ class MethodCode(NamedTuple):
 
     @staticmethod
     def formulation_settings(formulation: Any, scales: Scales) -> dict[str, Any]:
-        """Return the settings of a formulation by name: its rank tolerance, and the characteristic mass (kg)."""
+        """Return the settings of a formulation by name: the characteristic mass (kg), its rank tolerance or its own numbers."""
+        if isinstance(formulation_code(formulation), OwnFormulationCode):
+            numbers = [number for x in numbers_of(formulation) for number in x.reshape(-1)]
+            return {MASS: scales.mass, **dict(zip(number_names(len(numbers)), numbers, strict=True))}
         if isinstance(formulation, Augmented):
             tol = None if formulation.method is None else formulation.method.rank_tol
             tol = RANK_TOL**2 if tol is None else tol

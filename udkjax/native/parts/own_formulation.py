@@ -1,0 +1,106 @@
+"""A user-defined formulation (`udkjax.equations.PointwiseFormulation`), written in jax.numpy, as machine code."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import jax.numpy as jnp
+
+from udkjax.native.code import processor
+from udkjax.native.lowering.own_objects import OwnObject, Written, named, traced, written
+from udkjax.native.module.module import Module
+from udkjax.native.parts.formulations import MASS, FormulatedAccelerations, FormulationCode, ScaledAccelerations
+from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, MatrixRow
+
+_TRIAL = (2, 3)  # the numbers of rows and coordinates by which the operations of a formulation are looked at
+_INPUTS = ("mass", "force", "D", "b", "numbers")
+
+
+@dataclass(frozen=True)
+class OwnFormulationCode(FormulationCode):
+    """Accelerations by the lowered text of a formulation, whose arrays are numbers of the run."""
+
+    own: OwnObject
+
+    needs_diagonal_mass = True
+
+    @classmethod
+    def of(cls, formulation: Any) -> "OwnFormulationCode":
+        """Return the machine code of a formulation.
+
+        Raises:
+            UnsupportedError: the message says which operation has none.
+        """
+        with named("formulation", formulation):
+            code = cls(OwnObject.of(formulation))
+            code.written(*_TRIAL)
+        return code
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        return (MASS, *number_names(sum(self.own.sizes)))
+
+    def prepare(self, module: Module) -> FormulatedAccelerations:
+        return OwnAccelerations(module, self)
+
+    def solve(self, mass: Any, F: Any, A: Any, c: Any, numbers: Any) -> Any:
+        """Return the accelerations for the diagonal of M."""
+        n = len(F)
+        a = self.own.filled(numbers).solve(jnp.where(jnp.eye(n, dtype=bool), mass, 0.0), F, A, c)
+        if a.shape != (n,):
+            raise ValueError(f"solve(M, F, A, c) must have the shape {(n,)}, not {a.shape}")
+        return a
+
+    def written(self, m: int, n: int) -> Written:
+        """Return the function for one lane; a member alone runs it, its rows of A filling registers."""
+        return _written(self, m, n, 1, -(-n // processor.lanes()) * processor.lanes())
+
+
+class OwnAccelerations(ScaledAccelerations):
+    """Accelerations from M, F = M a_F, A and c = b + A a_F."""
+
+    def __init__(self, module: Module, code: OwnFormulationCode):
+        m, n, self._code = module.m, module.n, code
+        self._numbers = code.settings[1:]
+        vectors = {"mass": n, "force": n, "free": n, "numbers": len(self._numbers), "scratch": code.written(m, n).size}
+        super().__init__(module, DenseLayout(module, {name: (1, k) for name, k in vectors.items()}, (m, n), "own formulation"))
+
+    def solve(self, d: DenseMatrices) -> MatrixRow:
+        f, x, c, free = d.f, d.row("x"), d.row("b"), d.row("free")
+        free.clear()
+        with f.each(d.n) as i:
+            mass = self.mass(f, i)
+            free.put(i, self._array(f, "terms", i) * self._array(f, "inverse unit", i))
+            d.row("mass").put(i, mass)
+            d.row("force").put(i, mass * free.entry(i))
+        with f.each(d.m) as i:
+            d.row("D", i).clear()
+        for row, column, value in self.each_entry(f):
+            d.row("D", row).put(column, value)
+        with f.each(d.m) as i:
+            c.put(i, self.right(f, i) + d.dot(d.row("D", i), free))
+        for k, name in enumerate(self._numbers):
+            d.row("numbers").put(k, self._array(f, name))
+        function = _written(self._code, d.m, d.n, f.width, d.row("D").registers * d.vector // f.width).function
+        function.call_in(f, *(d.row(name).address for name in (*_INPUTS, "scratch")))
+        with f.each(d.n) as i:
+            x.put(i, d.row("scratch").entry(i) - free.entry(i))
+        return x
+
+
+def number_names(count: int) -> Sequence[str]:
+    """Return the names of the settings that are the numbers of a formulation."""
+    return [f"formulation number {k}" for k in range(count)]
+
+
+@lru_cache(maxsize=64)
+def _traced(code: OwnFormulationCode, m: int, n: int) -> Any:
+    """Return the jaxpr of `solve`."""
+    return traced(code.solve, (n,), (n,), (m, n), (m,), (sum(code.own.sizes),))
+
+
+@lru_cache(maxsize=64)
+def _written(code: OwnFormulationCode, m: int, n: int, width: int, stride: int) -> Written:
+    """Write the function; `stride` is the length of a row of A."""
+    return written(_traced(code, m, n), [(name, stride if name == "D" else None) for name in _INPUTS], width)
