@@ -35,6 +35,19 @@ class LoweredFunction(Function):
             local
         ).replace("@table", f"@{self.name}.table")
 
+    @property
+    def parts(self) -> tuple[list[str], ...]:
+        """The lines of its text."""
+        return self._lines, self._reserved, self.tables, sorted(self.declared)
+
+    @classmethod
+    def of_parts(cls, name: str, pointers: Sequence[str], width: int, parts: Sequence[list[str]]) -> "LoweredFunction":
+        """Return a function with the lines of another one, which calls none."""
+        f = cls(name, pointers, width)
+        f._lines, f._reserved, f.tables, declared = parts
+        f.declared = set(declared)
+        return f
+
     def call_in(self, f: Function, *arguments: Value):
         """Write a call of this function in another, whose module has to define it."""
         f.evaluated |= self.evaluated | {self.name: self}

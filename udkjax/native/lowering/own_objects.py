@@ -1,19 +1,23 @@
 """User-defined objects whose methods, written in jax.numpy, become functions of machine code."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+import json
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
 
+from udkjax.native.code import code_cache
 from udkjax.native.language.ir import DOUBLE
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.arrays import Stored
 from udkjax.native.lowering.lowering import LoweredFunction, Lowering
 from udkjax.native.lowering.rules import lower
+from udkjax.native.lowering.source_key import source_key
 
 
 class NumberOfRun(NamedTuple):
@@ -50,6 +54,11 @@ class OwnObject:
         """The number of elements of each of its arrays."""
         return [int(np.prod(x.shape)) for x in self.leaves if isinstance(x, NumberOfRun)]
 
+    @property
+    def template(self) -> Any:
+        """The object, with the shapes of its arrays instead of these."""
+        return jax.tree.unflatten(self.structure, [x if isinstance(x, NumberOfRun) else x[1] for x in self.leaves])
+
     def filled(self, numbers: jax.Array) -> Any:
         """Return the object with numbers, which are in one vector."""
         parts = iter(np.split(np.arange(sum(self.sizes)), np.cumsum(self.sizes)[:-1]))
@@ -82,6 +91,24 @@ def named(kind: str, x: Any) -> Iterator[None]:
         raise UnsupportedError(f"{name} ({type(error).__name__} while it was traced)") from error
 
 
+class OwnMethod(Protocol):
+    """The code of a method of a user-defined object; equal code has equal text."""
+
+    @property
+    def own(self) -> OwnObject: ...
+
+    def evaluate(self, *inputs: Any) -> Any:
+        """Return the results of the method, as JAX traces it."""
+
+
+class Input(NamedTuple):
+    """An input of a function: its name, its shape, and for a matrix the length of its rows in memory."""
+
+    name: str
+    shape: tuple[int, ...]
+    stride: int | None = None
+
+
 class Written(NamedTuple):
     """A function of machine code, and how many numbers of memory it takes in each lane."""
 
@@ -89,27 +116,37 @@ class Written(NamedTuple):
     size: int
 
 
-def written(closed: Any, inputs: Sequence[tuple[str, int | None]], width: int) -> Written:
-    """Write `name(inputs..., scratch)`, whose outputs are in `scratch` from its beginning, one after another.
+@lru_cache(maxsize=64)
+def written(code: OwnMethod, inputs: tuple[Input, ...], width: int) -> Written:
+    """Return `name(inputs..., scratch)`, whose outputs are in `scratch` from its beginning, one after another.
 
-    Args:
-        closed: The jaxpr.
-        inputs: The name of each input, and for a matrix the length of its rows in memory.
-        width: The number of lanes.
+    The text is stored on disk by the object's source, if that is known: tracing and lowering take 30 ms.
     """
-    f = LoweredFunction("own", [*(name for name, _ in inputs), "scratch"], width)
+    pointers = [*(x.name for x in inputs), "scratch"]
+    key = source_key(type(code).__name__, code.own.template, inputs, width)
+    stored = None if key is None else code_cache.read(f"text-{key}")
+    if stored is not None:
+        name, size, *parts = json.loads(stored)
+        return Written(LoweredFunction.of_parts(name, pointers, width, parts), size)
+    f = LoweredFunction("own", pointers, width)
+    found = Written(f, _write(f, _traced(code, tuple(x.shape for x in inputs)), inputs))
+    f.name = f"own_{hashlib.sha256(f.text().encode()).hexdigest()[:16]}"
+    if key is not None and not f.evaluated:
+        code_cache.write(f"text-{key}", json.dumps((f.name, found.size, *f.parts)).encode())
+    return found
+
+
+@lru_cache(maxsize=64)
+def _traced(code: OwnMethod, shapes: tuple[tuple[int, ...], ...]) -> Any:
+    return jax.make_jaxpr(code.evaluate)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
+
+
+def _write(f: LoweredFunction, closed: Any, inputs: Sequence[Input]) -> int:
+    """Write a jaxpr; return the size of its memory."""
     to = Lowering(f, f.given["scratch"], lower)
-    given = [
-        Stored(f.given[name], v.aval.shape, DOUBLE, True, strides=None if stride is None else (stride, 1))
-        for (name, stride), v in zip(inputs, closed.jaxpr.invars, strict=True)
-    ]
+    strides = (None if x.stride is None else (x.stride, 1) for x in inputs)
+    given = [Stored(f.given[x.name], x.shape, DOUBLE, True, strides=y) for x, y in zip(inputs, strides, strict=True)]
     outputs = [to.new(v.aval.shape, DOUBLE, True) for v in closed.jaxpr.outvars]
     for output, found in zip(outputs, to.closed(closed, given), strict=True):
         to.fill(output, found)
-    f.name = f"own_{hashlib.sha256(f.text().encode()).hexdigest()[:16]}"
-    return Written(f, to.size)
-
-
-def traced(function: Callable[..., Any], *shapes: tuple[int, ...]) -> Any:
-    """Return the jaxpr of a function of arrays of numbers."""
-    return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
+    return to.size

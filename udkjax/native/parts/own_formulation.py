@@ -2,19 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import jax.numpy as jnp
 
 from udkjax.native.code import processor
-from udkjax.native.lowering.own_objects import OwnObject, Written, named, traced, written
+from udkjax.native.lowering.own_objects import Input, OwnObject, Written, named, written
 from udkjax.native.module.module import Module
 from udkjax.native.parts.formulations import MASS, FormulatedAccelerations, FormulationCode, ScaledAccelerations
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, MatrixRow
 
 _TRIAL = (2, 3)  # the numbers of rows and coordinates by which the operations of a formulation are looked at
-_INPUTS = ("mass", "force", "D", "b", "numbers")
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class OwnFormulationCode(FormulationCode):
     def prepare(self, module: Module) -> FormulatedAccelerations:
         return OwnAccelerations(module, self)
 
-    def solve(self, mass: Any, F: Any, A: Any, c: Any, numbers: Any) -> Any:
+    def evaluate(self, mass: Any, F: Any, A: Any, c: Any, numbers: Any) -> Any:
         """Return the accelerations for the diagonal of M."""
         n = len(F)
         a = self.own.filled(numbers).solve(jnp.where(jnp.eye(n, dtype=bool), mass, 0.0), F, A, c)
@@ -52,9 +50,12 @@ class OwnFormulationCode(FormulationCode):
             raise ValueError(f"solve(M, F, A, c) must have the shape {(n,)}, not {a.shape}")
         return a
 
-    def written(self, m: int, n: int) -> Written:
-        """Return the function for one lane; a member alone runs it, its rows of A filling registers."""
-        return _written(self, m, n, 1, -(-n // processor.lanes()) * processor.lanes())
+    def written(self, m: int, n: int, width: int = 1, stride: int | None = None) -> Written:
+        """Return the function, with the length of the rows of A in memory; by default that of a single member."""
+        stride = -(-n // processor.lanes()) * processor.lanes() if stride is None else stride
+        shapes = {"mass": (n,), "force": (n,), "D": (m, n), "b": (m,), "numbers": (sum(self.own.sizes),)}
+        inputs = [Input(name, shape, stride if name == "D" else None) for name, shape in shapes.items()]
+        return written(self, tuple(inputs), width)
 
 
 class OwnAccelerations(ScaledAccelerations):
@@ -82,8 +83,8 @@ class OwnAccelerations(ScaledAccelerations):
             c.put(i, self.right(f, i) + d.dot(d.row("D", i), free))
         for k, name in enumerate(self._numbers):
             d.row("numbers").put(k, self._array(f, name))
-        function = _written(self._code, d.m, d.n, f.width, d.row("D").registers * d.vector // f.width).function
-        function.call_in(f, *(d.row(name).address for name in (*_INPUTS, "scratch")))
+        function = self._code.written(d.m, d.n, f.width, d.row("D").registers * d.vector // f.width).function
+        function.call_in(f, *(d.row(name).address for name in ("mass", "force", "D", "b", "numbers", "scratch")))
         with f.each(d.n) as i:
             x.put(i, d.row("scratch").entry(i) - free.entry(i))
         return x
@@ -92,15 +93,3 @@ class OwnAccelerations(ScaledAccelerations):
 def number_names(count: int) -> Sequence[str]:
     """Return the names of the settings that are the numbers of a formulation."""
     return [f"formulation number {k}" for k in range(count)]
-
-
-@lru_cache(maxsize=64)
-def _traced(code: OwnFormulationCode, m: int, n: int) -> Any:
-    """Return the jaxpr of `solve`."""
-    return traced(code.solve, (n,), (n,), (m, n), (m,), (sum(code.own.sizes),))
-
-
-@lru_cache(maxsize=64)
-def _written(code: OwnFormulationCode, m: int, n: int, width: int, stride: int) -> Written:
-    """Write the function; `stride` is the length of a row of A."""
-    return written(_traced(code, m, n), [(name, stride if name == "D" else None) for name in _INPUTS], width)

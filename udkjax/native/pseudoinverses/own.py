@@ -1,7 +1,6 @@
 """A user-defined pseudoinverse, written in jax.numpy (`udkjax.pinv.MatrixPseudoinverse`), as machine code."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import numpy as np
 from udkjax import pinv
 from udkjax.native.code import processor
 from udkjax.native.language.program import UnsupportedError
-from udkjax.native.lowering.own_objects import OwnObject, Written, named, traced, written
+from udkjax.native.lowering.own_objects import Input, OwnObject, Written, named, written
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
 _TRIAL = (2, 3)  # the shape of a matrix by which the operations of a method are looked at
@@ -37,24 +36,25 @@ class OwnCode(DenseMethod):
             code.written(*_TRIAL)
         return code
 
-    def factors(self, D: Any, tol: Any) -> Any:
+    def evaluate(self, D: Any, tol: Any) -> Any:
         """Return D^+ and the rank."""
         plus, rank = self.own.filled(tol).factor(D)
         if plus.shape != D.shape[::-1]:
             raise ValueError(f"matrix(D) must have the shape {D.shape[::-1]}, not {plus.shape}")
         return plus, rank
 
-    def written(self, m: int, n: int) -> Written:
-        """Return the function for one lane; a member alone runs it, its rows of D filling registers."""
-        return _written(self, m, n, 1, -(-n // processor.lanes()) * processor.lanes())
+    def written(self, m: int, n: int, width: int = 1, stride: int | None = None) -> Written:
+        """Return the function of D, whose rows have a length in memory, and the tolerance; by default that of a single member."""
+        stride = -(-n // processor.lanes()) * processor.lanes() if stride is None else stride
+        return written(self, (Input("D", (m, n), stride), Input("tol", (1,))), width)
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
         return {"plus": (n, m), "rank": (1, 1), "tol": (1, 1), "scratch": (1, self.written(m, n).size)}
 
     def factor(self, d: DenseMatrices):
         f, scratch = d.f, d.row("scratch")
-        function = _written(self, d.m, d.n, f.width, d.row("D").registers * d.vector // f.width).function
         d.row("tol").put(0, d.tol)
+        function = self.written(d.m, d.n, f.width, d.row("D").registers * d.vector // f.width).function
         function.call_in(f, d.row("D").address, d.row("tol").address, scratch.address)
         with f.each(d.n) as i:  # the function stores rows of D^+ without gaps; padded rows are filled here
             row = d.row("plus", i)
@@ -74,15 +74,3 @@ class OwnCode(DenseMethod):
         b.clear()
         with d.f.each(d.n) as i:
             d.axpy(x.entry(i), d.row("plus", i), b)
-
-
-@lru_cache(maxsize=64)
-def _traced(code: OwnCode, m: int, n: int) -> Any:
-    """Return the jaxpr of `factors`."""
-    return traced(code.factors, (m, n), (1,))
-
-
-@lru_cache(maxsize=64)
-def _written(code: OwnCode, m: int, n: int, width: int, stride: int) -> Written:
-    """Write the function of D and the tolerance; `stride` is the length of a row of D."""
-    return written(_traced(code, m, n), (("D", stride), ("tol", None)), width)
