@@ -138,6 +138,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "tolerance": "tolerance of the fastest velocity, in its unit",
     "rank": "rank of D found by the fallback",
     "highest_rank": "largest rank that a dense method has found in the attempted step",
+    "moves": "whether the state moves so fast that it passes singular configurations unturned",
     "wanted": "whether a rank-revealing method is requested",
     "iterating": "whether Newton's method continues",
     "violated": "largest violation of Psi at an output, over the row's scale",

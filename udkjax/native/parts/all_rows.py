@@ -13,7 +13,7 @@ from udkjax.native.module.parts import FallbackPart
 from udkjax.native.module.programs import PROGRAMS
 from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.parts.fallback import RankRevealing
-from udkjax.native.parts.manifold import with_threshold
+from udkjax.native.parts.manifold import is_moving, with_threshold
 from udkjax.native.pseudoinverses.dense import MatrixRow
 from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
@@ -98,7 +98,10 @@ class BySingularValues(RankRevealing):
         for x, (start, sign, right, place) in self._solutions.items():
             if x == "q" and splits:
                 rows.factor(f, of_positions=True)
-            put(f, x, rows.solve(f, right, place), start, sign)
+            change = rows.solve(f, right, place)
+            if x == "a" and module.plan.steps and not couples:
+                self._hold_left_out(f, rows)
+            put(f, x, change, start, sign)
         f = module.new_function("fallback_tangent_part_of_lane", of_lane, 1)
         rows.factor(f, of_positions=True)
         for x in ("dq", "dv"):
@@ -116,6 +119,33 @@ class BySingularValues(RankRevealing):
             new = part if couples else rows.array(f, "fallback dv", i) - part
             rows.put(f, "change" if couples else "fallback dv", i, new)
 
+    def _hold_left_out(self, f: Function, rows: WeightedRows):
+        """Take the loads from the accelerations along left out rows, of a mechanism that moves, in the row `x`.
+
+        It passes the singular configuration within so short a time that its velocity changes little. But no row opposes loads
+        along those that are left out: loads as large as that of a stiff damper would turn it, and the motion change its branch.
+        Directions of rows that are dependent everywhere are rounding errors.
+        """
+        d, squares = rows.matrices(f), rows.matrices(f).row("lengths")
+
+        def along(row: MatrixRow) -> Value:
+            total = f.variable(0.0)
+            with f.each(self._in.n) as i:
+                root = rows.array(f, "root", i)
+                load = rows.array(f, "terms", i) / f.select(root > 0.0, root, 1.0)
+                total.value = f.fma(row.entry(i), load, total.value)
+            return total.value
+
+        longest = f.variable(0.0)
+        with f.each(d.steps) as i:
+            longest.value = f.max(d.dot(d.row("D", i), d.row("D", i)), longest.value)
+        with f.each(d.steps) as i:
+            row = d.row("D", i)
+            square = d.dot(row, row)
+            is_held = squares.entry(i).is_(0.0) & (square > longest.value * ROUNDING_PIVOT) & (rows.array(f, "moves", 0) > 0.5)
+            with f.if_(f.any_of(is_held)):
+                d.axpy(-along(row) / square, row, d.row("x"))
+
     def _write_functions(self):
         """Write the functions of all lanes, which call those of one lane."""
         module, couples = self._in, self._in.code.couples
@@ -132,6 +162,8 @@ class BySingularValues(RankRevealing):
 
         f, s = module.function("fallback", [(POINTER, "work"), (POINTER, "out")])
         self.with_loads(f, lambda: module.invoke(f, "rows_and_loads"))
+        if module.plan.steps:
+            s.moves = f.select(is_moving(module, f, s), f.const(1.0, DOUBLE, f.width), 0.0)
         each_lane(f, s, "fallback")
         if couples:
             for x, (start, *_) in self._solutions.items():

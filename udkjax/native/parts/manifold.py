@@ -60,6 +60,16 @@ def with_threshold(f: Function, place: int | None, threshold: Value, do: Callabl
     f.store(before, f.given["work"], place * f.width, f.width)
 
 
+def is_moving(module: Module, f: Function, s: Lane) -> Value:
+    """Return whether the state moves so fast that natural loads turn it little within a singular configuration.
+
+    A mechanism with the velocity v is where rows are left out for a time of their threshold over v, in natural units: loads of
+    order one change the velocity by as much, which is less than itself above the root of the threshold.
+    """
+    fastest = module.largest(f, lambda r: [f.abs(module.vector(f, "state v", r)) * module.vector(f, "inverse unit", r)]) / s.omega
+    return fastest * fastest > s.fallback_tol
+
+
 def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value:
     """Return the tolerance of the fastest velocity, in its unit."""
     fastest = module.largest(f, lambda r: [f.abs(module.vector(f, name, r)) * module.vector(f, "inverse unit", r)])
