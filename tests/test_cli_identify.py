@@ -52,6 +52,24 @@ def test_what_the_data_cannot_tell_is_said_and_all_is_written(tmp_path, capsys, 
     assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_it_draws_from_the_posterior_and_continues(tmp_path, capsys, data):
+    pytest.importorskip("blackjax")
+    out, folder = tmp_path / "found", tmp_path / "posterior"
+    arguments = ["identify", PENDULUM, data, "--parameters", INERTIA, "--ignore", "remark", "--starts", "0", "--tol", "1e-8"]
+    texts = []
+    for _ in range(2):
+        assert udkjax(*arguments, "--out", out, "--posterior", folder, "--quiet") == 0
+        texts.append(capsys.readouterr().out.partition("posterior: ")[2])
+    assert "8 chains of 1000 draws" in texts[0] and "the chains agree" in texts[0] and texts[0] == texts[1]
+    found = json.loads((folder / "summary.json").read_text())["posterior"]
+    estimate = json.loads((out / "estimate.json").read_text())["parameters"][INERTIA]
+    row = found["parameters"][INERTIA]
+    assert found["converged"] and row["units"] == "kg m2" and row["rhat"] < 1.01
+    assert abs(row["mean"] - estimate["value"]) < 0.3 * estimate["standard_error"]
+    with xarray.open_dataset(folder / "draws.nc", group="posterior", engine="h5netcdf") as draws:
+        assert draws[INERTIA].shape == (8, 1000) and draws[INERTIA].attrs["units"] == "kg m2"
+
+
 @pytest.mark.slow
 def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
     out = tmp_path / "found"

@@ -8,6 +8,8 @@ from types import TracebackType
 EXTRAS = {
     "PIL": "plot",
     "anywidget": "notebook",
+    "arviz": "bayes",
+    "blackjax": "bayes",
     "dask": "dask",
     "distributed": "dask",
     "ezdxf": "dxf",
@@ -26,6 +28,7 @@ EXTRAS = {
 # Extras that others bring along.
 BRINGS = {
     "identify": ("io",),
+    "bayes": ("io", "identify"),
     "cli": ("io", "plot", "identify"),
     "dask": ("io",),
     "notebook": ("io", "plot"),
@@ -36,6 +39,7 @@ BRINGS = {
 # The packages that write a pose or a film, by the suffix of its file.
 WRITERS = {".png": ("PIL",), ".gif": ("PIL",), ".mp4": ("PIL", "imageio_ffmpeg"), ".dxf": ("ezdxf",)}
 NETCDF = "xarray", "h5netcdf"  # the packages that read and write runs
+BAYES = "blackjax", "arviz"  # the packages that draw from posteriors and judge the draws
 STUDIO = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
 
 

@@ -124,6 +124,7 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "check_gradients": {"": studies.check_gradients, "names": studies.check_gradients_names},
     "design_experiment": {"": studies.design_experiment},
     "inference": {"": studies.inference},
+    "sample": {"": studies.sample},
     "sweep": {"": studies.sweep, "names": studies.sweep_names},
     "design": {"": studies.design},
     "design_all": {"": studies.design_all},

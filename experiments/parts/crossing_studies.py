@@ -101,6 +101,21 @@ def inference(case: Case) -> str:
     return "likelihood of a run"
 
 
+def sample(case: Case) -> str:
+    """Draws around a number with a normal prior that is much narrower than the likelihood of a record with large noise."""
+    name, values = case.number, next(iter(channel(case).values()))
+    x0, noise = float(np.asarray(case.model.parameters()[name])), 1e2 * float(np.ptp(values)) + 1.0
+    if x0 == 0.0:
+        return "the number is zero"
+    priors = {name: (x0, 1e-2 * abs(x0))}
+    problem = udk.inference(case.model, {"time": TS, **channel(case)}, [name], noise=noise, priors=priors, tol=EXACT["rtol"])
+    found = udk.sample(problem, chains=4, draws=50, warmup=50, progress=False)
+    claim(np.isfinite(found.log_density).all(), "draws without density")
+    error = abs(found.draws[name].mean() / x0 - 1.0)
+    claim(error < 1e-2, f"the mean is off by {error:.2g}")
+    return "mean of the prior"
+
+
 def sweep(case: Case) -> str:
     name = case.number
     x0 = np.asarray(case.model.parameters()[name])

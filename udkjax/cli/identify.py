@@ -3,16 +3,16 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from udkjax.cli.common import Json, Quiet, Scene, fail, load, show
 from udkjax.cli.datasets import check_folder
-from udkjax.extras import NETCDF, require
+from udkjax.extras import BAYES, NETCDF, require
 
 if TYPE_CHECKING:
-    from udkjax import Estimate
+    from udkjax import Estimate, Posterior
     from udkjax.study.identify.answers.profile_likelihood import ProfileLikelihood
 
 # The names in udkjax.study.identify, which cannot be imported here, since it imports JAX.
@@ -49,6 +49,7 @@ def identify(
     tol: float = 1e-11,
     seed: int = 0,
     profile: Names = (),
+    posterior: Path | None = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -77,10 +78,13 @@ def identify(
         tol: tolerance of the integration.
         seed: seed of the further first guesses.
         profile: parameters for which to compute confidence intervals by profile likelihood, which does not assume a linear model.
+        posterior: folder for draws from the posterior density, as draws.nc, and their summary, as summary.json. An interrupted
+            command continues from the draws that are there.
         json: write the results as JSON, as in estimate.json.
     """
-    check_folder(out)
-    require(*NETCDF, "matplotlib")
+    for folder in filter(None, (out, posterior)):
+        check_folder(folder)
+    require(*NETCDF, "matplotlib", *(BAYES if posterior else ()))
     mech, text = load(scene)
 
     import udkjax as udk
@@ -106,9 +110,26 @@ def identify(
     }
     files = _write(estimate, profiles, results, out)
     lines = [str(estimate), *(likelihood.text for likelihood in profiles), f"wrote {', '.join(files)} to {out}"]
+    if posterior is not None:
+        drawn = udk.sample(estimate, seed=seed, out=posterior, progress=False if quiet else None)
+        results |= _write_draws(drawn, posterior)
+        lines += [str(drawn), f"wrote draws.nc and summary.json to {posterior}"]
     show(results | {"files": [out / name for name in files]}, "\n".join(lines), json)
     if not estimate.success:
         fail("the fit has not converged" if not estimate.converged else "the measurements do not determine every parameter")
+
+
+def _write_draws(drawn: "Posterior", folder: Path) -> Mapping[str, Any]:
+    """Write draws and their summary, and return the summary."""
+    import json
+
+    from udkjax.study.report import plain
+
+    drawn.to_arviz(pointwise=False).to_netcdf(str(folder / "draws.nc"), engine="h5netcdf")
+    rows = {name: row._asdict() for name, row in drawn.summary().items()}
+    found = {"posterior": {"parameters": rows, "converged": drawn.converged, "message": drawn.message}}
+    (folder / "summary.json").write_text(json.dumps(plain(found), indent=1) + "\n", encoding="utf-8")
+    return found
 
 
 def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], results: Mapping[str, object], out: Path) -> list[str]:

@@ -105,6 +105,15 @@ def test_sums_of_many_residuals_are_those_of_numpy(samples, members):
     assert_allclose(jax.jit(jax.vmap(lambda x: jnp.sum(problem.log_likelihoods(x))))(x), each.sum(1), rtol=1e-10)
 
 
+def test_records_with_different_conditions_go_in_lanes():
+    stiff = {"force.spring.stiffness": 5.0}
+    both = udk.inference(pendulum(0.4), [record(ts=TS[:9]), record(ts=TS[:9], conditions=stiff)], NAMES[:1])
+    each = [udk.inference(m, record(ts=TS[:9]), NAMES[:1]) for m in (pendulum(0.4), pendulum(0.4).with_parameters(stiff))]
+    x = points(both)
+    parts = [np.asarray(problem.log_densities(x) - jax.vmap(problem.log_prior)(x)) for problem in each]
+    assert_allclose(both.log_densities(x) - jax.vmap(both.log_prior)(x), np.sum(parts, axis=0), rtol=1e-6)
+
+
 def test_steps_are_bounded_by_those_at_the_start(problem):
     runs = np.arange(2)
     taken = problem.fit_problem.predictor(problem.fit_problem.members(np.zeros((1, problem.fit_problem.K)), runs), problem.tol)

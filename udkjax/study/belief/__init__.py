@@ -1,7 +1,12 @@
-"""Posteriors of parameters: from a mechanism, records and priors to a density.
+"""Posteriors of parameters: from a mechanism, records and priors to a density, and to draws from it.
 
 inference   the public function that returns the density
+chains      Hamiltonian Monte Carlo: chunks of draws of all chains, and their tuning
+sampling    the public function that draws, `sample`, with its store
+posterior   the draws, their summary, and the data for ArviZ
 """
 
 from udkjax.study.belief.inference import inference as inference
+from udkjax.study.belief.posterior import Posterior as Posterior
+from udkjax.study.belief.sampling import sample as sample
 from udkjax.study.identify.density.log_density import InferenceProblem as InferenceProblem

@@ -31,11 +31,11 @@ STATS = ("steps", "accepted", "rejected", "implicit", "right_hand_sides", "proje
 def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
     """Return all inputs that determine the results; plans with equal fingerprints have the same results."""
     return {
-        **_mechanism(plan.mechanism, math.prod(plan.state_shape_of(plan.groups[0]))),
+        **describe_model(plan.mechanism, math.prod(plan.state_shape_of(plan.groups[0]))),
         "axes": {dimension.name: {c.name: _axis(plan, c) for c in dimension.columns} for dimension in plan.dimensions},
         "design": repr(plan.design) if plan.design else None,
-        "ts": _value(plan.ts),
-        "settings": {name: _value(value) for name, value in plan.settings.items()},
+        "ts": describe_value(plan.ts),
+        "settings": {name: describe_value(value) for name, value in plan.settings.items()},
         "measures": {f"{k} {measure.name}": _measure(plan, measure) for k, measure in enumerate(plan.measures, 1)},
         "derivatives": list(plan.derivatives),
         **({"loads of runs with events": "of the constraints that hold"} if "events" in plan.settings else {}),
@@ -46,23 +46,26 @@ def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
 def _axis(plan: SweepPlan, column: AxisColumn) -> dict[str, JsonValue]:
     of: JsonValue = None if callable(column.of) else column.of
     if callable(column.of):
-        of = _function(column.of, plan.mechanism, np.zeros(column.numbers.shape[1:]))
+        of = describe_function(column.of, plan.mechanism, np.zeros(column.numbers.shape[1:]))
     n = math.prod(plan.state_shape_of(plan.groups[0]))
 
     def described(x: AxisChoice) -> JsonValue:
-        return _mechanism(x, n) if isinstance(x, Model) else _value(x)
+        return describe_model(x, n) if isinstance(x, Model) else describe_value(x)
 
-    return {"of": of, "values": [described(value) for value in column.values] if column.is_choice else _value(column.values)}
+    return {
+        "of": of,
+        "values": [described(value) for value in column.values] if column.is_choice else describe_value(column.values),
+    }
 
 
 def _measure(plan: SweepPlan, measure: Measure) -> dict[str, JsonValue]:
     found: dict[str, JsonValue] = {"variables": list(measure.labels)}
     if measure.function is not None:
-        found["function"] = _function(measure.function, plan.mechanism, _solution(plan))
+        found["function"] = describe_function(measure.function, plan.mechanism, _solution(plan))
     if callable(measure.reference):
-        found["reference"] = _function(measure.reference, plan.mechanism, plan.ts)
+        found["reference"] = describe_function(measure.reference, plan.mechanism, plan.ts)
     elif measure.reference is not None:
-        found["reference"] = _value(measure.reference)
+        found["reference"] = describe_value(measure.reference)
     return found
 
 
@@ -78,7 +81,7 @@ def _solution(plan: SweepPlan) -> Solution:
     return Solution(plan.ts, states, states, count, number, stats, number, number, model.body_names, ())  # pyright: ignore[reportArgumentType]
 
 
-def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
+def describe_function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
     """Describe a function by its name, and digests of its traced operations and constants."""
     program = eqx.filter_make_jaxpr(function)(*arguments)[0]
     text = _without_addresses(str(program.jaxpr))
@@ -87,17 +90,22 @@ def _function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
     return {"name": name, "operations": digest(text.encode()), "constants": digest(constants)}
 
 
-def _mechanism(mechanism: Model, n: int) -> dict[str, JsonValue]:
+def describe_model(mechanism: Model, n: int) -> dict[str, JsonValue]:
+    """Describe a model with n coordinates by its text and numbers."""
     if not mechanism.has_bodies:
         traced = mechanism.traced(n)
         text = traced.functions.text if traced.has_programs else repr(mechanism)
-        numbers = [_value(x) for x in getattr(traced, "numbers", jax.tree.leaves(eqx.filter(mechanism, eqx.is_array)))]
-        return {"functions": digest(text.encode()), "numbers": numbers, "guess": [_value(mechanism.q0), _value(mechanism.v0)]}
-    numbers = {name: _value(x) for name, x in mechanism.parameters().items()}
+        numbers = [describe_value(x) for x in getattr(traced, "numbers", jax.tree.leaves(eqx.filter(mechanism, eqx.is_array)))]
+        return {
+            "functions": digest(text.encode()),
+            "numbers": numbers,
+            "guess": [describe_value(mechanism.q0), describe_value(mechanism.v0)],
+        }
+    numbers = {name: describe_value(x) for name, x in mechanism.parameters().items()}
     return {"scene": scene_text(mechanism), "parameters": numbers}
 
 
-def _value(value: PyTree) -> JsonValue:
+def describe_value(value: PyTree) -> JsonValue:
     """Describe a number, an array or a choice."""
     if value is None or isinstance(value, str | bool | int):
         return value
@@ -117,7 +125,7 @@ def _value(value: PyTree) -> JsonValue:
         "type": type(value).__name__,
         "digest": digest(_without_addresses(str(jax.tree.structure(value))).encode()),
         **{
-            jax.tree_util.keystr(path).lstrip("."): _value(x) if eqx.is_array(x) else _without_addresses(repr(x))
+            jax.tree_util.keystr(path).lstrip("."): describe_value(x) if eqx.is_array(x) else _without_addresses(repr(x))
             for path, x in leaves
         },
     }

@@ -1,4 +1,4 @@
-"""The finished chunks of a sweep on disk, which survive a crash and are not computed again.
+"""The finished chunks of a sweep, or of chains of samples, on disk, which survive a crash and are not computed again.
 
 A folder contains `sweep.json`, the fingerprint of the sweep, and `chunks/`, with one file per chunk. A file gets its name only
 when it is completely on the disk. The name ends with digests of the sweep and of the file; they identify chunks even if
@@ -22,7 +22,7 @@ from udkjax.wording import abbreviate
 
 FORMAT = 2  # format of the folder; a folder with another format counts as another sweep
 UNFINISHED_SUFFIX = ".unfinished"  # suffix of files that are not complete
-MANIFEST, CHUNKS, LOCK, WRITER = "sweep.json", "chunks", "lock", "writer"
+CHUNKS, LOCK, WRITER = "chunks", "lock", "writer"
 MEMBERS, STORED_PREFIX = "members", "stored/"  # names in a file: that of the members' indices, and the prefix of stored variables
 ADVICE = "choose another folder, or remove this one to start over"
 
@@ -58,14 +58,14 @@ class FolderStore:
     """The finished chunks of a sweep in a folder. Only one process at a time may write to it.
 
     `fingerprint` contains all inputs that determine the results. A folder with another sweep is refused, with a list of the
-    differences.
+    differences. `what` is the kind of the computation, which messages name.
 
     Raises:
         StoreError: the folder cannot be used.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, JsonValue]):
-        self.folder = Path(folder)
+    def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, JsonValue], what: str = "sweep"):
+        self.folder, self.what = Path(folder), what
         try:
             (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
             self._lock = FileLock(self.folder / LOCK, timeout=0)
@@ -93,7 +93,7 @@ class FolderStore:
         self._lock.release()
 
     def write(self, chunk: Chunk, data: Variables) -> None:
-        """Write the variables of a chunk atomically: arrays by name, whose first axis is the chunk's members."""
+        """Write the variables of a chunk atomically: arrays by name; in a sweep, their first axis is the chunk's members."""
         stream = io.BytesIO()
         np.savez(stream, allow_pickle=False, **{MEMBERS: chunk.members}, **{STORED_PREFIX + name: x for name, x in data.items()})
         content = stream.getvalue()
@@ -107,7 +107,7 @@ class FolderStore:
             except OSError as error:
                 raise StoreError(f"cannot read {file}: {error.strerror or error}; make it readable, or remove it") from error
             if not file.stem.endswith(digest(content)):
-                warnings.warn(f"{file} is damaged: its members are computed again", stacklevel=2)
+                warnings.warn(f"{file} is damaged: it is computed again", stacklevel=2)
                 file.unlink()
                 continue
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
@@ -118,7 +118,7 @@ class FolderStore:
         """Write the fingerprint of the sweep, or compare it with an existing one."""
         for file in (*self.folder.glob(f"*{UNFINISHED_SUFFIX}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED_SUFFIX}")):
             file.unlink(missing_ok=True)  # file of a process that was killed while writing
-        manifest = self.folder / MANIFEST
+        manifest = self.folder / f"{self.what}.json"
         try:
             begun = json.loads(manifest.read_text(encoding="utf-8"))
         except (FileNotFoundError, ValueError, RecursionError):
@@ -126,14 +126,14 @@ class FolderStore:
         if isinstance(begun, dict):
             if found := differences(begun, sweep):
                 lines = "\n  ".join(found)
-                raise StoreError(f"{self.folder} contains another sweep: {ADVICE}. Differences:\n  {lines}")
+                raise StoreError(f"{self.folder} contains another {self.what}: {ADVICE}. Differences:\n  {lines}")
             return
         if others := [file.name for file in self._files() if f"-{self._sweep}-" not in file.name]:
             state = "damaged" if manifest.exists() else "missing"
             raise StoreError(
-                f"{manifest} is {state}, and the folder contains chunks of another sweep ({abbreviate(others)}): {ADVICE}"
+                f"{manifest} is {state}, and the folder contains chunks of another {self.what} ({abbreviate(others)}): {ADVICE}"
             )
-        self._write(MANIFEST, json.dumps(sweep, indent=1).encode())
+        self._write(manifest.name, json.dumps(sweep, indent=1).encode())
 
     def _writer(self) -> str:
         """Return the name of the process that has the lock."""
@@ -150,13 +150,15 @@ class FolderStore:
             write_whole(self.folder / name, content)
         except OSError as error:
             valid = f"the {len(self._files())} finished chunks in {self.folder} stay valid"
-            advice = "once the folder can be written to, run the same sweep again to continue"
+            advice = f"once the folder can be written to, run the same {self.what} again to continue"
             raise StoreError(f"cannot write {name}: {error.strerror or error}; {valid}; {advice}") from error
 
 
-def open_store(out: str | os.PathLike[str] | None, fingerprint: Mapping[str, JsonValue]) -> MemoryStore | FolderStore:
+def open_store(
+    out: str | os.PathLike[str] | None, fingerprint: Mapping[str, JsonValue], what: str = "sweep"
+) -> MemoryStore | FolderStore:
     """Return the store of finished chunks: the folder `out`, or memory if it is None."""
-    return MemoryStore() if out is None else FolderStore(out, fingerprint)
+    return MemoryStore() if out is None else FolderStore(out, fingerprint, what)
 
 
 def read_variable(store: MemoryStore | FolderStore, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -188,20 +188,21 @@ class Estimate:
         Raises:
             IdentificationError: the records were fitted with another loss, or in pieces; or something is undetermined.
         """
-        return approximate(self._posterior, self._unconstrained, int(seed))
+        x = np.append(self.z, np.zeros(len(self.posterior.names) - len(self.z)))  # the noise is that of the residuals
+        return approximate(self.posterior, x, int(seed))
 
     @cached_property
-    def _posterior(self) -> InferenceProblem:
+    def posterior(self) -> InferenceProblem:
+        """The posterior density of the parameters, as `udkjax.inference` returns it, with the fit's priors.
+
+        Raises:
+            IdentificationError: the records were fitted with another loss, or in pieces.
+        """
         if self.loss is not squares or self.problem.constrained:
             what = "the records were fitted in pieces" if self.problem.constrained else "the loss is no log density"
-            raise IdentificationError([f"laplace: {what}: give the records and parameters to udkjax.inference"])
+            raise IdentificationError([f"posterior: {what}: give the records and parameters to udkjax.inference"])
         tol = max(self.tol[0], LOOSE_TOL), max(self.tol[1], LOOSE_TOL)
         return InferenceProblem(self.problem, {}, tol, self.z)
-
-    @property
-    def _unconstrained(self) -> Float[np.ndarray, "K"]:
-        """The unconstrained vector of the estimate: z, and the noise of the residuals."""
-        return np.append(self.z, np.zeros(len(self._posterior.names) - len(self.z)))
 
     # --- as a table
 

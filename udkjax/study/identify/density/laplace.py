@@ -16,11 +16,13 @@ from udkjax.study.identify.density.log_density import InferenceProblem
 from udkjax.study.identify.problem.residuals import reduce_groups
 from udkjax.study.identify.problem.unknowns import INVISIBLE_RATIO
 from udkjax.study.identify.records.records import IdentificationError
+from udkjax.study.noise import NOISE_FLOOR
 from udkjax.wording import join_names
 
 DRAWS = 1024  # number of importance weights; from a quarter of these, k varies by 0.2 from seed to seed
 TRUSTED_EXPONENT = 1.0 - 1.0 / np.log10(DRAWS)  # largest k with which so many importance weights have a reliable mean
 STEPS, HALVINGS, STANDING = 40, 12, 1e-6  # of Newton's method: largest numbers, and the step in standard deviations at its end
+FARTHEST_STEP = 2.0  # largest step of an unknown, which is dimensionless: a factor of 7 for a positive number
 VISIBLE_PART = 0.1  # component of an undetermined direction, relative to the largest, from which an unknown is named
 
 
@@ -35,6 +37,8 @@ class Laplace:
         k: exponent of the largest importance weights; the approximation may be trusted up to 0.67.
         log_evidence: logarithm of the integral of the density, by importance sampling.
         log_evidence_error: its standard error.
+        trials: vectors (S, K) drawn from the approximation.
+        log_weights: logarithms (S,) of their importance weights, the ratios of the density to the approximation.
     """
 
     problem: InferenceProblem
@@ -43,6 +47,8 @@ class Laplace:
     k: float
     log_evidence: float
     log_evidence_error: float
+    trials: Float[np.ndarray, "S K"]
+    log_weights: Float[np.ndarray, "S"]
 
     @property
     def covariance(self) -> Float[np.ndarray, "K K"]:
@@ -72,6 +78,11 @@ class Laplace:
         """Return unconstrained vectors drawn from the approximation."""
         return self.mode + np.random.default_rng(int(seed)).standard_normal((count, len(self.mode))) @ self.root.T
 
+    def starts(self, count: int, seed: int = 0) -> Float[np.ndarray, "count K"]:
+        """Return different vectors that are nearly draws of the density itself, by resampling the trials with their weights."""
+        order = np.argsort(-(self.log_weights + np.random.default_rng(int(seed)).gumbel(size=len(self.log_weights))))
+        return np.resize(self.trials[order[: min(count, np.isfinite(self.log_weights).sum())]], (count, len(self.mode)))
+
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name}: {value:.6g} +- {error:.2g}" for name, (value, error) in self.parameters.items())
         return f"Laplace({numbers}; {self.message})"
@@ -81,7 +92,8 @@ def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int 
     """Find the mode of a density from a vector near it, and approximate the density there.
 
     Raises:
-        IdentificationError: neither the records nor a prior determine some unknowns, or the density is zero at the mode.
+        IdentificationError: neither the records nor a prior determine some unknowns, records without given noise fit exactly, or
+            the density is zero at the mode.
     """
     x = np.asarray(x, float)
     value, gradient, curvature = expand(problem, x)
@@ -89,6 +101,7 @@ def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int 
         step, size = _newton_step(gradient, curvature)
         if size <= STANDING:
             break
+        step *= min(1.0, FARTHEST_STEP / np.abs(step).max())
         for halving in range(HALVINGS):
             trial = expand(problem, x + 0.5**halving * step)
             if trial[0] >= value:
@@ -96,9 +109,11 @@ def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int 
                 break
         else:
             break
+    _require_noise(problem, x)
     root = _root(problem, curvature)
     normal = np.random.default_rng(int(seed)).standard_normal((DRAWS, len(x)))
-    densities = np.asarray(problem.log_densities(np.concatenate([x[None], x + normal @ root.T])))
+    trials = x + normal @ root.T
+    densities = np.asarray(problem.log_densities(np.concatenate([x[None], trials])))
     if not np.isfinite(densities[0]):
         cure = "give a prior or bounds that keep the numbers where the mechanism runs, or a larger max_steps"
         raise IdentificationError([f"the posterior density is zero at its mode, where a run fails: {cure}"])
@@ -107,7 +122,18 @@ def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int 
     top = weights.max()
     ratios = np.exp(weights - top)
     error = float(ratios.std() / ratios.mean() / np.sqrt(DRAWS))
-    return Laplace(problem, x, root, pareto_exponent(weights), float(top + np.log(ratios.mean())), error)
+    evidence = float(top + np.log(ratios.mean())), error
+    return Laplace(problem, x, root, pareto_exponent(weights), *evidence, trials, weights)
+
+
+def _require_noise(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> None:
+    """Raise an error if noise that is not given is too small to be noise; the density would grow without limit."""
+    fit, sizes = problem.fit_problem, problem.unknowns.values(x)[problem.fit_problem.K :]
+    least = [NOISE_FLOOR * fit.channel_scale[channel] for _, channel in problem.scales.values()]
+    names = [name.removeprefix("noise of ") for name, size, low in zip(problem.scales, sizes, least, strict=True) if size < low]
+    if names:
+        cure = f"give the noise of {join_names(names)}, noise=..."
+        raise IdentificationError([f"the records fit to rounding, as simulated ones do: {cure}"])
 
 
 def expand(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> tuple[float, np.ndarray, np.ndarray]:

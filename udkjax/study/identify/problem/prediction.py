@@ -110,7 +110,7 @@ class Predictor:
 
         if len(members.x) == 1:  # `vmap` of a single member would execute all branches
             return jax.tree.map(lambda x: jnp.asarray(x)[None], predict(jax.tree.map(lambda x: x[0], members)))
-        return jax.vmap(predict)(members)
+        return jax.vmap(predict)(jax.tree.map(jnp.asarray, members))
 
     def second_derivatives(
         self, members: Members, tol: TolerancePair, first: Float[np.ndarray, "M P+S"], second: Float[np.ndarray, "M P+S"]

@@ -1,0 +1,144 @@
+"""`sample`: from a posterior density to draws, which are stored as they come."""
+
+import os
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Annotated
+
+import jax
+import numpy as np
+
+from udkjax.argument_types import COUNT, NOT_NEGATIVE_COUNT
+from udkjax.devices import computing_on_host
+from udkjax.extras import BAYES, require
+from udkjax.integrate.solution import versions
+from udkjax.progress import ProgressOption, report_progress
+from udkjax.requirements import concrete_only
+from udkjax.scene.arguments import checked
+from udkjax.study.belief.chains import (
+    DRAWS,
+    FIRST_STEP,
+    ChainState,
+    DrawChunk,
+    Tuning,
+    compile_draws,
+    coordinates_of,
+    first_state,
+    settled,
+    tuned,
+)
+from udkjax.study.belief.posterior import Posterior
+from udkjax.study.identify.answers.estimate import Estimate
+from udkjax.study.identify.density.laplace import approximate
+from udkjax.study.identify.density.log_density import InferenceProblem
+from udkjax.study.sweep.fingerprint import JsonValue, describe_function, describe_model, describe_value
+from udkjax.study.sweep.plan import Chunk as StoredChunk
+from udkjax.study.sweep.store import open_store
+from udkjax.study.sweep.sweep import PATH
+
+STARTS = 256  # number of nearly independent draws whose covariance first scales the chains
+WARMUP = 300  # default number of draws that tune the chains
+STATE = "logdensity", "logdensity_grad"  # parts of the state of chains that are stored besides the last draw
+
+
+@checked
+@concrete_only()
+def sample(
+    density: InferenceProblem | Estimate,
+    *,
+    chains: Annotated[int, COUNT] = 8,
+    draws: Annotated[int, COUNT] = 1000,
+    warmup: Annotated[int, COUNT] = WARMUP,
+    seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
+    out: Annotated[str | os.PathLike[str], PATH] | None = None,
+    progress: ProgressOption = None,
+) -> Posterior:
+    """Draw parameters from their posterior density, by chains of Hamiltonian Monte Carlo that run side by side.
+
+    The chains start from the normal approximation at the mode (`Estimate.laplace`), which also scales the unknowns. Where a run
+    fails, a proposal is rejected. Ctrl-C returns the draws so far, once the warm-up is over.
+
+    Args:
+        density: the problem from `inference`, or an estimate from `identify`.
+        chains: number of chains.
+        draws: number of draws of each chain.
+        warmup: number of earlier draws, which only tune the chains, in whole chunks of 25.
+        seed: seed of all random numbers.
+        out: a folder for finished chunks of draws. The same call continues from these, to the same numbers; with more `draws`,
+            it appends to them.
+        progress: as for `identify`.
+
+    Returns:
+        The draws, by name and in the units of the parameters, and how far they may be trusted.
+
+    Raises:
+        IdentificationError: neither the records nor a prior determine some parameters, or records without given noise fit to
+            rounding.
+        StoreError: `out` cannot be written to, or contains another posterior.
+    """
+    require(*BAYES)
+    problem = density.posterior if isinstance(density, Estimate) else density
+    first = -(-warmup // DRAWS)
+    total = first + -(-draws // DRAWS)
+    settings = {"chains": chains, "warmup": first * DRAWS, "seed": seed}
+    done: list[DrawChunk] = []
+    with open_store(out, {**settings, **_fingerprint(problem)} if out is not None else {}, "posterior") as store:
+        stored = {int(index[0]): data for index, data in store.read_chunks()}
+
+        def finished(k: int, data: DrawChunk) -> DrawChunk:
+            if k not in stored:
+                store.write(StoredChunk(k, 0, np.array([k]), 1.0), data)
+            return data
+
+        start = finished(0, stored[0] if 0 in stored else _start(density, problem, chains, seed))
+        coordinates = coordinates_of(problem, start["mode"], start["covariance"])
+        w = coordinates.w(start["x"])
+        begin = tuning = Tuning(FIRST_STEP, np.cov(w.T).reshape(len(w.T), -1))
+        state, compute = first_state(w[:chains]), compile_draws(problem, coordinates)
+        try:
+            with report_progress(progress, total * DRAWS, "sample") as report, computing_on_host():
+                for k in range(1, total + 1):
+                    if k not in stored:
+                        key = jax.random.fold_in(jax.random.key(seed), k)
+                        state, found = jax.tree.map(np.asarray, compute(key, tuning, state))
+                        stored_state = {name: getattr(state, name) for name in STATE}
+                        done.append(finished(k, {**found, **stored_state}))
+                    else:
+                        done.append(stored[k])
+                    state = ChainState(done[-1]["position"][-1], *(done[-1][name] for name in STATE))
+                    if k <= first:
+                        tuning = (settled if k == first else tuned)(begin, done)
+                    report(k * DRAWS, "warm-up" if k <= first else "")
+        except KeyboardInterrupt:
+            if len(done) <= first:
+                raise
+    return Posterior.of(problem, coordinates, done[first:], draws, tuning.step)
+
+
+def _start(density: InferenceProblem | Estimate, problem: InferenceProblem, chains: int, seed: int) -> DrawChunk:
+    """Return the mode, its covariance, and vectors that are nearly draws of the density, those of the chains first."""
+    approximation = density.laplace(seed) if isinstance(density, Estimate) else approximate(problem, problem.start, seed)
+    starts = approximation.starts(max(chains, STARTS), seed)
+    return {"x": starts, "mode": approximation.mode, "covariance": approximation.covariance}
+
+
+def _fingerprint(problem: InferenceProblem) -> Mapping[str, JsonValue]:
+    """Return the inputs that determine the draws of a density."""
+    fit, u = problem.fit_problem, problem.unknowns
+    numbers = np.stack([u.guess, u.low, u.high, u.scale, u.mean, u.sigma], axis=1).tolist()
+    return {
+        **describe_model(fit.mechanism, int(np.prod(fit.mechanism.state_shape()))),
+        "unknowns": {name: [kind, *map(repr, row)] for name, kind, row in zip(u.names, u.kinds, numbers, strict=True)},
+        "targets": {
+            name: list(target.names) if target.function is None else describe_value(repr(target.function))
+            for name, target in zip(u.names, u.targets, strict=True)
+        },
+        "priors": {u.names[k]: describe_function(f, np.ones(())) for k, f in problem.prior.functions.items()},
+        "measured": describe_value(fit.measured),
+        "noise": describe_value(problem.sigma),
+        "runs": [describe_value(np.asarray(x)) for x in jax.tree.leaves(fit.runs)],
+        "settings": {name: describe_value(x) for name, x in fit.settings.items() if name != "analysis"},
+        "max_steps": problem.max_steps,
+        "tol": list(problem.tol),
+        "versions": {**{k: v for k, v in versions().items() if k != "python"}, "blackjax": version("blackjax")},
+    }
