@@ -118,9 +118,28 @@ CASES = {
         lambda a, b: (a < b, a <= b, a > b, a >= b, a == b, a != b, jnp.isfinite(a), ~((a < b) & (a > 0) | (b > 1) ^ (a > 1))),
         (A, B),
     ),
+    "repeated": (
+        lambda a, b: (
+            a[:, :1] * b,
+            a[:1] - b,
+            a[:1, 0] + b[0],
+            jnp.where(a[:, :1] > 0, a, b),
+            (a[:1] > 0) & (b > 0),
+            2.0 / b[:1, :1] * a,
+        ),
+        (A, B),
+    ),
     "extremes": (lambda a, b: (jnp.maximum(a, b), jnp.minimum(a, b), lax.clamp(-0.5, a, 0.5), jnp.where(a < b, a, b)), (A, B)),
     "rounded": (
-        lambda a: (jnp.floor(a), jnp.ceil(a), jnp.round(a), (3 * a).astype(int), lax.stop_gradient(a), lax.copy_p.bind(a)),
+        lambda a: (
+            jnp.floor(a),
+            jnp.ceil(a),
+            jnp.round(a),
+            (3 * a).astype(int),
+            lax.stop_gradient(a),
+            lax.copy_p.bind(a),
+            lax.convert_element_type_p.bind(a > 0, new_dtype=np.dtype(bool), weak_type=False, sharding=None),
+        ),
         (A,),
     ),
     "roots": (lambda p: (jnp.sqrt(p), lax.rsqrt(p), jnp.power(p, 0.3), p**-2), (P,)),
@@ -154,6 +173,7 @@ CASES = {
         ),
         (A,),
     ),
+    "cumulative": (lambda a: (jnp.cumsum(a, 0), jnp.cumprod(a, 1), lax.cumsum(a, 1, reverse=True), jnp.diagonal(a[:, :4])), (A,)),
     "largest": (
         lambda a: (a.max(1), a.min(0), jnp.argmax(a, 1), jnp.argmin(a, 0), jnp.argmax(a > 1, 1), (5 * a).astype(int).max(0)),
         (A,),

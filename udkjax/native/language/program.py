@@ -215,8 +215,8 @@ def _convert(f: Function, a: Value, dtype: Any) -> Value:
         return a
     if kind in "iu" and a.base == DOUBLE:
         return _truncate(f, a, np.dtype(dtype))
-    if kind == "b" and a.base != BOOL:
-        return a.is_not(0)
+    if kind == "b":
+        return a if a.base == BOOL else a.is_not(0)
     raise UnsupportedError(f"{a.base} as {dtype}")
 
 

@@ -184,6 +184,8 @@ class Lowering:
 
     def cond(self, which: Array, branches: Sequence[Any], operands: Sequence[Array]) -> list[Array]:
         """Run the branches that lanes take."""
+        if isinstance(which, Constant):
+            return self.closed(branches[min(max(int(which.numbers), 0), len(branches) - 1)], operands)
         f, index, last = self.f, which.read(self.f, ()), len(branches) - 1
         operands = [self.stored(x) for x in operands]
         flags = [varying(branch, [x.varies for x in operands]) for branch in branches]

@@ -89,6 +89,21 @@ def extreme(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out
     return reduce_axes(start, join, to, inputs, p, out)
 
 
+def cumulative(join: Any, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    """Join each element of an axis with those before it, or in reverse with those after it."""
+    x, f, axis, n = to.stored(inputs[0]), to.f, p["axis"], out.shape[p["axis"]]
+    whole = to.new(out.shape, x.base, x.varies)
+
+    def put(index: Index):
+        for k in range(n):
+            places = [(*index[:axis], n - 1 - i if p["reverse"] else i, *index[axis:]) for i in (k, k - 1)]
+            new = x.read(f, places[0])
+            whole.write(f, places[0], join(whole.read(f, places[1]), new) if k else new)
+
+    to.each(out.shape[:axis] + out.shape[axis + 1 :], put)
+    return whole
+
+
 def argument(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
     """Return the index of the first extreme element; a NaN counts as one."""
     f, x, (axis,) = to.f, to.stored(inputs[0]), p["axes"]

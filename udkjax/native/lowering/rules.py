@@ -8,7 +8,7 @@ from udkjax.native.language.ir import BOOL, DOUBLE, INT, Value
 from udkjax.native.language.program import UnsupportedError, apply, sincos
 from udkjax.native.lowering.arrays import Array, Index, Lazy, base_of, fit
 from udkjax.native.lowering.lowering import Lowering
-from udkjax.native.lowering.reductions import argument, dot, extreme, reduce_axes
+from udkjax.native.lowering.reductions import argument, cumulative, dot, extreme, reduce_axes
 from udkjax.native.lowering.solving import cholesky, linear_solve, lu, triangular_solve
 from udkjax.native.lowering.updates import dynamic_update_slice, scatter
 from udkjax.native.lowering.varying import counts_of_scan, inlined
@@ -19,6 +19,7 @@ from udkjax.native.lowering.views import (
     gather,
     iota,
     pad,
+    platform_index,
     reshape,
     reverse,
     split,
@@ -65,7 +66,8 @@ def _elementwise(to: Lowering, name: str, inputs: list[Array], p: dict[str, Any]
     operation = "add" if name == "add_any" else name
 
     def read(index: Index) -> Value:
-        a = [x.read(f, index if x.shape else ()) for x in inputs]
+        # Axes of length one, and single numbers, stand for all elements.
+        a = [x.read(f, tuple(0 if n == 1 else i for n, i in zip(x.shape, index, strict=False))) for x in inputs]
         if operation in ("add", "sub", "mul", "div") and base == DOUBLE:
             return fit(f, f.arithmetic(operation, *a), varies)
         return fit(f, apply(f, operation, p, a, partial(sincos, f)), varies)
@@ -95,9 +97,12 @@ RULES: dict[str, LoweringRule] = {
     "reduce_min": partial(extreme, "min"),
     "argmax": partial(argument, "max"),
     "argmin": partial(argument, "min"),
+    "cumsum": partial(cumulative, lambda a, b: a + b),
+    "cumprod": partial(cumulative, lambda a, b: a * b),
     "dot_general": dot,
     "pad": pad,
     "iota": iota,
+    "platform_index": platform_index,
     "scatter": partial(scatter, False),
     "scatter-add": partial(scatter, True),
     "dynamic_update_slice": dynamic_update_slice,

@@ -174,6 +174,11 @@ def split(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
     return found
 
 
+def platform_index(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
+    """Return which of the variants of a function is for the CPU, or for any platform."""
+    return to.constant(np.array(next(k for k, names in enumerate(p["platforms"]) if names is None or "cpu" in names)))
+
+
 def iota(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
     """Return the index along an axis."""
     f, axis, base = to.f, p["dimension"], base_of(out.dtype)
