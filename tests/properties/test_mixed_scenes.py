@@ -151,3 +151,23 @@ def test_driven_parallelogram_with_a_stiff_damper_keeps_its_branch(numbers, forc
         assert_allclose(q[:, 0, 2], angles[0], atol=1e-9)
         assert_allclose(q[:, 2, 2] - q[:, 1, 2], angles[2] - angles[1], atol=1e-9)
         assert np.max(steps) < 250
+
+
+@pytest.mark.parametrize("numbers", [4, 8])
+def test_driven_parallelogram_in_other_coordinates_keeps_its_branch(numbers):
+    """Its mass matrix is not diagonal."""
+    table = mixed_scene(SEED, 12, numbers).table
+    mech = build(table | {"event": [], "force": [x for x in table["force"] if x["name"] == "stiff"]})
+    state = udk.assemble(mech)
+    to = np.eye(9) + 0.3 * np.random.default_rng(1).normal(size=(9, 9))
+    back = np.linalg.inv(to)
+    mass = back.T @ np.diag(np.ravel([[b["mass"], b["mass"], b["inertia"]] for b in table["body"]])) @ back
+    system = udk.ConstrainedSystem(
+        lambda y: mass,
+        lambda t, y, w: back.T @ udk.equations.force(mech, t, back @ y, back @ w),
+        lambda t, y: udk.equations.psi(mech, t, back @ y),
+    )
+    start = udk.State(to @ np.ravel(state.q), to @ np.ravel(state.v))
+    for tol in np.logspace(-5, -10, 6):
+        end = back @ np.asarray(udk.simulate(system, [0.0, 1.0], start, rtol=tol, atol=tol).q[-1])
+        assert_allclose(end[2], state.q[0, 2], atol=1e-9)

@@ -99,7 +99,7 @@ class BySingularValues(RankRevealing):
             if x == "q" and splits:
                 rows.factor(f, of_positions=True)
             change = rows.solve(f, right, place)
-            if x == "a" and module.plan.steps and not couples:
+            if x == "a" and module.plan.steps:
                 self._hold_left_out(f, rows)
             put(f, x, change, start, sign)
         f = module.new_function("fallback_tangent_part_of_lane", of_lane, 1)
@@ -126,13 +126,13 @@ class BySingularValues(RankRevealing):
         along those that are left out: loads as large as that of a stiff damper would turn it, and the motion change its branch.
         Directions of rows that are dependent everywhere are rounding errors.
         """
-        d, squares = rows.matrices(f), rows.matrices(f).row("lengths")
+        d, squares, name = rows.matrices(f), rows.matrices(f).row("lengths"), "fallback a" if self._in.code.couples else "terms"
 
         def along(row: MatrixRow) -> Value:
             total = f.variable(0.0)
             with f.each(self._in.n) as i:
                 root = rows.array(f, "root", i)
-                load = rows.array(f, "terms", i) / f.select(root > 0.0, root, 1.0)
+                load = rows.array(f, name, i) / f.select(root > 0.0, root, 1.0)
                 total.value = f.fma(row.entry(i), load, total.value)
             return total.value
 
@@ -164,6 +164,10 @@ class BySingularValues(RankRevealing):
         self.with_loads(f, lambda: module.invoke(f, "rows_and_loads"))
         if module.plan.steps:
             s.moves = f.select(is_moving(module, f, s), f.const(1.0, DOUBLE, f.width), 0.0)
+            if couples:
+                with f.each(module.n) as i:
+                    module.put_entry(f, "fallback a", i, module.entry(f, "terms", i))
+                module.invoke(f, "gather", "fallback a")
         each_lane(f, s, "fallback")
         if couples:
             for x, (start, *_) in self._solutions.items():
