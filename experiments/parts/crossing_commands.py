@@ -23,6 +23,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "kinematics": ("SCENE", "--driver", "DRIVER", "--from", "FIRST", "--to", "LAST", "--count", "5", "--json"),
     "inverse": ("SCENE", *SHORT, "--json"),
     "reactions": ("SCENE", *SHORT, "--json"),
+    "tolerances": (
+        *("SCENE", "--tol", "TOLERANCE", "--measure", "MEASURE", "--driver", "DRIVER", "--from", "FIRST", "--to", "LAST"),
+        *("--count", "4", "--samples", "100", "--json", "--quiet"),
+    ),
     "statics": ("SCENE", "--json"),
     "modes": ("SCENE", "--json"),
     "check": ("SCENE", "--json"),
@@ -69,6 +73,9 @@ def _words(name: str, case: Case, folder: Path) -> dict[str, str]:
     if case.driver in case.model.driver_names and case.model.drivers[case.driver].coordinate != "angle":
         first, last = (f"{float(x)!r} m" for x in case.values()[[0, -1]])
     words = {"DRIVER": str(case.driver), "NUMBER": case.number, "FIRST": first, "LAST": last}
+    if name == "tolerances":
+        words["TOLERANCE"] = f"{case.number}=1e-3 {case.model.unit_of(case.number)}"
+        words["MEASURE"] = f"range(body.{case.model.body_names[-1]}.angle)"
     if name == "sweep":
         grid, value = folder / "grid.toml", float(np.ravel(case.model.parameters()[case.number])[0])
         axes = f'[axes]\n"{case.number}" = [{value!r}, {1.01 * value!r}]\n'
@@ -117,6 +124,12 @@ def read_kinematics(case: Case, scene: Any, results: Any, folder: Path) -> str:
     wanted = udk.kinematics(case.model, case.driver, case.values(2)[:1], rate=1.0)
     agree(np.array(results["q"])[0], np.asarray(wanted.q)[0], "the first value", 1e-6)
     return same(results["q"], found.q, "udk.kinematics", 1e-6)
+
+
+def read_tolerances(case: Case, scene: Any, results: Any, folder: Path) -> str:
+    measure = f"range(body.{scene.body_names[-1]}.angle)"
+    found = udk.tolerances(scene, {case.number: 1e-3}, [measure], drive=case.driver, values=case.values(), samples=100)
+    return same([results["quantiles"], results["yield"]], [found.quantiles(), found.yield_], "udk.tolerances", 1e-6)
 
 
 def read_inverse(case: Case, scene: Any, results: Any, folder: Path) -> str:

@@ -125,6 +125,7 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "design_experiment": {"": studies.design_experiment},
     "inference": {"": studies.inference},
     "sample": {"": studies.sample},
+    "tolerances": {"": studies.tolerances},
     "sweep": {"": studies.sweep, "names": studies.sweep_names},
     "design": {"": studies.design},
     "design_all": {"": studies.design_all},

@@ -208,7 +208,9 @@ MODELS: dict[str, Model] = {
     "belt": Model(belt),
     "cam": Model(lambda: udk.load(EXAMPLES / "drawings" / "cam_follower.toml")),
     "slots": Model(udk.library.elliptic_trammel),
-    "no gravity": Model(lambda: udk.Mechanism(plain().bodies, plain().joints, gravity=[0.0, 0.0])),
+    "no gravity": Model(
+        lambda: udk.Mechanism(plain().bodies, plain().joints, None, [udk.TorsionSpring(["ground", CRANK], 1.0)], [0.0, 0.0])
+    ),
     "stop": Model(pendulum, lambda: udk.Event(lambda t, frames: frames["a"].angle + 0.1, udk.Stop())),
     "log": Model(pendulum, lambda: udk.Event(lambda t, frames: frames["a"].angle + 0.1, udk.Log())),
     "impact": Model(pendulum, lambda: udk.Event(lambda t, frames: frames["a"].angle + 0.1, udk.Impact(0.5))),

@@ -1,8 +1,8 @@
-"""The table of public functions and commands by models: `python -m experiments.parts.crossings [MINUTES] [K/N] [WORD ...]`.
+"""Cells of the table of public functions and commands by models: `python -m experiments.parts.crossings [MINUTES] [WORD ...]`.
 
 Each cell runs one function on one model, one after another in one process, and is compared with another way to the same numbers,
-or is refused by udkjax with a sentence. Anything else is a fault. K/N limits the table to every N-th model from the K-th, WORD to
-rows and models of this name.
+or is refused by udkjax with a sentence. Anything else is a fault. WORD limits the table to rows and models of this name. The
+study `python -m experiments crossings` computes all of it and writes its page.
 """
 
 import re
@@ -67,10 +67,10 @@ def _is_ours(error: Exception) -> bool:
     return (type(error).__module__.startswith("udkjax") or is_raised) and len(str(error)) > 20
 
 
-def cells(minutes: float = 1e9, words: tuple[str, ...] = (), part: tuple[int, int] = (0, 1)) -> Iterator[Cell]:
-    """Iterate over the cells of the table, model by model, within a time; of the models, every n-th from the k-th, (k, n)."""
+def cells(minutes: float = 1e9, words: tuple[str, ...] = ()) -> Iterator[Cell]:
+    """Iterate over the cells of the table, model by model, within a time."""
     end = time.time() + 60 * minutes
-    for name, model in list(MODELS.items())[part[0] :: part[1]]:
+    for name, model in MODELS.items():
         chosen = [row for row in rows() if not words or any(word in (name, row) or word in row.split() for word in words)]
         case = Case(name, model) if chosen else None
         for row in chosen:
@@ -78,22 +78,6 @@ def cells(minutes: float = 1e9, words: tuple[str, ...] = (), part: tuple[int, in
                 return
             assert case is not None
             yield cell(row, case)
-
-
-def table(found: list[Cell]) -> str:
-    """Return the table as text: functions by models; r: runs, and agrees; n: is refused by name; F: a fault."""
-    models, letters = list(dict.fromkeys(x.model for x in found)), {"runs": "r", "refuses": "n", "fault": "F"}
-    by_place = {(x.function, x.model): letters[x.result] for x in found}
-    lines = [f"{k:3d}  {model}" for k, model in enumerate(models)]
-    functions = list(dict.fromkeys(x.function for x in found))
-    width = max(map(len, functions), default=0)
-    for row in functions:
-        counts = Counter(x.result for x in found if x.function == row)
-        by = Counter(x.text for x in found if x.function == row and x.result == "runs").most_common(2)
-        marks = "".join(by_place.get((row, model), " ") for model in models)
-        compared = "; ".join(text for text, _ in by)
-        lines.append(f"{row:{width}}  {marks}  {counts['runs']:3d} run, {counts['refuses']:3d} refused, by {compared[:60]}")
-    return "\n".join([*lines, summary(found)])
 
 
 def summary(found: list[Cell]) -> str:
@@ -106,22 +90,15 @@ def summary(found: list[Cell]) -> str:
 
 
 def main() -> None:
-    """Print each fault as it is found, then the table."""
+    """Print each fault as it is found, then the counts."""
     warnings.simplefilter("ignore")
     arguments, found = sys.argv[1:], []
     minutes = float(arguments.pop(0)) if arguments and arguments[0].replace(".", "").isdigit() else 1e9
-    first, _, count = (
-        arguments.pop(0).partition("/") if arguments and re.fullmatch(r"\d+/\d+", arguments[0]) else "0/1".partition("/")
-    )
-    for x in cells(minutes, tuple(arguments), (int(first), int(count))):
+    for x in cells(minutes, tuple(arguments)):
         found.append(x)
         if x.result == "fault":
             print(f"{x.model} | {x.function} | {x.text}", flush=True)
-    print(table(found))
-    for reason, count in Counter(re.sub(r'"[^"]*"|[\d.e+-]+', "*", x.text) for x in found if x.result == "refuses").most_common(
-        25
-    ):
-        print(f"{count:4d} refused: {reason[:150]}")
+    print(summary(found))
 
 
 if __name__ == "__main__":

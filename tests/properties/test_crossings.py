@@ -1,6 +1,6 @@
 """The table of public functions and commands by models: a diagonal of it.
 
-`python -m experiments.parts.crossings` computes and prints all of it. A new public name needs an entry: a row, a model, or a
+`python -m experiments crossings` computes all of it. A new public name needs an entry: a row, a model, or a
 place among `OTHERS`.
 """
 
@@ -28,10 +28,11 @@ OTHERS = {
     "results": """Result Solution Events Characteristics Reached Kinematics Travel MotionRanges PinMotion BatchPositions Workspace
         PositionBatch Animation Equilibrium HoldingEfforts Modes Diagnosis SystemDiagnosis Explanation Estimate GradientCheck
         Posterior InverseDynamics PowerBalance Design Designs DesignSearch FoundDesign MotionPoint CompleteDesign
-        CompleteDesigns""",
+        CompleteDesigns ToleranceAnalysis""",
     "errors": "SimulationError AssemblyError SceneError IdentificationError SweepError",
     "studies": """Candidate Parameter Quantity Record Start Axis LatinHypercube Random Sobol Zipped EnergyGoal FrequencyGoal
-        FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal ToleranceGoal TorqueGoal""",
+        FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal ToleranceGoal TorqueGoal Tolerance
+        PinClearance""",
     "bases of classes": "Constraint ForceElement Joint RollingJoint Motion Profile Frame Point Link Drawing Mechanism",
     "tested with all elements": "LiftProfile SwingProfile",
 }
