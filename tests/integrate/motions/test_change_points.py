@@ -57,7 +57,8 @@ def test_derivatives_pass_a_change_point_with_friction_by_load(sticks):
     reverse = jax.jit(jax.vmap(jax.grad(angle), (None, 0)))(ONE, SIZES)
     # Steps across the change point leave rows out, whose motion the differences include.
     np.testing.assert_allclose(forward, differences, rtol=2e-3)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-4)
+    # Both modes differ by rounding errors, multiplied beside the change point: 1e-4 with some lengths of registers.
+    np.testing.assert_allclose(reverse, forward, rtol=1e-3)
 
 
 def test_second_derivatives_end_where_loads_are_left_out_of_friction():
