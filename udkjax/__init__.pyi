@@ -178,6 +178,10 @@ from udkjax.study.sweep import Sobol as Sobol
 from udkjax.study.sweep import SweepError as SweepError
 from udkjax.study.sweep import Zipped as Zipped
 from udkjax.study.sweep import sweep as sweep
+from udkjax.study.tolerancing import PinClearance as PinClearance
+from udkjax.study.tolerancing import Tolerance as Tolerance
+from udkjax.study.tolerancing import ToleranceAnalysis as ToleranceAnalysis
+from udkjax.study.tolerancing import tolerances as tolerances
 from udkjax.synthesis import Designs as Designs
 from udkjax.synthesis import DesignSearch as DesignSearch
 from udkjax.synthesis import EnergyGoal as EnergyGoal

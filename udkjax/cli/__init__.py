@@ -23,6 +23,7 @@ COMMANDS = (
     "kinematics",
     "inverse",
     "reactions",
+    "tolerances",
     "statics",
     "modes",
     "check",

@@ -5,6 +5,7 @@ from udkjax.show.doctor import summary as summary
 from udkjax.show.figures import channels_figure as channels_figure
 from udkjax.show.figures import driven_figure as driven_figure
 from udkjax.show.figures import reactions_figure as reactions_figure
+from udkjax.show.figures import tolerances_figure as tolerances_figure
 from udkjax.show.identify_figures import save_fit_pictures as save_fit_pictures
 from udkjax.show.player import Animation as Animation
 from udkjax.show.player import animate as animate

@@ -10,6 +10,7 @@ from udkjax.positions.following.kinematics import Kinematics
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.plots import draw_angles, draw_motion, draw_reactions
 from udkjax.show.style import COLOURS, DASHES, legend, plain
+from udkjax.study.tolerancing import ToleranceAnalysis
 
 with OptionalImport():
     from matplotlib.axes import Axes
@@ -55,5 +56,23 @@ def reactions_figure(ts: ArrayLike, loads: Mapping[str, Mapping[str, ArrayLike]]
     """Draw the magnitude of the force at each pin over time."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     draw_reactions(figure.subplots(), ts, loads)
+    figure.suptitle(title)
+    return figure
+
+
+def tolerances_figure(found: ToleranceAnalysis, title: str = "") -> Figure:
+    """Draw, for each measure, the samples with the limits, and the shares of the variance."""
+    figure = Figure(figsize=(8, 0.6 + 2.4 * len(found.names)), layout="constrained")
+    for k, (name, (samples, bars)) in enumerate(
+        zip(found.names, figure.subplots(len(found.names), 2, squeeze=False), strict=True)
+    ):
+        samples.hist(found.measured[np.isfinite(found.measured[:, k]), k], bins=80, color=COLOURS[0])
+        for edge in found.limits_of(name):
+            samples.axvline(edge, color=COLOURS[1])
+        samples.set(xlabel=name, ylabel="samples")
+        shares = found.shares[name]
+        bars.barh(list(shares), [100 * share.total for share in shares.values()], color=COLOURS[2])
+        bars.set(xlabel="share of the variance (%)")
+        bars.invert_yaxis()
     figure.suptitle(title)
     return figure

@@ -12,6 +12,7 @@ from udkjax.synthesis.fit import design_lines as design_lines
 from udkjax.synthesis.fit import deviation_of as deviation_of
 from udkjax.synthesis.goal_file import read_design as read_design
 from udkjax.synthesis.goals import FunctionGoal as FunctionGoal
+from udkjax.synthesis.goals import Goal as Goal
 from udkjax.synthesis.goals import PathGoal as PathGoal
 from udkjax.synthesis.goals import PoseGoal as PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal as EnergyGoal

@@ -1,0 +1,105 @@
+"""`udkjax tolerances`."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+from udkjax.cli.common import Json, Quiet, Scene, choose_driver, load, refuse, show
+from udkjax.extras import OptionalImport
+
+with OptionalImport():
+    import tyro
+
+
+def tolerances(
+    scene: Scene,
+    /,
+    tol: tuple[str, ...],
+    measure: tuple[str, ...],
+    limit: tuple[str, ...] = (),
+    driver: str | None = None,
+    first: Annotated[str | None, tyro.conf.arg(name="from")] = None,
+    last: Annotated[str | None, tyro.conf.arg(name="to")] = None,
+    count: int = 72,
+    samples: int = 100_000,
+    seed: int = 0,
+    cheapest: float | None = None,
+    plot: Path | None = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find how often a mechanism made with tolerances stays within limits, which tolerances matter, and which cost least.
+
+    Args:
+        scene: the mechanism.
+        tol: tolerances: "length(crank)=0.05 mm", "pin.D[0]=h9", or "clearance(B)=0.02 mm", the play of a pin.
+        measure: measures over the drive: "range(body.rocker.angle)", "deviation(pin.C)"; max, min, range, mean, rms, first, last.
+        limit: limits of measures: "deviation(pin.C)=0.5 mm".
+        driver: a driver of the scene, by default its only one; or a coordinate, such as body.crank.angle.
+        first: first value of the driver (rad, m); by default, positions over a turn from the drawn one.
+        last: last value.
+        count: number of values.
+        samples: number of samples.
+        seed: seed of the samples.
+        cheapest: also find the tolerances of least cost with this yield, such as 0.99.
+        plot: picture to write (.png, .svg, .pdf or .jpg): the measures of the samples with their limits, and shares.
+    """
+    if (first is None) != (last is None):
+        refuse("give both --from and --to, or neither")
+    if count < 1:
+        refuse(f"--count {count}: must be positive")
+    mech, _ = load(scene)
+    import numpy as np
+
+    import udkjax as udk
+    from udkjax.positions.answers.counting import Count
+    from udkjax.printing import PrintedTable, text_table
+
+    chosen, values = choose_driver(mech, driver), None
+    if first is not None and last is not None:
+        counted = Count.of(mech, chosen)
+        values = np.linspace(counted.read(first, "--from"), counted.read(last, "--to"), count)
+    given: dict[str, str | udk.PinClearance] = {}
+    for name, text in _pairs("--tol", tol):
+        of_pin = name.startswith("clearance(") and name.endswith(")")
+        given[name[10:-1] if of_pin else name] = udk.PinClearance(text) if of_pin else text
+    limits = {name: float(text) if _is_number(text) else text for name, text in _pairs("--limit", limit)}
+    found = udk.tolerances(
+        mech, given, list(measure), drive=chosen, values=values, limits=limits, samples=samples, seed=seed,
+        progress=False if quiet else None,
+    )  # fmt: skip
+    results: dict[str, object] = {
+        "yield": found.yield_, "standard_error": found.standard_error, "not_assembled": found.not_assembled,
+        "outside": found.outside, "mean": found.mean, "standard_deviation": found.standard_deviation,
+        "quantiles": found.quantiles(), "shares": found.shares, "trusted": found.second_order.trusted,
+    }  # fmt: skip
+    text = str(found)
+    if cheapest is not None:
+        best = results["cheapest"] = found.cheapest(cheapest)
+        rows = [(name, f"{low:.4g}", f"{high:.4g}") for name, (low, high) in best.deviations.items()]
+        title = f"cheapest tolerances with a yield of {100 * best.yield_:.4g} %: {best.cost:.3g} times the cost"
+        text += "\n" + text_table(PrintedTable(title, rows, ("number", "lower", "upper deviation (SI)")))
+    if plot is not None:
+        from udkjax.show.figures import tolerances_figure
+
+        tolerances_figure(found, mech.name).savefig(plot, dpi=150)
+    show(results, text, json)
+
+
+def _pairs(option: str, given: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the name and the text of each "NAME=VALUE"."""
+    pairs = []
+    for text in given:
+        name, equals, value = (part.strip() for part in text.rpartition("="))
+        if not equals or not name or not value:
+            refuse(f'{option} "{text}": write NAME=VALUE')
+        pairs.append((name, value))
+    return pairs
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
