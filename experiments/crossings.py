@@ -123,6 +123,7 @@ def figure(data: xarray.Dataset) -> Figure:
     one.tick_params("x", labelrotation=90)
     one.grid(visible=False)
     one.invert_yaxis()
+    one.set_xlabel(headline(data), fontsize=7)
     named = zip(("runs, and agrees", "refused by name", "fault"), colours[1:], strict=True)
     one.legend(handles=[Patch(color=colour, label=label) for label, colour in named], fontsize=6, loc="lower left",
                bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)  # fmt: skip

@@ -83,6 +83,8 @@ def objects() -> dict[str, object]:
             (batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])),
             batch({"gravity": np.zeros((2, 2))}, np.array([0.1])),
         ),
+        *(udk.Tolerance(0.1, "mm"), udk.PinClearance("0.1 mm")),
+        udk.tolerances(linkage, {"length(crank)": 1e-3}, ["range(body.rocker.angle)"], drive="body.crank.angle", samples=10),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),
     ]
     return {type(one).__name__: one for one in found}
@@ -91,7 +93,7 @@ def objects() -> dict[str, object]:
 # In tests/study: they take a fit or a search, or are made within one.
 ELSEWHERE = {"Estimate", "GradientCheck", "Design", "Designs", "FoundDesign", "DesignSearch", "MotionPoint"}
 ELSEWHERE |= {"CompleteDesign", "CompleteDesigns"}
-ELSEWHERE |= {"SystemDiagnosis", "ConstraintState"}
+ELSEWHERE |= {"SystemDiagnosis", "ConstraintState", "Posterior"}
 ABSTRACT = {"Constraint", "Joint", "RollingJoint", "Motion", "ForceElement"}
 ABSTRACT |= {"MatrixPseudoinverse", "PointwiseFormulation", "Stabilization"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"
