@@ -76,8 +76,8 @@ CAUSES = {
     Result.event_limit: "there were more events than `max_events`: raise it, or look for what makes them follow so closely",
     Result.beyond_contact: "the run starts beyond a contact or limit, where its condition is negative already",
     Result.event_impossible: "an event asks for what the constraints do not allow: an impact in a direction in which they leave "
-    "no motion, or in which friction would have to stop a driver, a joint attached where it is open, or joints that neither "
-    "stick nor slide, as their friction jams them",
+    "no motion, or in which friction would have to stop a driver, a joint attached where it is open or would have to stop a "
+    "driver, or joints that neither stick nor slide, as their friction jams them",
     Result.invalid_argument: "an argument of this run cannot be used: output times that do not increase, a state that is not "
     "finite, a tolerance or first step that is not positive, or a number of the scene or of an event that cannot be: one that is "
     "not finite, a mass that is not positive, knots that do not increase, a lower limit above the upper one",

@@ -286,3 +286,17 @@ def test_a_timeline_refuses_released_constraints():
     cut = udk.simulate(case.mechanism, output_times(case.times), events=case.events)
     with pytest.raises(ValueError, match='release "A"'):
         udk.diagnose(case.mechanism, solution=cut, fixes=False)
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_a_joint_that_would_have_to_stop_a_driver_cannot_be_attached(engine):
+    """If only later positions showed it, runs would end as `drift` after the event, or as `missing_rank`."""
+    mech, ts = udk.library.driven_pendulum(0.8, 3.0), np.linspace(0.0, 1.0, 5)
+    rods = {"along the rod": [(0.0, 0.0), (0.5, 0.0)], "beside the pin": [(0.0, 0.3), (0.5, 0.0)]}
+    actions = {name: udk.Attach(udk.Distance(("ground", "rod"), points), "link") for name, points in rods.items()}
+    cases = (udk.Lock("pin"), False), (actions["along the rod"], True), (actions["beside the pin"], False)
+    for action, is_possible in cases if engine == "native" else cases[:1]:
+        event = udk.Event(lambda t, at: t - 0.3, action, direction=1, name="event")
+        sol = udk.simulate(mech, ts, events=[event], engine=engine, throw=False)
+        assert sol.result == (udk.Result.successful if is_possible else udk.Result.event_impossible)
+        assert abs(sol.time - (1.0 if is_possible else 0.3)) < 1e-9

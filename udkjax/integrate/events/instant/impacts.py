@@ -66,7 +66,9 @@ REST = 1e-5
 # ratio is a cosine, with rounding errors of 1e-15 times the condition number of the constraints, up to a thousand.
 COUPLED = 1e-12
 
-ATTACHABLE = 1e-6  # relative to L, or rad: largest gap of an attached joint
+# Largest gap of an attached joint, relative to L, or in rad; and largest change of velocities, relative to the fastest, by which
+# they violate the other constraints.
+ATTACHABLE = 1e-6
 
 OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed, closed, closed and without restitution
 
