@@ -14,7 +14,7 @@ def without_constants(jaxpr: Any) -> Any:
 
 
 def inlined(equation: Any) -> Any:
-    """Return the jaxpr of a call that is inlined, or None."""
+    """Return the program of a call that is lowered in its place; None for other operations."""
     if equation.primitive.name not in INLINED:
         return None
     return next(equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params)

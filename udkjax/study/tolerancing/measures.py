@@ -174,9 +174,9 @@ class Measuring:
                 f"the goal must have a target for each of the {len(self.values)} values, and no start that is to be found"
             )
         goal.check(self.numbers.mechanism)
-        place = slice(sum(x.shape[1] for x in data), None)
+        start = sum(x.shape[1] for x in data)
+        place = slice(start, start + goal.targets.shape[1])
         data.append(goal.targets)
-        place = slice(place.start, place.start + goal.targets.shape[1])
 
         def differences(mechanism: Mechanism, q: Array, data: Array) -> list[Array]:
             return list(map(jnp.asarray, goal.residual(goal.measure(mechanism, q), data[place], jnp.zeros(0), jnp)))
