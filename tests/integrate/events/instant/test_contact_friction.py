@@ -146,6 +146,25 @@ def test_energy_never_grows_in_impacts(count):
     assert change.max() <= 1e-14 and beyond.max() < 1e-11
 
 
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_rounding_errors_of_speeds_are_no_impact(xp):
+    """Contacts that are held in few freedoms, with speeds of 1e-28 in ratios that no motion has: no impulses, nothing blocked."""
+    rng, unsolved = np.random.default_rng(7), 0
+    for N, n in rng.integers((2, 1), (4, 3), size=(40 if xp is np else 3, 2)):
+        U = rng.normal(size=(2 * N, n))
+        is_contact, tangents = np.arange(2 * N) < N, np.append(np.arange(N) + N, np.full(N, -1))
+        mu = np.append(rng.uniform(0.1, 1.5, N), np.zeros(N))
+        contacts = Contacts(is_contact, is_contact, ~is_contact, tangents, np.zeros(2 * N), mu, np.array(1.0))
+        rows = ContactRows(xp.asarray(U @ U.T), xp.asarray(U), xp.full(2 * N, True))
+        rate, closed = xp.asarray(1e-28 * rng.normal(size=2 * N)), is_contact
+        given = contacts, rows, rate, np.zeros(2 * N), closed
+        found = impulses_with_friction(*given, xp.full(2 * N, 1e-12), xp)
+        assert not found.remaining and not np.any(found.impulse)
+        if xp is np:
+            unsolved += np.isnan(impulses_with_friction(*given, np.zeros(2 * N), np).impulse).any()
+    assert unsolved or xp is not np  # as impacts they would have no solution
+
+
 @pytest.mark.slow
 def test_both_forms_of_lemke_agree():
     for M, q in map(problem_of_friction, range(3)):

@@ -188,7 +188,10 @@ def impulses_with_friction(
     sizes = size[..., : len(normals)][..., rubbing], size[..., len(normals) :]
     coefficient = contacts.friction[..., normals[rubbing]] * sizes[1] / sizes[0]
     takes_part = (closed & rows.free)[..., normals]
-    given = RubbingContacts(W, rate[..., columns] / size, restitution[..., normals], coefficient, takes_part)
+    # Speeds that are zero but for rounding errors are no impact: their ratios are those of no motion, which may have no solution.
+    approaches = xp.any(closed & rows.free & (rate < -floor), axis=-1, keepdims=True)
+    speeds = xp.where(approaches, rate[..., columns] / size, 0.0)
+    given = RubbingContacts(W, speeds, restitution[..., normals], coefficient, takes_part)
     impulse = (rubbing_impact(given, rubbing, xp) / size) @ np.eye(E)[columns]
     after = rate + times(rows.W, impulse)
     limit = floor + STILL * _largest(rate, closed, xp)
