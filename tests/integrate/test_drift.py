@@ -12,7 +12,7 @@ import udkjax as udk
 from tests.choices import fast
 from udkjax import Result
 from udkjax.native import primitive
-from udkjax.native.run import controller
+from udkjax.native.parts import elimination, projection
 
 TS = np.linspace(0.0, 5.0, 26)
 TIGHT = {"rtol": 1e-8, "atol": 1e-8, "throw": False}
@@ -236,7 +236,7 @@ def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
     before = verdicts()
     assert before == [Result.singular] * 3 + [Result.successful] * 2
     assert verdicts(drift_tol=1e-3 * factor) == before
-    monkeypatch.setattr(controller, "NEAREST", controller.NEAREST * factor)
+    monkeypatch.setattr(elimination, "NEAREST", elimination.NEAREST * factor)
     primitive.generate.cache_clear()
     primitive.machine_code.cache_clear()
     assert verdicts() == before
@@ -248,7 +248,7 @@ def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
 def test_ten_times_more_or_less_refuses_no_projected_run_across_singular_configurations(factor, monkeypatch):
     """The bound of Psi after a projection, in tolerances."""
-    monkeypatch.setattr(controller, "CLOSED_TOL", controller.CLOSED_TOL * factor)
+    monkeypatch.setattr(projection, "CLOSED_TOL", projection.CLOSED_TOL * factor)
     primitive.generate.cache_clear()
     primitive.machine_code.cache_clear()
     for mech in (swing(), swing(0.9), kite(), equal_crank(), udk.library.n_four_bar(2), udk.library.peaucellier(1.1, 2.0)):

@@ -2,6 +2,7 @@
 
 import ctypes
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ INDEX = np.arange(9) % 7 - 1  # an index for each member, some outside
 def write(function, given, width):
     """Write `lowered(inputs..., outputs..., scratch)`; return it, and the shapes and types of the outputs."""
     closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in given))
-    outs = [v.aval for v in closed.jaxpr.outvars]
+    outs: list[Any] = [v.aval for v in closed.jaxpr.outvars]
     names = [*(f"in{k}" for k in range(len(given))), *(f"out{k}" for k in range(len(outs)))]
     f = LoweredFunction("lowered", [*names, "scratch"], width)
     to = Lowering(f, f.given["scratch"], lower)

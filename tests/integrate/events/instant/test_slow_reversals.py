@@ -18,6 +18,7 @@ def creeping(damping):
 @pytest.mark.parametrize("end", [0.05, 0.8])
 def test_a_run_ends_with_no_event_that_it_has_not_had(end):
     loose = udk.simulate(creeping(2e7), [0.0, 0.5 * end, end], rtol=1e-6, atol=1e-6)
+    assert loose.events is not None
     names = [loose.events.names[int(k)] for k in loose.events.index]
     assert not names or np.max(loose.events.time) < end
     exact = 0.3 - 0.5 / 2e7  # the way to the stop; creeping back takes days
@@ -26,5 +27,5 @@ def test_a_run_ends_with_no_event_that_it_has_not_had(end):
 
 def test_a_reversal_that_tolerances_show_is_found():
     tight = udk.simulate(creeping(2e3), [0.0, 0.8], rtol=1e-10, atol=1e-10)
-    assert [tight.events.names[int(k)] for k in tight.events.index] == ["guide turns round"]
+    assert tight.events is not None and [tight.events.names[int(k)] for k in tight.events.index] == ["guide turns round"]
     assert float(tight.v[-1, 0, 0]) < 0.0

@@ -129,7 +129,7 @@ def _friction(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]
     names = [name for name, force in mechanism.forces.items() if isinstance(force, Friction)]
     if not names:
         return []
-    powers = power_balance(mechanism, cast(StateHistory, solution)).forces  # NumPy's arrays will do
+    powers = power_balance(mechanism, solution).forces
     return [MeasureCurve("power of friction", "W", np.sum([np.asarray(powers[name]) for name in names], axis=0))]
 
 
