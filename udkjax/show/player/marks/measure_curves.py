@@ -1,7 +1,7 @@
 """Curves over time below the motion, and arrows of reactions."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,7 +11,6 @@ from udkjax.equations import determinacy
 from udkjax.equations.rows.analysis import analyse
 from udkjax.equations.states.quantities import efforts, energy, violation
 from udkjax.equations.states.reactions import reactions, unique_reactions
-from udkjax.positions.assembling.channels import StateHistory
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
