@@ -16,6 +16,7 @@ from udkjax.requirements import (
     ArgumentError,
     ArgumentTypeError,
     GivenArguments,
+    Sign,
     array,
     describe,
     require_count,
@@ -128,6 +129,18 @@ def require_history(name: str, value: Any, given: GivenArguments) -> None:
     if ts.ndim != 1 or q.shape[:1] != ts.shape or q.shape != expected_shape or v.shape != q.shape:
         expected = f"ts (T,), q and v (T, bodies, 3) of {len(names)} bodies" if names else "ts (T,), q and v (T, n)"
         raise ArgumentError(f"{name} must have {expected}; the shapes are {ts.shape}, {q.shape} and {v.shape}")
+
+
+def several(count: int, sign: Sign = "any") -> ArgumentRequirement:
+    """Return the requirement of a list of numbers, each finite and of a sign."""
+
+    def check(name: str, value: Any, given: GivenArguments):
+        if array(name, value).shape != (count,):
+            raise ArgumentTypeError(f"{name} must be {count} numbers, {describe(value)}")
+        for k, x in enumerate(value):
+            require_number(f"{name}[{k}]", x, sign)
+
+    return ArgumentRequirement(f"{count} {'' if sign == 'any' else sign + ' '}numbers", check)
 
 
 NOT_NEGATIVE = ArgumentRequirement("zero or positive", partial(require_number, sign="not negative"))

@@ -246,6 +246,7 @@ def targets() -> list[tuple[str, Callable[..., Any], dict[str, Any]]]:
                 given |= {"motion": fitting()["motion"], "drivers": ["body.b.angle"]}
             found += [(name, function, given)] * (1 if name in SELDOM else 12)
     found += [("simulate", udk.simulate, {"mechanism": scene(), "ts": fitting()["ts"]})] * 60
+    found += [(f"library.{name}", getattr(udk.library, name), {}) for name in udk.library.__all__] * 4
     for name, function in vars(evaluate).items():
         if not hasattr(function, "__wrapped__") or not function.__module__.startswith("udkjax.equations.terms."):
             continue
@@ -331,6 +332,7 @@ def case_of(name: str, function: Callable[..., Any], given: dict[str, Any], wron
     about = f"{name}({', '.join(wrong)})"
     # An argument that is valid alone but does not fit the others may be reported under any name.
     mismatched = any(isinstance(value, udk.Mechanism | udk.Analysis | udk.State | SimpleNamespace) for value in wrong.values())
+    mismatched |= name.startswith("library.")  # numbers with which links do not meet: the message names lengths, bodies or pins
     names = [] if mismatched else _names(wrong)
     if traced:
         return Case(f"{about} traced", functools.partial(_traced, function, given, traced), names)

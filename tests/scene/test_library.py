@@ -199,3 +199,21 @@ def test_andrews_squeezer_moves_as_published():
     motion = simulate(library.andrews_squeezer(), [0.0, 0.03], rtol=1e-12, atol=1e-12)
     k1, k2, k3, k4, k5, k6, k7 = np.asarray(motion.q[-1, :, 2])
     assert_allclose([k1, k2 - k1, k3, k4 - k5, k5, k6 - k7, k7], published, rtol=0, atol=2e-9)
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_a_wrong_argument_is_named(name):
+    """A text, NaN, no number or too many: each parameter of each mechanism refuses them by its name."""
+    build = getattr(library, name)
+    for parameter in inspect.signature(build).parameters.values():
+        for value in ("text", float("nan"), [], np.ones(7), {"a": 1.0}, None):
+            if value is not None or parameter.default is not None:
+                with pytest.raises((TypeError, ValueError), match=rf"^{parameter.name}\b"):
+                    build(**{parameter.name: value})
+
+
+def test_links_that_do_not_meet_are_refused():
+    with pytest.raises(ValueError, match="links of 1 and 10 m cannot meet"):
+        udk.library.four_bar(lengths=(1.0, 1.0, 10.0))
+    with pytest.raises(ValueError, match=r"a rod of 0[.]2 m does not reach"):
+        udk.library.slider_crank(angle=1.5, rod=0.2)

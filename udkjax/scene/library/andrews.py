@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import ArrayLike
 
-from udkjax.annotations import Numbers
+from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import POSITIVE, several
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.forces import Spring, Torque
 from udkjax.scene.elements.joints import Revolute
@@ -36,7 +37,10 @@ START: Mapping[str, float] = MappingProxyType(  # rad
 
 @with_concrete_numbers
 def andrews_squeezer(
-    torque: ArrayLike = 0.033, stiffness: ArrayLike = 4530.0, spring_length: ArrayLike = 0.07785, gravity: Numbers = (0.0, 0.0)
+    torque: NumberLike = 0.033,
+    stiffness: NumberLike = 4530.0,
+    spring_length: Annotated[NumberLike, POSITIVE] = 0.07785,
+    gravity: Annotated[Numbers, several(2)] = (0.0, 0.0),
 ) -> Mechanism:
     """Return Andrews' squeezing mechanism: seven bodies in three loops, driven by a constant torque against a stiff spring.
 

@@ -1,12 +1,15 @@
 """Mechanisms made from drawings: a four-bar, a slider-crank, a scissor lift. SI units, radians."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import ArrayLike
 
+from udkjax.annotations import NumberLike
+from udkjax.argument_types import COUNT, POSITIVE, several
 from udkjax.arrays import array_namespace
+from udkjax.requirements import ArgumentError
 from udkjax.scene.drawing.drawing import Drawing
 from udkjax.scene.drawing.drawn_forces import Motor
 from udkjax.scene.drawing.drawn_joints import PinInSlot, Slide
@@ -27,12 +30,12 @@ from udkjax.scene.mechanism import Mechanism
 
 @with_concrete_numbers
 def four_bar(
-    angle: ArrayLike = np.pi / 3,
-    angular_velocity: ArrayLike = 0.0,
-    lengths: Sequence[ArrayLike] = (1.0, 2.5, 2.0),
-    ground: ArrayLike = 2.5,
-    density: ArrayLike = 1.0,
-    gravity: ArrayLike = 9.81,
+    angle: NumberLike = np.pi / 3,
+    angular_velocity: NumberLike = 0.0,
+    lengths: Annotated[Sequence[NumberLike], several(3, "positive")] = (1.0, 2.5, 2.0),
+    ground: Annotated[NumberLike, POSITIVE] = 2.5,
+    density: Annotated[NumberLike, POSITIVE] = 1.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return a four-bar, by default a crank-rocker: crank, coupler and rocker of `lengths`, uniform, `density` in kg/m.
 
@@ -52,15 +55,15 @@ def four_bar(
 
 @with_concrete_numbers
 def slider_crank(
-    angle: ArrayLike = 0.0,
-    angular_velocity: ArrayLike = 4.0,
+    angle: NumberLike = 0.0,
+    angular_velocity: NumberLike = 4.0,
     driven: bool = True,
-    crank: ArrayLike = 0.5,
-    rod: ArrayLike = 1.5,
-    masses: Sequence[ArrayLike] = (1.0, 1.5, 2.0),
-    slider_inertia: ArrayLike = 0.1,
-    gravity: ArrayLike = 9.81,
-    spring: Sequence[ArrayLike] | None = None,
+    crank: Annotated[NumberLike, POSITIVE] = 0.5,
+    rod: Annotated[NumberLike, POSITIVE] = 1.5,
+    masses: Annotated[Sequence[NumberLike], several(3, "positive")] = (1.0, 1.5, 2.0),
+    slider_inertia: Annotated[NumberLike, POSITIVE] = 0.1,
+    gravity: NumberLike = 9.81,
+    spring: Annotated[Sequence[NumberLike] | None, several(3)] = None,
 ) -> Mechanism:
     """Return a slider-crank on the x axis: crank of length `crank` about the origin, connecting rod, slider in a guide.
 
@@ -71,6 +74,8 @@ def slider_crank(
 
     def places(s):
         xp = array_namespace(s, crank, rod)
+        if xp is np and abs(np.sin(s.real) * crank) > rod:
+            raise ArgumentError(f"a rod of {rod:g} m does not reach from a crank of {crank:g} m to the guide in this position")
         tilt = -xp.arcsin(crank * xp.sin(s) / rod)
         pin = crank * unit_vector(s)
         return {"O": np.zeros(2), "P": pin, "B": pin + rod * unit_vector(tilt)}
@@ -92,13 +97,13 @@ def slider_crank(
 
 @with_concrete_numbers
 def scissor_lift(
-    stages: int = 2,
-    angle: ArrayLike = np.pi / 6,
-    angular_velocity: ArrayLike = 0.0,
-    length: ArrayLike = 1.0,
-    mass: ArrayLike = 1.0,
-    platform_mass: ArrayLike = 5.0,
-    gravity: ArrayLike = 9.81,
+    stages: Annotated[int, COUNT] = 2,
+    angle: NumberLike = np.pi / 6,
+    angular_velocity: NumberLike = 0.0,
+    length: Annotated[NumberLike, POSITIVE] = 1.0,
+    mass: Annotated[NumberLike, POSITIVE] = 1.0,
+    platform_mass: Annotated[NumberLike, POSITIVE] = 5.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return a scissor lift: `stages` pairs of crossed bars and a platform, whose guide makes 2 rows redundant.
 

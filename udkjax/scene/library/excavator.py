@@ -1,11 +1,12 @@
 """The arm of an excavator: an open chain of three bodies, the last one driven through a four-bar. SI units, radians."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import ArrayLike
 
-from udkjax.annotations import Numbers
+from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import several
 from udkjax.arrays import array_namespace
 from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME, Frame, between
 from udkjax.scene.elements.drivers import Driver, Sine
@@ -33,16 +34,16 @@ BASE = (0.13, -0.09)  # pin of the boom's cylinder on the ground, relative to th
 
 @with_concrete_numbers
 def excavator(
-    angles: Sequence[ArrayLike] = (0.6, -1.1, -2.2),
-    angular_velocities: Sequence[ArrayLike] = (-0.2, 0.3, 0.6),
+    angles: Annotated[Sequence[NumberLike], several(3)] = (0.6, -1.1, -2.2),
+    angular_velocities: Annotated[Sequence[NumberLike], several(3)] = (-0.2, 0.3, 0.6),
     driven: bool = False,
-    lengths: Sequence[ArrayLike] = (5.7, 2.9, 0.62, 0.6, 1.45),
-    masses: Sequence[ArrayLike] = (1500.0, 750.0, 80.0, 60.0, 900.0),
-    stiffness: Sequence[ArrayLike] = (1.5e7, 1.2e7, 8e6),
-    damping: Sequence[ArrayLike] = (6e4, 4e4, 1e4),
-    strokes: Sequence[ArrayLike] = (0.3, -0.4, -0.3),
-    frequencies: Sequence[ArrayLike] = (0.6, 0.8, 1.1),
-    gravity: ArrayLike = 9.81,
+    lengths: Annotated[Sequence[NumberLike], several(5, "positive")] = (5.7, 2.9, 0.62, 0.6, 1.45),
+    masses: Annotated[Sequence[NumberLike], several(5, "positive")] = (1500.0, 750.0, 80.0, 60.0, 900.0),
+    stiffness: Annotated[Sequence[NumberLike], several(3)] = (1.5e7, 1.2e7, 8e6),
+    damping: Annotated[Sequence[NumberLike], several(3)] = (6e4, 4e4, 1e4),
+    strokes: Annotated[Sequence[NumberLike], several(3)] = (0.3, -0.4, -0.3),
+    frequencies: Annotated[Sequence[NumberLike], several(3)] = (0.6, 0.8, 1.1),
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return the arm of an excavator of 20 t: boom, stick, rocker, link and bucket, 12 rows, three degrees of freedom.
 

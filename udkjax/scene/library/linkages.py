@@ -1,8 +1,11 @@
 """Linkages with one degree of freedom, including the paper's. SI units, radians."""
 
-import numpy as np
-from jaxtyping import ArrayLike
+from typing import Annotated
 
+import numpy as np
+
+from udkjax.annotations import NumberLike
+from udkjax.argument_types import COUNT, POSITIVE
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Revolute, Slot
 from udkjax.scene.library.posed_bodies import (
@@ -17,15 +20,15 @@ from udkjax.scene.mechanism import Mechanism
 
 @with_concrete_numbers
 def parallelogram(
-    angle: ArrayLike = -np.pi / 4,
-    angular_velocity: ArrayLike = 0.0,
-    length: ArrayLike = 1.0,
-    mass: ArrayLike = 1.0,
-    inertia: ArrayLike = 0.1,
-    coupler_mass: ArrayLike = 2.0,
-    coupler_inertia: ArrayLike = 0.2,
-    gravity: ArrayLike = 9.81,
-    spacing: ArrayLike = 1.0,
+    angle: NumberLike = -np.pi / 4,
+    angular_velocity: NumberLike = 0.0,
+    length: Annotated[NumberLike, POSITIVE] = 1.0,
+    mass: Annotated[NumberLike, POSITIVE] = 1.0,
+    inertia: Annotated[NumberLike, POSITIVE] = 0.1,
+    coupler_mass: Annotated[NumberLike, POSITIVE] = 2.0,
+    coupler_inertia: Annotated[NumberLike, POSITIVE] = 0.2,
+    gravity: NumberLike = 9.81,
+    spacing: Annotated[NumberLike, POSITIVE] = 1.0,
 ) -> Mechanism:
     """Return the paper's five-bar parallelogram: three parallel links carry a coupler. 12 rows, rank 11, one degree of freedom.
 
@@ -57,7 +60,7 @@ def parallelogram(
 
 @with_concrete_numbers
 def n_four_bar(
-    n: int = 2, angle: ArrayLike = np.pi / 2, angular_velocity: ArrayLike = -1.0, gravity: ArrayLike = 9.81
+    n: Annotated[int, COUNT] = 2, angle: NumberLike = np.pi / 2, angular_velocity: NumberLike = -1.0, gravity: NumberLike = 9.81
 ) -> Mechanism:
     """Return the IFToMM benchmark A02: n square four-bars in a row, which pass through singular configurations twice a turn.
 
@@ -81,11 +84,11 @@ def n_four_bar(
 
 @with_concrete_numbers
 def elliptic_trammel(
-    angle: ArrayLike = np.pi / 4,
-    angular_velocity: ArrayLike = 0.0,
-    length: ArrayLike = 2.0,
-    mass: ArrayLike = 1.0,
-    gravity: ArrayLike = 9.81,
+    angle: NumberLike = np.pi / 4,
+    angular_velocity: NumberLike = 0.0,
+    length: Annotated[NumberLike, POSITIVE] = 2.0,
+    mass: Annotated[NumberLike, POSITIVE] = 1.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return a uniform rod whose end A slides on the y axis and whose end B slides on the x axis.
 

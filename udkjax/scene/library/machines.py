@@ -1,10 +1,12 @@
 """Larger mechanisms: a straight-line linkage, a planetary gear. SI units, radians."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import ArrayLike
 
+from udkjax.annotations import NumberLike
+from udkjax.argument_types import COUNT, POSITIVE, several
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.couplings import Gear
 from udkjax.scene.elements.joints import Joint, Revolute
@@ -24,13 +26,13 @@ from udkjax.scene.mechanism import Mechanism
 
 @with_concrete_numbers
 def peaucellier(
-    angle: ArrayLike = np.pi / 6,
-    angular_velocity: ArrayLike = 0.0,
-    crank: ArrayLike = 0.6,
-    arm: ArrayLike = 2.0,
-    side: ArrayLike = 1.2,
-    density: ArrayLike = 1.0,
-    gravity: ArrayLike = 9.81,
+    angle: NumberLike = np.pi / 6,
+    angular_velocity: NumberLike = 0.0,
+    crank: Annotated[NumberLike, POSITIVE] = 0.6,
+    arm: Annotated[NumberLike, POSITIVE] = 2.0,
+    side: Annotated[NumberLike, POSITIVE] = 1.2,
+    density: Annotated[NumberLike, POSITIVE] = 1.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return the Peaucellier-Lipkin linkage, which converts a rotation to an exact straight line.
 
@@ -73,12 +75,12 @@ def peaucellier(
 
 @with_concrete_numbers
 def planetary_gear(
-    planets: int = 3,
-    angular_velocity: ArrayLike = 1.0,
-    sun: ArrayLike = 0.2,
-    planet: ArrayLike = 0.1,
-    masses: Sequence[ArrayLike] = (4.0, 1.0, 2.0),
-    gravity: ArrayLike = 0.0,
+    planets: Annotated[int, COUNT] = 3,
+    angular_velocity: NumberLike = 1.0,
+    sun: Annotated[NumberLike, POSITIVE] = 0.2,
+    planet: Annotated[NumberLike, POSITIVE] = 0.1,
+    masses: Annotated[Sequence[NumberLike], several(3, "positive")] = (4.0, 1.0, 2.0),
+    gravity: NumberLike = 0.0,
 ) -> Mechanism:
     """Return a planetary gear with a fixed ring: `planets` planets on a carrier mesh with the sun and the ring.
 

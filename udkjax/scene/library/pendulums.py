@@ -1,11 +1,12 @@
 """Pendulums. SI units, radians."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import ArrayLike
 
-from udkjax.annotations import Numbers
+from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import COUNT, POSITIVE, several
 from udkjax.scene.elements.bodies import GROUND, Body
 from udkjax.scene.elements.drivers import Driver, Sine
 from udkjax.scene.elements.joints import Distance, Revolute
@@ -23,10 +24,10 @@ from udkjax.scene.mechanism import Mechanism
 
 @with_concrete_numbers
 def simple_pendulum(
-    position: Numbers = (-1.0, 0.0),
-    velocity: Numbers = (0.0, 0.0),
-    mass: ArrayLike = 1.0,
-    gravity: ArrayLike = 9.81,
+    position: Annotated[Numbers, several(2)] = (-1.0, 0.0),
+    velocity: Annotated[Numbers, several(2)] = (0.0, 0.0),
+    mass: Annotated[NumberLike, POSITIVE] = 1.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return the IFToMM benchmark A01: a point mass on a massless rod from the origin to `position`.
 
@@ -38,11 +39,11 @@ def simple_pendulum(
 
 @with_concrete_numbers
 def compound_pendulum(
-    angle: ArrayLike = np.pi / 3,
-    angular_velocity: ArrayLike = 0.0,
-    length: ArrayLike = 1.5,
-    mass: ArrayLike = 2.0,
-    gravity: ArrayLike = 9.81,
+    angle: NumberLike = np.pi / 3,
+    angular_velocity: NumberLike = 0.0,
+    length: Annotated[NumberLike, POSITIVE] = 1.5,
+    mass: Annotated[NumberLike, POSITIVE] = 2.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return a uniform rod pinned at one end; `angle` is measured from the downward vertical."""
 
@@ -59,11 +60,11 @@ def compound_pendulum(
 
 @with_concrete_numbers
 def double_pendulum(
-    angles: Sequence[ArrayLike] = (np.pi / 2, np.pi / 2),
-    angular_velocities: Sequence[ArrayLike] = (0.0, 0.0),
-    lengths: Sequence[ArrayLike] = (1.0, 1.0),
-    masses: Sequence[ArrayLike] = (1.0, 1.0),
-    gravity: ArrayLike = 9.81,
+    angles: Annotated[Sequence[NumberLike], several(2)] = (np.pi / 2, np.pi / 2),
+    angular_velocities: Annotated[Sequence[NumberLike], several(2)] = (0.0, 0.0),
+    lengths: Annotated[Sequence[NumberLike], several(2, "positive")] = (1.0, 1.0),
+    masses: Annotated[Sequence[NumberLike], several(2, "positive")] = (1.0, 1.0),
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return a double pendulum of two uniform rods, which is chaotic; `angles` are measured from the downward vertical."""
     a, b = (0.5 * length for length in lengths)
@@ -86,11 +87,11 @@ def double_pendulum(
 
 @with_concrete_numbers
 def driven_pendulum(
-    amplitude: ArrayLike = 0.8,
-    frequency: ArrayLike = 3.0,
-    length: ArrayLike = 1.0,
-    mass: ArrayLike = 1.0,
-    gravity: ArrayLike = 9.81,
+    amplitude: NumberLike = 0.8,
+    frequency: NumberLike = 3.0,
+    length: Annotated[NumberLike, POSITIVE] = 1.0,
+    mass: Annotated[NumberLike, POSITIVE] = 1.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return a uniform rod pinned at one end and driven to the angle `amplitude` sin(`frequency` t) from the x axis."""
     half = 0.5 * length
@@ -109,12 +110,12 @@ def driven_pendulum(
 
 @with_concrete_numbers
 def chain(
-    n: int = 10,
-    angle: ArrayLike = np.pi / 2,
-    angular_velocity: ArrayLike = 0.0,
-    length: ArrayLike = 1.0,
-    mass: ArrayLike = 1.0,
-    gravity: ArrayLike = 9.81,
+    n: Annotated[int, COUNT] = 10,
+    angle: NumberLike = np.pi / 2,
+    angular_velocity: NumberLike = 0.0,
+    length: Annotated[NumberLike, POSITIVE] = 1.0,
+    mass: Annotated[NumberLike, POSITIVE] = 1.0,
+    gravity: NumberLike = 9.81,
 ) -> Mechanism:
     """Return n uniform rods in a chain of `length` and `mass`, suspended at one end: an n-fold pendulum.
 

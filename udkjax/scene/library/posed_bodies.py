@@ -18,7 +18,8 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from udkjax.arrays import array_namespace, number
 from udkjax.programs.deferred import deferred_if_traced
-from udkjax.scene.arguments import bind_arguments
+from udkjax.requirements import ArgumentError
+from udkjax.scene.arguments import bind_arguments, checked
 from udkjax.scene.elements.bodies import Body
 from udkjax.scene.mechanism import Mechanism
 
@@ -29,7 +30,7 @@ COMPLEX_STEP = 1e-100  # the square is negligible relative to 1, and products wi
 
 
 def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
-    """Decorate a function of the library to receive concrete numbers as NumPy arrays, which JAX does not trace."""
+    """Decorate a function of the library: its arguments are checked, and numbers that are not traced arrive as NumPy arrays."""
     parameters, build_deferred = signature(build), deferred_if_traced(build)
 
     @wraps(build)
@@ -41,7 +42,7 @@ def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanis
                 bound.arguments[name] = jax.tree.map(_as_concrete, value)
         return build_deferred(*bound.args, **bound.kwargs)
 
-    return build_with_concrete_numbers
+    return checked(build_with_concrete_numbers)
 
 
 def _as_concrete(value: ArrayLike) -> ArrayLike:
@@ -119,7 +120,11 @@ def apex(start, end, a, b):
     base = end - start
     square = base @ base
     x = (square + a**2 - b**2) / (2 * square)
-    y = xp.sqrt(a**2 / square - x**2)
+    height = a**2 / square - x**2
+    if xp is np and height.real < 0:
+        distance = np.sqrt(square.real)
+        raise ArgumentError(f"links of {a:g} and {b:g} m cannot meet: their other ends are {distance:g} m apart in this position")
+    y = xp.sqrt(height)
     return start + x * base + y * as_array([-base[1], base[0]])
 
 
