@@ -159,7 +159,7 @@ def _page(candidate: Any, goal: Any) -> Any:
     speed = constant_speed(mech, driver) if isinstance(driver, str) else 0.0
     if candidate.turns and speed:
         sol = udk.simulate(mech, np.linspace(0.0, 2 * np.pi / abs(speed), TURN_INSTANTS), throw=False)
-        live = [name for name in mech.parameters() if name.startswith("pin.") or name == f"motor.{driver}.speed"]
+        live = [name for name in mech.independent_parameters() if name.startswith("pin.") or name == f"motor.{driver}.speed"]
         with contextlib.suppress(ValueError):  # a page cannot simulate it
             return udk.animate(mech, sol, traces=traces, targets=targets, live=live)
     return udk.animate(mech, candidate.motion(), measures=(), traces=traces, targets=targets)

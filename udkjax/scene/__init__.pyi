@@ -79,6 +79,7 @@ from udkjax.scene.model import Model as Model
 from udkjax.scene.model import RunModel as RunModel
 from udkjax.scene.numbers.description import format_pose as format_pose
 from udkjax.scene.numbers.description import size_of as size_of
+from udkjax.scene.numbers.named_numbers import numbers_in_expressions as numbers_in_expressions
 from udkjax.scene.numbers.number_fields import NumberField as NumberField
 from udkjax.scene.numbers.number_fields import split_index as split_index
 from udkjax.scene.numbers.origin import Origin as Origin

@@ -27,6 +27,7 @@ from udkjax.scene.model import Model
 from udkjax.scene.numbers.description import mechanism_table
 from udkjax.scene.numbers.direct_numbers import DirectNumbers
 from udkjax.scene.numbers.mechanism_fields import fields_of
+from udkjax.scene.numbers.named_numbers import formula_mistakes, independent
 from udkjax.scene.numbers.number_fields import (
     SECTIONS,
     ElementGroups,
@@ -339,8 +340,9 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         Numbers given directly instead of those that follow from the drawing are among them.
         """
         source = self._source
-        groups = source.drawing.groups if isinstance(source, Drawn) else source.groups(self._names)
+        groups = source.drawing.own_groups if isinstance(source, Drawn) else source.groups(self._names)
         found = {name: p.value for name, p in parameters_in(groups).items() if p.value is not None}
+        found = independent(found, source.drawing.formulas) if isinstance(source, Drawn) and source.drawing.formulas else found
         direct = [(f"{key}.values", x.values) if isinstance(x, Held) else (key, x) for key, x in self.direct.items()]
         return {"gravity": self.gravity, **found, **dict(direct)}
 
@@ -394,7 +396,9 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         if direct:  # this raises an error if they do not fit
             elements, _ = replace_numbers(groups, self.gravity, direct, known, self.name)
         if of_drawing:
-            drawing = drawing.with_groups(*replace_numbers(drawing.groups, self.gravity, of_drawing, drawn, self.name))
+            if mistakes := list(formula_mistakes(of_drawing, drawing.formulas)):
+                raise SceneError(mistakes, self.name)
+            drawing = drawing.with_groups(*replace_numbers(drawing.own_groups, self.gravity, of_drawing, drawn, self.name))
         changed = Drawn(drawing, DirectNumbers.of(direct, source.direct))
         if of_drawing or self._valid_elements(elements, self.gravity) is None:
             return Mechanism.of_drawing(changed, self.name, origin)

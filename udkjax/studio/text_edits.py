@@ -15,7 +15,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.studio.limits import require_few, require_size
 
 Document = dict[str, Any]
-NEW_TABLES = ("pins", "velocities")  # tables that are written with a header
+NEW_TABLES = ("numbers", "pins", "velocities")  # tables that are written with a header
 HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries are written with a header
 
 

@@ -15,6 +15,8 @@ from udkjax.requirements import require_count, require_number
 from udkjax.scene.arguments import checked
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.numbers.named_numbers import numbers_in_expressions
+from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import Designs
@@ -201,8 +203,10 @@ def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[Motion
 def _all_pins(mechanism: Mechanism) -> list[str]:
     if mechanism.drawing is None:
         raise SceneError(["free: name the free numbers; only a drawing has a default, all pins"], mechanism.name)
-    numbers = {name: x for name, x in mechanism.number_fields().items() if x.section == "pin" and x.value is not None}
-    return [name for name, x in numbers.items() if x.path[-1] not in ("velocity", "along")]
+    known, named = mechanism.number_fields(), numbers_in_expressions(mechanism.drawing.formulas, "pin")
+    fields = {name: known[split_index(name, known)[0]] for name in mechanism.independent_parameters()}
+    of_pins = [name for name, x in fields.items() if x.section == "pin" and x.path[-1] not in ("velocity", "along")]
+    return [*(name for name, x in fields.items() if x.section == "number" and x.owner in named), *of_pins]
 
 
 def _places(mechanism: Mechanism, goal: Goal) -> np.ndarray:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from udkjax.annotations import Numbers, TomlTable
+from udkjax.annotations import NumberLike, Numbers, TomlTable
 from udkjax.arrays import by_numpy, make_module, number
 from udkjax.printing import PrintedTable, has_numbers
 from udkjax.scene.drawing.drawing_reader import (
@@ -32,6 +32,7 @@ from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.elements.joints import Joint, Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.description import drawing_table
+from udkjax.scene.numbers.named_numbers import Formula, with_expressions, without_expressions
 from udkjax.scene.numbers.number_fields import ElementGroups
 from udkjax.scene.numbers.sources import AbstractDrawing, Drawn, Follows, is_number
 from udkjax.scene.tables.checks import SceneEntry, SceneError
@@ -72,6 +73,8 @@ class Drawing(AbstractDrawing):
             its unit, such as "60 rpm".
         friction: Friction at pins, in slides and in slots, as the elements above.
         screws: Screws that turn at a pin and move a slide, as the elements above.
+        numbers: Named numbers, which other numbers may be expressions of: with {"r": 40}, a length may be "2*r". They are plain
+            numbers in the drawing's units, strings with a unit, or expressions of each other.
 
     Raises:
         SceneError: The drawing is wrong; the error lists all mistakes. Traced numbers are not checked.
@@ -81,6 +84,7 @@ class Drawing(AbstractDrawing):
     gravity: Float[Array, "2"]  # m/s^2
     ground: tuple[str, ...] = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # the units in which it was written
+    formulas: tuple[Formula, ...] = eqx.field(static=True)  # numbers that expressions give
     _names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # names of the elements of each section
     _elements: tuple[tuple[Any, ...] | None, ...]
 
@@ -107,6 +111,7 @@ class Drawing(AbstractDrawing):
         units: Mapping[str, str] | None = None,
         friction: "Mapping[str, PinFriction | TomlTable] | Sequence[PinFriction | TomlTable] | None" = None,
         screws: "Mapping[str, ScrewPair | TomlTable] | Sequence[ScrewPair | TomlTable] | None" = None,
+        numbers: Mapping[str, NumberLike | str] | None = None,
     ):
         given = {"link": links, "slide": slides, "slot": slots, "gear": gears, "screw": screws, "cam": cams}
         given |= {"motor": motors, "spring": springs, "damper": dampers, "load": loads, "friction": friction}
@@ -118,23 +123,38 @@ class Drawing(AbstractDrawing):
             *pin_entries(pins, velocities or {}),
             *(e for section, group in given.items() for e in _entries(section, group)),
         ]
-        checked = read_drawing(entries, ground, gravity, Units(units))
+        checked = read_drawing(entries, ground, gravity, Units(units), numbers=numbers or {})
         if unknown or checked.problems:
             raise SceneError([*unknown, *checked.problems], name)
         self.name, self.gravity, self.ground = name, number(checked.gravity), tuple(ground)
         self.units = tuple((units or {}).items())
-        self._names, self._elements = _in_order(checked.groups)
+        self.formulas = checked.formulas
+        self._names, self._elements = _in_order(without_expressions(checked.groups, checked.formulas))
 
     @classmethod
     def of_elements(cls, checked: DrawingElements, ground: Sequence[str], name: str, units: Mapping[str, str]) -> "Drawing":
         """Return the drawing of elements that were read without mistakes."""
-        names, elements = _in_order(checked.groups)
-        gravity, choices = number(checked.gravity), tuple(units.items())
-        return make_module(cls, name=name, gravity=gravity, ground=tuple(ground), units=choices, _names=names, _elements=elements)
+        names, elements = _in_order(without_expressions(checked.groups, checked.formulas))
+        head: dict[str, Any] = {"name": name, "gravity": number(checked.gravity), "ground": tuple(ground)}
+        head |= {"units": tuple(units.items()), "formulas": checked.formulas}
+        return make_module(cls, **head, _names=names, _elements=elements)
 
     @property
     def groups(self) -> dict[str, dict[str, Any]]:
-        """All elements by section (pin, link, motor, ...) and name."""
+        """All elements by section (number, pin, link, motor, ...) and name, with all of their numbers."""
+        own = self.own_groups
+        if not self.formulas:
+            return own
+        units, named = Units(dict(self.units)), [x for x in own["number"].values() if x.value is not None]
+        if not all(is_number(x.value) for x in named):  # as in `eqx.tree_at`
+            return own
+        given = {formula.owner for formula in self.formulas if formula.section == "number"}
+        measured = {name: units.measured(x) for name, x in own["number"].items() if name not in given}
+        return with_expressions(own, self.formulas, measured, units.size_of)
+
+    @property
+    def own_groups(self) -> dict[str, dict[str, Any]]:
+        """All elements by section and name as the leaves are: a number given by an expression is None, or zero if an entry."""
         sections = zip((*DRAWN, *BY_HAND), self._names, self._elements, strict=True)
         return {section: dict(zip(names, elements or (), strict=True)) for section, names, elements in sections}
 
@@ -157,8 +177,9 @@ class Drawing(AbstractDrawing):
         places, pins = self.pins, self.groups["pin"]
         if all(isinstance(pin, Pin) for pin in pins.values()):
             return self
-        drawn = self.groups | {"pin": {name: Pin(places[name], pin.velocity) for name, pin in pins.items()}}
-        return make_module(Drawing, **vars(self) | {"_elements": _in_order(drawn)[1]})
+        drawn = self.own_groups | {"pin": {name: Pin(places[name], pin.velocity) for name, pin in pins.items()}}
+        formulas = tuple(formula for formula in self.formulas if formula.section != "pin")
+        return make_module(Drawing, **vars(self) | {"_elements": _in_order(drawn)[1], "formulas": formulas})
 
     @property
     def links(self) -> dict[str, Link]:
@@ -255,11 +276,16 @@ class Drawing(AbstractDrawing):
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
-        drawn = [entry for section, group in groups.items() if section != "pin" for entry in _entries(section, group)]
-        checked = read_drawing([*pin_entries(groups["pin"], {}), *drawn], self.ground, gravity, Units(), Units(dict(self.units)))
+        plain = make_module(Drawing, **vars(self) | {"_elements": _in_order(groups)[1]}).groups
+        drawn = [
+            entry for section, group in plain.items() if section not in ("pin", "number") for entry in _entries(section, group)
+        ]
+        units = Units(dict(self.units))
+        checked = read_drawing([*pin_entries(plain["pin"], {}), *drawn], self.ground, gravity, Units(), units)
         if checked.problems:
             raise SceneError(checked.problems, self.name)
-        return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(checked.groups)[1]})
+        own = without_expressions(checked.groups | {"number": plain["number"]}, self.formulas)
+        return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(own)[1]})
 
 
 def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...] | None, ...]]:

@@ -1,8 +1,11 @@
 """Read the elements of a drawing from tables, and find all mistakes: in units, keys, names, connections and geometry."""
 
+import re
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from udkjax.annotations import TomlTable
@@ -10,7 +13,7 @@ from udkjax.arrays import by_numpy, is_traced
 from udkjax.scene.drawing.drawn_forces import Load, Motor, PinDamper, PinSpring
 from udkjax.scene.drawing.drawn_friction import PinFriction
 from udkjax.scene.drawing.drawn_joints import CamPair, GearPair, PinInSlot, ScrewPair, Slide
-from udkjax.scene.drawing.drawn_quantities import Units, without_failed
+from udkjax.scene.drawing.drawn_quantities import Expression, Units, without_failed
 from udkjax.scene.drawing.link import Link, with_concrete_numbers
 from udkjax.scene.drawing.mistakes import gap_mistakes, joint_names, layout_mistakes, pin_mistakes, shape_mistakes, where
 from udkjax.scene.drawing.pin_forms import AbstractPin, PointArray, lowest_of_stack, places_of
@@ -20,9 +23,10 @@ from udkjax.scene.elements.couplings import Coupling
 from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.elements.joints import Joint, Revolute
+from udkjax.scene.numbers.named_numbers import Formula, NamedNumber
 from udkjax.scene.tables.checks import SceneEntry, check_table, gravity_mistakes, name_mistake
 from udkjax.scene.tables.element_setup import as_leaves
-from udkjax.scene.tables.schema import build
+from udkjax.scene.tables.schema import build, keys
 from udkjax.wording import abbreviate, quote, suggestion
 
 SECTIONS: Mapping[str, type[DrawnElement]] = {
@@ -37,7 +41,8 @@ SECTIONS: Mapping[str, type[DrawnElement]] = {
     "load": Load,
     "friction": PinFriction,
 }
-DRAWN = {"pin": AbstractPin, "link": Link, **SECTIONS}
+DRAWN = {"number": NamedNumber, "pin": AbstractPin, "link": Link, **SECTIONS}
+ONLY_PLAIN = "must be a plain number, not the expression"
 BY_HAND = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}  # as in a mechanism
 
 
@@ -47,20 +52,32 @@ class DrawingElements(NamedTuple):
     groups: dict[str, dict[str, Any]]
     gravity: Any
     problems: list[str]
+    formulas: tuple[Formula, ...] = ()  # numbers that expressions give, in the order in which they follow from each other
 
 
 def read_drawing(
-    entries: Sequence[SceneEntry], ground: object, gravity: Any, units: Units, shown: Units | None = None
+    entries: Sequence[SceneEntry],
+    ground: object,
+    gravity: Any,
+    units: Units,
+    shown: Units | None = None,
+    numbers: object = MappingProxyType({}),
 ) -> DrawingElements:
     """Read the elements of a drawing and find all mistakes: in units, keys, shapes, names, connections and geometry.
 
-    Plain numbers are in `units`; messages have numbers in the units `shown`, by default the same.
+    Plain numbers are in `units`; messages have numbers in the units `shown`, by default the same. `numbers` maps the names of
+    numbers to their values, or to expressions.
     """
     problems = list(units.problems)
+    named_numbers = units.read_numbers(numbers, problems)
+    if len(problems) > len(units.problems):  # expressions of these numbers have no values
+        return DrawingElements({}, gravity, problems)
+    formulas = [Formula("number", x.path.split(".")[1], ("value",), (), x.text, "") for x in units.expressions]
     if gravity is None:
         gravity = (0.0, -9.81)
     elif isinstance(gravity, str | list | tuple):
         gravity = units.convert("gravity", gravity, "m/s2", problems)
+        problems += [f"{x.path}: {ONLY_PLAIN} {quote(x.text)}" for x in units.expressions[len(formulas) :]]
     problems += [] if gravity is None else gravity_mistakes(gravity)
     named = {s: {str(e.name): e.cls for e in entries if e.section == s} for s in (*DRAWN, *BY_HAND)}
     bodies = {GROUND: None, **named["link"], **named["body"]}
@@ -76,6 +93,7 @@ def read_drawing(
         if p not in named["pin"]
     ]
     groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWN, *BY_HAND)}
+    groups["number"], named["number"] = named_numbers, dict.fromkeys(named_numbers)
     for section in groups:
         if section == "body":  # the pins and links, which determine the joints, have been read
             layout = PinLayout(groups["link"], fixed_pins, groups["slide"])
@@ -83,7 +101,7 @@ def read_drawing(
             known["rubbing"] |= named["joint"]
         for entry in entries:
             if entry.section == section:
-                _read_element(entry, known, units, groups[section], problems)
+                _read_element(entry, known, units, groups[section], problems, formulas)
     if any(len(groups[s]) < len(named[s]) for s in ("pin", "link")) or any(pin not in named["pin"] for pin in fixed_pins):
         return DrawingElements(groups, gravity, problems)
     if misplaced := list(pin_mistakes(groups["pin"], shown or units)):
@@ -96,11 +114,18 @@ def read_drawing(
         problems += shape_mistakes(drawn["pin"], drawn["link"], {slot.pin for slot in drawn["slot"].values()})
         if not problems:
             problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
-    return DrawingElements(groups, gravity, problems)
+    return DrawingElements(groups, gravity, problems, tuple(formulas))
 
 
-def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, group: dict[str, Any], problems: list[str]) -> None:
-    """Add an element to its group, or its mistakes to the problems."""
+def _read_element(
+    entry: SceneEntry,
+    known: Mapping[str, Any],
+    units: Units,
+    group: dict[str, Any],
+    problems: list[str],
+    formulas: list[Formula],
+) -> None:
+    """Add an element to its group and its expressions to the formulas, or its mistakes to the problems."""
     path = entry.where if entry.section != "pin" else where("pin", entry.index, str(entry.name))
     if mistake := name_mistake(entry.name):
         problems.append(f"{path}.name: {mistake}")
@@ -110,7 +135,7 @@ def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, gro
         problems.append(entry.problem)
         return
     failed: list[str] = []
-    table, cls = entry.table, entry.cls
+    table, cls, count = entry.table, entry.cls, len(units.expressions)
     if not isinstance(entry.element, cls):
         variant, law = units_of_element(cls, table)
         table = units.convert_table(path, cls, table, failed, variant, law)
@@ -120,7 +145,27 @@ def _read_element(entry: SceneEntry, known: Mapping[str, Any], units: Units, gro
     problems += mistakes
     if not mistakes and isinstance(entry.name, str):
         element: Any = entry.element
-        group.setdefault(entry.name, as_leaves(element) if isinstance(element, cls) else build(cls, table))
+        built = as_leaves(element) if isinstance(element, cls) else build(cls, table)
+        group.setdefault(entry.name, built)
+        for expression in units.expressions[count:]:
+            formula = _formula(entry, built, expression, path)
+            if formula is None:
+                problems.append(f"{expression.path}: {ONLY_PLAIN} {quote(expression.text)}")
+            else:
+                formulas.append(formula)
+
+
+def _formula(entry: SceneEntry, built: Any, expression: Expression, path: str) -> Formula | None:
+    """Return the formula of an expression in an element; None if the number is no leaf of it."""
+    keys_and_places = re.findall(r"\.([^.\[\]]+)|\[(\d+)\]", expression.path.removeprefix(path))
+    fields, holder = [], built
+    for key in (key for key, _ in keys_and_places if key):
+        fields.append(keys(type(holder))[key].field)
+        holder = getattr(holder, fields[-1])
+    at = tuple(int(place) for _, place in keys_and_places if place)
+    if not isinstance(holder, np.ndarray | jax.Array) or holder.ndim != len(at):
+        return None
+    return Formula(entry.section, str(entry.name), tuple(fields), at, expression.text, expression.unit)
 
 
 def units_of_element(cls: type, table: TomlTable) -> tuple[str, str]:

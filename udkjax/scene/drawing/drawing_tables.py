@@ -10,23 +10,24 @@ from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, read_drawing, un
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.pin_forms import pin_entries
 from udkjax.scene.mechanism_tables import check_classes, check_known, head_mistakes, key_lines, read_section, type_key
+from udkjax.scene.numbers.named_numbers import NamedNumber
 from udkjax.scene.tables.checks import SceneEntry, SceneError
 from udkjax.scene.tables.schema import table_of
 from udkjax.wording import abbreviate, suggestion
 
-LISTS = tuple(section for section in DRAWN if section != "pin")  # sections of tables in double brackets
+LISTS = tuple(section for section in DRAWN if section not in ("pin", "number"))  # sections of tables in double brackets
 
 
 def drawing_of_tables(scene: Mapping[str, Any], source: str) -> Drawing:
     """Return the drawing described by the tables of a file; raise a `SceneError` that names the file."""
-    head = ("format", "name", "units", "gravity", "ground", "pins", "velocities")
+    head = ("format", "name", "units", "gravity", "ground", "numbers", "pins", "velocities")
     problems = list(head_mistakes(scene, (*head, *LISTS, *BY_HAND)))
     entries = list(_read_pins(scene, problems))
     for section in (*LISTS, *BY_HAND):
         is_counted = section in LISTS and section != "link"
         entries.extend(read_section(section, scene.get(section, []), problems, (DRAWN | BY_HAND)[section], is_counted))
     ground, gravity, units = scene.get("ground", []), scene.get("gravity"), scene.get("units", {})
-    elements = read_drawing(entries, ground, gravity, Units(units))
+    elements = read_drawing(entries, ground, gravity, Units(units), numbers=scene.get("numbers", {}))
     problems.extend(elements.problems)
     if problems:
         raise SceneError(problems, source)
@@ -47,7 +48,7 @@ def _read_pins(scene: Mapping[str, Any], problems: list[str]) -> Iterator[SceneE
 def drawing_text(drawing: Drawing) -> str:
     """Return a drawing as the text of a TOML file, in the units in which it was drawn; raise a `SceneError` if that fails."""
     check_known(drawing, drawing.name)
-    drawing.with_groups(drawing.groups, drawing.gravity)  # numbers changed as leaves of a tree have not been checked
+    drawing.with_groups(drawing.own_groups, drawing.gravity)  # numbers changed as leaves of a tree have not been checked
     units, groups = Units(dict(drawing.units)), drawing.groups
     problems = [
         problem
@@ -68,7 +69,10 @@ def drawing_text(drawing: Drawing) -> str:
         head["units"] = dict(drawing.units)
     head["gravity"] = [units.write(x, "m/s2") for x in np.asarray(drawing.gravity).tolist()]
     lines = key_lines(head | ({"ground": list(drawing.ground)} if drawing.ground else {}))
-    tables = {name: _without_empty(units.write_table(pin)) for name, pin in groups["pin"].items()}
+    texts = _Texts(drawing)
+    named = {name: texts.put("number", name, _written(x))["value"] for name, x in groups["number"].items()}
+    lines += ["", "[numbers]", *key_lines(named)] if named else []
+    tables = {name: texts.put("pin", name, _without_empty(units.write_table(pin))) for name, pin in groups["pin"].items()}
     velocities = {name: table.pop("velocity") for name, table in tables.items() if "velocity" in table}
     pins = {name: table.get("position", table) for name, table in tables.items()}
     for title, written in (("pins", pins), ("velocities", velocities)):
@@ -76,9 +80,36 @@ def drawing_text(drawing: Drawing) -> str:
     for section in (*LISTS, *BY_HAND):
         for name, element in groups[section].items():
             table = units.write_table(element, *units_of_element(type(element), table_of(element)))
+            table = texts.put(section, name, table)
             kind = type_key(type(element)) if section in BY_HAND else {}
             lines += ["", f"[[{section}]]", *key_lines({"name": name, **kind, **_without_empty(table)})]
     return "\n".join(lines) + "\n"
+
+
+def _written(named: NamedNumber) -> dict[str, object]:
+    """Return a named number as a table with its value, a string if it has a unit."""
+    value = float(np.asarray(named.value))
+    return {"value": f"{value!r} {named.unit}" if named.unit else value}
+
+
+class _Texts:
+    """The texts of the expressions of a drawing, to be written instead of their values."""
+
+    def __init__(self, drawing: Drawing):
+        self.formulas = drawing.formulas
+
+    def put(self, section: str, owner: str, table: dict[str, Any]) -> dict[str, Any]:
+        """Return the table of an element with the texts of its expressions."""
+        for formula in self.formulas:
+            if (formula.section, formula.owner) == (section, owner):
+                self._put(table, (*(field.removesuffix("_") for field in formula.path), *formula.at), formula.text)
+        return table
+
+    @staticmethod
+    def _put(holder: Any, path: tuple[str | int, ...], text: str) -> None:
+        for key in path[:-1]:
+            holder = holder[key]
+        holder[path[-1]] = text
 
 
 def _without_empty(table: Mapping[str, Any]) -> dict[str, Any]:

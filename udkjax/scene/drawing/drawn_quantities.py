@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, get_origin
+from typing import Any, Literal, NamedTuple, get_origin
 
 import equinox as eqx
 import jax
@@ -13,7 +13,9 @@ from udkjax.annotations import TomlTable
 from udkjax.printing import format_number
 from udkjax.scene.elements.fields import vector_as_angle
 from udkjax.scene.elements.profiles import AbstractProfile, profile_class
-from udkjax.scene.numbers.units import FOLLOWS, conversion_factor, field_unit, read_quantity, unit_sizes
+from udkjax.scene.numbers.formula import Measured, evaluate, is_computed, name_mistake, names_in
+from udkjax.scene.numbers.named_numbers import NamedNumber
+from udkjax.scene.numbers.units import FOLLOWS, QUANTITY, conversion_factor, dimension_of, field_unit, read_quantity, unit_sizes
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.wording import abbreviate, quote, suggestion
 
@@ -39,8 +41,16 @@ _KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
 VECTORS = ("axis", "to_axis", "direction", "face")  # angles that may also be vectors
 
 
+class Expression(NamedTuple):
+    """A number that an expression gives: its path in a drawing, the text, and the SI unit of the number."""
+
+    path: str
+    text: str
+    unit: str
+
+
 class Units:
-    """The units of plain numbers in a file.
+    """The units of plain numbers in a file, and its named numbers, of which other numbers may be expressions.
 
     A quantity is in SI units unless the file chooses another unit for it. If the file changes only a part of its unit (of a
     stiffness, in a file in millimetres), a plain number is ambiguous and is refused: it needs a unit. Densities are in kg/m^3
@@ -50,6 +60,8 @@ class Units:
     def __init__(self, chosen: object = None):
         self.problems: list[str] = []
         self.chosen: dict[str, str] = {}
+        self.numbers: dict[str, Measured] = {}  # in the units of the file
+        self.expressions: list[Expression] = []  # those met by `convert`
         if chosen is not None and not isinstance(chosen, Mapping):
             self.problems.append(f'units: must be a table such as {{length = "mm"}}, not {abbreviate(chosen)}')
             return
@@ -75,11 +87,88 @@ class Units:
             return None if any(x is None for x in converted) else converted
         try:
             if isinstance(value, str):
-                return read_quantity(value, unit)
+                return self._read(path, value, unit)
             return self._plain(value, unit)
         except ValueError as problem:
             problems.append(f"{path}: {problem}")
             return None
+
+    def read_numbers(self, table: object, problems: list[str]) -> dict[str, NamedNumber]:
+        """Return the named numbers of a table: numbers, strings with a unit, expressions of others, or `NamedNumber`s."""
+        if not isinstance(table, Mapping):
+            problems.append(f"numbers: must be a table, such as {{r = 40}}, not {abbreviate(table)}")
+            return {}
+        found: dict[str, NamedNumber] = {}
+        waiting = {}
+        for name, value in table.items():
+            if mistake := name_mistake(name):
+                problems.append(f"numbers.{name}: {mistake}")
+            else:
+                waiting[name] = value
+        while ready := [name for name, x in waiting.items() if not self._uses(x) & waiting.keys()]:
+            for name in ready:
+                value = waiting.pop(name)
+                try:
+                    found[name], self.numbers[name] = self._named(name, value)
+                except ValueError as problem:
+                    problems.append(f"numbers.{name}: {problem}")
+        problems += [f"numbers.{name}: refers to itself, directly or through other numbers" for name in waiting]
+        return {name: found[name] for name in table if name in found}
+
+    @staticmethod
+    def _uses(value: object) -> set[str]:
+        return set(names_in(value) or ()) if isinstance(value, str) and is_computed(value) else set()
+
+    def _named(self, name: str, value: object) -> tuple[NamedNumber, Measured]:
+        """Return a named number, and its value in the units of the file."""
+        if isinstance(value, str) and is_computed(value):
+            measured = evaluate(value, self.numbers, self.size_of)
+            self.expressions.append(Expression(f"numbers.{name}.value", value, ""))
+            return NamedNumber(measured.value), measured
+        unit = ""
+        if isinstance(value, NamedNumber):
+            value, unit = value.value, value.unit
+        elif isinstance(value, str):
+            match = QUANTITY.fullmatch(value)
+            if match is None or not match[2]:
+                raise ValueError(f"must be a number, a number with its unit or an expression, not {quote(value)}")
+            value, unit = float(match[1]), match[2]
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number | np.ndarray | jax.Array) or np.ndim(value):
+            raise ValueError(f"must be a number, not {abbreviate(value)}")
+        if not isinstance(value, Tracer) and not np.isfinite(value):
+            raise ValueError(f"must be finite, not {value}")
+        named = NamedNumber(value, unit)
+        return named, self.measured(named)
+
+    def measured(self, named: NamedNumber) -> Measured:
+        """Return a named number in the units of the file, with the SI unit of its quantity; plain numbers have none."""
+        if not named.unit:
+            return Measured(named.value, "")
+        kind = kind_of(named.unit)
+        factor = conversion_factor(named.unit, kind) / self.size_of(kind)
+        return Measured(named.value if factor == 1.0 else named.value * factor, kind)
+
+    def size_of(self, unit: str) -> float:
+        """Return the size, in an SI unit, of the unit in which expressions have their values: the file's, or the SI unit."""
+        return self._factor(unit) or 1.0
+
+    def _read(self, path: str, text: str, unit: str) -> object:
+        """Return a number given as a string: a number with its unit, or an expression of named numbers."""
+        names = names_in(text) or ()
+        if not (names and all(name in self.numbers for name in names)):  # a name has precedence over a unit: "2*h"
+            try:
+                return read_quantity(text, unit)
+            except ValueError:
+                if not is_computed(text) or not (self.numbers or len(names) == 0):
+                    raise
+        value, own = evaluate(text, self.numbers, self.size_of)
+        if own and own != unit:
+            raise ValueError(f"{quote(text)} is measured in {own}; {unit or 'a number without a unit'} is needed here")
+        if own != unit and self._factor(unit) is None:
+            raise ValueError(f"{quote(text)} needs a unit: give one of its numbers with its unit, such as {quote(f'1 {unit}')}")
+        self.expressions.append(Expression(path, text, unit))
+        factor = self.size_of(unit) if unit else 1.0
+        return value if factor == 1.0 else value * factor
 
     def _plain(self, value: object, unit: str) -> object:
         if isinstance(value, bool) or not isinstance(value, int | float | np.number | np.ndarray | jax.Array) or not unit:
@@ -188,6 +277,15 @@ class Units:
             return value
         cls = profile_class(value) if annotation is AbstractProfile else CLASSES_BY_TYPE["motion"].get(str(value.get("type")))
         return value if cls is None else self.convert_table(path, cls, value, problems, law=law)
+
+
+def kind_of(unit: str) -> str:
+    """Return the SI unit of the quantity that has a unit, such as "m" for "mm"; raise a `ValueError` for an unknown unit."""
+    dimension = dimension_of(unit)
+    for kind in QUANTITY_KINDS.values():
+        if dimension_of(kind) == dimension:
+            return kind
+    raise ValueError(f"{quote(unit)} measures no quantity of a drawing: {', '.join(QUANTITY_KINDS)}")
 
 
 def without_failed(mistakes: Iterable[str], failed: Iterable[str]) -> list[str]:

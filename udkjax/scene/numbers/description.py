@@ -8,6 +8,7 @@ from jaxtyping import ArrayLike
 
 from udkjax.printing import PrintedTable, format_number, format_numbers, has_numbers
 from udkjax.scene.elements.held import Held
+from udkjax.scene.numbers.named_numbers import NamedNumber
 from udkjax.scene.numbers.number_fields import Sections
 from udkjax.scene.numbers.units import field_unit
 from udkjax.scene.tables.schema import numbers_in
@@ -66,6 +67,8 @@ def _plural(section: str, count: int) -> str:
 
 def _names_in(element: eqx.Module) -> str:
     """Return the pins and links that an element of a drawing names."""
+    if isinstance(element, NamedNumber):
+        return ""
     static = [value for value in vars(element).values() if isinstance(value, str | tuple)]
     return ", ".join(name for value in static for name in ([value] if isinstance(value, str) else value) if name)
 
@@ -79,7 +82,11 @@ def _format_element(element: eqx.Module) -> str:
         for field in path[:-1]:
             holder = getattr(holder, field)
         is_held = isinstance(holder, Held)
-        unit = field_unit(type(element if is_held else holder).__name__, path[-2] if is_held else path[-1], driven)
+        unit = (
+            holder.unit
+            if isinstance(holder, NamedNumber)
+            else field_unit(type(element if is_held else holder).__name__, path[-2] if is_held else path[-1], driven)
+        )
         shown.append(f"{' '.join(path)} {format_numbers(value, unit)}".replace("_", " "))
     return ", ".join(shown)
 

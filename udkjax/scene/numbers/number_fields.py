@@ -13,6 +13,7 @@ from udkjax.arrays import make_module, number
 from udkjax.programs.identity_cache import cached_within_trace
 from udkjax.scene.elements.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.elements.held import Held, given_sampled
+from udkjax.scene.numbers.named_numbers import NAMED_BY_OWNER
 from udkjax.scene.tables.checks import SceneError
 from udkjax.scene.tables.schema import keys, numbers_in
 from udkjax.wording import abbreviate, quote, suggestion
@@ -73,12 +74,12 @@ def parameters_of_drawing(drawing: ElementsOfDrawing) -> Mapping[str, NumberFiel
 
 
 def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, NumberField]:
-    """Return all numbers of elements by name; the position of a pin has the pin's name, `pin.A`."""
+    """Return all numbers of elements by name; the position of a pin has the pin's name, `pin.A`, a named number `number.r`."""
     fields = {}
     for section, elements in groups.items():
         for owner, element in elements.items():
             for path, value, shape in numbers_in(element):
-                name = (section, owner) if section == "pin" and path == ("position",) else (section, owner, *path)
+                name = (section, owner) if (section, path) in NAMED_BY_OWNER else (section, owner, *path)
                 fields[".".join(name)] = NumberField(section, owner, path, value, shape)
     return fields
 

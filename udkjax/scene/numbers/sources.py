@@ -30,6 +30,7 @@ from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.elements.joints import Joint
 from udkjax.scene.numbers.direct_numbers import DirectNumbers
+from udkjax.scene.numbers.named_numbers import Formula
 from udkjax.scene.numbers.number_fields import SECTIONS, ElementGroups, parameters_in, replace_numbers
 from udkjax.scene.tables.checks import SceneError
 from udkjax.scene.tables.element_setup import complete, with_constants
@@ -100,6 +101,13 @@ class AbstractDrawing(PrintsTable):
     @abstractmethod
     def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
         """The elements that hold the drawing's numbers, by section and name."""
+
+    @property
+    @abstractmethod
+    def own_groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
+        """The elements as the leaves of the drawing hold them: without the numbers that expressions give."""
+
+    formulas: eqx.AbstractVar[tuple[Formula, ...]]
 
     @abstractmethod
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "AbstractDrawing":
@@ -312,7 +320,7 @@ def _batch_axes(source: Any, leaves: Leaves) -> list[int]:
     """Return the number of leading axes of each leaf that it has because numbers of several mechanisms are stacked."""
     of_all = max(np.ndim(source.gravity) - 1, 0)
     if isinstance(source, Drawn):
-        modules: list[Any] = [element for group in source.drawing.groups.values() for element in group.values()]
+        modules: list[Any] = [element for group in source.drawing.own_groups.values() for element in group.values()]
     else:
         modules = [x for group in (source.bodies, source.joints, source.drivers, source.forces) for x in group or ()]
     dims: dict[int, int] = {}

@@ -9,6 +9,7 @@ import re
 from typing import Any, NamedTuple
 
 from udkjax.scene.elements.held import Held
+from udkjax.scene.numbers.named_numbers import NamedNumber
 from udkjax.scene.numbers.number_fields import owner_of, split_index
 from udkjax.wording import quote
 
@@ -76,6 +77,7 @@ _OF_TYPE = {
     ("SwingProfile", "start"): "rad",
     ("SwingProfile", "pivot"): "m",
     ("SwingProfile", "arm"): "m",
+    ("NamedNumber", "value"): "",
     ("GearPair", "pitch"): "m",
     ("Cam", "face"): "rad",
     ("CamPair", "face"): "rad",
@@ -96,6 +98,8 @@ def units_of(mechanism: Any, name: str) -> str:
         return _FIELDS.get(name.partition("[")[0], "")
     driven = getattr(mechanism.groups["driver"].get(field.owner), "coordinate", "")
     owner = owner_of(mechanism, field)
+    if isinstance(owner, NamedNumber):
+        return owner.unit
     if isinstance(owner, Held):
         field = field._replace(path=field.path[:-1])
         owner = owner_of(mechanism, field)
@@ -171,13 +175,16 @@ _USUAL = (
 )
 
 
+QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")  # a number and its unit
+
+
 def read_quantity(text: str, wanted: str) -> float:
     """Convert a string such as "60 rpm" to a number in the SI units `wanted`.
 
     Raises:
         ValueError: it is not a number with a unit, or its unit is unknown or has another dimension.
     """
-    match = re.fullmatch(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
+    match = QUANTITY.fullmatch(text)
     if match is None:
         raise ValueError(f"must be a number, or a string with a number and its unit, not {quote(text)}")
     number, units = match.groups()
@@ -208,6 +215,11 @@ def conversion_factor(units: str, wanted: str) -> float:
     if given.dimension != goal.dimension:
         raise ValueError(f"{quote(units)} does not fit; it is measured in {_usual_units(wanted)}")
     return given.size / goal.size
+
+
+def dimension_of(units: str) -> tuple[int, ...]:
+    """Return the powers of length, mass, time and angle of units; raise a `ValueError` if they are unknown."""
+    return _read(units).dimension
 
 
 def unit_sizes(wanted: str) -> dict[str, float]:

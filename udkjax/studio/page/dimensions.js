@@ -34,6 +34,24 @@ function follows(document, name, from, seen = new Set()) {
 
 const withPin = (document, name, value) => ({...document, pins: {...pinsOf(document), [name]: value}});
 
+/** Where the length of a bar is written as a number: its pin, the keys that lead to the number, and its value; null if nowhere. */
+export function lengthOf(document, link) {
+  for (const [pin, anchor] of [[link.pins[1], link.pins[0]], link.pins]) {
+    const value = pinsOf(document)[pin];
+    if (!value || Array.isArray(value) || value.to !== undefined || value.length === undefined) continue;
+    const k = Array.isArray(value.from) ? value.from.indexOf(anchor) : -1;
+    if (k >= 0) return {pin, keys: ["length", k], value: value.length[k]};
+    if (value.from === anchor) return {pin, keys: ["length"], value: value.length};
+  }
+  return null;
+}
+
+/** The document in which the length of a bar, which is written as a number, is an expression of named numbers. */
+export function withLengthText(document, link, text) {
+  const {pin, keys: [key, k]} = lengthOf(document, link), value = pinsOf(document)[pin];
+  return withPin(document, pin, {...value, [key]: k === undefined ? text : value[key].with(k, text)});
+}
+
 /** The drawings in which a pin is at a distance from its anchor, by the numbers of its form, so that its other dimensions stay. */
 function placed(document, link, pin, anchor, size) {
   const value = pinsOf(document)[pin], at = placeOf(document, pin), from = placeOf(document, anchor), rail = railOf(document, pin);

@@ -1,6 +1,6 @@
 // Pins by lengths and angles: where they are, and their numbers for another place. A pin is [x, y], or a table that refers to others.
 
-import {angle, angleWritten, length, point, written} from "./units.js";
+import {angle, angleWritten, length, point, usesNumbers, written} from "./units.js";
 
 const places = new WeakMap();  // of the pins of each document
 const isTable = value => typeof value === "object" && value !== null && !Array.isArray(value);
@@ -75,9 +75,22 @@ function formPlace(form, at, document) {
   return axis && plus(start, turned(axis, [Math.cos(by), Math.sin(by)]), metres(form.length));
 }
 
-/** The value of a pin at a place (m): its coordinates, or the numbers of its form. A form on a line keeps the pin on it. */
+/** The value of a pin at a place (m): its coordinates, or the numbers of its form. A form on a line keeps the pin on it, and expressions of
+ *  named numbers stay: the pin comes as near as the other numbers allow. */
 export function pinAt(document, name, place) {
-  const old = document.pins?.[name], at = placesOf(document);
+  const old = document.pins?.[name];
+  return withExpressions(valueAt(document, old, place), old, document);
+}
+
+function withExpressions(value, old, document) {
+  if (usesNumbers(old, document)) return old;
+  if (typeof old !== "object" || old === null || typeof value !== "object") return value;
+  const kept = Object.entries(value).map(([key, x]) => [key, withExpressions(x, old[key], document)]);
+  return Array.isArray(value) ? kept.map(([, x]) => x) : Object.fromEntries(kept);
+}
+
+function valueAt(document, old, place) {
+  const at = placesOf(document);
   if (!isTable(old)) return place.map((x, k) => written(x, document, old?.[k]));
   const metres = (x, key) => written(x, document, old[key]);
   if (old.stacked !== undefined || !referencesOf(old).every(other => at[other])) return old;

@@ -4,12 +4,13 @@ import {groundOf, list, movePin, nameOf, pinsOf, placeOf, renameElement, renameP
 import {readValue, valueText} from "./values.js";
 import {shapeProblem} from "./checks.js";
 import {copy, remove} from "./keys.js";
-import {withBar} from "./dimensions.js";
+import {lengthOf, withBar, withLengthText} from "./dimensions.js";
+import {numberFields} from "./number_fields.js";
 import {swapPair} from "./actions.js";
 import {camFields} from "./cam_fields.js";
 import {carry} from "./motions.js";
 import {formsOf} from "./pin_forms.js";
-import {angle, angleUnit, angleWritten, direction, expressed, isMeasure, length, lengthName, lengthUnit, placeFrom, shown, tidy} from "./units.js";
+import {angle, angleUnit, angleWritten, direction, expressed, isMeasure, length, lengthName, lengthUnit, placeFrom, shown, tidy, usesNumbers} from "./units.js";
 import {make} from "./player/elements.js";
 
 // The editable keys of each kind of element, and the kind of quantity of each.
@@ -111,7 +112,7 @@ export class PropertiesPanel {
     return [make("h3", {}, "mechanism"),
       this.field("name", document.name ?? "", "", value => change("name", value), "e.g. four-bar"),
       this.field("gravity", valueText(document.gravity), unitOf(document, "acceleration") || "m/s²", value => change("gravity", readValue(value)), "[0, -9.81 m/s2]"),
-      unit("length", ["mm", "cm", "m", "in", "ft"], "m"), unit("angle", ["deg", "rad"], "rad"),
+      unit("length", ["mm", "cm", "m", "in", "ft"], "m"), unit("angle", ["deg", "rad"], "rad"), ...numberFields(this),
     ];
   }
 
@@ -124,7 +125,8 @@ export class PropertiesPanel {
       if (!Number.isFinite(read(next, document))) return this.refuse(`"${text}" is not ${{length: "a length: write 12 or 12 mm", angle: "an angle: write 30 or 30 deg"}[quantity] ?? "a number: write 0.5"}, for example`);
       return put(change(next));
     };
-    const numbers = (key, quantity, values, names) => values.map((x, k) => this.field(names?.[k] ?? key, valueText(x), unitOf(document, quantity),
+    const unitAt = (x, quantity) => (usesNumbers(x, document) ? this.valueWords(x, quantity) : unitOf(document, quantity));
+    const numbers = (key, quantity, values, names) => values.map((x, k) => this.field(names?.[k] ?? key, valueText(x), unitAt(x, quantity),
       take(quantity, next => (key === "" ? value.with(k, next) : {...value, [key]: Array.isArray(value[key]) ? value[key].with(k, next) : next}))));
     const polar = text => (text.includes("@") ? placeFrom(text, [0, 0], document) : null);
     if (Array.isArray(value)) {
@@ -163,9 +165,13 @@ export class PropertiesPanel {
   /** The value of a text: a number of an expression, where numbers are wanted. */
   read(text, quantity) {
     const value = readValue(text, ["name", "names"].includes(quantity));
+    if (usesNumbers(value, this.studio.document)) return value;
     const number = typeof value === "string" && NUMBERS.concat("direction", "").includes(quantity) && !isMeasure(value) ? expressed(value, quantity === "direction" ? "angle" : quantity, this.studio.document) : undefined;
     return number ?? value;
   }
+
+  /** The value of an expression of named numbers, with its unit. */
+  valueWords(text, quantity) { return `= ${tidy(+expressed(text, quantity, this.studio.document)?.toPrecision(6))} ${unitOf(this.studio.document, quantity)}`; }
 
   /** Length and angle of a bar of two pins as fields, or the lengths of another link; and its mass. */
   shape(link) {
@@ -174,18 +180,20 @@ export class PropertiesPanel {
     const [a, b] = (link.pins ?? []).map(pin => placeOf(document, pin));
     if (link.pins?.length !== 2 || !a || !b) return [make("p", {}, lengthsText(document, link)), ...facts];
     const size = Math.hypot(b[0] - a[0], b[1] - a[1]), turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
-    const put = (long, way) => {
-      if (long === size && way === turn) return this.again();
+    const own = lengthOf(document, link)?.value, isNamed = usesNumbers(own, document);
+    const put = (long, way, text) => {
+      if (long === size && way === turn && !text && !(isNamed && way === turn)) return this.again();
       const {document: found, note, problem} = withBar(document, link, long, way);
       if (problem) return this.refuse(problem);
-      this.set(found);
+      this.set(text && lengthOf(found, link) ? withLengthText(found, link, text) : found);
       return note && studio.say(note);
     };
     const field = (label, quantity, value, unit, take) => this.field(label, value, unit, text => {
-      const next = {length, angle}[quantity](this.read(text, quantity), document);
-      return Number.isFinite(next) && (quantity !== "length" || next > 0) ? take(next) : this.refuse(`"${text}" is not ${quantity === "length" ? "a length" : "an angle"}`);
+      const read = this.read(text, quantity), next = {length, angle}[quantity](read, document);
+      return Number.isFinite(next) && (quantity !== "length" || next > 0) ? take(next, usesNumbers(read, document) ? read : "") : this.refuse(`"${text}" is not ${quantity === "length" ? "a length" : "an angle"}`);
     });
-    return [field("length", "length", tidy(+(size / lengthUnit(document)).toPrecision(9)), lengthName(document), next => put(next, turn)),
+    const shownSize = isNamed ? own : tidy(+(size / lengthUnit(document)).toPrecision(9)), sizeUnit = isNamed ? this.valueWords(own, "length") : lengthName(document);
+    return [field("length", "length", shownSize, sizeUnit, (next, text) => put(next, turn, text)),
       field("angle", "angle", tidy(+(turn / angleUnit(document)).toPrecision(9)), unitOf(document, "angle"), next => put(size, next)), ...facts];
   }
 

@@ -1,33 +1,58 @@
 // Lengths and angles of a drawing in metres and radians, and back in the units of the file.
 
-import {evaluate} from "./expressions.js";
+import {evaluate, namesIn} from "./expressions.js";
 import {ANGLES, LENGTHS} from "./unit_sizes.js";
 
 const TEXT = /^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$/;
 const DIGITS = 12;  // significant digits of a written number; further ones are rounding
 
 /** The sizes of the units of length and angle of numbers without a unit. */
-export const lengthUnit = document => LENGTHS[document.units?.length ?? "m"] ?? 1;
-export const angleUnit = document => ANGLES[document.units?.angle ?? "rad"] ?? 1;
+export const lengthUnit = document => LENGTHS[document?.units?.length ?? "m"] ?? 1;
+export const angleUnit = document => ANGLES[document?.units?.angle ?? "rad"] ?? 1;
 export const lengthName = document => document.units?.length ?? "m";
 
-function read(value, plain, units) {
+function read(value, plain, units, document) {
   if (typeof value === "number") return value * plain;
-  const found = typeof value === "string" ? TEXT.exec(value) : null;
-  if (!found) return NaN;
-  return found[2] === undefined ? +found[1] * plain : +found[1] * (units[found[2]] ?? NaN);
+  if (typeof value !== "string") return NaN;
+  const found = TEXT.exec(value), isPlain = found && (found[2] === undefined || Object.hasOwn(units, found[2]));
+  if (isPlain && !usesNumbers(value, document)) return found[2] === undefined ? +found[1] * plain : +found[1] * units[found[2]];
+  return evaluate(value, {angleUnit: angleUnit(document), numbers: numbersOf(document)}) * plain;
 }
 
-/** A length in metres, from a number or a string such as "12 mm"; NaN if it is neither. */
-export const length = (value, document) => read(value, lengthUnit(document), LENGTHS);
+const named = new WeakMap();  // the named numbers of each document
 
-/** An angle in radians, from a number or a string such as "30 deg"; NaN if it is neither. */
-export const angle = (value, document) => read(value, angleUnit(document), ANGLES);
+/** The named numbers of a document, in its units, by name; those that cannot be computed are left out. */
+export function numbersOf(document) {
+  if (named.has(document)) return named.get(document);
+  const found = {}, waiting = new Map(Object.entries(document?.numbers ?? {})), sizes = [[LENGTHS, lengthUnit(document)], [ANGLES, angleUnit(document)]];
+  for (let count = -1; count !== waiting.size;) {
+    count = waiting.size;
+    for (const [name, value] of [...waiting]) {
+      const [, size, unit] = (typeof value === "string" && TEXT.exec(value)) || [], known = sizes.find(([units]) => Object.hasOwn(units, unit ?? ""));
+      const number = typeof value === "number" ? value : typeof value !== "string" ? NaN : known ? +size * known[0][unit] / known[1] : evaluate(value, {angleUnit: angleUnit(document), numbers: found});
+      if (Number.isFinite(number)) { found[name] = number; waiting.delete(name); }
+    }
+  }
+  named.set(document, found);
+  return found;
+}
+
+/** True for a text with named numbers of a document alone: "2*r". */
+export function usesNumbers(text, document) {
+  const names = typeof text === "string" && document?.numbers ? namesIn(text) : [];
+  return names.length > 0 && names.every(name => Object.hasOwn(document.numbers, name));
+}
+
+/** A length in metres, from a number, a string such as "12 mm" or an expression of named numbers; NaN if it is neither. */
+export const length = (value, document) => read(value, lengthUnit(document), LENGTHS, document);
+
+/** An angle in radians, from a number, a string such as "30 deg" or an expression; NaN if it is neither. */
+export const angle = (value, document) => read(value, angleUnit(document), ANGLES, document);
 
 /** The number of an expression such as 40 + 50*cos(60), in the document's unit of a quantity; undefined if the text is none. */
 export function expressed(text, quantity, document) {
   const [unit, units] = {length: [lengthUnit(document), LENGTHS], angle: [angleUnit(document), ANGLES]}[quantity] ?? [1, {}];
-  const value = evaluate(text, {unit, units, angleUnit: angleUnit(document)});
+  const value = evaluate(text, {unit, units, angleUnit: angleUnit(document), numbers: numbersOf(document)});
   return Number.isFinite(value) ? tidy(value) : undefined;
 }
 
