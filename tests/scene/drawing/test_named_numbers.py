@@ -182,7 +182,7 @@ def test_expressions_compute_in_the_units_of_the_drawing():
         ("r = 40.0", "sin = 40.0", 'numbers.sin: "sin" has a meaning in expressions already'),
         ("r = 40.0", "r = true", "numbers.r: must be a number, not true"),
         ("r = 40.0", 'r = "40 furlongs"', "numbers.r: "),
-        ("gravity = [0.0, 0.0]", 'gravity = [0.0, "-r"]', 'gravity[1]: must be a plain number, not the expression "-r"'),
+        ("gravity = [0.0, 0.0]", 'gravity = [0.0, "2*3"]', 'gravity[1]: "2*3" needs a unit'),
         ("r = 40.0", "r = -40.0", "pins.A.length: must be > 0, not -0.04"),
         ('width = "d/2"', 'width = "d/0"', "must be"),
         ('length = "r"', 'length = "r mm"', "pins.A.length: must be a number"),

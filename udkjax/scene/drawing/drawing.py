@@ -276,7 +276,7 @@ class Drawing(AbstractDrawing):
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
-        plain = make_module(Drawing, **vars(self) | {"_elements": _in_order(groups)[1]}).groups
+        plain = make_module(Drawing, **vars(self) | {"_elements": _in_order(groups)[1]}).groups if self.formulas else groups
         drawn = [
             entry for section, group in plain.items() if section not in ("pin", "number") for entry in _entries(section, group)
         ]

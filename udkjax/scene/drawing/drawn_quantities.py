@@ -61,7 +61,7 @@ class Units:
         self.problems: list[str] = []
         self.chosen: dict[str, str] = {}
         self.numbers: dict[str, Measured] = {}  # in the units of the file
-        self.expressions: list[Expression] = []  # those met by `convert`
+        self.expressions: list[Expression] = []  # found by `convert`
         if chosen is not None and not isinstance(chosen, Mapping):
             self.problems.append(f'units: must be a table such as {{length = "mm"}}, not {abbreviate(chosen)}')
             return

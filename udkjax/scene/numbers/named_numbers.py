@@ -52,8 +52,10 @@ class Formula(NamedTuple):
 NAMED_BY_OWNER = (("pin", ("position",)), ("number", ("value",)))
 
 
-def without_expressions(groups: ElementsByName, formulas: Iterable[Formula]) -> dict[str, dict[str, Any]]:
+def without_expressions(groups: ElementsByName, formulas: Sequence[Formula]) -> ElementsByName:
     """Return elements whose numbers that are given by expressions are no leaves: None, or zero where they are entries."""
+    if not formulas:
+        return groups
     changed = {section: dict(group) for section, group in groups.items()}
     for section, owner, path, index, _, _ in formulas:
         element = changed[section][owner]

@@ -31,7 +31,7 @@ export function numberFields(panel) {
     panel.field("new number", "", "", add, "r = 40, then lengths may be 2*r")];
 }
 
-/** What uses a named number: pins, elements and other numbers. */
+/** The users of a named number: pins, elements and other numbers. */
 function usersOf(document, name) {
   const uses = value => (typeof value === "string" ? namesIn(value).includes(name) : typeof value === "object" && value !== null && Object.entries(value).some(([key, x]) => !["name", "from", "to", "on", "line", "pins", "pin"].includes(key) && uses(x)));
   const {numbers = {}, pins = {}, ...rest} = document;
