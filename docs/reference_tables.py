@@ -1,6 +1,4 @@
-"""A hook of MkDocs: adds a table of arguments or fields to each public class of the reference, and makes the page of commands.
-
-It also puts the tables and plots of the study `atlas` into the site.
+"""Entries of the reference: signature, description, arguments or fields, results and errors of public names, and the commands.
 
 Their meanings come from the docstring of a class (Args, Attributes) or from the comment on the line of a field, the rest from its
 signature. Commands are functions of their options, with the same sections.
@@ -11,42 +9,23 @@ import importlib
 import inspect
 import io
 import re
+import textwrap
 import tokenize
 from collections.abc import Iterator
 from enum import Enum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
-if TYPE_CHECKING:
-    from mkdocs.config.defaults import MkDocsConfig
-    from mkdocs.structure.files import Files
+from mathml import latex
 
-DIRECTIVE = re.compile(r"^::: (udkjax[\w.]*\.([A-Z]\w*))$", re.M)
+DIRECTIVE = re.compile(r"^::: (udkjax[\w.]*)\n(?: {4}(options: .*)\n)?", re.M)
 ARRAY = re.compile(r"(?:jaxtyping\.)?(?:Float|Int|Bool)\[[\w.]*(?:Array|ArrayLike|ndarray|Union\[.*?\]), *(['\"])(.*?)\1\]")
 MODULE = re.compile(r"\b(?:udkjax|collections|typing|jax|numpy|pathlib|diffrax|optimistix|scipy)(?:\.\w+)*\.(?=\w)")
-COMMANDS, ATLAS = "<!-- commands -->", "<!-- atlas -->"
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+SECTION = re.compile(r"^(?=(?:Args|Attributes|Returns|Raises|Source|Yields):\n)", re.M)
+RAISED = re.compile(r"^(\w+(?:, \w+)*): (.*(?:\n +.*)*)", re.M)
+EQUATION = re.compile(r"\$([^$\n]+)\$")  # in a docstring, in the names of the code
+WIDTH = 86  # columns of a call
 ITEM = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {5,}.*)*)", re.M)
-
-
-def on_page_markdown(markdown: str, **_: object) -> str:
-    """Add a table after each class on a page of the reference, and replace `COMMANDS` by all commands, `ATLAS` by its tables."""
-    if COMMANDS in markdown:
-        from udkjax.cli import COMMANDS as names
-
-        markdown = markdown.replace(COMMANDS, "\n".join(command(name) for name in names))
-    if ATLAS in markdown:
-        *_, tables = (EXPERIMENTS / "atlas.md").read_text(encoding="utf-8").split("\n", 4)  # after its title and links
-        markdown = markdown.replace(ATLAS, f"[All plots](atlas-plots.html), by mechanism and choice, are one page.\n{tables}")
-    return DIRECTIVE.sub(lambda found: found[0] + OPTIONS + table(resolve(found[1])), markdown)
-
-
-def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
-    """Add the page of plots."""
-    from mkdocs.structure.files import File  # which tests of this module do without
-
-    files.append(File.generated(config, "theory/atlas-plots.html", abs_src_path=str(EXPERIMENTS / "atlas.html")))
-    return files
 
 
 def command(name: str) -> str:
@@ -72,13 +51,90 @@ def command(name: str) -> str:
     return "\n".join([*lines, ""])
 
 
-OPTIONS = "\n    options: {show_docstring_parameters: false, show_docstring_attributes: false}\n\n"
+def results() -> str:
+    """Return the table of the results of runs with their causes."""
+    from udkjax.integrate.solution import CAUSES, Result
+
+    rows = [f"| `{each.name}` | {CAUSES.get(each, 'the run reached its end')} |" for each in Result]
+    return "\n".join(["| Result | Meaning, and cure |", "|---|---|", *rows])
 
 
-def resolve(name: str) -> type:
-    """Return the class of a full name."""
+def resolve(name: str) -> Any:
+    """Return the object of a full name."""
     module, _, attribute = name.rpartition(".")
     return getattr(importlib.import_module(module), attribute)
+
+
+def entry(name: str, options: str = "") -> str:
+    """Return the entry of a public name in Markdown; `options` may name inherited methods that it shows."""
+    it = resolve(name)
+    lines = [f"## {name.rpartition('.')[2]}", "", *signature(name.removeprefix("udkjax."), it), *description(it)]
+    if inspect.isclass(it):
+        lines += [table(it), *(line for method in methods(it, options) for line in method)]
+    return "\n".join(lines)
+
+
+def signature(name: str, it: Any) -> list[str]:
+    """Return a block with the call of a function or class; an enumeration has none."""
+    try:
+        parameters = list(inspect.signature(it).parameters.values())
+    except (TypeError, ValueError):
+        return []
+    if inspect.isclass(it) and (issubclass(it, Enum | Exception) or it.__init__ is object.__init__):
+        return []
+    words = []
+    for each in (p for p in parameters if p.name not in ("self", "cls")):
+        star = {each.VAR_POSITIONAL: "*", each.VAR_KEYWORD: "**"}.get(each.kind, "")
+        shown = default_text(it if inspect.isclass(it) else type, each.name, each).strip("`")
+        words.append(star + each.name + ("" if shown == "required" or star else f"={shown or '...'}"))
+    text = f"udk.{name}({', '.join(words)})"
+    return [
+        "```python",
+        textwrap.fill(text, WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False),
+        "```",
+        "",
+    ]
+
+
+def description(it: Any) -> list[str]:
+    """Return a docstring in Markdown, with a table of a function's arguments."""
+    lines = []
+    for section in SECTION.split(inspect.cleandoc(it.__doc__ or "")):
+        heading, _, rest = section.partition(":\n")
+        text = textwrap.dedent(rest)
+        if heading == "Args":
+            lines += [] if inspect.isclass(it) else [arguments(it), ""]
+        elif heading == "Raises":
+            lines += ["**Raises**", "", *(f"- `{kind}`: {' '.join(said.split())}" for kind, said in RAISED.findall(text)), ""]
+        elif heading in ("Returns", "Yields", "Source"):
+            lines += [f"**{heading}** {text.strip()}", ""]
+        elif heading != "Attributes":
+            lines += [EQUATION.sub(lambda found: f"${latex(found[1])}$", section.strip()), ""]
+    return lines
+
+
+def arguments(function: Any) -> str:
+    """Return the table of a function's arguments in Markdown."""
+    said, rows = sections(function), []
+    for name, parameter in inspect.signature(function).parameters.items():
+        if name in said:
+            meaning = said[name].replace("|", "\\|")
+            rows.append(f"| `{name}` | {type_text(parameter.annotation)} | {default_text(type, name, parameter)} | {meaning} |")
+    return "\n".join(["| Name | Type | Default | Meaning |", "|---|---|---|---|", *rows]) if rows else ""
+
+
+def methods(cls: type, options: str) -> Iterator[list[str]]:
+    """Iterate over the entries of a class's public methods and properties that have docstrings."""
+    inherited = re.findall(r"\w+", options.partition("[")[2])
+    names = [name for name in vars(cls) if not name.startswith("_") or name == "__call__"]
+    for name in [*names, *(each for each in inherited if each not in names)]:
+        it = inspect.getattr_static(cls, name)
+        function = it.fget if isinstance(it, property) else getattr(it, "func", getattr(it, "__func__", it))
+        function = inspect.unwrap(getattr(function, "method", function))
+        if not inspect.isfunction(function) or not function.__doc__:
+            continue
+        call = [] if isinstance(it, property) or hasattr(it, "func") else signature(f"{cls.__name__}.{name}", function)
+        yield [f"### {cls.__name__}.{name}", "", *call, *description(function)]
 
 
 def table(cls: type) -> str:
@@ -141,6 +197,10 @@ def comments(cls: type) -> dict[str, str]:
 
 def type_text(annotation: object) -> str:
     """Return a type in words: arrays by their shapes."""
+    if get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
+    if get_origin(annotation) in (Union, UnionType):
+        return " or ".join(dict.fromkeys(type_text(each).replace("NoneType", "None") for each in get_args(annotation)))
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
     text = MODULE.sub("", ARRAY.sub(shape, text)).replace("~", "")
     return "" if annotation is inspect.Parameter.empty else f"`{text}`".replace(" | ", " or ")
