@@ -158,7 +158,7 @@ def copy_players(app: Any, error: Exception | None) -> None:
     """Copy pages and scripts that are not made from Markdown to their places."""
     if error is None and app.builder.format == "html":
         out = Path(app.outdir)
-        for path in (*(DOCS / "gallery").glob("*.html"), *(DOCS / "gallery").glob("*.js"), *(DOCS / "gallery").glob("*.gif")):
+        for path in (path for path in (DOCS / "gallery").iterdir() if path.suffix != ".md"):
             (out / "gallery").mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, out / "gallery" / path.name)
         (out / "theory").mkdir(parents=True, exist_ok=True)

@@ -16,14 +16,13 @@ from enum import Enum
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
-from mathml import latex
+from mathml import typeset
 
 DIRECTIVE = re.compile(r"^::: (udkjax[\w.]*)\n(?: {4}(options: .*)\n)?", re.M)
 ARRAY = re.compile(r"(?:jaxtyping\.)?(?:Float|Int|Bool)\[[\w.]*(?:Array|ArrayLike|ndarray|Union\[.*?\]), *(['\"])(.*?)\1\]")
 MODULE = re.compile(r"\b(?:udkjax|collections|typing|jax|numpy|pathlib|diffrax|optimistix|scipy)(?:\.\w+)*\.(?=\w)")
 SECTION = re.compile(r"^(?=(?:Args|Attributes|Returns|Raises|Source|Yields):\n)", re.M)
 RAISED = re.compile(r"^(\w+(?:, \w+)*): (.*(?:\n +.*)*)", re.M)
-EQUATION = re.compile(r"\$([^$\n]+)\$")  # in a docstring, in the names of the code
 WIDTH = 86  # columns of a call
 ITEM = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {5,}.*)*)", re.M)
 
@@ -105,11 +104,16 @@ def description(it: Any) -> list[str]:
         if heading == "Args":
             lines += [] if inspect.isclass(it) else [arguments(it), ""]
         elif heading == "Raises":
-            lines += ["**Raises**", "", *(f"- `{kind}`: {' '.join(said.split())}" for kind, said in RAISED.findall(text)), ""]
+            lines += [
+                "**Raises**",
+                "",
+                *(f"- `{kind}`: {typeset(' '.join(said.split()))}" for kind, said in RAISED.findall(text)),
+                "",
+            ]
         elif heading in ("Returns", "Yields", "Source"):
-            lines += [f"**{heading}** {text.strip()}", ""]
+            lines += [f"**{heading}** {typeset(text.strip())}", ""]
         elif heading != "Attributes":
-            lines += [EQUATION.sub(lambda found: f"${latex(found[1])}$", section.strip()), ""]
+            lines += [typeset(section.strip()), ""]
     return lines
 
 

@@ -12,6 +12,7 @@ import udkjax
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
+mathml = importlib.import_module("mathml")
 pages = importlib.import_module("pages")
 reference = importlib.import_module("reference_tables")
 MOST_ENTRIES = 9  # of a group of the menu
@@ -110,3 +111,56 @@ def test_a_name_in_the_text_leads_to_its_entry():
     assert pages.linked("`udk.simulate` and `udk.nothing`", "how-to/x") == "[`udk.simulate`](#udkjax.simulate) and `udk.nothing`"
     assert pages.linked("`udk.Design` of [`udk.design`](a.md)", "a") == "[`udk.Design`](#class.Design) of [`udk.design`](a.md)"
     assert pages.linked("[one](a/b.html)", "index") == "[one](page:a/b.html)"
+
+
+# --- equations
+
+EQUATION = re.compile(r"\$\$.*?\$\$|\$[^$\n]+\$", re.S)
+BOX = re.compile(r"(?:^\n|\A)((?: {4}(?! *[-*|]).*\n)+)|`([^`\n]+)`", re.M)
+TYPED = re.compile(r"Psi_?\w* [-+=]|[-+=] Psi|\^\+|\^\(-|\^T\b|\b(?:lambda|gamma|mu|rho)(?:\(\w\))? = ")
+
+
+def untypeset(text: str) -> list[str]:
+    """Return the equations of a page that stand in a code box, or as plain text."""
+    prose = EQUATION.sub("", pages.FENCE.sub("", text))
+    boxes = ["".join(found) for found in BOX.findall(prose)]
+    plain = [found[0] for found in mathml.EXPRESSION.finditer(BOX.sub("\n", prose)) if mathml.inline(found) != found[0]]
+    return plain + [box for box in boxes if TYPED.search(box)]
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: str(page.relative_to(DOCS)))
+def test_its_equations_are_typeset(page):
+    assert untypeset(page.read_text()) == []
+
+
+def test_an_equation_that_is_not_typeset_is_noticed():
+    assert untypeset("By Psi_q a = gamma it moves.") == ["Psi_q a = gamma"]
+    assert untypeset("It is\n\n    mu(s) = c tanh(4 x)\n\nhere.") == ["    mu(s) = c tanh(4 x)\n"]
+    assert untypeset("`a = a_F + M^(-1/2) D^+ b`") == ["a = a_F + M^(-1/2) D^+ b"]
+    assert untypeset(r"$a = M^{-1} F$ in m/s^2 of `mu`") == []
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ("M a + Psi_q^T lambda = F", r"M a + \Psi_{q}^T \lambda = F"),
+        ("a = a_F + M^(-1/2) D^+ b", r"a = a_{F} + M^{-1/2} D^+ b"),
+        ("Psi_ddot + 2 alpha Psi_dot + beta^2 Psi = 0", r"\ddot{\Psi} + 2 \alpha \dot{\Psi} + \beta^2 \Psi = 0"),
+        ("K = -F_q + (lambda^T Psi)_qq", r"K = -F_{q} + (\lambda^T \Psi)_{qq}"),
+        ("c0 + c1 t + c2 t^2 + ...", r"c_{0} + c_{1} t + c_{2} t^2 + \dots"),
+    ],
+)
+def test_equations_of_docstrings_are_typeset(said, shown):
+    assert (
+        mathml.typeset(f"With {said}, a run of a mechanism is {said}.") == f"With ${shown}$, a run of a mechanism is ${shown}$."
+    )
+
+
+def test_units_and_code_of_docstrings_are_no_equations():
+    said = "A rate (m/s^2) of `Psi_q a = gamma` in N m, a motion of I and 5 kg m^2."
+    assert mathml.typeset(said) == said
+
+
+@pytest.mark.parametrize("name", ["Baumgarte", "accelerations", "kinematics", "modes", "equilibrium", "reactions", "Friction"])
+def test_entries_show_their_equations_typeset(name):
+    assert EQUATION.search(reference.entry(f"udkjax.{name}"))

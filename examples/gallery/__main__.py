@@ -10,34 +10,56 @@ import argparse
 import html
 import re
 import time
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
-NAMES = (
-    "four_bar",
-    "five_bar",
-    "parallelogram",
-    "excavator",
-    "jansen_leg",
-    "peaucellier",
-    "scissor_lift",
-    "dwell_cam",
-    "planetary_gear",
-    "hammer",
-    "toggle_clamp",
-    "woodpecker",
-    "rod_on_floor",
-    "identification",
-    "double_pendulum_map",
-    "neural_friction",
-    "designed_paths",
-    "six_bar_dwell",
-)
+# Groups of the page: names with a short title, and what to try on the page of the example.
+GROUPS = {
+    "Classic linkages": {
+        "four_bar": ("Four-bar", "drag the crank, and make the coupler longer until the motor cannot turn on"),
+        "peaucellier": ("Peaucellier's straight line", "change the length of one bar, and see the line bend"),
+        "jansen_leg": ("Jansen's leg", "compare the paths of the foot of all cranks"),
+        "parallelogram": ("Parallelogram with a redundant link", "make the third link longer: the linkage cannot move"),
+        "five_bar": ("With and without projection", "wait until the right linkage stops in mid-air"),
+    },
+    "Machines": {
+        "toggle_press": ("Toggle press", "follow the ram near the bottom, where it almost stands still"),
+        "quick_return": ("Quick return", "move the pivot of the lever, and compare the times of the two strokes"),
+        "excavator": ("Excavator", "make the dampers of the cylinders weaker"),
+        "scissor_lift": ("Scissor lift", "give the platform another load"),
+        "scissor_lift_spring": ("Scissor lift on a spring", "make the spring softer until the lift does not rise any more"),
+        "door_closer": ("Door closer", "take the damping away: the door slams"),
+        "planetary_gear": ("Planetary gear", "count the turns of the sun for one turn of the carrier"),
+    },
+    "Cams": {
+        "cam_follower": ("Cam and follower", "drag the cam, and watch the spring press the follower"),
+        "dwell_cam": ("Cam with two dwells", "look for the jumps of the acceleration at the ends of a dwell"),
+    },
+    "Friction and impacts": {
+        "hammer": ("Hammer", "change the restitution of the anvil"),
+        "toggle_clamp": ("Toggle clamp", "compare the dry clamp with the greased one"),
+        "woodpecker": ("Woodpecker", "stop at a peck, when the ring is free"),
+        "rod_on_floor": ("Rod on the floor", "compare the two coefficients when the tip digs in"),
+    },
+    "Identification": {
+        "identification": ("Two masses from a motion", "compare the first guess with the result"),
+        "neural_friction": ("Friction learned by a network", "compare the learned law with the true one"),
+    },
+    "Design": {
+        "designed_paths": ("Paths by design", "follow the foot, which stays level on the ground"),
+        "six_bar_dwell": ("Six-bar with a dwell", "watch the output rest for a third of a turn"),
+    },
+    "Chaos": {"double_pendulum_map": ("A map of chaos", "compare pendulums that start next to each other")},
+}
 DRAWINGS = {"toggle_press": 1.0, "quick_return": 2.0, "cam_follower": 0.5, "door_closer": 6.0, "scissor_lift_spring": 2.0}  # s
+NAMES = tuple(name for group in GROUPS.values() for name in group if name not in DRAWINGS)
 PLAYER = "player.js"  # the script of all pages
 FRAMES = 121  # of their players
 WIDTH = 720  # px, of pictures
 DPI = 96  # of plots
+THUMBNAIL = {"width": 260, "fps": 10.0}  # a film beside the short title
+LOOP = 2.4  # s, its length
 MOMENT = 0.3  # fraction of the motion at which its picture is taken
 
 
@@ -56,6 +78,10 @@ def make(name: str, out: Path) -> dict:
             span = thing.data["end"] - thing.data["start"]
             moment = getattr(module, "MOMENT", MOMENT)
             picture = thing.save(out / f"{name}.png", thing.data["start"] + moment * span, width=WIDTH)
+            thing.save(out / f"{name}.moving.gif", speed=span / LOOP, **THUMBNAIL)
+        elif what == "home":
+            share_player(thing.save(out / "home.html", autoplay=True))
+            continue
         elif what == "film":
             thing.save(out / f"{name}.gif", **getattr(module, "FILM", {}))
             continue
@@ -120,6 +146,8 @@ def _shrink(picture: Path) -> None:
 
 def page(examples: list[dict]) -> str:
     """Return the page of the gallery in Markdown, with the players in the same folder."""
+    from docs.mathml import typeset
+
     lines = [
         "# Gallery",
         "",
@@ -128,15 +156,31 @@ def page(examples: list[dict]) -> str:
         "the drawings in `examples/drawings`.",
         "",
     ]
-    for example in examples:
-        name = example["name"]
-        facts = [f"- {html.escape(words)}: {value:.4g}" for words, value in example["facts"].items()]
-        motion, *others = example["files"]
-        lines += [f"## {example['title']}", "", example["words"], "", f"[![{name}]({motion})]({name}.html)", ""]
-        lines += [f"![{name}: {file}]({file})" for file in others]
-        kind = "Drawing" if name in DRAWINGS else "Script"
-        lines += ["", *facts, "", f"{kind}: `{example['source']}`", ""]
+    found = {example["name"]: example for example in examples}
+    for group, members in GROUPS.items():
+        shown = [name for name in members if name in found]
+        lines += [f"## {group}", "", *cards(shown, members), ""] if shown else []
+        for name in shown:
+            short, tried = members[name]
+            example = found[name]
+            facts = [f"- {typeset(html.escape(words, quote=False))}: {value:.4g}" for words, value in example["facts"].items()]
+            motion, *others = example["files"]
+            lines += [f"### {short}", "", typeset(example["title"]), typeset(example["words"]), ""]
+            lines += [f"[![{short}: a pose of its motion]({motion})]({name}.html)", ""]
+            lines += [f"![{short}: {Path(file).stem.removeprefix(name + '_')}]({file})" for file in others]
+            kind = "Drawing" if name in DRAWINGS else "Script"
+            lines += ["", *facts, "", f"**Try:** {tried}. {kind}: `{example['source']}`", ""]
     return "\n".join(lines)
+
+
+def cards(names: list[str], members: dict[str, tuple[str, str]]) -> Iterator[str]:
+    """Iterate over the lines of a grid of moving thumbnails; where no motion is wanted, pictures stand still."""
+    yield '<div class="cards moving">'
+    for name in names:
+        moving = f'<img class="moving" loading="lazy" src="{name}.moving.gif" alt="" width="260">'
+        still = f'<img class="still" loading="lazy" src="{name}.png" alt="" width="260">'
+        yield f'<a class="card" href="{name}.html">{moving}{still}<b>{html.escape(members[name][0])}</b></a>'
+    yield "</div>"
 
 
 def main() -> None:

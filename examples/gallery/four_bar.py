@@ -39,7 +39,8 @@ def make():
     }
     turn = udk.simulate(mech, np.linspace(0.0, 1.0, 101))
     film = udk.animate(mech, turn, traces=["A", "B", "P"], measures=())
-    return facts, {"motion": udk.animate(mech, sol, traces=["P"], live=LIVE), "film": film}
+    home = udk.animate(mech, sol, traces=["P"], live=LIVE[:3], measures=())  # for the first page of the documentation
+    return facts, {"motion": udk.animate(mech, sol, traces=["P"], live=LIVE), "film": film, "home": home}
 
 
 if __name__ == "__main__":
