@@ -12,7 +12,7 @@ import numpy as np
 
 import udkjax as udk
 from experiments.parts.crossing_case import TS, Case, WrongError, agree, arrays, claim
-from experiments.parts.crossing_studies import page_data, shown
+from experiments.parts.crossing_studies import accelerations_by_c, page_data, shown
 from udkjax.cli import main as udkjax_cli
 from udkjax.study.report import plain
 
@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "statics": ("SCENE", "--json"),
     "modes": ("SCENE", "--json"),
+    "export": ("SCENE", "--c", "OUT.c", "--what", "accelerations", "--json"),
     "check": ("SCENE", "--json"),
     "convert": ("SCENE", "OUT.toml", "--json"),
     "diagnose": ("SCENE", "--json"),
@@ -153,6 +154,11 @@ def read_modes(case: Case, scene: Any, results: Any, folder: Path) -> str:
     rest = udk.equilibrium(case.model, stable=True)
     found = udk.modes(case.model, rest.state)
     return same([results[x] for x in ("q", "omega2", "damping")], [found.q, found.omega2, found.damping], "udk.modes", 1e-6)
+
+
+def read_export(case: Case, scene: Any, results: Any, folder: Path) -> str:
+    a = accelerations_by_c(folder / "out.c", results["prefix"], results["memory"]["accelerations"], case)
+    return agree(a, np.ravel(udk.accelerations(case.model, 0.0, case.state.q, case.state.v)), "udk.accelerations", 1e-9)
 
 
 def read_check(case: Case, scene: Any, results: Any, folder: Path) -> str:

@@ -132,6 +132,7 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "dumps": {"": studies.dumps},
     "loads": {"": studies.dumps},
     "save": {"": studies.save},
+    "export_c": {"": studies.export_c},
     "load": {"": studies.save},
     "mjcf_text": {"": studies.mjcf},
     "read_mjcf": {"": studies.mjcf},

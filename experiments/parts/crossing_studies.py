@@ -1,7 +1,9 @@
 """Rows of the table of functions by models: studies, files and pictures."""
 
+import ctypes
 import json
 import re
+import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -211,6 +213,29 @@ def save(case: Case) -> str:
         file = Path(folder) / "scene.toml"
         udk.save(case.model, file)
         return agree(udk.simulate(udk.load(file), TS, case.state, **EXACT).q, case.alone.q, "the motion")
+
+
+def accelerations_by_c(folder: Path, prefix: str, memory: int, case: Case) -> np.ndarray:
+    """Compile the accelerations of a folder of C, and evaluate them at the start of a case."""
+    flags = ["-O0", "-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-shared", "-fPIC"]
+    sources = [str(folder / f"{prefix}_{x}.c") for x in ("accelerations", "numbers")]
+    subprocess.run(["cc", *flags, *sources, "-o", str(folder / "code.so"), "-lm"], check=True)
+    library = ctypes.CDLL(str(folder / "code.so"))
+    q, v = (np.ravel(np.asarray(x, float)) for x in (case.state.q, case.state.v))
+    a, work = np.zeros_like(q), np.zeros(memory // 8)
+    numbers, arrays = (
+        ctypes.c_double.in_dll(library, f"{prefix}_numbers"),
+        [x.ctypes.data_as(ctypes.c_void_p) for x in (q, v, a, work)],
+    )
+    getattr(library, f"{prefix}_accelerations")(ctypes.byref(numbers), ctypes.c_double(0.0), *arrays)
+    return a
+
+
+def export_c(case: Case) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        found = udk.export_c(case.model, folder, ["accelerations"])
+        a = accelerations_by_c(Path(folder), found.prefix, found.memory["accelerations"], case)
+    return agree(a, np.ravel(udk.accelerations(case.model, 0.0, case.state.q, case.state.v)), "udk.accelerations", 1e-9)
 
 
 def mjcf(case: Case) -> str:

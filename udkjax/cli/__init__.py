@@ -26,6 +26,7 @@ COMMANDS = (
     "tolerances",
     "statics",
     "modes",
+    "export",
     "check",
     "convert",
     "diagnose",

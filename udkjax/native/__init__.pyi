@@ -1,5 +1,9 @@
 """The door of `native`: the names that floors above import, each from its own module."""
 
+from udkjax.native.c import CUnit as CUnit
+from udkjax.native.c import c_function as c_function
+from udkjax.native.c import c_unit as c_unit
+from udkjax.native.c import number_text as number_text
 from udkjax.native.closing.batch_program import BatchProgram as BatchProgram
 from udkjax.native.closing.positions import PositionCode as PositionCode
 from udkjax.native.code.code_cache import cache_folder as cache_folder

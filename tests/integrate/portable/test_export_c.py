@@ -1,0 +1,153 @@
+"""C of scenes compiles without a warning, allocates nothing, and equals machine code, in every bit if products are fused."""
+
+import ctypes
+import glob
+import platform
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import udkjax as udk
+from tests.command_line import udkjax
+from tests.fused import is_fused
+from udkjax.native.code import processor
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None or platform.system() != "Linux", reason="no C compiler")
+STRICT = "-O1 -std=c99 -Wall -Wextra -pedantic -Werror"
+DRAWINGS = sorted(glob.glob(str(Path(__file__).parents[3] / "examples" / "drawings" / "*.toml")))
+OF_C = {"memcpy", "memset", "sqrt", "fabs", "floor", "ceil", "trunc", "rint", "fma", "copysign"}
+TS = np.linspace(0.0, 1.0, 11)
+
+
+def fused() -> str:
+    """Return the option by which C fuses products if machine code of this processor does."""
+    return "-march=native" if is_fused() and not processor._setting() else ""
+
+
+def compiled(folder: Path, flags: str = "") -> ctypes.CDLL:
+    sources = [x.name for x in folder.glob("*.c") if x.name != "main.c"]
+    subprocess.run(
+        ["cc", *STRICT.split(), *flags.split(), "-shared", "-fPIC", *sources, "-o", "code.so", "-lm"], cwd=folder, check=True
+    )
+    return ctypes.CDLL(str(folder / "code.so"))
+
+
+def numbers(x):
+    return np.ascontiguousarray(x, float).ctypes.data_as(ctypes.c_void_p)
+
+
+def flat(*xs):
+    return [np.array(x, float).ravel() for x in xs]
+
+
+def scene_numbers(library, prefix):
+    return ctypes.byref(ctypes.c_double.in_dll(library, f"{prefix}_numbers"))
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pendulum")
+    mechanism = udk.library.compound_pendulum()
+    what = ["run", "accelerations", "projection", "positions"]
+    code = udk.export_c(mechanism, folder, what, TS, ["body.rod.mass", "gravity"])
+    return mechanism, code, compiled(folder, fused())
+
+
+def test_functions_of_a_state_equal_those_of_the_package(pendulum):
+    mechanism, code, library = pendulum
+    state, given = udk.assemble(mechanism), scene_numbers(library, code.prefix)
+    q, v = flat(state.q, state.v)
+    v = v + np.asarray(udk.simulate(mechanism, TS).v[-1]).ravel()
+    q = np.asarray(udk.simulate(mechanism, TS).q[-1]).ravel().copy()
+    a, memory = np.zeros_like(q), {k: np.full(x // 8, np.nan) for k, x in code.memory.items()}
+    getattr(library, f"{code.prefix}_accelerations")(
+        given, ctypes.c_double(0.0), numbers(q), numbers(v), numbers(a), numbers(memory["accelerations"])
+    )
+    assert_allclose(a, np.ravel(udk.accelerations(mechanism, 0.0, q, v)), rtol=1e-12, atol=1e-12)
+    close = getattr(library, f"{code.prefix}_close")
+    close.restype = ctypes.c_double
+    p, w = q + 1e-3, v.copy()
+    assert close(given, ctypes.c_double(0.0), numbers(p), numbers(w), numbers(memory["positions"])) < 1e-9
+    p, w = q + 1e-4, v + 1e-4
+    getattr(library, f"{code.prefix}_project")(given, ctypes.c_double(0.0), numbers(p), numbers(w), numbers(memory["projection"]))
+    assert np.abs(p - q).max() < 1e-3
+    assert float(close(given, ctypes.c_double(0.0), numbers(p), numbers(w), numbers(memory["positions"]))) < 1e-9
+
+
+def test_a_step_with_other_parameters_equals_that_of_the_package(pendulum):
+    mechanism, code, library = pendulum
+    state, memory = udk.assemble(mechanism), np.full(code.memory["run"] // 8, np.nan)
+    header = next(x for x in code.files if x.suffix == ".h").read_text()
+    count = int(re.search(r"_NUMBERS (\d+)", header)[1])
+    own = np.array((ctypes.c_double * count).in_dll(library, f"{code.prefix}_numbers"))
+    for values in ({}, {"body.rod.mass": 1.3, "gravity": np.array([0.5, -9.0])}):
+        if values:
+            getattr(library, f"{code.prefix}_set_parameters")(
+                numbers(np.concatenate(flat(*values.values()), axis=None)), numbers(own)
+            )
+        q, v = flat(state.q, state.v)
+        step = getattr(library, f"{code.prefix}_step")
+        assert step(numbers(own), ctypes.c_double(0.0), ctypes.c_double(0.05), numbers(q), numbers(v), numbers(memory)) == 0
+        wanted = udk.step(mechanism, state, values, 0.05, analysis=udk.analyse(mechanism))
+        assert_allclose(np.concatenate([q, v]), np.concatenate(flat(wanted.q, wanted.v)), rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("scene", ["compound_pendulum", "parallelogram"])
+def test_the_program_prints_the_table_of_the_command(scene, tmp_path, capsys):
+    arguments = ("--t1", "0.5", "--dt", "0.1", "--json")
+    assert udkjax("export", scene, "--c", tmp_path / "c", *arguments) == 0
+    assert udkjax("simulate", scene, "--out", tmp_path / "run.csv", *arguments) == 0
+    capsys.readouterr()
+    wanted = (tmp_path / "run.csv").read_text().splitlines()
+    options = f"{STRICT} {fused()}".split()
+    subprocess.run(f"cc {' '.join(options)} *.c -o run -lm", shell=True, cwd=tmp_path / "c", check=True)
+    found = subprocess.run(["./run"], cwd=tmp_path / "c", check=True, capture_output=True, text=True).stdout.splitlines()
+    assert found[0] == wanted[0]
+    pairs = [np.array([[float(x) for x in line.split(",")] for line in lines[1:]]) for lines in (found, wanted)]
+    (assert_array_equal if fused() and processor.lanes() > 1 else assert_allclose)(*pairs, **({} if fused() else {"atol": 1e-9}))
+    called = subprocess.run(["nm", "-u", "run"], cwd=tmp_path / "c", check=True, capture_output=True, text=True).stdout.split()
+    own = {x.partition("@")[0] for x in called if "@GLIBC" in x and not x.startswith("__")}
+    assert own <= OF_C | {"puts", "putchar", "printf", "fprintf", "stderr", "fputc", "putc", "fwrite"}
+
+
+def test_scenes_without_c_are_refused_by_name(tmp_path):
+    mechanism = udk.library.compound_pendulum()
+    with pytest.raises(ValueError, match="what must be"):
+        udk.export_c(mechanism, tmp_path, [])
+    with pytest.raises(ValueError, match="ts must be at least two increasing times"):
+        udk.export_c(mechanism, tmp_path, ts=[0.0, 0.0])
+    joint = next(iter(mechanism.joints))
+    sticking = udk.Mechanism(
+        mechanism.bodies,
+        mechanism.joints,
+        {},
+        {"rub": udk.Friction(joint, coefficient=0.2, radius=0.01, law="set-valued")},
+        mechanism.gravity,
+        "rubbing",
+    )
+    with pytest.raises(ValueError, match=f'no C for joints that stick .*{joint}.*law="smooth"'):
+        udk.export_c(sticking, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*sorted(udk.library.__all__), *DRAWINGS], ids=lambda x: Path(x).stem)
+def test_every_scene_runs_in_c(name, tmp_path):
+    mechanism = udk.load(name) if name.endswith(".toml") else getattr(udk.library, name)(*([3] if name == "n_four_bar" else []))
+    ts = np.linspace(0.0, 0.03 if name == "andrews_squeezer" else 20.0, 401)
+    code = udk.export_c(mechanism, tmp_path, ["run", "accelerations", "projection", "positions"], ts)
+    assert code.flops < 4000 or len(mechanism.bodies) > 12
+    subprocess.run(f"cc {STRICT} {fused()} *.c -o run -lm", shell=True, cwd=tmp_path, check=True)
+    lines = subprocess.run(["./run"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout.splitlines()[1:]
+    found = np.array([[float(x) for x in line.split(",")] for line in lines])[:, 1:]
+    run = udk.simulate(mechanism, ts)
+    wanted = np.hstack([np.asarray(x).reshape(len(ts), -1) for x in (run.q, run.v)])
+    if fused():
+        assert_array_equal(found, wanted)
+    else:
+        assert_allclose(found[1], wanted[1], atol=1e-9 * np.abs(wanted).max())

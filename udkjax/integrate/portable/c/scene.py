@@ -1,0 +1,279 @@
+"""The functions of a scene in C: each is a unit of the engine with a call record around it."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.rows.analysis import analyse
+from udkjax.integrate.compiled_mechanism import compile_concrete, evaluation_of
+from udkjax.integrate.events.law.kinks import kinks_of
+from udkjax.integrate.native_engine import packed, scene_inputs
+from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
+from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, may_stick, prepare_run, with_held_pins
+from udkjax.integrate.problem import Problem
+from udkjax.integrate.projection import Projection
+from udkjax.integrate.solution import Result
+from udkjax.native.c import CUnit, c_function, c_unit, number_text
+from udkjax.native.module.steps import SMALLEST_STEP, Status
+from udkjax.native.operations import Operation, StateOperation
+from udkjax.native.position_operations import Close
+from udkjax.native.runs import RunStates
+from udkjax.positions.assembling.assembly import State, assemble
+from udkjax.requirements import ArgumentError
+from udkjax.scene.elements.bodies import COORDINATES
+from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import quote
+
+RESULTS = {
+    Status.DONE: Result.successful,
+    Status.STEP_LIMIT: Result.step_limit,
+    Status.NOT_FINITE: Result.not_finite,
+    Status.LOST: Result.drift,
+    Status.SINGULAR: Result.singular,
+    Status.SPURIOUS_RANK: Result.spurious_rank,
+    Status.MISSING_RANK: Result.missing_rank,
+}
+INFO = {name: k for k, name in enumerate(RunStates.info_names)}  # places in the result "info"
+STEPS_OF_INTERVAL = 1_000  # most steps of `step`, as of `udkjax.step`
+
+
+class SceneCode:
+    """The functions of a scene in C.
+
+    Args:
+        mechanism: the scene, with concrete numbers.
+        ts: output times of its run (s).
+        rtol: relative tolerance of a step.
+        atol: absolute tolerance of a step, relative to the scene's scales.
+        stiff: whether a run goes on by an implicit method where it is stiff.
+
+    Raises:
+        ArgumentError: there is no C for the scene.
+    """
+
+    def __init__(self, mechanism: Mechanism, ts: np.ndarray, rtol: float, atol: float, stiff: bool = True):
+        choices = Choices(rtol=rtol, atol=atol, drift_tol=DRIFT_PROJECTED, dt0=None, method=AUTO, stabilization=Projection())
+        given, analysis, choices = with_held_pins(mechanism, None, None, choices)
+        self.mechanism: Mechanism = given
+        refuse_what_needs_python(self.mechanism)
+        self.ts, self.analysis = ts, analyse(self.mechanism) if analysis is None else analysis
+        self.state = assemble(self.mechanism, float(ts[0]))
+        self.compiled = compile_concrete(self.mechanism, self.analysis, *choices.of_mechanism)
+        plan = self.compiled.plan
+        if plan.why_not_native:
+            raise ArgumentError(f"no C for this scene: {plan.why_not_native}")
+        if plan.shares_by_marks:
+            why = "friction depends on the loads of joints, and rows that may be redundant share these"
+            raise ArgumentError(f"no C for this scene: {why}; remove the redundant constraint that udkjax.diagnose names")
+        start = State(np.asarray(self.state.q).ravel(), np.asarray(self.state.v).ravel())
+        self.problem: Problem = prepare_run(self.compiled, self.analysis, ts, start, None, choices, np).problem
+        assert plan.operation is not None  # there is machine code
+        self.operation = plan.operation if stiff else replace(plan.operation, changes=False, leaves=False)
+        self.prefix = re.sub(r"\W+", "_", mechanism.name or "scene").strip("_").lower()
+        if not re.match(r"[a-z]", self.prefix):
+            self.prefix = f"scene_{self.prefix}"
+
+    @property
+    def n(self) -> int:
+        """Count of coordinates."""
+        return self.operation.code.coordinate_count
+
+    @property
+    def coordinate_names(self) -> list[str]:
+        return [f"body.{body}.{x}" for body in self.mechanism.body_names for x in COORDINATES]
+
+    @cached_property
+    def inputs(self) -> dict[str, np.ndarray]:
+        """The inputs of a run, by name."""
+        names = (*Operation.input_names, *(("samples",) if self.operation.sampled else ()))
+        return {name: np.ravel(x) for name, x in zip(names, packed(self.problem), strict=True)}
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """All numbers of the scene, marks of rows, and the thresholds of pivots."""
+        return self.inputs["numbers"]
+
+    # --- functions
+
+    def run(self) -> tuple[str, CUnit]:
+        """Return `run` and `step`."""
+        unit, p = c_unit(self.operation), self.prefix
+        settings = dict(zip(self.operation.all_settings, self.inputs["settings"], strict=True))
+        rate, length = (number_text(float(x)) for x in (self.analysis.scales.rate, self.analysis.scales.length))
+        results = [int(RESULTS.get(k, Result.step_too_small)) for k in range(Status.MISSING_RANK + 1)]
+        values = {"numbers": "numbers", "ts": "ts", "q": "q", "v": "v", "settings": "own", "rows": "rows", "breaks": "breaks"}
+        values |= {"times": "times", "knots": str(len(self.inputs["breaks"]))}
+        values |= {"samples": "samples"} if self.operation.sampled else {}
+        values |= {"qs": "qs", "vs": "vs", "violation": "violation", "info": "info"}
+        columns = {name: k for k, name in enumerate(self.operation.all_settings)}
+        text = f"""
+{_arrays(rows=self.inputs["rows"], breaks=self.inputs["breaks"], samples=self.inputs.get("samples", np.zeros(0)))}
+static const double settings[] = {{ /* {", ".join(settings)} */
+    {", ".join(map(number_text, settings.values()))}}};
+static const int results[] = {{{", ".join(map(str, results))}}}; /* of a run, by its status */
+
+static double larger(double a, double b) {{ return a > b ? a : b; }}
+
+/* Integrate from ts[0] to the last time; `first` is the step to try, 0 if it is chosen. */
+static int integrate(const double *numbers, const double *ts, int times, const double *q, const double *v, double *qs, double *vs,
+    double *violation, double *info, double *memory, double first, double most_steps)
+{{
+    double own[sizeof settings / sizeof *settings], lengths = 0.0, angles = 0.0;
+    memcpy(own, settings, sizeof settings);
+    for (int i = 0; i < {self.n}; i++) {{
+        if (i % 3 == 2) angles = larger(angles, fabs(v[i])); else lengths = larger(lengths, fabs(v[i]));
+    }}
+    own[{columns["smallest"]}] = {number_text(SMALLEST_STEP * np.finfo(float).eps)} * larger(fabs(ts[0]), fabs(ts[times - 1]));
+    own[{columns["first"]}] = first;
+    own[{columns["omega"]}] = larger({rate}, larger(lengths / {length}, angles));
+    own[{columns["omega"]}] = larger(own[{columns["omega"]}], 1 / (ts[times - 1] - ts[0]));
+    own[{columns["max_steps"]}] = most_steps;
+{unit.call_record(values)}
+    run_member(call, memory, 0);
+    if (info[{INFO["lost"]}] < times) return info[{INFO["lost"]}] > 0 ? {int(Result.drift)} : {int(Result.initial_state_open)};
+    return results[(int)info[{INFO["code"]}]];
+}}
+
+int {p}_run(const double *numbers, const double *ts, int times, const double *q, const double *v, double *qs, double *vs,
+    double *violation, double *info, double *memory)
+{{
+    return integrate(numbers, ts, times, q, v, qs, vs, violation, info, memory, 0.0, {number_text(settings["max_steps"])});
+}}
+
+int {p}_step(const double *numbers, double t, double dt, double *q, double *v, double *memory)
+{{
+    double ts[2], qs[{2 * self.n}], vs[{2 * self.n}], violation[2], info[{len(INFO) + 2 * self.n}];
+    ts[0] = t;
+    ts[1] = t + dt;
+    const int result = integrate(numbers, ts, 2, q, v, qs, vs, violation, info, memory, dt, {number_text(STEPS_OF_INTERVAL)});
+    if (!result) {{
+        memcpy(q, qs + {self.n}, {self.n} * sizeof *q);
+        memcpy(v, vs + {self.n}, {self.n} * sizeof *v);
+    }}
+    return result;
+}}
+"""
+        return unit.text + text, unit
+
+    def accelerations(self) -> tuple[str, CUnit]:
+        """Return `accelerations`."""
+        state = "const double *numbers, double t, const double *q, const double *v"
+        head = f"void {self.prefix}_accelerations({state}, double *a, double *memory)"
+        return self._of_state(self._evaluation, head, {"found": "a"})
+
+    def projection(self) -> tuple[str, CUnit]:
+        """Return `project`."""
+        head = f"void {self.prefix}_project(const double *numbers, double t, double *q, double *v, double *memory)"
+        copied = f"    memcpy(q, found, {self.n} * sizeof *q);\n    memcpy(v, found + {self.n}, {self.n} * sizeof *v);\n"
+        return self._of_state(self._evaluation.projection, head, {"found": "found"}, f"    double found[{2 * self.n}];\n", copied)
+
+    def positions(self) -> tuple[str, CUnit]:
+        """Return `close`."""
+        operation = Close(scene_programs(self.mechanism).with_all_rows)
+        scales, m, n = self.analysis.scales, operation.code.row_count, self.n
+        tol = float(scales.rank_tol)
+        count = len(self._own_numbers)
+        head = f"double {self.prefix}_close(const double *numbers, double t, double *q, double *v, double *memory)"
+        before = f"""    double own[{count + 2}], found[{2 * n}], left[{2 * m or 1}], rank[1], largest = 0.0;
+    memcpy(own, numbers, {count} * sizeof *own);
+    own[{count}] = {number_text(tol**2)};
+    own[{count + 1}] = 0.0;
+"""
+        after = f"""    memcpy(q, found, {n} * sizeof *q);
+    memcpy(v, found + {n}, {n} * sizeof *v);
+    for (int i = 0; i < {m}; i++) largest = fabs(left[i]) / rows[i] > largest ? fabs(left[i]) / rows[i] : largest;
+    return largest;
+"""
+        results = dict(zip(c_unit(operation).module.results, ("found", "left", "rank"), strict=True))
+        settings = {"length": scales.length, "fallback_tol": tol}
+        return self._of_state(operation, head, {"numbers": "own", **results}, before, after, settings)
+
+    @property
+    def _evaluation(self) -> StateOperation:
+        operation = evaluation_of(self.compiled.equations)
+        if operation is None:
+            raise ArgumentError("no C for accelerations and projections of a scene without constraints: export its run")
+        if self.operation.sampled:
+            raise ArgumentError("no C for single states of a scene with tables over time: export its run")
+        return operation
+
+    @property
+    def _numbered(self) -> Mechanism:
+        return self.compiled.textbook.mechanism
+
+    @property
+    def _own_numbers(self) -> np.ndarray:
+        return scene_numbers(self.mechanism)
+
+    def _of_state(
+        self, operation: Operation, head: str, values: dict, before: str = "", after: str = "", settings: Any = None
+    ) -> tuple[str, CUnit]:
+        unit = c_unit(operation)
+        found = settings or scene_inputs(self.compiled.equations, self._numbered, operation.code.policy, np).settings
+        given = np.array([float(found[name]) for name in operation.all_settings])
+        record = {"numbers": "numbers", "ts": "ts", "q": "q", "v": "v", "settings": "settings", "rows": "rows", "times": "2"}
+        text = f"""
+{_arrays(rows=np.asarray(self.analysis.scales.rows), settings=given)}
+{head}
+{{
+    double ts[2];
+    ts[0] = ts[1] = t;
+{before}{unit.call_record(record | values)}
+    run_member(call, memory, 0);
+{after}}}
+"""
+        return unit.text + text, unit
+
+    def parameters(self, names: Sequence[str]) -> tuple[str, dict[str, float]]:
+        """Return the function that sets parameters, and the values of the parameters one number at a time."""
+        values = scalar_parameters(self.mechanism, names)
+        program = NumberProgram(self.mechanism, values, lambda given: given.without_origin)
+        moved = [k for k in program.changing if k >= program.count]
+        if moved:
+            raise ArgumentError(
+                "parameters move times at which the motion is not smooth: leave out those of motion laws over time"
+            )
+        text = c_function(program.function()) if values else ""
+        call = (
+            "    numbers((double *)(uintptr_t)parameters, values);"
+            if program.changing
+            else "    (void)parameters;\n    (void)values;"
+        )
+        head = f"void {self.prefix}_set_parameters(const double *parameters, double *values)"
+        return f"{text if program.changing else ''}\n{head}\n{{\n{call}\n}}\n", values
+
+
+def scene_numbers(mechanism: Mechanism) -> np.ndarray:
+    """Return the numbers of a scene as its programs take them, without thresholds."""
+    return NumberProgram(mechanism, {}, lambda given: given.without_origin).base
+
+
+def _arrays(**arrays: np.ndarray) -> str:
+    """Return definitions of constant arrays; an empty one has a zero."""
+    lines = []
+    for name, values in arrays.items():
+        if name == "samples" and not values.size:
+            continue
+        lines.append(f"static const double {name}[] = {{{table(values if values.size else np.zeros(1))}}};")
+    return "\n".join(lines)
+
+
+def table(values: np.ndarray) -> str:
+    """Return numbers separated by commas, six in a line."""
+    texts = [number_text(float(x)) for x in np.ravel(values)]
+    return ",\n    ".join(", ".join(texts[k : k + 6]) for k in range(0, len(texts), 6))
+
+
+def refuse_what_needs_python(mechanism: Mechanism) -> None:
+    """Raise an error for a scene whose run needs events, which Python applies."""
+    if may_stick(mechanism):
+        joints = [force.joint for force in mechanism.forces.values() if getattr(force, "sticks", False)]
+        names = ", ".join(map(quote, joints))
+        raise ArgumentError(f'no C for joints that stick ({names}): give their friction law="smooth"')
+    if mechanism.may_have_kinks and kinks_of(mechanism).are_held:
+        raise ArgumentError("no C for forces with jumps or kinks that depend on the state: make them smooth")

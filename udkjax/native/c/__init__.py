@@ -1,0 +1,9 @@
+"""Modules of the engine as C99: the same text as machine code, for processors without Python.
+
+`c_unit` makes the C of an operation for one member, whose memory the caller gives; `c_function` translates one function.
+"""
+
+from udkjax.native.c.syntax import number_text
+from udkjax.native.c.unit import CUnit, c_function, c_unit
+
+__all__ = ["CUnit", "c_function", "c_unit", "number_text"]
