@@ -321,3 +321,26 @@ def test_sudden_changes_beside_breakpoints(tol):
             stopped = udk.simulate(ball, ts[::10], events=clock, rtol=tol, atol=tol)
             assert stopped.events is not None
             assert_allclose(stopped.events.v_before[0, 0, 0], v[k], rtol=0.0, atol=within)
+
+
+def test_outputs_after_jumps_beside_a_stiff_damper():
+    """A torque jumps: w = tau / c, but for I / c = 7 ns, which no step resolves. Derivatives and lanes, too."""
+    inertia, damping, torques = 0.07, 1e7, np.array([0.8, -1.0, 0.3, 1.2, -0.7, 0.1])
+    ts = np.append(0.0, 0.1 * np.arange(1, 12) + 0.013)
+
+    def speeds(torques, tol=1e-9):
+        """Return c w, which is tau."""
+        rotor = {"rotor": udk.Body(1.0, inertia, angular_velocity=2.0)}
+        pin = {"pin": udk.Revolute(["ground", "rotor"], [[0.0, 0.0], [0.0, 0.0]])}
+        drag = udk.TorsionSpring(["ground", "rotor"], stiffness=0.0, damping=damping, angle=0.0)
+        held = udk.Torque(["ground", "rotor"], udk.Held(torques, 0.2))
+        mechanism = udk.Mechanism(rotor, pin, forces={"drag": drag, "held": held}, gravity=[0.0, 0.0])
+        return damping * udk.simulate(mechanism, ts, rtol=tol, atol=tol).v[1:, 0, 2]
+
+    now = (ts[1:, None] // 0.2 == np.arange(6)).astype(float)
+    for tol in (1e-6, 1e-9):
+        assert_allclose(speeds(torques, tol), now @ torques, rtol=0.0, atol=1e-4)
+    factors = jnp.array([1.0, -2.0, 3.0])
+    assert_allclose(jax.vmap(lambda x: speeds(x * torques))(factors), factors[:, None] * (now @ torques), rtol=0.0, atol=1e-4)
+    for transform in (jax.jacfwd, jax.jacrev):
+        assert_allclose(transform(speeds)(jnp.asarray(torques)), now, rtol=0.0, atol=1e-4)

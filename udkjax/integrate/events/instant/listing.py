@@ -61,7 +61,7 @@ def listing(
     k, kind, event = xp.arange(len(found.event_index)), found.event_index // E, found.event_index % E
     is_event = k < found.count
     is_kink, is_hidden = is_event & (event >= own + 2 * F), is_event & (event >= own + 2 * F)
-    index, sticking = kind * own + event, None
+    index, sticking, also = kind * own + event, None, xp.zeros((len(k), 0), bool)
     if F:
         after, first = (_stick(phases, x, y, xp) for x, y in ((found.event_phase, found.sides), _first(found)))
         i, of_joint = xp.clip((event - own) // 2, 0, F - 1), (event >= own) & (event < own + 2 * F)
@@ -70,13 +70,18 @@ def listing(
         transition = xp.where((kind == 1) | (began & ~stays), SLIPS, xp.where(stays, STICKS, TURNS))
         index = xp.where(of_joint, 3 * own + len(TRANSITIONS) * i + transition, index)
         is_hidden = is_hidden | (is_event & of_joint & (kind == 1) & stays)  # another joint holds it now
+        # Joints that move together stop together: one event of a joint decides about all that are at rest.
+        also = (is_event & of_joint)[:, None] & (np.arange(F) != i[:, None]) & _turn(phases, found, ~after, xp)
         last = xp.searchsorted(found.event_time, ts, side="right") - 1
         held = xp.where((last >= 0)[:, None], after[xp.maximum(last, 0)], first[0])
         sticking = {x.name: held[:, j] for j, x in enumerate(phases.sticking)}
-    order = xp.argsort(xp.where(is_event & ~is_hidden, k, len(k)), stable=True)[:max_events]
+    listed = xp.concatenate([(is_event & ~is_hidden)[:, None], also], axis=1)
+    indices = xp.concatenate([index[:, None], 0 * index[:, None] + 3 * own + len(TRANSITIONS) * np.arange(F) + TURNS], axis=1)
+    order = xp.argsort(~listed.ravel(), stable=True)[:max_events]
+    rows = order // (1 + F)
     run = found._replace(
-        **{name: getattr(found, name)[order] for name in RECORD} | {"event_index": index[order]},
-        count=found.count - xp.sum(is_hidden),
+        **{name: getattr(found, name)[rows] for name in RECORD} | {"event_index": indices.ravel()[order]},
+        count=xp.minimum(xp.sum(listed), max_events),
         unresolved=found.unresolved[:own],
         undefined=found.undefined[:own],
     )
@@ -85,6 +90,13 @@ def listing(
     count, unresolved = xp.sum(is_kink), found.unresolved[own + 2 * F :].min()
     full = xp.where(count >= MOST_KINKS, xp.max(xp.where(is_kink, found.event_time, -xp.inf)), xp.inf)
     return Listing(run, Kinks(count, xp.minimum(unresolved, full)), sticking)
+
+
+def _turn(phases: Phases, found: EventRun, slides: Bool[Any, "k F"], xp: ModuleType) -> Bool[Any, "k F"]:
+    """Return which joints slide in another direction after each event than before it."""
+    places = [x.first for x in phases.sticking]
+    after, first = found.sides[:, places], found.first_sides[None, places]
+    return slides & (xp.concatenate([first, after[:-1]]) * after < 0)
 
 
 def _first(found: EventRun) -> tuple[Any, Any]:
