@@ -183,6 +183,8 @@ from udkjax.study.tolerancing import PinClearance as PinClearance
 from udkjax.study.tolerancing import Tolerance as Tolerance
 from udkjax.study.tolerancing import ToleranceAnalysis as ToleranceAnalysis
 from udkjax.study.tolerancing import tolerances as tolerances
+from udkjax.study.worked.solution import WorkedSolution as WorkedSolution
+from udkjax.study.worked.solution import worked_solution as worked_solution
 from udkjax.synthesis import Designs as Designs
 from udkjax.synthesis import DesignSearch as DesignSearch
 from udkjax.synthesis import EnergyGoal as EnergyGoal

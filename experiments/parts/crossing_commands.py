@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "identify": ("SCENE", "DATA", "--parameters", "NUMBER", "--out", "OUT.found", "--json", "--quiet"),
 }
 # Commands that read no scene, or that answer a question about drawings alone.
-WITHOUT_SCENE = ("report", "studio", "doctor", "design")
+WITHOUT_SCENE = ("report", "studio", "doctor", "design", "solve", "exercise")
 
 
 class RefusedError(Exception):

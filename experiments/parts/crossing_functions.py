@@ -102,6 +102,7 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "travel": {"": positions.travel},
     "motion_ranges": {"": positions.motion_ranges},
     "motion_at": {"": positions.motion_at},
+    "worked_solution": {"": positions.worked_solution},
     "pin_motion": {"": positions.pin_motion, "transformed": transformed(driven(lambda m, k: udk.pin_motion(m, k).links))},
     "pressure_angle": {"": positions.pressure_angle},
     "coupler_curve": {"": positions.coupler_curve},

@@ -190,6 +190,15 @@ def motion_at(case: Case) -> str:
     return agree([found.pins, found.links], [wanted.pins, wanted.links], "pin_motion", 1e-9)
 
 
+def worked_solution(case: Case) -> str:
+    m, value = case.model, case.values(1)[0]
+    at = value if case.is_system else Count.of(m, case.driver).text(value)
+    found = udk.worked_solution(m, at)
+    claim(found.residual < 1e-9, f"a line is off by {found.residual}")
+    wanted = udk.motion_at(m, at)
+    return agree([found.motion.pins, found.motion.links], [wanted.pins, wanted.links], "motion_at", 1e-9)
+
+
 def pressure_angle(case: Case) -> str:
     """With the cam taken away, the follower can move in one way; a finite difference of the driven motion has its tangent."""
     m = case.model

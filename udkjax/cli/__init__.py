@@ -21,6 +21,8 @@ COMMANDS = (
     "identify",
     "design",
     "kinematics",
+    "solve",
+    "exercise",
     "inverse",
     "reactions",
     "tolerances",

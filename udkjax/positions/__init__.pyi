@@ -4,6 +4,7 @@ from udkjax.positions.answers.characteristics import Characteristics as Characte
 from udkjax.positions.answers.characteristics import characteristics as characteristics
 from udkjax.positions.answers.characteristics import instant_centres as instant_centres
 from udkjax.positions.answers.counting import Count as Count
+from udkjax.positions.answers.counting import link_line as link_line
 from udkjax.positions.answers.linkage_type import pins_with_bodies as pins_with_bodies
 from udkjax.positions.answers.linkage_type import transmission_pins as transmission_pins
 from udkjax.positions.answers.motion_ranges import MotionRanges as MotionRanges

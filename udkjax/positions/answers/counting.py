@@ -51,14 +51,9 @@ class Count(NamedTuple):
         if first != GROUND or not isinstance(mechanism.drawing, Drawing) or second not in mechanism.drawing.links:
             of = f"the angle of {second}" if first == GROUND else f"the angle of {second} from {first}"
             return cls(0.0, size, "deg", of, units)
-        drawing = mechanism.drawing
-        pins, places = drawing.links[second].pins, {name: np.asarray(place) for name, place in drawing.pins.items()}
-        if len(pins) < 2:
+        if len(mechanism.drawing.links[second].pins) < 2:
             return cls(0.0, size, "deg", f"the angle of {second}, from the drawn position", units)
-        start = next((pin for pin in pins if pin in drawing.ground), pins[0])
-        end = next(pin for pin in pins if pin != start)
-        drawn, of_frame = places[end] - places[start], places[pins[1]] - places[pins[0]]
-        offset = math.atan2(of_frame[0] * drawn[1] - of_frame[1] * drawn[0], of_frame @ drawn)
+        start, end, offset = link_line(mechanism.drawing, second)
         return cls(offset, size, "deg", f"the angle of {start}-{end} from the x axis", units)
 
     @property
@@ -119,6 +114,20 @@ class Count(NamedTuple):
         if problems or not isinstance(found, int | float | np.number):
             raise SceneError(problems or [f"{name}: must be a number, or a text with a number and its unit"])
         return float(found)
+
+
+def link_line(drawing: Drawing, link: str) -> tuple[str, str, float]:
+    """Return the two pins whose line has the angle of a link in a course, and that angle less the angle of its body (rad).
+
+    The line begins at a pin on the ground if the link has one. A link of one pin has its body's angle.
+    """
+    pins, places = drawing.links[link].pins, {name: np.asarray(place) for name, place in drawing.pins.items()}
+    if len(pins) < 2:
+        return pins[0], pins[0], 0.0
+    start = next((pin for pin in pins if pin in drawing.ground), pins[0])
+    end = next(pin for pin in pins if pin != start)
+    drawn, of_frame = places[end] - places[start], places[pins[1]] - places[pins[0]]
+    return start, end, math.atan2(of_frame[0] * drawn[1] - of_frame[1] * drawn[0], of_frame @ drawn)
 
 
 def units_of_drawing(mechanism: Mechanism) -> Units:

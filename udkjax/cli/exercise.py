@@ -1,0 +1,61 @@
+"""`udkjax exercise`."""
+
+import csv
+from pathlib import Path
+
+from udkjax.cli.common import Json, Scene, load, refuse, show
+
+MOST_STUDENTS = 2000
+
+
+def exercise(
+    scene: Scene,
+    /,
+    vary: tuple[str, ...],
+    out: Path,
+    at: str = "40 deg",
+    count: int | None = None,
+    students: Path | None = None,
+    seed: int = 0,
+    json: Json = False,
+) -> None:
+    """Write an exercise for each student with numbers of their own, its solution, and a table of all answers.
+
+    All numbers assemble, turn all the way round if the drawing does, and differ. The same seed gives the same files.
+
+    Args:
+        scene: the drawing, with one motor.
+        vary: numbers that differ, with their ranges, such as "length(crank) 35..45 mm", "number.r 30..50" or "at 20..70 deg".
+        out: folder to write; teacher.csv is the table.
+        at: value of the motor, unless it is varied.
+        count: number of students, called student 1, student 2, ...
+        students: instead, a table (.csv) with their names in the first column.
+        seed: seed of the numbers.
+    """
+    if (count is None) == (students is None):
+        refuse("give --count or --students")
+    if seed < 0:
+        refuse(f"--seed {seed}: must not be negative")
+    names = _names(students) if students is not None else [f"student {k + 1}" for k in range(count or 0)]
+    if not 0 < len(names) <= MOST_STUDENTS:
+        refuse(f"{len(names)} students: must be from 1 to {MOST_STUDENTS}")
+    if out.exists() and not out.is_dir():
+        refuse(f"--out {out}: is not a folder")
+    mech, _ = load(scene)
+    from udkjax.study.worked.exercises import exercises, read_variation, write_exercises
+
+    variations = [read_variation(mech, text) for text in vary]
+    found = list(exercises(mech, variations, names, at, seed))
+    files = write_exercises(found, variations, out)
+    results = {"files": files, "students": {one.student: {"numbers": one.numbers, "answers": one.answers()} for one in found}}
+    show(results, f"wrote {len(files)} files to {out}", json)
+
+
+def _names(path: Path) -> list[str]:
+    """Return the names of a table: its first column, without a heading."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        refuse(f"cannot read {path}: {problem}")
+    names = [row[0].strip() for row in rows if row and row[0].strip()]
+    return names[1:] if names and names[0].lower() in ("name", "names", "student", "students") else names

@@ -1,0 +1,142 @@
+"""Figures of worked solutions as SVG: the drawing with its dimensions, and polygons of velocities and accelerations to scale."""
+
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.study.worked.loops import Geometry
+from udkjax.study.worked.terms import Style
+
+WIDTH, MARGIN = 560.0, 46.0  # of a figure, in its units
+TALLEST = 460.0
+HEAD = 9.0  # length of an arrow's head
+NICE = (1.0, 2.0, 5.0)  # times a power of ten: the scales of polygons
+PER_CM = 37.8  # units of a figure in a centimetre
+
+
+class Side(NamedTuple):
+    """An arrow of a polygon, from one point to another, with its name.
+
+    Attributes:
+        start, end: its ends (m/s, m/s^2).
+        name: a letter, and the index after an underscore.
+        kind: "pole" from the pole to a pin, "relative" between two pins.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    name: str
+    kind: str
+
+
+class _Frame:
+    """The map of a figure from coordinates to its units, the same along both axes; y points up."""
+
+    def __init__(self, points: Sequence[np.ndarray], scale: float | None = None):
+        low, high = np.min(points, axis=0), np.max(points, axis=0)
+        size = np.maximum(high - low, 1e-300)
+        self.scale = scale or float(min((WIDTH - 2 * MARGIN) / size[0], (TALLEST - 2 * MARGIN) / size[1]))
+        self.width, self.height = np.maximum(self.scale * (high - low) + 2 * MARGIN, 160.0)
+        self.low, self.middle = low, 0.5 * (low + high)
+
+    def at(self, point: np.ndarray) -> tuple[float, float]:
+        x, y = self.scale * (np.asarray(point) - self.middle)
+        return float(0.5 * self.width + x), float(0.5 * self.height - y)
+
+    def svg(self, parts: Sequence[str], title: str) -> str:
+        box = f"0 0 {self.width:.1f} {self.height:.1f}"
+        inner = "".join(parts)
+        return f'<svg viewBox="{box}" role="img" aria-label="{escape(title)}" xmlns="http://www.w3.org/2000/svg">{inner}</svg>'
+
+
+def drawing_figure(geometry: Geometry, style: Style, names: bool = True) -> str:
+    """Return the drawing in its position: links, slots, pins with their names, and the lengths of bars."""
+    drawing, places = geometry.drawing, _all_places(geometry)
+    frame, parts = _Frame(list(places.values())), []
+    for start, way, _ in geometry.lines.values():
+        middle, along = geometry.places[start], np.array([np.cos(way), np.sin(way)])
+        ends = [middle + s * 0.6 * geometry.extent * along for s in (-0.3, 1.6)]
+        parts.append(_line(frame, ends[0], ends[1], "guide"))
+    labels = []
+    for link in drawing.links.values():
+        corners = [places[pin] for pin in link.pins if pin in places]
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in map(frame.at, corners))
+        tag, kind = ("polygon", "link plate") if link.kind == "plate" else ("polyline", "link")
+        parts.append(f'<{tag} points="{path}" class="{kind}"/>' if len(corners) > 1 else "")
+        for a, b in link.sides if names else []:
+            arm = places[b] - places[a]
+            if not np.any(arm):
+                continue
+            x, y = frame.at(0.5 * (places[a] + places[b]))
+            across = np.array([-arm[1], arm[0]]) / np.hypot(*arm)
+            text = style.number(float(np.hypot(*arm)), "m")
+            labels.append(
+                f'<text x="{x + 14 * across[0]:.1f}" y="{y - 14 * across[1] + 4:.1f}" text-anchor="middle">{text}</text>'
+            )
+    for pin, place in places.items():
+        x, y = frame.at(place)
+        fixed = pin in drawing.ground
+        parts.append(f'<path d="M{x:.1f},{y:.1f}l-8,13h16z" class="fixed"/>' if fixed else "")
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" class="pin"/>')
+        labels.append(f'<text x="{x + 8:.1f}" y="{y - 8:.1f}">{escape(pin)}</text>')
+    return frame.svg([*parts, *labels], "the drawing in this position")
+
+
+def _all_places(geometry: Geometry) -> dict[str, np.ndarray]:
+    """Return the places of all pins of links, in the position of the geometry."""
+    found = dict(geometry.places)
+    for pin in geometry.drawing.pins:
+        located = geometry.drawing.locate_pin(pin)
+        if pin in found or located is None or (located[0] == GROUND and pin not in geometry.drawing.ground):
+            continue
+        x, y, angle = geometry.frames[located[0]]
+        (px, py), c, s = np.asarray(located[1]), np.cos(angle), np.sin(angle)
+        found[pin] = np.array([x + c * px - s * py, y + s * px + c * py])
+    return found
+
+
+def polygon_figure(sides: Sequence[Side], style: Style, unit: str, title: str) -> str:
+    """Return a polygon to scale, with a caption that says the scale."""
+    points = [np.zeros(2), *(x for side in sides for x in (side.start, side.end))]
+    size = float(np.max(np.ptp(points, axis=0)))
+    if size == 0.0:
+        return f"<p>{escape(title)}: all are zero.</p>"
+    fits = _Frame(points).scale
+    shown = style.size(unit)
+    per_cm = PER_CM / fits / shown  # of the shown unit
+    power = 10.0 ** np.floor(np.log10(per_cm))
+    nice = next((k * power for k in NICE if k * power >= per_cm * (1 - 1e-9)), 10 * power)
+    frame = _Frame(points, PER_CM / (nice * shown))
+    parts = [_arrow(frame, side) for side in sides]
+    x, y = frame.at(np.zeros(2))
+    parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" class="pin"/><text x="{x - 14:.1f}" y="{y + 16:.1f}">o</text>')
+    caption = f"{title}; 1 cm is {nice:g} {style.unit(unit)}"
+    svg = frame.svg(parts, title).replace("<svg ", f'<svg style="width:{frame.width / PER_CM:.2f}cm" ', 1)
+    return f'<figure class="scaled">{svg}<figcaption>{escape(caption)}.</figcaption></figure>'
+
+
+def _line(frame: _Frame, start: np.ndarray, end: np.ndarray, kind: str) -> str:
+    (x1, y1), (x2, y2) = frame.at(start), frame.at(end)
+    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{kind}"/>'
+
+
+def _arrow(frame: _Frame, side: Side) -> str:
+    (x1, y1), (x2, y2) = frame.at(side.start), frame.at(side.end)
+    way = np.array([x2 - x1, y2 - y1])
+    length = float(np.hypot(*way))
+    if length < 1.0:
+        return ""
+    unit = way / length
+    across, base = np.array([-unit[1], unit[0]]), np.array([x2, y2]) - min(HEAD, 0.5 * length) * unit
+    corners = [np.array([x2, y2]), base + 3.2 * across, base - 3.2 * across]
+    head = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+    letter, _, index = side.name.partition("_")
+    x, y = 0.5 * (x1 + x2) + 13 * across[0], 0.5 * (y1 + y2) + 13 * across[1] + 4
+    label = f'{escape(letter)}<tspan dy="4" font-size="10">{escape(index)}</tspan>'
+    line = f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{base[0]:.1f}" y2="{base[1]:.1f}" class="{side.kind}"/>'
+    return (
+        f'{line}<polygon points="{head}" class="{side.kind}"/><text x="{x:.1f}" y="{y:.1f}" text-anchor="middle">{label}</text>'
+    )

@@ -1,0 +1,290 @@
+"""The vector loops of a drawing: closed chains of vectors from pin to pin, in an order in which each has two unknowns."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.positions.answers.counting import link_line
+from udkjax.positions.assembling.coordinates import Coordinate
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Prismatic, Revolute, Slot
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
+from udkjax.wording import quote
+
+NOTHING = 1e-9  # relative to the extent of the pins: vectors and offsets that are shorter are left out
+TURN = 2 * np.pi
+
+
+class Connection(NamedTuple):
+    """A joint of two bodies, with the name of its point.
+
+    Attributes:
+        name: of the joint.
+        bodies: of which the first carries the line of a slot or slide.
+        pin: the point: a pin of the drawing.
+        slides: whether the point moves along a line of the first body.
+        turns: whether the bodies turn on each other.
+    """
+
+    name: str
+    bodies: tuple[str, str]
+    pin: str
+    slides: bool
+    turns: bool
+
+    def other(self, body: str) -> str:
+        """Return the other body."""
+        return self.bodies[1] if body == self.bodies[0] else self.bodies[0]
+
+
+class Vector(NamedTuple):
+    """A vector of a loop, from one point to another, in the direction of its own angle.
+
+    Attributes:
+        start, end: names of points, in the direction of the angle.
+        sign: minus one where the loop runs against it.
+        body: the body whose angle its angle follows.
+        turn: its angle less that of the body (rad).
+        size: its length (m).
+        slide: the joint along whose line it lies; its length then changes. Else "".
+    """
+
+    start: str
+    end: str
+    sign: float
+    body: str
+    turn: float
+    size: float
+    slide: str = ""
+
+
+class Loop(NamedTuple):
+    """A closed chain of vectors, and the unknowns that it determines: angles of bodies, and lengths along slots and slides."""
+
+    vectors: list[Vector]
+    angles: list[str]
+    slides: list[str]
+
+
+class Geometry:
+    """Points, lines and angles of a drawn mechanism in one position.
+
+    Args:
+        mechanism: a drawn mechanism of pins, slides and slots.
+        q: coordinates (bodies, 3) of the position.
+        driven: the driven coordinate, of a link or slide on the ground.
+    """
+
+    def __init__(self, mechanism: Mechanism, q: np.ndarray, driven: Coordinate):
+        drawing = mechanism.drawing
+        if not isinstance(drawing, Drawing):
+            raise SceneError(["a worked solution needs a drawing: pins and links, in format 2"], mechanism.name)
+        self.mechanism, self.drawing, self.driven = mechanism, drawing, driven
+        self.frames = dict(zip(mechanism.body_names, q, strict=True)) | {GROUND: np.zeros(3)}
+        self.connections = list(_connections(mechanism, drawing))
+        self.places = {joint.pin: self._place(joint) for joint in self.connections}
+        self.extent = float(np.max(np.ptp(np.array([*self.places.values()]), axis=0), initial=0.0)) or 1.0
+        self.lines = {joint.name: self._line(joint) for joint in self.connections if joint.slides}
+
+    def _place(self, joint: Connection) -> np.ndarray:
+        points, body = np.asarray(self.mechanism.joints[joint.name].points), joint.bodies[1]
+        x, y, angle = self.frames[body]
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array([x + c * points[1][0] - s * points[1][1], y + s * points[1][0] + c * points[1][1]])
+
+    def _line(self, joint: Connection) -> tuple[str, float, float]:
+        """Return the pin from which lengths along a line are counted, the angle of the line (rad), and its offset (m)."""
+        guide, place = joint.bodies[0], self.places[joint.pin]
+        way = float(np.asarray(self.mechanism.joints[joint.name].axis)) + float(self.frames[guide][2])
+        along = np.array([np.cos(way), np.sin(way)])
+        pins = [one.pin for one in self.connections if guide in one.bodies and not (one.slides and one.bodies[0] == guide)]
+        own = self.drawing.ground if guide == GROUND else self.drawing.links[guide].pins
+        pins = list(dict.fromkeys([*pins, *(pin for pin in own if pin in self.places)]))
+        if not pins:
+            raise SceneError([f"the line of {joint.name} is on {guide}, which has no pin to count from"], self.mechanism.name)
+        arms = {pin: place - self.places[pin] for pin in pins}
+        offsets = {pin: float(along[0] * arm[1] - along[1] * arm[0]) for pin, arm in arms.items()}
+        least, fixed = NOTHING * self.extent, self.drawing.ground
+        start = min(pins, key=lambda pin: (round(abs(offsets[pin]) / least), pin not in fixed))
+        sign = -1.0 if along @ arms[start] < 0 else 1.0
+        return start, float(np.arctan2(sign * along[1], sign * along[0])), sign * offsets[start]
+
+    def angle(self, body: str) -> float:
+        """Return the angle of a body (rad): that of its first vector, from its pin on the ground if it has one."""
+        return wrapped(float(self.frames[body][2]) + (0.0 if body == GROUND else link_line(self.drawing, body)[2]))
+
+    def root(self, body: str) -> str:
+        """Return the body with which a body keeps its angle because it slides on it, directly or through others."""
+        for joint in self.connections:
+            if not joint.turns and joint.bodies[1] == body:
+                return self.root(joint.bodies[0])
+        return body
+
+    def within(self, body: str, start: str, end: str) -> list[Vector]:
+        """Return the vector between two pins of a body, none if they coincide, in the order of the drawing's pins."""
+        arm = self.places[end] - self.places[start]
+        size = float(np.hypot(*arm))
+        if size <= NOTHING * self.extent:
+            return []
+        root = self.root(body)
+        turn = wrapped(float(np.arctan2(arm[1], arm[0])) - self.angle(root))
+        is_against = abs(abs(turn) - np.pi) < NOTHING if root != GROUND else turn > 0.5 * np.pi + NOTHING or turn < -0.5 * np.pi
+        if is_against:
+            return [Vector(end, start, -1.0, root, _tidy(wrapped(turn + np.pi)), size)]
+        return [Vector(start, end, 1.0, root, _tidy(turn), size)]
+
+    def along(self, joint: Connection, sign: float) -> list[Vector]:
+        """Return the vectors from the pin from which a line is counted to the sliding pin: across the line, and along it."""
+        start, way, offset = self.lines[joint.name]
+        root = self.root(joint.bodies[0])
+        turn = wrapped(way - self.angle(root))
+        arm = self.places[joint.pin] - self.places[start]
+        size = float(arm @ [np.cos(way), np.sin(way)])
+        foot, found = start, []
+        if abs(offset) > NOTHING * self.extent:
+            foot = f"{joint.pin}′"
+            side = wrapped(turn + np.copysign(0.5 * np.pi, offset))
+            found.append(Vector(start, foot, sign, root, _tidy(side), abs(offset)))
+        found.append(Vector(foot, joint.pin, sign, root, _tidy(turn), size, joint.name))
+        return found if sign > 0 else found[::-1]
+
+    def chain(self, body: str, entry: Connection, leave: Connection) -> list[Vector]:
+        """Return the vectors of a loop within a body, from the joint by which it enters to that by which it leaves."""
+        before, after, start, end = [], [], entry.pin, leave.pin
+        if entry.slides and entry.bodies[0] == body:
+            start, before = self.lines[entry.name][0], self.along(entry, -1.0)
+        if leave.slides and leave.bodies[0] == body:
+            end, after = self.lines[leave.name][0], self.along(leave, 1.0)
+        return [*before, *self.within(body, start, end), *after]
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle (rad) above minus half a turn, and at most half a turn."""
+    return float(np.pi - (np.pi - angle) % TURN)
+
+
+def _tidy(angle: float) -> float:
+    """Return an angle, with one that rounding separates from zero as zero."""
+    return 0.0 if abs(angle) < NOTHING else angle
+
+
+def _connections(mechanism: Mechanism, drawing: Drawing) -> Iterator[Connection]:
+    for name, joint in mechanism.joints.items():
+        if isinstance(joint, Revolute):
+            pin = name if name in drawing.pins else name.rpartition("-")[0]
+            yield Connection(name, joint.bodies, pin, False, True)  # pyright: ignore[reportArgumentType]
+        elif isinstance(joint, Slot):
+            yield Connection(name, joint.bodies, drawing.groups["slot"][name].pin, True, True)  # pyright: ignore
+        elif isinstance(joint, Prismatic):
+            yield Connection(name, joint.bodies, drawing.links[joint.bodies[1]].pins[0], True, False)  # pyright: ignore
+        else:
+            kind = f"{quote(name)} is a {type(joint).__name__.lower()}"
+            raise SceneError([f"a worked solution has pins, slides and slots; {kind}"], mechanism.name)
+
+
+def loops_of(geometry: Geometry) -> tuple[list[Loop], list[Loop]]:
+    """Return the loops that determine two unknowns each, one after the other, and those that are left, to be solved together."""
+    known_bodies, known_slides = _driven(geometry)
+    bodies, found = list(geometry.mechanism.body_names), []
+    used = {joint.name for joint in geometry.connections if set(joint.bodies) <= known_bodies}
+    while not set(bodies) <= known_bodies:
+        paths = list(_paths(geometry, known_bodies))
+        rated = [(path, *_unknowns(geometry, path, known_bodies, known_slides)) for path in paths]
+        dyads = [one for one in rated if len(one[1]) + len(one[2]) == 2]
+        if not dyads:
+            return found, _together(geometry, known_bodies, known_slides, used)
+        path, angles, slides = min(dyads, key=lambda one: len(one[0]))
+        found.append(Loop(_closed(geometry, path, known_bodies, used), angles, slides))
+        known_bodies |= {body for body, _ in path}
+        known_slides |= set(slides)
+        used |= {joint.name for _, joint in path}
+    return found, []
+
+
+def _driven(geometry: Geometry) -> tuple[set[str], set[str]]:
+    """Return the bodies whose motion the driver gives, and the slides."""
+    driven = geometry.driven
+    moving = [body for body in driven.bodies if body != GROUND]
+    joints = [joint for joint in geometry.connections if set(joint.bodies) == set(driven.bodies)]
+    if len(moving) == 1 and GROUND in driven.bodies and joints:
+        if driven.coordinate == "angle" and joints[0].turns and not joints[0].slides:
+            return {GROUND, moving[0]}, set()
+        if driven.coordinate == "x" and not joints[0].turns:
+            return {GROUND, moving[0]}, {joints[0].name}
+    raise SceneError(
+        ["a worked solution needs a motor that turns a link about a pin of the ground, or moves a slide on the ground"]
+    )
+
+
+Path = list[tuple[str, Connection]]  # bodies, each with the joint by which the path leaves it; the first body is known
+
+
+def _paths(geometry: Geometry, known: set[str]) -> Iterator[Path]:
+    """Iterate over the chains of unknown bodies between two joints of known ones."""
+
+    def onward(path: Path, body: str) -> Iterator[Path]:
+        visited = {name for name, _ in path}
+        for joint in geometry.connections:
+            if body not in joint.bodies or any(joint.name == other.name for _, other in path):
+                continue
+            after = joint.other(body)
+            if after in known:
+                if path:
+                    yield [*path, (body, joint)]
+            elif after not in visited:
+                yield from onward([*path, (body, joint)], after)
+
+    for body in sorted(known, key=[*geometry.mechanism.body_names, GROUND].index):
+        for path in onward([], body):
+            if len(path) > 1:
+                yield path
+
+
+def _unknowns(geometry: Geometry, path: Path, known: set[str], slides: set[str]) -> tuple[list[str], list[str]]:
+    roots = [geometry.root(body) for body, _ in path if body not in known]
+    angles = [root for root in dict.fromkeys(roots) if root not in known]
+    return angles, [joint.name for _, joint in path if joint.slides and joint.name not in slides]
+
+
+def _closed(geometry: Geometry, path: Path, known: set[str], used: set[str]) -> list[Vector]:
+    """Return the vectors of the loop of a path and of the known bodies that join its ends."""
+    first, last = path[0][0], path[-1][1].other(path[-1][0])
+    back = _shortest(geometry, last, first, used)
+    ring = [*path, *back]
+    return [x for k, (body, leave) in enumerate(ring) for x in geometry.chain(body, ring[k - 1][1], leave)]
+
+
+def _shortest(geometry: Geometry, start: str, goal: str, used: set[str]) -> Path:
+    """Return the shortest chain of known bodies from one to another, by joints that loops have used."""
+    ways: list[tuple[str, Path]] = [(start, [])]
+    seen = {start}
+    for body, path in ways:
+        if body == goal:
+            return path
+        for joint in geometry.connections:
+            if joint.name in used and body in joint.bodies and joint.other(body) not in seen:
+                seen.add(joint.other(body))
+                ways.append((joint.other(body), [*path, (body, joint)]))
+    raise AssertionError(f"{start} and {goal} are not connected")
+
+
+def _together(geometry: Geometry, known: set[str], slides: set[str], used: set[str]) -> list[Loop]:
+    """Return independent loops of all bodies that no dyad determines, with their unknowns at the first one."""
+    joined, found = set(known), []
+    used, slides = set(used), set(slides)
+    angles: list[str] = []
+    for path in sorted(_paths(geometry, known), key=len):
+        fresh = [joint for _, joint in path if joint.name not in used]
+        bodies = {body for body, _ in path}
+        if not fresh or (bodies <= joined and len(fresh) != 1):
+            continue
+        here, sliding = _unknowns(geometry, path, joined, slides)
+        found.append(Loop(_closed(geometry, path, known, used), here, sliding))
+        joined |= bodies
+        slides |= set(sliding)
+        used |= {joint.name for joint in fresh}
+        angles += here
+    return found

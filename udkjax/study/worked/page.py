@@ -1,0 +1,123 @@
+"""The page of a worked solution: MathML and SVG, without any other file."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from udkjax.printing import PrintedTable
+from udkjax.study.worked.figures import drawing_figure, polygon_figure
+from udkjax.study.worked.terms import Line, Style, Symbol
+
+if TYPE_CHECKING:
+    from udkjax.study.worked.solution import LoopSolution, WorkedSolution
+
+
+def document(title: str, body: str) -> str:
+    """Return a page with a title and the style of worked solutions."""
+    style = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
+    return f'<!doctype html>\n<html lang="en"><head>{head}<style>{style}</style></head><body>\n{body}\n</body></html>\n'
+
+
+def page_of(solution: "WorkedSolution") -> str:
+    """Return the page of a solution."""
+    style, parts = solution.style, [f"<h1>{escape(solution.title)}</h1>"]
+    caption = f"The drawing in this position; lengths in {style.unit('m')}."
+    parts.append(f"<figure>{drawing_figure(solution.geometry, style)}<figcaption>{caption}</figcaption></figure>")
+    for k, loop in enumerate(solution.loops):
+        parts += _loop(loop, style, f" {k + 1}" if len(solution.loops) > 1 else "")
+    parts.append("<h2>Motion of pins and links</h2>")
+    parts += [_table(table) for table in solution.motion.tables()]
+    parts.append(polygon_figure(solution.velocities, style, "m/s", "Polygon of velocities"))
+    parts.append(polygon_figure(solution.accelerations, style, "m/s2", "Polygon of accelerations"))
+    if solution.balances:
+        parts.append("<h2>Static forces, link by link</h2>")
+        parts.append('<p class="soft">Forces in N along x and y, then moments in N m about the centre of mass; arms in m.</p>')
+        for body, lines in solution.balances.items():
+            parts += [f"<h3>{escape(body)}</h3>", *(_equation(line, style) for line in lines)]
+    return document(solution.title, "\n".join(parts))
+
+
+def _loop(solution: "LoopSolution", style: Style, number: str) -> list[str]:
+    parts = [f"<h2>Position: vector loop{number}</h2>"]
+    for loop in solution.loops:
+        terms = [
+            f"{'<mo>−</mo>' if x.sign < 0 else '<mo>+</mo>' if k else ''}{_vector(f'{x.start}{x.end}')}"
+            for k, x in enumerate(loop.vectors)
+        ]
+        parts.append(
+            f'<div class="equation"><math displaystyle="true"><mrow>{"".join(terms)}<mo>=</mo><mn>0</mn></mrow></math></div>'
+        )
+    parts.append("<p>Its components along x and y:</p>")
+    parts += [_equation(line, style) for line in solution.closures]
+    if solution.branches:
+        parts.append("<p>The sum of the known vectors, and the solution:</p>")
+        parts += [_equation(line, style) for line in solution.shared]
+    else:
+        parts.append("<p>These equations have no closed form: they are solved together, by Newton's method.</p>")
+        parts += [_equation(Line(symbol, symbol), style) for symbol in solution.found]
+    for branch in solution.branches:
+        if branch.words:
+            note = "this position" if branch.is_actual else "the other position"
+            parts.append(f"<h3>{escape(branch.words)}: {note}</h3>")
+        parts += [_equation(line, style) for line in branch.lines]
+    for title, system in (("Velocities", solution.velocity), ("Accelerations", solution.acceleration)):
+        parts.append(f"<h2>{title}{f': loop{number}' if number else ''}</h2>")
+        parts.append(_system(system.matrix, system.unknowns, system.right, style))
+        coefficients = [line for row in system.matrix for line in row] if system is solution.velocity else []
+        parts += [_equation(line, style) for line in (*coefficients, *system.right, *system.lines)]
+        if not system.lines:
+            parts += [_equation(Line(symbol, symbol), style) for symbol in system.unknowns]
+    return parts
+
+
+def _vector(index: str) -> str:
+    return f'<msub><mover><mi>r</mi><mo stretchy="false">→</mo></mover><mtext>{escape(index)}</mtext></msub>'
+
+
+def _equation(line: Line, style: Style) -> str:
+    words = f"<p>{escape(line.words)}</p>" if line.words else ""
+    return f"{words}{line.mathml(style)}"
+
+
+def _system(matrix: Sequence[Sequence[Line]], unknowns: Sequence[Symbol], right: Sequence[Line], style: Style) -> str:
+    """Return a linear system as matrices."""
+
+    def column(rows: Sequence[Sequence[str]]) -> str:
+        inner = "".join(f"<mtr>{''.join(f'<mtd>{cell}</mtd>' for cell in row)}</mtr>" for row in rows)
+        return f"<mrow><mo>[</mo><mtable>{inner}</mtable><mo>]</mo></mrow>"
+
+    cells = [[line.left.mathml(style, False) for line in row if line.left is not None] for row in matrix]
+    sides = [[line.left.mathml(style, False)] for line in right if line.left is not None]
+    parts = column(cells) + column([[x.mathml(style, False)] for x in unknowns]) + "<mo>=</mo>" + column(sides)
+    return f'<div class="equation"><math displaystyle="true"><mrow>{parts}</mrow></math></div>'
+
+
+def _table(table: PrintedTable) -> str:
+    head = "".join(f"<th>{escape(name)}</th>" for name in table.heads)
+    rows = "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>" for row in table.rows)
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+
+
+def sheet_of(solution: "WorkedSolution", student: str, given: Mapping[str, tuple[float, str]]) -> str:
+    """Return the sheet of an exercise: the drawing with its dimensions, the numbers of a student, and the questions."""
+    style, title = solution.style, solution.mechanism.name or "Exercise"
+    figure = drawing_figure(solution.geometry, style)
+    numbers = "".join(f"<li>{escape(name)} = {value:g} {escape(unit)}</li>" for name, (value, unit) in given.items())
+    pins, links = ", ".join(solution.motion.pins), ", ".join(solution.motion.links)
+    questions = (
+        "Write the vector loop and its components.",
+        f"Find the positions of the pins {pins}, and the angles of the links, on both branches.",
+        f"Find the angular velocities and accelerations of the links {links}.",
+        f"Find the velocities and accelerations of the pins {pins}, and draw their polygons to scale.",
+    )
+    blanks = "".join(f"<li>{escape(text)}{''.join('<div class=blank></div>' for _ in range(4))}</li>" for text in questions)
+    parts = [
+        f"<h1>{escape(title)}: {escape(student)}</h1>",
+        f"<p>Position: {escape(solution.motion.title())}.</p>",
+        f"<figure>{figure}<figcaption>Lengths in {style.unit('m')}.</figcaption></figure>",
+        f"<p>Your numbers:</p><ul>{numbers}</ul>",
+        f"<ol>{blanks}</ol>",
+    ]
+    return document(f"{title}: {student}", "\n".join(parts))
