@@ -51,9 +51,9 @@ from udkjax.pinv import Householder as Householder
 from udkjax.pinv import MatrixPseudoinverse as MatrixPseudoinverse
 from udkjax.pinv import OneOf as OneOf
 from udkjax.pinv import Varga as Varga
+from udkjax.positions.answers.centres import instant_centres as instant_centres
 from udkjax.positions.answers.characteristics import Characteristics as Characteristics
 from udkjax.positions.answers.characteristics import characteristics as characteristics
-from udkjax.positions.answers.characteristics import instant_centres as instant_centres
 from udkjax.positions.answers.motion_ranges import MotionRanges as MotionRanges
 from udkjax.positions.answers.motion_ranges import motion_ranges as motion_ranges
 from udkjax.positions.answers.pin_motion import PinMotion as PinMotion

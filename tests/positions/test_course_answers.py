@@ -210,3 +210,30 @@ def test_instant_centres_lie_in_line():
     rates = np.asarray(motion.v)[0, :, 2]
     x = place["crank", "rocker"][0]  # omega_rocker / omega_crank from its distances to the two fixed centres
     assert_allclose(x / (x - 0.1), rates[2] / rates[0], rtol=1e-10)
+
+
+def test_a_pin_in_a_slot_has_the_answers_of_a_slider():
+    pins = {"A": (0, 0), "B": udk.polar("A", 50, 60), "C": (160.988783333, -20)}
+    links, given = {"crank": {"pins": ["A", "B"], "mass": 1}, "rod": {"pins": ["B", "C"], "mass": 1}}, {"units": MM}
+    given |= {"motors": [{"pin": "A", "speed": "60 rpm"}]}
+    slot = udk.Drawing(pins, links, ["A"], slots=[{"pin": "C", "direction": [1, 0]}], **given).mechanism()
+    links = links | {"block": {"pins": ["C"], "mass": 1, "width": 20}}
+    slide = udk.Drawing(pins, links, ["A"], slides=[{"link": "block", "direction": [1, 0]}], **given).mechanism()
+    pin, block = udk.characteristics(slot).outputs["C"], udk.characteristics(slide).outputs["block"]
+    assert_allclose(pin.extent, np.sqrt(0.2**2 - 0.02**2) - np.sqrt(0.1**2 - 0.02**2), rtol=1e-10)
+    assert_allclose(
+        [pin.extent, pin.time_ratio, *pin.dead_points], [block.extent, block.time_ratio, *block.dead_points], rtol=1e-9
+    )
+    assert_allclose([x.ratio for x in pin.speed_ratios], [x.ratio for x in block.speed_ratios], rtol=1e-12)
+
+
+def test_the_ram_of_whitworths_quick_return():
+    """A stroke of 2 r, with the angle 2 acos(e / a) of the crank for the way back."""
+    pins = {"A": (0, 0), "B": udk.polar("A", 50, 60), "E": (0, -30), "F": (110, -30)}
+    pins |= {"C": udk.polar("E", 70, 180, line=("E", "B"))}
+    links = {name: {"pins": list(ends), "mass": 1} for name, ends in {"crank": "AB", "lever": "CE", "rod": "CF"}.items()}
+    slots = [{"pin": "B", "along": ["C", "E"], "on": "lever"}, {"pin": "F", "direction": [1, 0]}]
+    motors = [{"pin": "A", "speed": "60 rpm"}]
+    ram = udk.characteristics(udk.Drawing(pins, links, ["A", "E"], slots=slots, motors=motors, units=MM).mechanism()).outputs["F"]
+    back = 2 * np.arccos(30 / 50)
+    assert_allclose([ram.extent, ram.time_ratio], [0.14, (2 * np.pi - back) / back], rtol=1e-9)

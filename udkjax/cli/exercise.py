@@ -42,11 +42,9 @@ def exercise(
     if out.exists() and not out.is_dir():
         refuse(f"--out {out}: is not a folder")
     mech, _ = load(scene)
-    from udkjax.study.worked.exercises import exercises, read_variation, write_exercises
+    from udkjax.study.worked.exercises import write_course
 
-    variations = [read_variation(mech, text) for text in vary]
-    found = list(exercises(mech, variations, names, at, seed))
-    files = write_exercises(found, variations, out)
+    found, files = write_course(mech, vary, names, at, seed, out)
     results = {"files": files, "students": {one.student: {"numbers": one.numbers, "answers": one.answers()} for one in found}}
     show(results, f"wrote {len(files)} files to {out}", json)
 

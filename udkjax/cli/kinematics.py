@@ -2,17 +2,16 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from udkjax.cli.common import Json, Scene, channels_of, choose_driver, fail, measure_channels, refuse, show
 from udkjax.cli.datasets import load_to_write, write
 from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
-    from udkjax import Mechanism
     from udkjax.annotations import Numbers
     from udkjax.positions.answers.counting import Count
-    from udkjax.positions.following.kinematics import Kinematics, Travel
+    from udkjax.positions.following.kinematics import Travel
 
 with OptionalImport():
     import tyro
@@ -63,6 +62,7 @@ def kinematics(
     import numpy as np
 
     import udkjax as udk
+    from udkjax.positions.answers.centres import centres_table
     from udkjax.positions.answers.counting import Count
     from udkjax.positions.answers.pin_motion import usual_rate
     from udkjax.positions.assembling.coordinates import value_of
@@ -106,7 +106,7 @@ def kinematics(
         tables = udk.pin_motion(mech, motion).counted(counted).tables()
         said = "\n\n".join([said, *(text_table(one, 10**9) for one in tables)])
     if at is not None and reached:
-        said += "\n\n" + _centres(mech, motion, counted)
+        said += "\n\n" + text_table(centres_table(mech, motion, counted), 10**9)
     columns = measure_channels(mech, motion, measured)
     results: dict[str, object] = {
         "driver": driver,
@@ -159,29 +159,6 @@ def _end(travel: "Travel", side: int, counted: "Count") -> str:
     lost = np.asarray(travel.status)[side] == udk.Reached.lost
     value = float((travel.lower, travel.upper)[side])
     return "unknown (lost on the way)" if lost else "no limit" if math.isinf(value) else counted.text(value)
-
-
-def _centres(mech: "Mechanism", motion: "Kinematics", counted: "Count") -> str:
-    """Return the table of the instant centres of all pairs of links in the first position."""
-    import numpy as np
-
-    import udkjax as udk
-    from udkjax.printing import PrintedTable, format_number, text_table
-
-    rows, unit, size = [], counted.units.shown("m"), counted.units.size("m")
-    centres = udk.instant_centres(mech, motion.q[0], motion.v[0])
-    largest = max((float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity), default=0.0)
-    for pair, (place, at_infinity) in centres.items():
-        x, y = (format_number(z / size, scale=largest / size) for z in place)
-        rows.append([" and ".join(pair), *((x, y) if not at_infinity else ("at infinity", _direction(place)))])
-    return text_table(PrintedTable("instant centres", rows, ("links", f"x ({unit})", f"y ({unit})")), 10**9)
-
-
-def _direction(vector: Any) -> str:
-    """Return the direction of a vector as text, an angle from the x axis."""
-    from udkjax.printing import format_number
-
-    return format_number(math.degrees(math.atan2(vector[1], vector[0])), "deg", 360.0)
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:

@@ -1,8 +1,9 @@
 """The door of `positions`: the names that floors above import, each from its own module."""
 
+from udkjax.positions.answers.centres import centres_table as centres_table
+from udkjax.positions.answers.centres import instant_centres as instant_centres
 from udkjax.positions.answers.characteristics import Characteristics as Characteristics
 from udkjax.positions.answers.characteristics import characteristics as characteristics
-from udkjax.positions.answers.characteristics import instant_centres as instant_centres
 from udkjax.positions.answers.counting import Count as Count
 from udkjax.positions.answers.counting import link_line as link_line
 from udkjax.positions.answers.linkage_type import pins_with_bodies as pins_with_bodies

@@ -8,10 +8,15 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.integrate import SimulationError
 from udkjax.integrate.causes.find import cause_of_standstill
+from udkjax.positions.answers.centres import centres_table
+from udkjax.positions.answers.characteristics import characteristics
 from udkjax.positions.answers.counting import Count
+from udkjax.positions.answers.pin_motion import pin_motion, usual_rate
 from udkjax.positions.assembling.assembly import AssemblyError, assemble
+from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.continuation import Reached
-from udkjax.positions.following.kinematics import travel
+from udkjax.positions.following.drive import only_driver
+from udkjax.positions.following.kinematics import kinematics, travel
 from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
@@ -33,9 +38,10 @@ def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None 
         mechanism: mechanism of the drawing.
         text: text of the drawing.
         about: "structure" (degrees of freedom, redundant constraints, reactions), "travel" (of each motor), "dynamics" (curves
-            of forces), "rest" (an equilibrium), "holding" (curves of holding torques and forces), or "end" (the cause of the
-            early end of a run).
-        end: for "end", a state `t`, `q`, `v` of the run, as the page sends it, and the time `end` (s) at which it ended.
+            of forces), "rest" (an equilibrium), "holding" (curves of holding torques and forces), "answers" (the answers of a
+            course), or "end" (the cause of the early end of a run).
+        end: for "answers", the value `at` of the motor, a text with its unit; for "end", a state `t`, `q`, `v` of the run, as the
+            page sends it, and the time `end` (s) at which it ended.
     """
     if about == "end":
         return {"cause": _cause(mechanism, end or {}), "problems": []}
@@ -45,6 +51,7 @@ def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None 
         "dynamics": force_curves,
         "rest": rest,
         "holding": holding_curves,
+        "answers": partial(answers, at=(end or {}).get("at")),
     }
     if about not in subjects:
         raise RefusedError(400, f"about: must be one of {', '.join(subjects)}")
@@ -52,6 +59,21 @@ def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None 
         return subjects[about](mechanism) | {"problems": []}
     except (AssemblyError, SimulationError) as error:
         return {"problems": [str(error)]}
+
+
+def answers(mechanism: Mechanism, at: object = None) -> JsonObject:
+    """Return the characteristics of a mechanism with one motor, and tables of its pins, links and instant centres at a value."""
+    if len(mechanism.driver_names) != 1:
+        return {"answers": [], "tables": []}
+    driver = only_driver(mechanism)
+    count, rate = Count.of(mechanism, driver), usual_rate(mechanism, driver)
+    drawn = float(value_of(mechanism, driver)(assemble(mechanism).q))
+    value = count.nearest(count.read(at, "at"), drawn) if isinstance(at, str) else drawn
+    motion = kinematics(mechanism, driver, [value], rate=rate)
+    lines = [list(line) for line in characteristics(mechanism, driver).lines().items()]
+    tables = [*pin_motion(mechanism, motion).counted(count).tables(), centres_table(mechanism, motion, count)]
+    shown = [{"title": x.title, "heads": list(x.heads), "rows": [[str(cell) for cell in row] for row in x.rows]} for x in tables]
+    return {"answers": lines, "tables": shown}
 
 
 def _cause(mechanism: Mechanism, end: JsonObject) -> str:

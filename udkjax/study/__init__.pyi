@@ -64,10 +64,6 @@ from udkjax.study.tolerancing import PinClearance as PinClearance
 from udkjax.study.tolerancing import Tolerance as Tolerance
 from udkjax.study.tolerancing import ToleranceAnalysis as ToleranceAnalysis
 from udkjax.study.tolerancing import tolerances as tolerances
-from udkjax.study.worked.exercises import exercises as exercises
-from udkjax.study.worked.exercises import read_variation as read_variation
-from udkjax.study.worked.exercises import write_exercises as write_exercises
-from udkjax.study.worked.solution import WorkedSolution as WorkedSolution
-from udkjax.study.worked.solution import worked_solution as worked_solution
+from udkjax.study.worked.exercises import write_course as write_course
 
 __all__: list[str]

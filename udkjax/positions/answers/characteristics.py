@@ -1,22 +1,18 @@
 """Characteristics of a mechanism as a course asks for them: type, mobility, strokes, dead points, transmission, ratios."""
 
-from collections.abc import Mapping
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import ArrayLike, Float
 
-from udkjax.argument_types import COORDINATES_OF_BODIES
 from udkjax.arrays import ROUNDING
 from udkjax.positions.answers.counting import Count
 from udkjax.positions.answers.linkage_type import FourBarType, Mobility, four_bars, mobility, transmission_pins
 from udkjax.positions.answers.pressure import pressure_angles
-from udkjax.positions.answers.turning_points import Combination, Cycle, TurningPoint
+from udkjax.positions.answers.turning_points import Combination, Cycle, Measured, PointAlong, TurningPoint
 from udkjax.positions.assembling.coordinates import Coordinate, element_of
 from udkjax.positions.following.drive import Drive, only_driver
 from udkjax.printing import PrintedTable, PrintsTable, format_number
-from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.couplings import Gear
@@ -170,9 +166,12 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
     return Characteristics(mobility(mechanism), bars, cycle.turns, limits, outputs, angles, pressures, ratios, count)
 
 
-def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, Combination]]:
-    """Return the angle or the displacement of each link that a joint connects to the ground, apart from the driven one."""
-    found = {}
+def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, Measured]]:
+    """Return the angle or the displacement of each link or pin that a joint connects to the ground, apart from the driven one.
+
+    A pin in a slot of the ground has its own name, unless its link is a slider that turns on it.
+    """
+    found: dict[str, tuple[str, Measured]] = {}
     for name, joint in mechanism.joints.items():
         moving = [body for body in getattr(joint, "bodies", ()) if body != GROUND]
         if len(moving) != 1 or not isinstance(joint, Revolute | Prismatic | Slot):
@@ -188,14 +187,14 @@ def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, C
             if axis is not None and driven.bodies != joint.bodies:
                 weights[k, :2] = np.cos(axis), np.sin(axis)
                 found[body] = ("slides", Combination(weights))
-        elif joint.bodies[0] == GROUND and not np.any(np.asarray(joint.points)[1]):
-            axis = float(np.asarray(joint.axis))
-            weights[k, :2] = np.cos(axis), np.sin(axis)
-            found.setdefault(name, ("slides", Combination(weights)))
+        elif joint.bodies[0] == GROUND:
+            drawn = {} if mechanism.drawing is None else mechanism.drawing.groups["slot"]
+            pin = getattr(drawn.get(name), "pin", name)
+            found.setdefault(pin, ("slides", PointAlong(k, np.asarray(joint.points)[1], float(np.asarray(joint.axis)))))
     return found
 
 
-def _output(cycle: Cycle, kind: str, weights: Combination, turning: list[TurningPoint]) -> Output:
+def _output(cycle: Cycle, kind: str, weights: Measured, turning: list[TurningPoint]) -> Output:
     heights = cycle.heights(weights, turning)
     extent = float(np.ptp(heights))
     if kind == "swings" and extent >= 2 * np.pi * (1 - 1e-9) and not turning:
@@ -207,10 +206,10 @@ def _output(cycle: Cycle, kind: str, weights: Combination, turning: list[Turning
     return Output(kind, extent, values, ratio)
 
 
-def _speed_ratios(cycle: Cycle, weights: Combination, extremes: list[tuple[float, float]]) -> tuple[SpeedRatio, SpeedRatio]:
+def _speed_ratios(cycle: Cycle, weights: Measured, extremes: list[tuple[float, float]]) -> tuple[SpeedRatio, SpeedRatio]:
     """Return the least and the largest of the extremes; if there are none, the constant ratio twice."""
     if not extremes:
-        constant = SpeedRatio(float(weights.of(cycle.dq[:1])[0]), ())
+        constant = SpeedRatio(float(cycle.rates(weights)[0]), ())
         return constant, constant
     rates = [rate for _, rate in extremes]
     same = ALIKE * max(map(abs, rates))
@@ -272,46 +271,3 @@ def _ratios(mechanism: Mechanism, cycle: Cycle, driven: Coordinate) -> dict[str,
     varies = np.ptp(rates, axis=0) > ROUNDING * 1e3 * np.max(np.abs(rates), initial=1.0)
     names = zip(mechanism.body_names, rates[0], varies, strict=True)
     return {name: float(rate) for name, rate, various in names if not various and name not in driven.bodies}
-
-
-class InstantCentre(NamedTuple):
-    """The point (m) at which two links move alike; at infinity it is a direction, a unit vector."""
-
-    place: Float[np.ndarray, "2"]
-    at_infinity: bool
-
-
-@checked
-@concrete_only()
-def instant_centres(
-    mechanism: Mechanism,
-    q: Annotated[Float[ArrayLike, "bodies 3"], COORDINATES_OF_BODIES],
-    v: Annotated[Float[ArrayLike, "bodies 3"], COORDINATES_OF_BODIES],
-) -> Mapping[tuple[str, str], InstantCentre]:
-    """Return the instant centres of all pairs of links in a position, by the names of the links; "ground" is one of them.
-
-    With u the velocity that a link has at the origin, (u_1 - u_2) + (omega_1 - omega_2) x p = 0. Links of the same angular
-    velocity have their centre at infinity, across their relative velocity; links that move as one have none.
-
-    Args:
-        mechanism: the mechanism.
-        q: coordinates of its bodies (m, m, rad), (bodies, 3) or flat.
-        v: their rates (m/s, m/s, rad/s), of the same shape.
-
-    Returns:
-        The centres by pairs of names.
-    """
-    q, v = (np.reshape(x, (-1, 3)) for x in (q, v))
-    at_origin = np.stack([v[:, 0] + v[:, 2] * q[:, 1], v[:, 1] - v[:, 2] * q[:, 0], v[:, 2]], 1)
-    motions = {GROUND: np.zeros(3)} | dict(zip(mechanism.body_names, at_origin, strict=True))
-    names, found = list(motions), {}
-    fastest = np.max(np.abs(v[:, 2]), initial=0.0)
-    speed = np.max(np.hypot(at_origin[:, 0], at_origin[:, 1]), initial=0.0)
-    for k, one in enumerate(names):
-        for other in names[k + 1 :]:
-            ux, uy, omega = motions[one] - motions[other]
-            if abs(omega) > ROUNDING * fastest:
-                found[one, other] = InstantCentre(np.array([-uy, ux]) / omega, False)
-            elif np.hypot(ux, uy) > ROUNDING * speed:
-                found[one, other] = InstantCentre(np.array([-uy, ux]) / np.hypot(ux, uy), True)
-    return found

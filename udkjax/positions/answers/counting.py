@@ -117,11 +117,12 @@ class Count(NamedTuple):
 
 
 def link_line(drawing: Drawing, link: str) -> tuple[str, str, float]:
-    """Return the two pins whose line has the angle of a link in a course, and that angle less the angle of its body (rad).
+    """Return the two pins whose line has the angle of a link in a course, and its difference from the body's angle (rad).
 
     The line begins at a pin on the ground if the link has one. A link of one pin has its body's angle.
     """
-    pins, places = drawing.links[link].pins, {name: np.asarray(place) for name, place in drawing.pins.items()}
+    places = {name: np.asarray(place) for name, place in drawing.pins.items()}
+    pins = list(drawing.links[link].pins)
     if len(pins) < 2:
         return pins[0], pins[0], 0.0
     start = next((pin for pin in pins if pin in drawing.ground), pins[0])

@@ -34,6 +34,45 @@ class Combination(NamedTuple):
         """Return the combination of coordinates, or of their first or second derivatives."""
         return np.einsum("tbc,bc->t", coordinates, self.weights)
 
+    def height(self, q: Float[np.ndarray, "T bodies 3"]) -> Float[np.ndarray, "T"]:
+        """Return the combination of coordinates."""
+        return self.of(q)
+
+    def curves(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the combination (T,) at coordinates, and its first and second derivatives, from theirs."""
+        return self.of(q), self.of(dq), self.of(ddq)
+
+
+class PointAlong(NamedTuple):
+    """The displacement of a point of a body along a line of the ground.
+
+    Attributes:
+        body: the index of the body.
+        point: the point in its frame (m).
+        axis: the angle of the line (rad).
+    """
+
+    body: int
+    point: Float[np.ndarray, "2"]
+    axis: float
+
+    def height(self, q: Float[np.ndarray, "T bodies 3"]) -> Float[np.ndarray, "T"]:
+        """Return the displacement at coordinates."""
+        return self.curves(q, q, q)[0]
+
+    def curves(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the displacement (T,) at coordinates, and its first and second derivatives, from theirs."""
+        along = np.array([np.cos(self.axis), np.sin(self.axis)])
+        (place, speed, change), angle = (x[:, self.body, :2] for x in (q, dq, ddq)), q[:, self.body, 2]
+        omega, alpha = dq[:, self.body, 2], ddq[:, self.body, 2]
+        c, s, (px, py) = np.cos(angle), np.sin(angle), self.point
+        arm = np.stack([c * px - s * py, s * px + c * py], -1)
+        on_arm, across = arm @ along, arm[:, 0] * along[1] - arm[:, 1] * along[0]
+        return place @ along + on_arm, speed @ along + omega * across, change @ along + alpha * across - omega**2 * on_arm
+
+
+Measured = Combination | PointAlong
+
 
 class TurningPoint(NamedTuple):
     """A value (rad, m) of the driver, the combination there, and whether it stands still around the value."""
@@ -81,13 +120,13 @@ class Cycle:
         good = np.isin(np.asarray(motion.status), [Reached.closed])
         return tuple(np.asarray(x)[good] for x in (motion.values, motion.q, motion.v, motion.a))
 
-    def turning_points(self, measured: Sequence[Combination]) -> list[list[TurningPoint]]:
+    def turning_points(self, measured: Sequence[Measured]) -> list[list[TurningPoint]]:
         """Return the places where each combination turns back, in the order of the driver's values."""
-        found = [(k, i) for k, one in enumerate(measured) for i in _sign_changes(one.of(self.dq))]
+        found = [(k, i) for k, one in enumerate(measured) for i in _sign_changes(self._curves(one)[1])]
         if not found:
             return [[] for _ in measured]
         which, index = np.array(found).T
-        slopes = np.stack([one.of(self.dq) for one in measured])
+        slopes = np.stack([self._curves(one)[1] for one in measured])
         low, high = self.values[index], self.values[index + 1]
         first, last = slopes[which, index], slopes[which, index + 1]
         value = low - first * (high - low) / (last - first)
@@ -99,22 +138,22 @@ class Cycle:
             parts = [np.empty((len(value), *np.shape(motion.q)[1:])) for _ in range(3)]
             for part, x in zip(parts, (motion.q, motion.v, motion.a), strict=True):
                 part[order] = np.asarray(x)
-            rows = [[measured[k].of(x[i : i + 1])[0] for i, k in enumerate(which)] for x in parts]
-            height, slope, curvature = np.array(rows)
+            rows = [np.ravel(measured[k].curves(*(x[i : i + 1] for x in parts))) for i, k in enumerate(which)]
+            height, slope, curvature = np.array(rows).T
             dwells = (np.abs(slope) <= largest) & (np.abs(curvature) <= largest)
             steps = np.divide(slope, curvature, out=np.zeros_like(slope), where=~dwells)
             value = np.clip(value - steps, low, high)
         points = [TurningPoint(float(v), float(h), bool(d)) for v, h, d in zip(value, height, dwells, strict=True)]
         return _by_number(zip(which, points, strict=True), len(measured))
 
-    def speed_extremes(self, measured: Sequence[Combination]) -> list[list[tuple[float, float]]]:
+    def speed_extremes(self, measured: Sequence[Measured]) -> list[list[tuple[float, float]]]:
         """Return the values of the driver, in order, at which the rate of each combination by it is extreme, with these rates.
 
         At these the second derivative is zero; it is found by the secants of Illinois, which also find places where it jumps. A
         combination that moves in proportion to the driver has none.
         """
-        curves = [one.of(self.ddq) for one in measured]
-        sizes = [np.max(np.abs(one.of(self.dq)), initial=0.0) for one in measured]
+        curves = [self._curves(one)[2] for one in measured]
+        sizes = [np.max(np.abs(self._curves(one)[1]), initial=0.0) for one in measured]
         found = [(k, i) for k, (x, size) in enumerate(zip(curves, sizes, strict=True)) for i in _sign_changes(x, size)]
         if not found:
             return [[] for _ in measured]
@@ -125,10 +164,9 @@ class Cycle:
             value = ends[0] - heights[0] * (ends[1] - ends[0]) / (heights[1] - heights[0])
             order = np.argsort(value)
             motion, back = self.at(value[order]), np.argsort(order)
-            rate, height = (
-                np.array([measured[k].of(np.asarray(x)[i : i + 1])[0] for i, k in zip(back, which, strict=True)])
-                for x in (motion.v, motion.a)
-            )
+            parts = [np.asarray(x) for x in (motion.q, motion.v, motion.a)]
+            rows = [measured[k].curves(*(x[i : i + 1] for x in parts))[1:] for i, k in zip(back, which, strict=True)]
+            rate, height = np.reshape(rows, (-1, 2)).T
             side = np.where(height * heights[0] > 0, 0, 1)  # the end that the new place replaces
             everyone = np.arange(len(found))
             heights[1 - side, everyone] *= np.where(side == kept, 0.5, 1.0)
@@ -138,10 +176,17 @@ class Cycle:
         pairs = zip(which, value.tolist(), rate.tolist(), strict=True)
         return _by_number(((k, (v, r)) for k, v, r in pairs), len(measured))
 
-    def heights(self, one: Combination, turning: Sequence[TurningPoint]) -> np.ndarray:
+    def rates(self, one: Measured) -> np.ndarray:
+        """Return the first derivative of a measured quantity by the driver's value, at `values`."""
+        return self._curves(one)[1]
+
+    def _curves(self, one: Measured) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return one.curves(self.q, self.dq, self.ddq)
+
+    def heights(self, one: Measured, turning: Sequence[TurningPoint]) -> np.ndarray:
         """Return the values of a combination among which are its least and its largest."""
-        at_ends = [one.of(q[None])[0] for _, q in self.ends]
-        inner = [] if turning else one.of(self.q[[0, -1]]).tolist()
+        at_ends = [one.height(q[None])[0] for _, q in self.ends]
+        inner = [] if turning else one.height(self.q[[0, -1]]).tolist()
         return np.array([point.height for point in turning] + at_ends + inner)
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -11,7 +12,8 @@ import numpy as np
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.wording import quote, suggestion
 
-LONGEST = 200  # characters of an expression
+LONGEST = 500  # characters of an expression
+_DEEP = re.compile(r"[-+(]{50}")  # so many signs and brackets in a row are no expression that one would write
 CONSTANTS = {"pi": math.pi}
 FUNCTIONS = {"sqrt": 1, "abs": 1, "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "hypot": 2}
 _INVERSE = ("asin", "acos", "atan", "atan2")  # functions that return angles
@@ -34,7 +36,7 @@ class Measured(NamedTuple):
 @lru_cache(1024)
 def parse(text: str) -> ast.expr | None:
     """Return the syntax tree of an expression of numbers, names, operations and functions; None for any other text."""
-    if len(text) > LONGEST:
+    if len(text) > LONGEST or _DEEP.search(text.replace(" ", "")):
         return None
     try:
         tree = ast.parse(text.strip().replace("^", "**"), mode="eval").body

@@ -80,7 +80,7 @@ export function buildPage(studio, root) {
   parts.stop.hidden = true;
   parts.strip = make("section", {class: "strip", "aria-label": "curves"});
   const transport = make("footer", {}, parts.home, parts.play, parts.time, parts.goto, parts.scrub, parts.speed, parts.stop, parts.loops);
-  const side = make("aside", {}, section("Findings", "findings"), section("Selection", "properties"), section("Text (TOML)", "source"));
+  const side = make("aside", {}, section("Findings", "findings"), section("Answers", "answers"), section("Selection", "properties"), section("Text (TOML)", "source"));
   parts.help = make("dialog", {class: "help", "aria-label": "keyboard shortcuts"}, make("h2", {}, "Keyboard shortcuts"),
     make("dl", {}, ...KEYS.flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])),
     make("form", {method: "dialog"}, make("button", {class: "strong"}, "Close")));

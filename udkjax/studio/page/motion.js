@@ -125,6 +125,7 @@ export class Motion {
   pause() {
     this.playing = false;
     this.showTime();
+    this.studio.answers?.moved();
   }
 
   seek(t) {
@@ -133,6 +134,7 @@ export class Motion {
     const state = this.pageEngine.at(this.run, this.t);
     if (this.t > 0 || this.posed) this.motions = this.pageEngine.motions(state.q); else this.still();
     this.studio.redraw();
+    this.studio.answers.moved();
   }
 
   /** Go to the time or the angle of the motor that a text names. */

@@ -6,6 +6,7 @@ import {CurvesPanel} from "./curves.js";
 import {EMPTY, list, members, nameOf, pinsOf} from "./document.js";
 import {PlaceEntry} from "./entry.js";
 import {FileActions} from "./files.js";
+import {AnswersPanel} from "./answers.js";
 import {FindingsPanel} from "./findings.js";
 import {Gestures} from "./gestures.js";
 import {History} from "./history.js";
@@ -46,6 +47,7 @@ class Studio {
     this.canvas = new DrawingCanvas(this.parts.canvas);
     this.motion = new Motion(this);
     this.findings = new FindingsPanel(this, this.parts.findings);
+    this.answers = new AnswersPanel(this, this.parts.answers);
     this.curves = new CurvesPanel(this, this.parts.strip);
     this.properties = new PropertiesPanel(this, this.parts.properties);
     this.source = new SourcePanel(this, this.parts.source);

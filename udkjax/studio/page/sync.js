@@ -24,6 +24,7 @@ export class Sync {
       studio.motion.forget();
     }
     studio.findings.markStale();
+    studio.answers.markStale();
     this.pending = this.update(stamp).catch(error => {
       if (stamp === this.stamp) studio.findings.showFailure(error.message);
       if (!(error instanceof RequestError)) throw error;
@@ -52,6 +53,7 @@ export class Sync {
     studio.files.showTitle();
     studio.findings.showProblems(found.problems);
     if (found.problems.length) {
+      studio.answers.clear();
       this.structure = null;
       studio.motion.forget();
       return undefined;
@@ -67,6 +69,7 @@ export class Sync {
     this.structure = null;
     this.studio.motion.forget();
     this.studio.findings.showEmpty();
+    this.studio.answers.clear();
   }
 
   async compile(text, document, isLate) {
@@ -105,11 +108,13 @@ export class Sync {
 
   async diagnose(text, isLate) {
     const {studio} = this, found = await ask("diagnose", {text});
-    if (isLate()) return;
+    if (isLate()) return undefined;
     studio.findings.showStructure(found);
     studio.motion.explain(studio.motion.run, found.conflict);
-    if (found.problems.length || !studio.motion.pageEngine?.scene.drivers.length) return;
+    if (found.problems.length || !studio.motion.pageEngine?.scene.drivers.length) return studio.answers.clear();
     const travel = await ask("diagnose", {text, about: "travel"});
-    if (!isLate()) studio.findings.showTravel(travel);
+    if (isLate()) return undefined;
+    studio.findings.showTravel(travel);
+    return studio.answers.follow(text, isLate);
   }
 }

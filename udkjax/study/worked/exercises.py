@@ -37,7 +37,7 @@ class Variation(NamedTuple):
         name: the parameter, or "at" for the value of the driver.
         low, high: its range, in `unit`.
         unit: its unit as it is shown.
-        size: that unit in the unit of the parameter.
+        size: the size of its unit, in the unit of the parameter.
     """
 
     title: str
@@ -73,7 +73,7 @@ def read_variation(mechanism: Mechanism, text: str) -> Variation:
     """Return the varied number of a text, such as "length(crank) 35..45 mm", "number.r 30..50" or "at 20..70 deg".
 
     Raises:
-        SceneError: it cannot be read, or the length of a link is no number of the drawing.
+        SceneError: it cannot be read, or the drawing does not give the length of a link.
     """
     match, drawing = _RANGE.fullmatch(text), mechanism.drawing
     if match is None or not isinstance(drawing, Drawing):
@@ -114,7 +114,7 @@ def _length_parameter(drawing: Drawing, link: str) -> str:
         if isinstance(start, tuple) and other in start:
             return f"pin.{pin}.length[{start.index(other)}]"
     cure = 'give its pin by a length, such as A = {from = "O", length = 40, angle = 60}, or vary a named number'
-    raise SceneError([f"vary: the length of {link} is no number of the drawing: {cure}"])
+    raise SceneError([f"vary: the drawing does not give the length of {link}: {cure}"])
 
 
 def exercises(
@@ -175,7 +175,7 @@ def _tried(
     return worked_solution(changed, place, digits=digits, forces=False)
 
 
-def write_exercises(found: Sequence[Exercise], vary: Sequence[Variation], folder: Path) -> list[Path]:
+def write_exercises(name: str, found: Sequence[Exercise], vary: Sequence[Variation], folder: Path) -> list[Path]:
     """Write a sheet and a solution for each student, and a table for the teacher; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
     width, files = len(str(len(found))), []
@@ -187,7 +187,7 @@ def write_exercises(found: Sequence[Exercise], vary: Sequence[Variation], folder
         stem = f"{k + 1:0{width}d}-{words}"
         given = {title: (value, units[title]) for title, value in one.numbers.items()}
         sheet, solution = folder / f"{stem}.html", folder / f"{stem}-solution.html"
-        sheet.write_text(sheet_of(one.solution, one.student, given), encoding="utf-8", newline="\n")
+        sheet.write_text(_sheet(one, name, given), encoding="utf-8", newline="\n")
         solution.write_text(one.solution.html(), encoding="utf-8", newline="\n")
         files += [sheet, solution]
         answers: dict[str, Any] = one.answers()
@@ -197,6 +197,20 @@ def write_exercises(found: Sequence[Exercise], vary: Sequence[Variation], folder
     table = folder / "teacher.csv"
     table.write_text(out.getvalue(), encoding="utf-8", newline="\n")
     return [*files, table]
+
+
+def _sheet(one: Exercise, name: str, given: dict[str, tuple[float, str]]) -> str:
+    solution = one.solution
+    return sheet_of(name, solution.geometry, solution.style, solution.motion, one.student, given)
+
+
+def write_course(
+    mechanism: Mechanism, vary: Sequence[str], students: Sequence[str], at: str, seed: int, folder: Path
+) -> tuple[list[Exercise], list[Path]]:
+    """Write the exercises of all students to a folder, from the texts of the varied numbers; returns them and the files."""
+    variations = [read_variation(mechanism, text) for text in vary]
+    found = list(exercises(mechanism, variations, students, at, seed))
+    return found, write_exercises(mechanism.name, found, variations, folder)
 
 
 def _plain(name: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.study.worked.loops import Geometry
-from udkjax.study.worked.terms import Style
+from udkjax.study.worked.terms import NumberStyle
 
 WIDTH, MARGIN = 560.0, 46.0  # of a figure, in its units
 TALLEST = 460.0
@@ -17,7 +17,7 @@ NICE = (1.0, 2.0, 5.0)  # times a power of ten: the scales of polygons
 PER_CM = 37.8  # units of a figure in a centimetre
 
 
-class Side(NamedTuple):
+class PolygonSide(NamedTuple):
     """An arrow of a polygon, from one point to another, with its name.
 
     Attributes:
@@ -52,7 +52,7 @@ class _Frame:
         return f'<svg viewBox="{box}" role="img" aria-label="{escape(title)}" xmlns="http://www.w3.org/2000/svg">{inner}</svg>'
 
 
-def drawing_figure(geometry: Geometry, style: Style, names: bool = True) -> str:
+def drawing_figure(geometry: Geometry, style: NumberStyle, names: bool = True) -> str:
     """Return the drawing in its position: links, slots, pins with their names, and the lengths of bars."""
     drawing, places = geometry.drawing, _all_places(geometry)
     frame, parts = _Frame(list(places.values())), []
@@ -98,7 +98,7 @@ def _all_places(geometry: Geometry) -> dict[str, np.ndarray]:
     return found
 
 
-def polygon_figure(sides: Sequence[Side], style: Style, unit: str, title: str) -> str:
+def polygon_figure(sides: Sequence[PolygonSide], style: NumberStyle, unit: str, title: str) -> str:
     """Return a polygon to scale, with a caption that says the scale."""
     points = [np.zeros(2), *(x for side in sides for x in (side.start, side.end))]
     size = float(np.max(np.ptp(points, axis=0)))
@@ -123,7 +123,7 @@ def _line(frame: _Frame, start: np.ndarray, end: np.ndarray, kind: str) -> str:
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{kind}"/>'
 
 
-def _arrow(frame: _Frame, side: Side) -> str:
+def _arrow(frame: _Frame, side: PolygonSide) -> str:
     (x1, y1), (x2, y2) = frame.at(side.start), frame.at(side.end)
     way = np.array([x2 - x1, y2 - y1])
     length = float(np.hypot(*way))

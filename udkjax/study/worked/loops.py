@@ -40,7 +40,7 @@ class Connection(NamedTuple):
         return self.bodies[1] if body == self.bodies[0] else self.bodies[0]
 
 
-class Vector(NamedTuple):
+class LoopVector(NamedTuple):
     """A vector of a loop, from one point to another, in the direction of its own angle.
 
     Attributes:
@@ -61,10 +61,10 @@ class Vector(NamedTuple):
     slide: str = ""
 
 
-class Loop(NamedTuple):
+class VectorLoop(NamedTuple):
     """A closed chain of vectors, and the unknowns that it determines: angles of bodies, and lengths along slots and slides."""
 
-    vectors: list[Vector]
+    vectors: list[LoopVector]
     angles: list[str]
     slides: list[str]
 
@@ -123,7 +123,7 @@ class Geometry:
                 return self.root(joint.bodies[0])
         return body
 
-    def within(self, body: str, start: str, end: str) -> list[Vector]:
+    def within(self, body: str, start: str, end: str) -> list[LoopVector]:
         """Return the vector between two pins of a body, none if they coincide, in the order of the drawing's pins."""
         arm = self.places[end] - self.places[start]
         size = float(np.hypot(*arm))
@@ -133,10 +133,10 @@ class Geometry:
         turn = wrapped(float(np.arctan2(arm[1], arm[0])) - self.angle(root))
         is_against = abs(abs(turn) - np.pi) < NOTHING if root != GROUND else turn > 0.5 * np.pi + NOTHING or turn < -0.5 * np.pi
         if is_against:
-            return [Vector(end, start, -1.0, root, _tidy(wrapped(turn + np.pi)), size)]
-        return [Vector(start, end, 1.0, root, _tidy(turn), size)]
+            return [LoopVector(end, start, -1.0, root, _tidy(wrapped(turn + np.pi)), size)]
+        return [LoopVector(start, end, 1.0, root, _tidy(turn), size)]
 
-    def along(self, joint: Connection, sign: float) -> list[Vector]:
+    def along(self, joint: Connection, sign: float) -> list[LoopVector]:
         """Return the vectors from the pin from which a line is counted to the sliding pin: across the line, and along it."""
         start, way, offset = self.lines[joint.name]
         root = self.root(joint.bodies[0])
@@ -147,11 +147,11 @@ class Geometry:
         if abs(offset) > NOTHING * self.extent:
             foot = f"{joint.pin}′"
             side = wrapped(turn + np.copysign(0.5 * np.pi, offset))
-            found.append(Vector(start, foot, sign, root, _tidy(side), abs(offset)))
-        found.append(Vector(foot, joint.pin, sign, root, _tidy(turn), size, joint.name))
+            found.append(LoopVector(start, foot, sign, root, _tidy(side), abs(offset)))
+        found.append(LoopVector(foot, joint.pin, sign, root, _tidy(turn), size, joint.name))
         return found if sign > 0 else found[::-1]
 
-    def chain(self, body: str, entry: Connection, leave: Connection) -> list[Vector]:
+    def chain(self, body: str, entry: Connection, leave: Connection) -> list[LoopVector]:
         """Return the vectors of a loop within a body, from the joint by which it enters to that by which it leaves."""
         before, after, start, end = [], [], entry.pin, leave.pin
         if entry.slides and entry.bodies[0] == body:
@@ -185,7 +185,7 @@ def _connections(mechanism: Mechanism, drawing: Drawing) -> Iterator[Connection]
             raise SceneError([f"a worked solution has pins, slides and slots; {kind}"], mechanism.name)
 
 
-def loops_of(geometry: Geometry) -> tuple[list[Loop], list[Loop]]:
+def loops_of(geometry: Geometry) -> tuple[list[VectorLoop], list[VectorLoop]]:
     """Return the loops that determine two unknowns each, one after the other, and those that are left, to be solved together."""
     known_bodies, known_slides = _driven(geometry)
     bodies, found = list(geometry.mechanism.body_names), []
@@ -197,7 +197,7 @@ def loops_of(geometry: Geometry) -> tuple[list[Loop], list[Loop]]:
         if not dyads:
             return found, _together(geometry, known_bodies, known_slides, used)
         path, angles, slides = min(dyads, key=lambda one: len(one[0]))
-        found.append(Loop(_closed(geometry, path, known_bodies, used), angles, slides))
+        found.append(VectorLoop(_closed(geometry, path, known_bodies, used), angles, slides))
         known_bodies |= {body for body, _ in path}
         known_slides |= set(slides)
         used |= {joint.name for _, joint in path}
@@ -219,13 +219,13 @@ def _driven(geometry: Geometry) -> tuple[set[str], set[str]]:
     )
 
 
-Path = list[tuple[str, Connection]]  # bodies, each with the joint by which the path leaves it; the first body is known
+BodyPath = list[tuple[str, Connection]]  # bodies, each with the joint by which the path leaves it; the first body is known
 
 
-def _paths(geometry: Geometry, known: set[str]) -> Iterator[Path]:
+def _paths(geometry: Geometry, known: set[str]) -> Iterator[BodyPath]:
     """Iterate over the chains of unknown bodies between two joints of known ones."""
 
-    def onward(path: Path, body: str) -> Iterator[Path]:
+    def onward(path: BodyPath, body: str) -> Iterator[BodyPath]:
         visited = {name for name, _ in path}
         for joint in geometry.connections:
             if body not in joint.bodies or any(joint.name == other.name for _, other in path):
@@ -243,13 +243,13 @@ def _paths(geometry: Geometry, known: set[str]) -> Iterator[Path]:
                 yield path
 
 
-def _unknowns(geometry: Geometry, path: Path, known: set[str], slides: set[str]) -> tuple[list[str], list[str]]:
+def _unknowns(geometry: Geometry, path: BodyPath, known: set[str], slides: set[str]) -> tuple[list[str], list[str]]:
     roots = [geometry.root(body) for body, _ in path if body not in known]
     angles = [root for root in dict.fromkeys(roots) if root not in known]
     return angles, [joint.name for _, joint in path if joint.slides and joint.name not in slides]
 
 
-def _closed(geometry: Geometry, path: Path, known: set[str], used: set[str]) -> list[Vector]:
+def _closed(geometry: Geometry, path: BodyPath, known: set[str], used: set[str]) -> list[LoopVector]:
     """Return the vectors of the loop of a path and of the known bodies that join its ends."""
     first, last = path[0][0], path[-1][1].other(path[-1][0])
     back = _shortest(geometry, last, first, used)
@@ -257,9 +257,9 @@ def _closed(geometry: Geometry, path: Path, known: set[str], used: set[str]) -> 
     return [x for k, (body, leave) in enumerate(ring) for x in geometry.chain(body, ring[k - 1][1], leave)]
 
 
-def _shortest(geometry: Geometry, start: str, goal: str, used: set[str]) -> Path:
+def _shortest(geometry: Geometry, start: str, goal: str, used: set[str]) -> BodyPath:
     """Return the shortest chain of known bodies from one to another, by joints that loops have used."""
-    ways: list[tuple[str, Path]] = [(start, [])]
+    ways: list[tuple[str, BodyPath]] = [(start, [])]
     seen = {start}
     for body, path in ways:
         if body == goal:
@@ -271,7 +271,7 @@ def _shortest(geometry: Geometry, start: str, goal: str, used: set[str]) -> Path
     raise AssertionError(f"{start} and {goal} are not connected")
 
 
-def _together(geometry: Geometry, known: set[str], slides: set[str], used: set[str]) -> list[Loop]:
+def _together(geometry: Geometry, known: set[str], slides: set[str], used: set[str]) -> list[VectorLoop]:
     """Return independent loops of all bodies that no dyad determines, with their unknowns at the first one."""
     joined, found = set(known), []
     used, slides = set(used), set(slides)
@@ -282,7 +282,7 @@ def _together(geometry: Geometry, known: set[str], slides: set[str], used: set[s
         if not fresh or (bodies <= joined and len(fresh) != 1):
             continue
         here, sliding = _unknowns(geometry, path, joined, slides)
-        found.append(Loop(_closed(geometry, path, known, used), here, sliding))
+        found.append(VectorLoop(_closed(geometry, path, known, used), here, sliding))
         joined |= bodies
         slides |= set(sliding)
         used |= {joint.name for joint in fresh}

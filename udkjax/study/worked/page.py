@@ -3,14 +3,13 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from udkjax.positions.answers.pin_motion import PinMotion
 from udkjax.printing import PrintedTable
-from udkjax.study.worked.figures import drawing_figure, polygon_figure
-from udkjax.study.worked.terms import Line, Style, Symbol
-
-if TYPE_CHECKING:
-    from udkjax.study.worked.solution import LoopSolution, WorkedSolution
+from udkjax.study.worked.equations import LoopSolution
+from udkjax.study.worked.figures import PolygonSide, drawing_figure, polygon_figure
+from udkjax.study.worked.loops import Geometry
+from udkjax.study.worked.terms import EquationLine, NamedQuantity, NumberStyle
 
 
 def document(title: str, body: str) -> str:
@@ -20,26 +19,34 @@ def document(title: str, body: str) -> str:
     return f'<!doctype html>\n<html lang="en"><head>{head}<style>{style}</style></head><body>\n{body}\n</body></html>\n'
 
 
-def page_of(solution: "WorkedSolution") -> str:
-    """Return the page of a solution."""
-    style, parts = solution.style, [f"<h1>{escape(solution.title)}</h1>"]
+def page_of(
+    title: str,
+    geometry: Geometry,
+    style: NumberStyle,
+    loops: Sequence[LoopSolution],
+    motion: PinMotion,
+    polygons: tuple[Sequence[PolygonSide], Sequence[PolygonSide]],
+    balances: Mapping[str, Sequence[EquationLine]],
+) -> str:
+    """Return the page of a solution: its figure, loops, motion, polygons of velocities and accelerations, and balances."""
+    parts = [f"<h1>{escape(title)}</h1>"]
     caption = f"The drawing in this position; lengths in {style.unit('m')}."
-    parts.append(f"<figure>{drawing_figure(solution.geometry, style)}<figcaption>{caption}</figcaption></figure>")
-    for k, loop in enumerate(solution.loops):
-        parts += _loop(loop, style, f" {k + 1}" if len(solution.loops) > 1 else "")
+    parts.append(f"<figure>{drawing_figure(geometry, style)}<figcaption>{caption}</figcaption></figure>")
+    for k, loop in enumerate(loops):
+        parts += _loop(loop, style, f" {k + 1}" if len(loops) > 1 else "")
     parts.append("<h2>Motion of pins and links</h2>")
-    parts += [_table(table) for table in solution.motion.tables()]
-    parts.append(polygon_figure(solution.velocities, style, "m/s", "Polygon of velocities"))
-    parts.append(polygon_figure(solution.accelerations, style, "m/s2", "Polygon of accelerations"))
-    if solution.balances:
+    parts += [_table(table) for table in motion.tables()]
+    parts.append(polygon_figure(polygons[0], style, "m/s", "Polygon of velocities"))
+    parts.append(polygon_figure(polygons[1], style, "m/s2", "Polygon of accelerations"))
+    if balances:
         parts.append("<h2>Static forces, link by link</h2>")
         parts.append('<p class="soft">Forces in N along x and y, then moments in N m about the centre of mass; arms in m.</p>')
-        for body, lines in solution.balances.items():
+        for body, lines in balances.items():
             parts += [f"<h3>{escape(body)}</h3>", *(_equation(line, style) for line in lines)]
-    return document(solution.title, "\n".join(parts))
+    return document(title, "\n".join(parts))
 
 
-def _loop(solution: "LoopSolution", style: Style, number: str) -> list[str]:
+def _loop(solution: LoopSolution, style: NumberStyle, number: str) -> list[str]:
     parts = [f"<h2>Position: vector loop{number}</h2>"]
     for loop in solution.loops:
         terms = [
@@ -56,7 +63,7 @@ def _loop(solution: "LoopSolution", style: Style, number: str) -> list[str]:
         parts += [_equation(line, style) for line in solution.shared]
     else:
         parts.append("<p>These equations have no closed form: they are solved together, by Newton's method.</p>")
-        parts += [_equation(Line(symbol, symbol), style) for symbol in solution.found]
+        parts += [_equation(EquationLine(symbol, symbol), style) for symbol in solution.found]
     for branch in solution.branches:
         if branch.words:
             note = "this position" if branch.is_actual else "the other position"
@@ -68,7 +75,7 @@ def _loop(solution: "LoopSolution", style: Style, number: str) -> list[str]:
         coefficients = [line for row in system.matrix for line in row] if system is solution.velocity else []
         parts += [_equation(line, style) for line in (*coefficients, *system.right, *system.lines)]
         if not system.lines:
-            parts += [_equation(Line(symbol, symbol), style) for symbol in system.unknowns]
+            parts += [_equation(EquationLine(symbol, symbol), style) for symbol in system.unknowns]
     return parts
 
 
@@ -76,12 +83,14 @@ def _vector(index: str) -> str:
     return f'<msub><mover><mi>r</mi><mo stretchy="false">→</mo></mover><mtext>{escape(index)}</mtext></msub>'
 
 
-def _equation(line: Line, style: Style) -> str:
+def _equation(line: EquationLine, style: NumberStyle) -> str:
     words = f"<p>{escape(line.words)}</p>" if line.words else ""
     return f"{words}{line.mathml(style)}"
 
 
-def _system(matrix: Sequence[Sequence[Line]], unknowns: Sequence[Symbol], right: Sequence[Line], style: Style) -> str:
+def _system(
+    matrix: Sequence[Sequence[EquationLine]], unknowns: Sequence[NamedQuantity], right: Sequence[EquationLine], style: NumberStyle
+) -> str:
     """Return a linear system as matrices."""
 
     def column(rows: Sequence[Sequence[str]]) -> str:
@@ -100,12 +109,13 @@ def _table(table: PrintedTable) -> str:
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
-def sheet_of(solution: "WorkedSolution", student: str, given: Mapping[str, tuple[float, str]]) -> str:
+def sheet_of(
+    name: str, geometry: Geometry, style: NumberStyle, motion: PinMotion, student: str, given: Mapping[str, tuple[float, str]]
+) -> str:
     """Return the sheet of an exercise: the drawing with its dimensions, the numbers of a student, and the questions."""
-    style, title = solution.style, solution.mechanism.name or "Exercise"
-    figure = drawing_figure(solution.geometry, style)
+    title, figure = name or "Exercise", drawing_figure(geometry, style)
     numbers = "".join(f"<li>{escape(name)} = {value:g} {escape(unit)}</li>" for name, (value, unit) in given.items())
-    pins, links = ", ".join(solution.motion.pins), ", ".join(solution.motion.links)
+    pins, links = ", ".join(motion.pins), ", ".join(motion.links)
     questions = (
         "Write the vector loop and its components.",
         f"Find the positions of the pins {pins}, and the angles of the links, on both branches.",
@@ -115,7 +125,7 @@ def sheet_of(solution: "WorkedSolution", student: str, given: Mapping[str, tuple
     blanks = "".join(f"<li>{escape(text)}{''.join('<div class=blank></div>' for _ in range(4))}</li>" for text in questions)
     parts = [
         f"<h1>{escape(title)}: {escape(student)}</h1>",
-        f"<p>Position: {escape(solution.motion.title())}.</p>",
+        f"<p>Position: {escape(motion.title())}.</p>",
         f"<figure>{figure}<figcaption>Lengths in {style.unit('m')}.</figcaption></figure>",
         f"<p>Your numbers:</p><ul>{numbers}</ul>",
         f"<ol>{blanks}</ol>",

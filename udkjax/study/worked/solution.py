@@ -2,13 +2,14 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from udkjax.annotations import NumberLike
-from udkjax.equations.states import evaluate
+from udkjax.equations.terms import loads as load_terms
 from udkjax.positions.answers.counting import Count
 from udkjax.positions.answers.pin_motion import PinMotion, pin_motion, usual_rate
 from udkjax.positions.assembling.coordinates import element_of, value_of
@@ -21,69 +22,41 @@ from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.statics import resting_forces
-from udkjax.study.worked.equations import (
-    Position,
-    Rates,
-    Symbols,
-    System,
-    acceleration_system,
-    closure,
-    solve,
-    velocity_system,
-)
-from udkjax.study.worked.figures import Side
-from udkjax.study.worked.loops import Geometry, Loop, loops_of
+from udkjax.study.worked.equations import LoopSolution, PositionRates, PositionSymbols, solution_of
+from udkjax.study.worked.figures import PolygonSide
+from udkjax.study.worked.loops import Geometry, loops_of
 from udkjax.study.worked.page import page_of
-from udkjax.study.worked.terms import Line, Product, Style, Symbol, Term, total
+from udkjax.study.worked.terms import EquationLine, EquationTerm, NamedQuantity, NumberStyle, ProductOfTerms, total
 
 
-class LoopSolution(NamedTuple):
-    """The solution of one loop, or of loops that are solved together.
-
-    Attributes:
-        loops: their vectors.
-        closures: the two components of the closure of each.
-        shared: lines of the positions that all branches share.
-        branches: the positions of the unknowns; empty if they follow by iteration alone.
-        found: the unknowns in this position.
-        velocity, acceleration: the linear systems of their derivatives.
-    """
-
-    loops: list[Loop]
-    closures: list[Line]
-    shared: list[Line]
-    branches: list[Position]
-    found: list[Symbol]
-    velocity: System
-    acceleration: System
-
-
+@dataclass(frozen=True, eq=False, repr=False)
 class WorkedSolution:
-    """A worked solution; `lines` are its equations, `html` is its page, and `save` writes it.
+    """A worked solution: its equations, line by line, which print as text and as a page.
 
     Attributes:
         title: the name of the mechanism, the place of the driver and its rate.
-        loops: the loops, in the order in which they are solved.
-        balances: by link, the equations of its equilibrium under the loads; empty without loads.
+        loops: the solutions of the loops, in order.
         motion: the motion of all pins and links.
-        velocities, accelerations: the polygons.
+        polygons: the arrows of the polygons of velocities (m/s) and of accelerations (m/s^2).
+        balances: by link, the equations of its equilibrium under the loads; empty without loads.
         style: the units and the digits of numbers.
+        geometry: pins, lines and angles in this position.
+        symbols: the symbols, with their values.
     """
 
-    def __init__(self, mechanism: Mechanism, motion: PinMotion, geometry: Geometry, symbols: Symbols, digits: int):
-        self.mechanism, self.motion, self.geometry, self.symbols = mechanism, motion, geometry, symbols
-        assert motion.count is not None
-        self.title = f"{mechanism.name or 'mechanism'}, {motion.title()}"
-        self.style = Style(motion.count.units, digits)
-        dyads, together = loops_of(geometry)
-        self.loops = [_solved(symbols, [loop]) for loop in dyads] + ([_solved(symbols, together)] if together else [])
-        self.velocities, self.accelerations = (_polygon(geometry, motion, order) for order in (1, 2))
-        self.balances: dict[str, list[Line]] = {}
+    title: str
+    loops: list[LoopSolution]
+    motion: PinMotion
+    polygons: tuple[list[PolygonSide], list[PolygonSide]]
+    balances: dict[str, list[EquationLine]]
+    style: NumberStyle
+    geometry: Geometry
+    symbols: PositionSymbols
 
     @property
-    def lines(self) -> list[Line]:
+    def lines(self) -> list[EquationLine]:
         """All equations, in order."""
-        found: list[Line] = []
+        found: list[EquationLine] = []
         for one in self.loops:
             found += [*one.closures, *one.shared, *(line for branch in one.branches for line in branch.lines)]
             found += [line for row in one.velocity.matrix for line in row]
@@ -104,11 +77,11 @@ class WorkedSolution:
 
     def html(self) -> str:
         """Return the solution as a page, typeset by MathML, which also prints."""
-        return page_of(self)
+        return page_of(self.title, self.geometry, self.style, self.loops, self.motion, self.polygons, self.balances)
 
     def save(self, path: str | Path) -> None:
         """Write the page to a file."""
-        Path(path).write_text(self.html(), encoding="utf-8")
+        Path(path).write_text(self.html(), encoding="utf-8", newline="\n")
 
 
 @checked
@@ -145,11 +118,14 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
     angles = {name: (geometry.angle(name), float(rates[0][k]), float(rates[1][k])) for k, name in enumerate(names)}
     slides = {joint.name: _slide(geometry, joint.name, v, a) for joint in geometry.connections if joint.slides}
     pins = {joint.name: joint.pin for joint in geometry.connections}
-    symbols = Symbols(Rates(angles, slides), pins)
-    solution = WorkedSolution(mechanism, pin_motion(mechanism, found).counted(count), geometry, symbols, digits)
-    if forces:
-        solution.balances = _balances(mechanism, geometry, q)
-    return solution
+    symbols = PositionSymbols(PositionRates(angles, slides), pins)
+    motion = pin_motion(mechanism, found).counted(count)
+    dyads, together = loops_of(geometry)
+    solved = [solution_of(symbols, [loop]) for loop in dyads] + ([solution_of(symbols, together)] if together else [])
+    polygons = _polygon(geometry, motion, 1), _polygon(geometry, motion, 2)
+    balances = _balances(mechanism, geometry, q) if forces else {}
+    title = f"{mechanism.name or 'mechanism'}, {motion.title()}"
+    return WorkedSolution(title, solved, motion, polygons, balances, NumberStyle(count.units, digits), geometry, symbols)
 
 
 def _slide(geometry: Geometry, name: str, v: np.ndarray, a: np.ndarray) -> tuple[float, float, float]:
@@ -175,17 +151,7 @@ def _point_motion(geometry: Geometry, rates: Mapping[str, Any], body: str, place
     return v[:2] + v[2] * side, a[:2] + a[2] * side - v[2] ** 2 * arm
 
 
-def _solved(symbols: Symbols, loops: list[Loop]) -> LoopSolution:
-    closures = [line for loop in loops for line in closure(symbols, loop)]
-    shared, branches = solve(symbols, loops[0]) if len(loops) == 1 else ([], [])
-    lines_of = {x.slide: x for loop in loops for x in loop.vectors if x.slide}
-    found = [symbols.angle(body) for loop in loops for body in loop.angles]
-    found += [symbols.length(lines_of[slide]) for loop in loops for slide in loop.slides]
-    systems = velocity_system(symbols, loops), acceleration_system(symbols, loops)
-    return LoopSolution(loops, closures, shared, branches, found, *systems)
-
-
-def _polygon(geometry: Geometry, motion: PinMotion, order: int) -> list[Side]:
+def _polygon(geometry: Geometry, motion: PinMotion, order: int) -> list[PolygonSide]:
     """Return the polygon of velocities or accelerations: each pin's from the pole, and between the pins of each link."""
     drawing = geometry.drawing
     vectors = {pin: np.asarray(x)[0, order] for pin, x in motion.pins.items()}
@@ -193,18 +159,18 @@ def _polygon(geometry: Geometry, motion: PinMotion, order: int) -> list[Side]:
     vectors = {pin: np.where(np.abs(x) > PRINTED_AS_ZERO * largest, x, 0.0) for pin, x in vectors.items()}
     letter = ("v", "a")[order - 1]
     zero = np.zeros(2)
-    sides = [Side(zero, x, f"{letter}_{pin}", "pole") for pin, x in vectors.items() if np.any(x)]
+    sides = [PolygonSide(zero, x, f"{letter}_{pin}", "pole") for pin, x in vectors.items() if np.any(x)]
     for link in drawing.links.values():
         moving = [pin for pin in link.pins if pin in vectors]
         for start, end in itertools.pairwise(moving):
             if np.any(vectors[start]) and np.any(vectors[end]):
-                sides.append(Side(vectors[start], vectors[end], f"{letter}_{end}{start}", "relative"))
+                sides.append(PolygonSide(vectors[start], vectors[end], f"{letter}_{end}{start}", "relative"))
     return sides
 
 
-def _balances(mechanism: Mechanism, geometry: Geometry, q: np.ndarray) -> dict[str, list[Line]]:
+def _balances(mechanism: Mechanism, geometry: Geometry, q: np.ndarray) -> dict[str, list[EquationLine]]:
     """Return the equations of equilibrium of each link: forces along x and y, and moments about its centre of mass."""
-    loads = np.asarray(evaluate.force(mechanism, 0.0, q, np.zeros_like(q))).reshape(-1, 3)
+    loads = np.asarray(load_terms.force(mechanism, 0.0, q, np.zeros_like(q))).reshape(-1, 3)
     if not np.any(np.abs(loads) > 0.0):
         return {}
     held, found = resting_forces(mechanism, q, 0.0), {}
@@ -229,28 +195,28 @@ def _balance(
     load: np.ndarray,
     forces: Sequence[tuple[str, np.ndarray]],
     efforts: Mapping[str, float],
-) -> list[Line]:
+) -> list[EquationLine]:
     centre, mechanism = np.asarray(geometry.frames[body])[:2], geometry.mechanism
-    sums: list[list[tuple[float, Term]]] = [[], [], []]
+    sums: list[list[tuple[float, EquationTerm]]] = [[], [], []]
     for axis, (name, unit) in enumerate((("x", "N"), ("y", "N"), ("M", "N m"))):
         if load[axis]:
-            sums[axis].append((1.0, Symbol("W", f"{body},{name}", float(load[axis]), unit)))
+            sums[axis].append((1.0, NamedQuantity("W", f"{body},{name}", float(load[axis]), unit)))
     for pin, (fx, fy, moment) in forces:
         arm = geometry.places[pin] - centre
         arm = np.where(np.abs(arm) > PRINTED_AS_ZERO * geometry.extent, arm, 0.0)
-        force = [Symbol("F", f"{pin},{name}", float(x), "N") for name, x in zip("xy", (fx, fy), strict=True)]
-        lever = [Symbol(name, pin, float(x), "arm") for name, x in zip("xy", arm, strict=True)]
+        force = [NamedQuantity("F", f"{pin},{name}", float(x), "N") for name, x in zip("xy", (fx, fy), strict=True)]
+        lever = [NamedQuantity(name, pin, float(x), "arm") for name, x in zip("xy", arm, strict=True)]
         for axis in (0, 1):
             sums[axis].append((1.0, force[axis]))
-        sums[2] += [(1.0, Product((lever[0], force[1]))), (-1.0, Product((lever[1], force[0])))]
+        sums[2] += [(1.0, ProductOfTerms((lever[0], force[1]))), (-1.0, ProductOfTerms((lever[1], force[0])))]
         if moment:
-            sums[2].append((1.0, Symbol("M", pin, float(moment), "N m")))
+            sums[2].append((1.0, NamedQuantity("M", pin, float(moment), "N m")))
     for name, effort in efforts.items():
         driver = mechanism.drivers[name]
         if driver.coordinate == "angle":
-            sums[2].append((1.0, Symbol("M", name, effort, "N m")))
+            sums[2].append((1.0, NamedQuantity("M", name, effort, "N m")))
             continue
         axis_angle = 0.0 if driver.axis is None else float(np.asarray(driver.axis))
         for axis, part in enumerate((np.cos(axis_angle), np.sin(axis_angle))):
-            sums[axis].append((1.0, Symbol("F", f"{name},{'xy'[axis]}", float(effort * part), "N")))
-    return [Line(total(*parts)) for parts in sums]
+            sums[axis].append((1.0, NamedQuantity("F", f"{name},{'xy'[axis]}", float(effort * part), "N")))
+    return [EquationLine(total(*parts)) for parts in sums]

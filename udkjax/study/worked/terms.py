@@ -18,8 +18,8 @@ _ANGLES_OF = ("acos", "atan2")
 _SHOWN_ANGLES = {"acos": "arccos", "atan2": "atan2"}
 
 
-class Style(NamedTuple):
-    """How numbers are written: the units of the drawing, angles in degrees, and significant digits."""
+class NumberStyle(NamedTuple):
+    """The units of printed numbers, those of the drawing with angles in degrees, and their significant digits."""
 
     units: Units
     digits: int = 6
@@ -50,7 +50,7 @@ class Style(NamedTuple):
         return "0" if float(text) == 0.0 else text
 
 
-class Term(ABC):
+class EquationTerm(ABC):
     """A part of an equation."""
 
     @property
@@ -59,16 +59,16 @@ class Term(ABC):
         """The value in SI units."""
 
     @abstractmethod
-    def text(self, style: Style, numbers: bool = True) -> str:
+    def text(self, style: NumberStyle, numbers: bool = True) -> str:
         """Return the term as an expression, with numbers or with names."""
 
     @abstractmethod
-    def mathml(self, style: Style, numbers: bool) -> str:
+    def mathml(self, style: NumberStyle, numbers: bool) -> str:
         """Return the term as MathML, with numbers or with symbols."""
 
 
 @dataclass(frozen=True)
-class Symbol(Term):
+class NamedQuantity(EquationTerm):
     """A quantity: a letter with an index, its value and its SI unit; `order` counts the dots of a derivative in time."""
 
     letter: str
@@ -103,7 +103,7 @@ class Symbol(Term):
 
 
 @dataclass(frozen=True)
-class Constant(Term):
+class PlainFactor(EquationTerm):
     """A plain number that is part of a formula, such as the 2 of 2 a b."""
 
     known: float
@@ -120,10 +120,10 @@ class Constant(Term):
 
 
 @dataclass(frozen=True)
-class Sum(Term):
+class SumOfTerms(EquationTerm):
     """Terms with signs."""
 
-    parts: tuple[tuple[float, Term], ...]
+    parts: tuple[tuple[float, EquationTerm], ...]
 
     @property
     def value(self):
@@ -147,10 +147,10 @@ class Sum(Term):
 
 
 @dataclass(frozen=True)
-class Product(Term):
+class ProductOfTerms(EquationTerm):
     """Factors."""
 
-    factors: tuple[Term, ...]
+    factors: tuple[EquationTerm, ...]
 
     @property
     def value(self):
@@ -165,11 +165,11 @@ class Product(Term):
 
 
 @dataclass(frozen=True)
-class Ratio(Term):
+class RatioOfTerms(EquationTerm):
     """A fraction."""
 
-    above: Term
-    below: Term
+    above: EquationTerm
+    below: EquationTerm
 
     @property
     def value(self):
@@ -183,10 +183,10 @@ class Ratio(Term):
 
 
 @dataclass(frozen=True)
-class Square(Term):
+class SquaredTerm(EquationTerm):
     """A squared term."""
 
-    inner: Term
+    inner: EquationTerm
 
     @property
     def value(self):
@@ -200,11 +200,11 @@ class Square(Term):
 
 
 @dataclass(frozen=True)
-class Function(Term):
+class AppliedFunction(EquationTerm):
     """cos, sin, sqrt, acos or atan2 of terms."""
 
     name: str
-    given: tuple[Term, ...] = field(default=())
+    given: tuple[EquationTerm, ...] = field(default=())
 
     @property
     def value(self):
@@ -217,7 +217,7 @@ class Function(Term):
         inner = [term.mathml(style, numbers) for term in self.given]
         if self.name == "sqrt":
             return f"<msqrt>{inner[0]}</msqrt>"
-        if self.name in ("cos", "sin") and isinstance(self.given[0], Symbol):
+        if self.name in ("cos", "sin") and isinstance(self.given[0], NamedQuantity):
             return f"<mrow><mi>{self.name}</mi><mo>&#8289;</mo>{_factor(self.given[0], style, numbers)}</mrow>"
         name = _SHOWN_ANGLES.get(self.name, self.name)
         return f"<mrow><mi>{name}</mi><mo>(</mo>{'<mo>,</mo>'.join(inner)}<mo>)</mo></mrow>"
@@ -236,46 +236,49 @@ def _signed(parts: Sequence[tuple[float, str]], minus: str, plus: str, space: st
     return begin + "".join(f"{space}{minus if sign < 0 else plus}{space}{term}" for sign, term in others)
 
 
-def _is_negative(term: Term, numbers: bool) -> bool:
-    return numbers and isinstance(term, Symbol) and not term.open and term.known < 0.0
+def _is_negative(term: EquationTerm, numbers: bool) -> bool:
+    return numbers and isinstance(term, NamedQuantity) and not term.open and term.known < 0.0
 
 
-def _grouped(term: Term, style: Style, numbers: bool) -> str:
+def _grouped(term: EquationTerm, style: NumberStyle, numbers: bool) -> str:
     inner = term.mathml(style, numbers)
-    return _in_brackets(inner) if isinstance(term, Sum) or _is_negative(term, numbers) else inner
+    return _in_brackets(inner) if isinstance(term, SumOfTerms) or _is_negative(term, numbers) else inner
 
 
-def _factor(term: Term, style: Style, numbers: bool) -> str:
+def _factor(term: EquationTerm, style: NumberStyle, numbers: bool) -> str:
     inner = term.mathml(style, numbers)
-    many = isinstance(term, Sum) and (len(term.parts) > 1 or any(sign < 0 for sign, _ in term.parts))
-    return _in_brackets(inner) if many or _is_negative(term, numbers) else inner
+    return _in_brackets(inner) if _is_compound(term) or _is_negative(term, numbers) else inner
+
+
+def _is_compound(term: EquationTerm) -> bool:
+    return isinstance(term, SumOfTerms) and (len(term.parts) > 1 or any(sign < 0 for sign, _ in term.parts))
 
 
 def _in_brackets(inner: str) -> str:
     return f"<mrow><mo>(</mo>{inner}<mo>)</mo></mrow>"
 
 
-def _grouped_text(term: Term, style: Style, numbers: bool) -> str:
+def _grouped_text(term: EquationTerm, style: NumberStyle, numbers: bool) -> str:
     inner = term.text(style, numbers)
-    return f"({inner})" if isinstance(term, Sum) else inner
+    return f"({inner})" if isinstance(term, SumOfTerms) else inner
 
 
-def _factor_text(term: Term, style: Style, numbers: bool) -> str:
+def _factor_text(term: EquationTerm, style: NumberStyle, numbers: bool) -> str:
     inner = term.text(style, numbers)
-    return f"({inner})" if isinstance(term, Sum) and (len(term.parts) > 1 or term.parts[0][0] < 0) else inner
+    return f"({inner})" if _is_compound(term) else inner
 
 
-def of_angle(name: str, angle: Term) -> Term:
+def of_angle(name: str, angle: EquationTerm) -> EquationTerm:
     """Return the cosine or sine of an angle."""
-    return Function(name, (angle,))
+    return AppliedFunction(name, (angle,))
 
 
-def total(*parts: tuple[float, Term]) -> Sum:
+def total(*parts: tuple[float, EquationTerm]) -> SumOfTerms:
     """Return a sum of terms with signs."""
-    return Sum(tuple(parts))
+    return SumOfTerms(tuple(parts))
 
 
-class Line(NamedTuple):
+class EquationLine(NamedTuple):
     """An equation: `left` equals `right`; without a left side, `right` is zero.
 
     Attributes:
@@ -284,8 +287,8 @@ class Line(NamedTuple):
         words: an explanation.
     """
 
-    right: Term
-    left: Symbol | None = None
+    right: EquationTerm
+    left: NamedQuantity | None = None
     words: str = ""
 
     @property
@@ -293,10 +296,10 @@ class Line(NamedTuple):
         """The difference of the two sides, relative to the largest of them or of their terms."""
         left = 0.0 if self.left is None else self.left.value
         difference = abs(left - self.right.value)
-        scale = max(abs(left), self.right.scale if isinstance(self.right, Sum) else abs(self.right.value))
+        scale = max(abs(left), self.right.scale if isinstance(self.right, SumOfTerms) else abs(self.right.value))
         return difference / scale if scale else difference
 
-    def text(self, style: Style, numbers: bool = True) -> str:
+    def text(self, style: NumberStyle, numbers: bool = True) -> str:
         """Return the equation as text, with numbers or with names."""
         right = self.right.text(style, numbers)
         if self.left is None:
@@ -305,7 +308,7 @@ class Line(NamedTuple):
         result = f" = {style.number(self.left.value, self.left.unit)}{unit}" if numbers else ""
         return f"{self.left.name} = {right}{result}"
 
-    def mathml(self, style: Style) -> str:
+    def mathml(self, style: NumberStyle) -> str:
         """Return the equation as MathML: by symbols, with numbers put in, and its value with its unit."""
         steps = [self.right.mathml(style, False), self.right.mathml(style, True)]
         if self.left is None:
