@@ -47,7 +47,7 @@ class LoopVector(NamedTuple):
         start, end: names of points, in the direction of the angle.
         sign: minus one where the loop runs against it.
         body: the body whose angle its angle follows.
-        turn: its angle less that of the body (rad).
+        turn: its angle, from that of the body (rad).
         size: its length (m).
         slide: the joint along whose line it lies; its length then changes. Else "".
     """

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import NumberLike
-from udkjax.equations.terms import loads as load_terms
+from udkjax.equations import loads as load_terms
 from udkjax.positions.answers.counting import Count
 from udkjax.positions.answers.pin_motion import PinMotion, pin_motion, usual_rate
 from udkjax.positions.assembling.coordinates import element_of, value_of
