@@ -308,6 +308,16 @@ class EquationLine(NamedTuple):
         result = f" = {style.number(self.left.value, self.left.unit)}{unit}" if numbers else ""
         return f"{self.left.name} = {right}{result}"
 
+    def _pieces(self, style: NumberStyle) -> list[str]:
+        """Return the right side with numbers, a piece for each term of a sum."""
+        if not isinstance(self.right, SumOfTerms):
+            return [f"<mo>=</mo>{self.right.mathml(style, True)}"]
+        pieces = []
+        for k, (sign, term) in enumerate(self.right.parts):
+            mark = "<mo>−</mo>" if sign < 0 else "<mo>+</mo>" if k else ""
+            pieces.append(f"{'<mo>=</mo>' if k == 0 else ''}{mark}{_grouped(term, style, True)}")
+        return pieces
+
     def mathml(self, style: NumberStyle) -> str:
         """Return the equation as MathML: by symbols, with numbers put in, and its value with its unit."""
         steps = [self.right.mathml(style, False), self.right.mathml(style, True)]
@@ -321,8 +331,14 @@ class EquationLine(NamedTuple):
             steps = steps[:-1]
         left = self.left.mathml(style, False)
         if len(steps) == 2 and len(self.text(style)) > LONGEST_LINE:  # by symbols, and below it with numbers
-            return _math(f"{left}<mo>=</mo>{steps[0]}") + _math(f"<mo>=</mo>{steps[1]}<mo>=</mo>{shown}")
+            return _math(f"{left}<mo>=</mo>{steps[0]}") + _wrapped([*self._pieces(style), f"<mo>=</mo>{shown}"])
         return _math("<mo>=</mo>".join([left, *steps, shown]))
+
+
+def _wrapped(pieces: Sequence[str]) -> str:
+    """Return pieces of a formula, between which a line may break."""
+    inner = " ".join(f'<math displaystyle="true"><mrow>{piece}</mrow></math>' for piece in pieces)
+    return f'<div class="equation">{inner}</div>'
 
 
 def _math(inner: str) -> str:
