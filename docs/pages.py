@@ -23,6 +23,7 @@ FENCE = re.compile(r"(^```.*?^```$)", re.S | re.M)
 PLAYER = re.compile(r"\]\((?!\w+:)([^)\s#]+\.html)\)")
 NAME = re.compile(r"(?<![\[`])`udk\.(\w+)(\([^`]*\))?`(?!\]|`)")
 ENTRY = re.compile(r"^- \[([^\]]+)\]\(([^)]+)\)(?:: (.*(?:\n  .*)*))?", re.M)
+DRAWING = re.compile(r"^<!-- picture\n.*?^-->\n", re.S | re.M)  # the code of a picture
 DRAWN = re.compile(r"^!\[([^\]]*)\]\(([^)]+\.svg)\)$", re.M)
 FIRST = "getting-started.md", "tutorial.md"  # pages in which a name is looked for first
 SHARED = "pictures"  # the folder of pictures that code has drawn
@@ -51,6 +52,7 @@ def read(app: Any, name: str, source: list[str]) -> None:
     text = reference.DIRECTIVE.sub(lambda found: entry(found[1], found[2]), text)
     if MENU in text:
         text = menu(text, (DOCS / name).parent)
+    text = DRAWING.sub("", text)
     text = DRAWN.sub(lambda found: drawn(found, (DOCS / name).parent), text)
     parts = FENCE.split(text)
     parts[::2] = [linked(part, name) for part in parts[::2]]
@@ -140,7 +142,7 @@ def card(title: str, target: str, said: str, folder: Path) -> str:
 def picture(page: Path) -> str:
     """Return the first picture that the code of a page has drawn; empty if there is none."""
     found = DRAWN.search(page.read_text(encoding="utf-8"))
-    return drawn(found, page.parent) if found else ""
+    return drawn(found, page.parent) if found and f"{SHARED}/" in found[2] else ""
 
 
 def drawn(found: re.Match[str], folder: Path) -> str:

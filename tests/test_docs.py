@@ -38,6 +38,9 @@ def name_of(page: Path) -> str:
 every_page = pytest.mark.parametrize("page", PAGES, ids=name_of)
 
 
+sys.path.insert(0, str(ROOT / "docs"))
+pictures = importlib.import_module("pictures")
+
 # --- blocks
 
 
@@ -115,7 +118,11 @@ FIRST = ("README.md",)
 def test_its_blocks_run_and_print_what_it_says(page, tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
-    assert untrue(page.read_text(), {"__name__": "__page__"}) == []
+    text, names = page.read_text(), {"__name__": "__page__"}
+    assert untrue(text, names) == []
+    for code, _, target in pictures.PICTURE.findall(text):
+        drawn, there = pictures.draw(code, names), pictures.stored(page.parent / target)
+        assert pictures.differ(pictures.numbers(drawn), there) == [], f"run: python docs/pictures.py {name_of(page)}"
 
 
 @every_page

@@ -14,6 +14,7 @@ DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 mathml = importlib.import_module("mathml")
 pages = importlib.import_module("pages")
+pictures = importlib.import_module("pictures")
 reference = importlib.import_module("reference_tables")
 MOST_ENTRIES = 9  # of a group of the menu
 GROUPS = sorted((DOCS / "guide").glob("*.md"))
@@ -164,3 +165,50 @@ def test_units_and_code_of_docstrings_are_no_equations():
 @pytest.mark.parametrize("name", ["Baumgarte", "accelerations", "kinematics", "modes", "equilibrium", "reactions", "Friction"])
 def test_entries_show_their_equations_typeset(name):
     assert EQUATION.search(reference.entry(f"udkjax.{name}"))
+
+
+# --- pictures
+
+# Pages that show code or tables only, until someone draws what they compute.
+WITHOUT_PICTURE = {
+    *(
+        f"how-to/{name}.md"
+        for name in ("animate", "belief", "cluster", "control", "design", "draw", "engines", "exercises", "force")
+    ),
+    *(
+        f"how-to/{name}.md"
+        for name in ("friction", "gpu", "identify", "identify-friction", "joint", "live", "mjcf", "neural-force")
+    ),
+    *(f"how-to/{name}.md" for name in ("own-method", "own-system", "speed", "sweep", "yield")),
+    *(f"theory/{name}.md" for name in ("atlas", "methods", "symbols")),
+}
+
+
+DIMENSIONLESS = {"rtol = atol", "step of the difference quotient", "error", "singular value"}  # labels of axes without a unit
+
+
+def test_pages_show_what_they_compute():
+    shown = [*(DOCS / "how-to").glob("*.md"), *(DOCS / "theory").glob("*.md")]
+    without = {str(page.relative_to(DOCS)) for page in shown if not re.search(r"^!\[", page.read_text(), re.M)}
+    assert without == WITHOUT_PICTURE
+
+
+@pytest.mark.parametrize("page", [p for p in DOCS.rglob("*.md") if pictures.PICTURE.search(p.read_text())], ids=lambda p: p.stem)
+def test_a_picture_has_numbers_units_and_an_alternative_text(page):
+    for code, said, target in pictures.PICTURE.findall(page.read_text()):
+        compile(code, "picture", "exec")
+        assert len(said.split()) >= 8
+        for axes in pictures.stored(page.parent / target):
+            assert axes["curves"] and all(axes["labels"])
+            assert [name for name in axes["labels"][1:] if "(" not in name and name not in DIMENSIONLESS] == []
+        text = pages.drawn(pages.DRAWN.search(f"![{said}]({target})"), page.parent)
+        assert 'role="img" aria-label=' in text and "<metadata>" not in text and "currentColor" in text
+
+
+def test_a_picture_that_is_out_of_date_is_noticed(tmp_path):
+    figure = pictures.draw("axes.plot([0, 1], [0, height])\naxes.set(xlabel='time (s)')", {"height": 2.0})
+    pictures.save(figure, tmp_path / "one.svg")
+    there = pictures.stored(tmp_path / "one.svg")
+    assert pictures.differ(pictures.numbers(figure), there) == []
+    other = pictures.draw("axes.plot([0, 1], [0, height])\naxes.set(xlabel='time (s)')", {"height": 2.1})
+    assert pictures.differ(pictures.numbers(other), there) == ["curves of ['', 'time (s)', '']"]
