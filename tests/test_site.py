@@ -180,6 +180,7 @@ WITHOUT_PICTURE = {
         for name in ("friction", "gpu", "identify", "identify-friction", "joint", "live", "mjcf", "neural-force")
     ),
     *(f"how-to/{name}.md" for name in ("own-method", "own-system", "speed", "sweep", "yield")),
+    "how-to/export.md",
     *(f"theory/{name}.md" for name in ("atlas", "methods", "symbols")),
 }
 
