@@ -42,6 +42,8 @@ from udkjax.integrate.events import Lock as Lock
 from udkjax.integrate.events import Log as Log
 from udkjax.integrate.events import Release as Release
 from udkjax.integrate.events import Stop as Stop
+from udkjax.native.exported import export_compiled as export_compiled
+from udkjax.native.exported import load_exported as load_exported
 from udkjax.pinv import SVD as SVD
 from udkjax.pinv import Auto as Auto
 from udkjax.pinv import Elimination as Elimination

@@ -13,6 +13,7 @@ EXTRAS = {
     "dask": "dask",
     "distributed": "dask",
     "ezdxf": "dxf",
+    "flatbuffers": "export",
     "h5netcdf": "io",
     "h5py": "io",
     "imageio_ffmpeg": "video",
@@ -40,6 +41,7 @@ BRINGS = {
 WRITERS = {".png": ("PIL",), ".gif": ("PIL",), ".mp4": ("PIL", "imageio_ffmpeg"), ".dxf": ("ezdxf",)}
 NETCDF = "xarray", "h5netcdf"  # the packages that read and write runs
 BAYES = "blackjax", "arviz"  # the packages that draw from posteriors and judge the draws
+EXPORT = ("flatbuffers",)  # the package with which JAX writes exported functions
 STUDIO = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
 
 

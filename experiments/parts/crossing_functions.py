@@ -134,6 +134,8 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "loads": {"": studies.dumps},
     "save": {"": studies.save},
     "export_c": {"": studies.export_c},
+    "export_compiled": {"": studies.export_compiled},
+    "load_exported": {"": studies.export_compiled},
     "load": {"": studies.save},
     "mjcf_text": {"": studies.mjcf},
     "read_mjcf": {"": studies.mjcf},

@@ -238,6 +238,14 @@ def export_c(case: Case) -> str:
     return agree(a, np.ravel(udk.accelerations(case.model, 0.0, case.state.q, case.state.v)), "udk.accelerations", 1e-9)
 
 
+def export_compiled(case: Case) -> str:
+    def run(q: Any) -> Any:
+        return udk.simulate(case.model, TS, udk.State(q, case.state.v), **EXACT).q
+
+    q = np.asarray(case.state.q, float)
+    return agree(udk.load_exported(udk.export_compiled(run, q))(q), case.alone.q, "the motion")
+
+
 def mjcf(case: Case) -> str:
     again = udk.read_mjcf(udk.mjcf_text(case.model))
     energies = [udk.energy(m, udk.simulate(m, TS, **EXACT)).kinetic for m in (again, case.model)]

@@ -2,7 +2,8 @@
 
 import ctypes
 import traceback
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Sequence
 from threading import Lock, RLock
 from typing import Any
 from weakref import WeakValueDictionary
@@ -43,9 +44,14 @@ class Code:
     """
 
     def __init__(
-        self, name: str, library: machine.Library, is_interruptible: bool, load_later: "Callable[[], Code] | None" = None
+        self,
+        name: str,
+        library: machine.Library,
+        is_interruptible: bool,
+        load_later: "Callable[[], Code] | None" = None,
+        packed_text: bytes = b"",
     ):
-        self._name, self.library = name, library
+        self._name, self.library, self._packed_text = name, library, packed_text
         self.run: Any = machine.function(library["run"], ctypes.c_void_p)
         self.run.library, self.later = library, None
         if is_interruptible:
@@ -56,18 +62,31 @@ class Code:
             address = ctypes.cast(self.run.load_later, ctypes.c_void_p).value
             ctypes.c_void_p.from_address(library[leaving.LOAD]).value = address
 
+    def texts(self) -> list[str]:
+        """Return the text of the module, and of the later module if runs may leave it."""
+        text = zlib.decompress(self._packed_text).decode()
+        if self.later is None:
+            return [text]
+        self.later.load()
+        assert self.later.code is not None  # loaded, or an error was printed
+        return [text, *self.later.code.texts()]
+
     @property
     def name(self) -> str:
         """The name of its FFI target in XLA, for optimized code; it is never freed from then on.
 
         XLA keeps one address for each name, and compiled programs may call it at any time.
         """
-        with _LOADING:
-            if self._name not in _REGISTERED:
-                capsule = jax.ffi.pycapsule(ctypes.c_void_p(self.library["call_frame"]))
-                jax.ffi.register_ffi_target(self._name, capsule, platform="cpu")
-                _REGISTERED[self._name] = self
+        self.register(self._name)
         return self._name
+
+    def register(self, name: str) -> None:
+        """Register the code with XLA by a name, unless there is code of this name."""
+        with _LOADING:
+            if name not in _REGISTERED:
+                capsule = jax.ffi.pycapsule(ctypes.c_void_p(self.library["call_frame"]))
+                jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+                _REGISTERED[name] = self
 
 
 _LOADED: WeakValueDictionary[str, Code] = WeakValueDictionary()  # optimized code that serves all callers with the same text
@@ -90,7 +109,18 @@ def load(text: str, level: int = machine.LEVEL, load_later: Callable[[], Code] |
     with _LOADING:
         code = _LOADED.get(name)
         if code is None:
-            code = Code(name, machine.library(text, names, level), is_interruptible, load_later)
+            code = Code(name, machine.library(text, names, level), is_interruptible, load_later, zlib.compress(text.encode(), 1))
             if code.library.is_optimized:
                 _LOADED[name] = code
         return code
+
+
+def registered(name: str) -> Code | None:
+    """Return the code that XLA knows by a name; None if there is none."""
+    return _REGISTERED.get(name)
+
+
+def load_as(name: str, texts: Sequence[str]) -> None:
+    """Load the code of texts (`Code.texts`), and register it with XLA by a name that another process gave it."""
+    later = texts[1:]
+    load(texts[0], load_later=(lambda: load(later[0])) if later else None).register(name)

@@ -1,0 +1,76 @@
+"""Compiled JAX functions as bytes for other processes: JAX's own export, with the texts of the machine code that it calls."""
+
+import json
+import re
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.export
+
+from udkjax.extras import EXPORT, require
+from udkjax.native.module import loading
+from udkjax.requirements import ArgumentError
+
+CALL = re.compile(r"custom_call @([\w.]+)")
+OWN = "udkjax_"  # prefix of the names of machine code
+FORMAT = b"udkjax exported 1\n"
+
+
+def export_compiled(function: Callable[..., Any], *arguments: Any) -> bytes:
+    """Compile a JAX function of arrays, such as a run, its gradient or a batch of runs, to bytes for other processes.
+
+    JAX's own export contains no machine code of udkjax, and refuses functions that call it. These bytes contain LLVM's texts of
+    this code as well, which `load_exported` compiles for the processor that it runs on.
+
+    Args:
+        function: a function that JAX can trace, for the CPU.
+        arguments: arguments like those that it will have: their shapes count, not their values.
+
+    Returns:
+        The bytes.
+
+    Raises:
+        MissingExtraError: the extra `export` is not installed.
+        ArgumentError: the function calls Python, as runs by diffrax, runs with events, and forces that do not trace.
+    """
+    require(*EXPORT)
+    jitted: Any = function if hasattr(function, "lower") else jax.jit(function)
+    names = sorted({*CALL.findall(jitted.lower(*arguments).as_text())})
+    own = {name: loading.registered(name) for name in names if name.startswith(OWN)}
+    lost = [name for name, code in own.items() if code is None]
+    foreign = [name for name in names if "callback" in name or "host" in name]
+    if lost or foreign:
+        why = f"it calls Python ({', '.join(lost + foreign)})"
+        cure = "export runs by machine code without events, or export_c"
+        raise ArgumentError(f"the function cannot be exported, since {why}: {cure}")
+    checks = [jax.export.DisabledSafetyCheck.custom_call(name) for name in own]
+    artifact = jax.export.export(jitted, platforms=("cpu",), disabled_checks=checks)(*arguments)
+    texts = json.dumps({name: code.texts() for name, code in own.items() if code is not None})
+    packed = zlib.compress(texts.encode())
+    return FORMAT + len(packed).to_bytes(8, "little") + packed + bytes(artifact.serialize())
+
+
+def load_exported(data: bytes) -> Callable[..., Any]:
+    """Load a function that `export_compiled` has written; its machine code is compiled for this processor, or read from disk.
+
+    Load bytes of people you trust only: machine code can do anything.
+
+    Args:
+        data: the bytes.
+
+    Returns:
+        The function, of arrays like those for which it was exported.
+
+    Raises:
+        ArgumentError: the bytes are not those of an exported function.
+    """
+    require(*EXPORT)
+    if not data.startswith(FORMAT):
+        raise ArgumentError("data must be the bytes that udkjax.export_compiled returned")
+    start = len(FORMAT) + 8
+    end = start + int.from_bytes(data[len(FORMAT) : start], "little")
+    for name, texts in json.loads(zlib.decompress(data[start:end])).items():
+        loading.load_as(name, texts)
+    return jax.export.deserialize(bytearray(data[end:])).call
