@@ -187,6 +187,8 @@ from udkjax.study.tolerancing import ToleranceAnalysis as ToleranceAnalysis
 from udkjax.study.tolerancing import tolerances as tolerances
 from udkjax.study.worked.solution import WorkedSolution as WorkedSolution
 from udkjax.study.worked.solution import worked_solution as worked_solution
+from udkjax.synthesis import CurveDesign as CurveDesign
+from udkjax.synthesis import CurveDesigns as CurveDesigns
 from udkjax.synthesis import Designs as Designs
 from udkjax.synthesis import DesignSearch as DesignSearch
 from udkjax.synthesis import EnergyGoal as EnergyGoal
@@ -201,6 +203,7 @@ from udkjax.synthesis import PoseGoal as PoseGoal
 from udkjax.synthesis import ToleranceGoal as ToleranceGoal
 from udkjax.synthesis import TorqueGoal as TorqueGoal
 from udkjax.synthesis import design as design
+from udkjax.synthesis import mechanisms_for as mechanisms_for
 from udkjax.synthesis.complete import CompleteDesign as CompleteDesign
 from udkjax.synthesis.complete import CompleteDesigns as CompleteDesigns
 from udkjax.synthesis.complete import design_all as design_all

@@ -1,0 +1,97 @@
+"""Mechanisms for drawn curves: positions, derivatives, distances and results."""
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+from udkjax.synthesis.curves.dyads import EACH, HEAD, SPAN, Topology, gradients, number_count, positions
+from udkjax.synthesis.curves.random_linkages import random_linkages, turn_angles
+from udkjax.synthesis.curves.targets import WantedCurve, as_points, chamfer
+
+ELLIPSE = np.array([[3.0 + 0.2 * np.cos(t), 1.0 + 0.1 * np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 40)])
+
+
+def test_derivatives_of_linkages_are_those_of_their_positions():
+    x, topology = random_linkages(12, 3, np.random.default_rng(0), geared=0.5)
+    share = np.arange(20) / 20
+    x[:, SPAN] = 5.0
+
+    def measures(y):
+        at = positions(y, topology, y[:, SPAN, None] * share)
+        joints = np.stack([at.origins[3::2], at.origins[4::2], at.ends])
+        third = np.sum(at.cosines**2, 0) + np.sum(np.abs(joints) ** 2, (0, 1))
+        return at, joints, np.stack([at.pin.real, at.pin.imag, third], 1)
+
+    at, joints, _ = measures(x)
+    found = gradients(x, topology, at, share, 2 * joints[:2], 2 * joints[2], 2 * at.cosines)
+    is_closed = (np.abs(at.cosines) < 0.95).all(0)[:, None]
+    assert is_closed.mean() > 0.5
+    for k in range(x.shape[1]):
+        step = 1e-6 * np.eye(x.shape[1])[k]
+        difference = (measures(x + step)[2] - measures(x - step)[2]) / 2e-6
+        error = np.abs(found[:, k] - difference) / (1.0 + np.abs(difference))
+        assert np.where(is_closed, error, 0.0).max() < 1e-6
+
+
+def test_random_linkages_close_over_the_whole_turn():
+    x, topology = random_linkages(200, 3, np.random.default_rng(1))
+    assert np.abs(positions(x, topology, turn_angles(200)).cosines).max() < 1.0
+
+
+def test_a_four_bar_has_the_positions_of_the_drawing():
+    x = np.zeros((1, number_count(1)))
+    x[0, HEAD : HEAD + EACH], x[0, -2:] = [1.0, 0.0, 3.0, 0.0, 2.5, 2.0], [1.0, 0.5]
+    topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]), np.ones(1))
+    at = positions(x, topology, np.array([[0.0, 1.0]]))
+    P, R, Q = at.origins[3, 0], at.ends[0, 0], at.origins[4, 0]
+    np.testing.assert_allclose(np.abs(R - P), 2.5, rtol=1e-12)
+    np.testing.assert_allclose(np.abs(R - Q), 2.0, rtol=1e-12)
+    np.testing.assert_allclose(P, np.exp(1j * np.array([0.0, 1.0])), rtol=1e-12)
+
+
+def test_the_distance_of_parallel_lines_is_twice_their_gap():
+    line = as_points(np.linspace(0.0, 1.0, 50) + 0j)
+    assert chamfer(line, line + [0.0, 0.25]) == pytest.approx(0.5, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("curve", "message"),
+    [
+        ([[0, 0], [1, 1]], "at least 3 points"),
+        ([[1, 1]] * 5, "coincide"),
+        ([[0, 0], [1, np.nan], [2, 0]], "finite"),
+        ([[0, 0, 0]] * 4, "shape"),
+    ],
+)
+def test_what_is_no_curve_is_refused(curve, message):
+    with pytest.raises(ValueError, match=message):
+        udk.mechanisms_for(curve)
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [({"size": 0.05}, "size"), ({"bars": 3}, "bars"), ({"transmission": 2.0}, "transmission"), ({"part": "half"}, "part")],
+)
+def test_limits_that_contradict_each_other_are_refused(limits, message):
+    with pytest.raises(ValueError, match=message):
+        udk.mechanisms_for(ELLIPSE, **limits)
+
+
+def test_mechanisms_turn_draw_the_curve_and_repeat_with_the_seed():
+    found, again = (udk.mechanisms_for(ELLIPSE, bars=4, seconds=600, rounds=1, results=2, progress=False) for _ in range(2))
+    assert [one.error for one in found] == [one.error for one in again] and len(found) == 2
+    best, wanted = found[0], WantedCurve(ELLIPSE)
+    assert best.error < 0.02 and best.bars == 4 and best.size <= 3.0 * wanted.extent * 1.001
+    normalized = (best.curve - as_points(np.array([wanted.middle]))) / wanted.scale
+    assert chamfer(normalized[:-1], wanted.fine) == pytest.approx(best.error, rel=0.5)
+    motion = best.motion(721)
+    assert np.asarray(motion.reached).all()
+    open_by = [np.abs(np.asarray(udk.equations.psi(best.mechanism, 0.0, q)))[:-1].max() for q in np.asarray(motion.q)[::60]]
+    assert max(open_by) < 1e-12
+    path = np.asarray(udk.path(best.mechanism, motion, best.pin))
+    assert chamfer(path, best.curve) < 0.01 * wanted.extent
+
+
+def test_without_time_there_is_the_best_so_far():
+    found = udk.mechanisms_for(ELLIPSE, bars=4, seconds=0, results=1, progress=False)
+    assert len(found) == 1 and "1 mechanisms" in str(found)

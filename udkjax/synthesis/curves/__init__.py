@@ -1,0 +1,6 @@
+"""Mechanisms for a drawn curve: structure and dimensions of linkages, by growth, lanes and exact derivatives.
+
+`mechanisms_for` is the public function. `targets` compares curves; `dyads` evaluates positions and derivatives of linkages,
+`random_linkages` makes and grows them, `matching` finds those whose curves resemble the target, `descent` improves them.
+`curve_search` combines these; `linkage_drawing` and `curve_designs` return results.
+"""

@@ -1,0 +1,136 @@
+"""Results of a search for mechanisms that draw a curve."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.positions.following.drive import Drive, only_driver
+from udkjax.printing import PrintedTable, PrintsTable, format_number
+from udkjax.scene.mechanism import Mechanism
+from udkjax.synthesis.curves.curve_search import FoundLinkage, drawn
+from udkjax.synthesis.curves.dyads import SPAN, positions
+from udkjax.synthesis.curves.linkage_drawing import PIN, drawing_of, turn_of
+from udkjax.synthesis.curves.targets import WantedCurve, as_points
+from udkjax.synthesis.found_mechanism import FoundMechanism
+
+
+class CurveDesign(FoundMechanism):
+    """A mechanism with one motor, whose pin draws a curve; drawn at the beginning of the curve.
+
+    Attributes:
+        error: Chamfer distance of the drawn curve from the wanted one, in RMS radii of the wanted curve: both by 2000 points at
+            equal arc lengths, the mean distance of each from the other, added.
+        mechanism: the mechanism, to be run, animated or saved; `drawing` is its drawing.
+        pin: the name of the drawing pin.
+        curve: the drawn curve (m, 2) (m).
+        bars: number of links, with the ground.
+        size: largest distance (m) of any pin from the middle of the curve over the whole turn.
+        transmission: smallest angle (rad) between the two links of a dyad, or between one and the other prolonged.
+        values: values of the driver (rad) at the ends of the curve.
+        turns: True: `kinematics` reached 720 positions of a whole turn.
+        driver: the driver.
+    """
+
+    error: float
+    mechanism: Mechanism
+    pin: str = eqx.field(static=True)
+    curve: Float[np.ndarray, "m 2"]
+    bars: int = eqx.field(static=True)
+    size: float
+    transmission: float
+    values: Float[np.ndarray, "2"]
+    turns: bool = eqx.field(static=True)
+    driver: Drive = eqx.field(static=True)
+
+    @property
+    def last_value(self) -> float:
+        """The value of the driver at the end of the curve."""
+        return float(self.values[-1])
+
+    def _table(self) -> PrintedTable:
+        rows = [("error", f"{self.error:.4g} of the curve's RMS radius"), ("bars", str(self.bars))]
+        rows += [
+            ("size", format_number(self.size, "m")),
+            ("transmission angle", f"at least {np.degrees(self.transmission):.3g} deg"),
+        ]
+        rows += [("part of the turn", f"{np.degrees(np.ptp(self.values)):.4g} deg"), *self._pin_rows()]
+        return PrintedTable(f"design {self.mechanism.name}".strip(), rows)
+
+
+class CurveDesigns(PrintsTable):
+    """Different mechanisms that draw a curve, the best first: a sequence of `CurveDesign`.
+
+    Attributes:
+        found: the designs.
+        rounds: number of completed rounds; the same seed and number of rounds give the same designs.
+        candidates: number of linkages that were improved.
+        seconds: time of the search (s).
+        reason: why no design was found, and the cure; empty if there are designs.
+    """
+
+    found: tuple[CurveDesign, ...]
+    rounds: int = eqx.field(static=True)
+    candidates: int = eqx.field(static=True)
+    seconds: float = eqx.field(static=True)
+    reason: str = eqx.field(static=True, default="")
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def __getitem__(self, k: int) -> CurveDesign:
+        return self.found[k]
+
+    def __iter__(self) -> Iterator[CurveDesign]:
+        return iter(self.found)
+
+    def _table(self) -> PrintedTable:
+        rows = [("rounds", f"{self.rounds}, {self.candidates} linkages, {self.seconds:.1f} s")]
+        rows += [("nothing was found", self.reason)] if self.reason else []
+        for k, design in enumerate(self.found):
+            angle = f"{np.degrees(design.transmission):.3g} deg"
+            rows.append((str(k + 1), f"error {design.error:.4g}, {design.bars} bars, transmission angle at least {angle}"))
+        return PrintedTable(f"{len(self.found)} mechanisms for a curve", rows)
+
+
+def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str) -> CurveDesign | None:
+    """Return a linkage as a design; None if `kinematics` does not confirm its turn."""
+    mechanism = drawing_of(found.x, found.topology, wanted, name).mechanism()
+    motion = turn_of(mechanism, found.x, found.topology, wanted)
+    if motion is None:
+        return None
+    start = float(motion.values[0])
+    at = positions(found.x[None], found.topology, np.asarray(motion.values)[None] - start, 0.0)
+    joints = np.concatenate(
+        [at.origins[3::2].ravel(), at.origins[4::2].ravel(), at.ends.ravel(), at.origins[1].ravel(), at.pin.ravel()]
+    )
+    path = wanted.middle + wanted.scale * drawn(found.x, found.topology, wanted.is_whole)
+    return CurveDesign(
+        error=found.error,
+        mechanism=mechanism,
+        pin=PIN,
+        curve=as_points(path),
+        bars=2 + 2 * found.dyads,
+        size=wanted.scale * float(np.abs(joints).max()),
+        transmission=float(np.arcsin(found.sine)),
+        values=start + np.array([0.0, found.x[SPAN]]),
+        turns=True,
+        driver=only_driver(mechanism),
+    )
+
+
+def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int, worth: float) -> list[CurveDesign]:
+    """Return the best different designs by error and simplicity: each dyad more must reduce the error by the fraction `worth`."""
+    every = sorted((one for of_size in found.values() for one in of_size), key=lambda one: one.error / (1.0 - worth) ** one.dyads)
+    chosen: list[CurveDesign] = []
+    errors: list[tuple[bytes, float]] = []
+    for one in every:
+        structure = one.topology.first.tobytes() + one.topology.second.tobytes()
+        if len(chosen) == count or any(s == structure and abs(e - one.error) < 0.02 * e for s, e in errors):
+            continue
+        design = confirmed(one, wanted, f"curve {len(chosen) + 1}")
+        if design is not None:
+            chosen.append(design)
+            errors.append((structure, one.error))
+    return chosen

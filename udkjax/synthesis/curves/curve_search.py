@@ -1,0 +1,200 @@
+"""The search for linkages that draw a curve: random ones, matched, improved in lanes, and grown by dyads, in rounds."""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.synthesis.curves.descent import Descended, LinkageLimits, Task, descend, sampling
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, TAIL, Topology, positions
+from udkjax.synthesis.curves.matching import find_starts
+from udkjax.synthesis.curves.random_linkages import grown
+from udkjax.synthesis.curves.targets import WantedCurve
+from udkjax.threads import thread_count
+
+LANES = 16  # linkages of a batch: their numbers stay in the cache
+SAMPLES = 6000  # random linkages of a stage
+START_DYADS = 3  # most dyads of random linkages; with more, few random curves resemble the target
+TRIES, CHILDREN = 200, 10  # random dyads for each linkage that grows, and how many of them are improved
+BEAM, FAMILY = 10, 3  # linkages of each number of dyads that are kept and grow, and most of them from the same start
+# blur (RMS radii), steps and linkages left of each part of a stage
+OF_STARTS = ((0.2, 10, 48), (0.1, 15, 24), (0.05, 25, 8))
+OF_GROWTH = ((0.05, 12, 40), (0.03, 20, 20), (0.02, 30, 10))
+OF_FINISH = ((0.01, 30), (0.004, 40))
+FINISHED = 4  # linkages of each number of dyads that are finished after a round
+CLOSE_TO = 1e-3  # losses that differ by less, relative, in the same structure are those of the same linkage
+SLACK = 1e-3  # violation below which a descent is not in vain: it may end at a limit
+CHECKED = 1440  # angles of a turn at which limits are verified
+
+
+class Kept(NamedTuple):
+    """Linkages of the same number of dyads with their losses, and the starts from which they come."""
+
+    x: np.ndarray
+    topology: Topology
+    loss: np.ndarray
+    family: np.ndarray
+
+    def take(self, which: np.ndarray) -> "Kept":
+        """Return some of the linkages."""
+        return Kept(self.x[which], self.topology.take(which), self.loss[which], self.family[which])
+
+    def with_others(self, other: "Kept | None") -> "Kept":
+        """Return these linkages and others."""
+        if other is None:
+            return self
+        joined = [np.concatenate(pair) for pair in zip(self.topology, other.topology, strict=True)]
+        rest = [np.concatenate([getattr(self, n), getattr(other, n)]) for n in ("x", "loss", "family")]
+        return Kept(rest[0], Topology(*joined), rest[1], rest[2])
+
+    def best(self, count: int, family: int) -> "Kept":
+        """Return the best different linkages, at most `family` of them from the same start."""
+        chosen: list[int] = []
+        for k in np.argsort(self.loss, kind="stable"):
+            if not np.isfinite(self.loss[k]) or len(chosen) == count:
+                break
+            same = [j for j in chosen if self.family[j] == self.family[k]]
+            if len(same) < family and not any(abs(self.loss[j] - self.loss[k]) <= CLOSE_TO * self.loss[k] for j in same):
+                chosen.append(int(k))
+        return self.take(np.array(chosen, int))
+
+
+class FoundLinkage(NamedTuple):
+    """A linkage within the limits over the whole turn, its Chamfer distance, and its smallest sine between links of dyads."""
+
+    error: float
+    x: np.ndarray
+    topology: Topology
+    sine: float
+
+    @property
+    def dyads(self) -> int:
+        """The number of dyads that the drawing pin needs."""
+        return self.topology.dyads
+
+
+class CurveSearch:
+    """A search in rounds. All results follow from the seed and the number of stages: no decision depends on time.
+
+    Args:
+        wanted: the wanted curve.
+        limits: the limits.
+        dyads: the largest number of dyads.
+        seed: seed of all random numbers.
+        geared: the fraction of random linkages with a second crank.
+    """
+
+    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, dyads: int, seed: int, geared: float = 0.0):
+        self.wanted, self.limits, self.dyads, self.geared = wanted, limits, dyads, geared
+        self.seed, self.families, self.candidates = seed, 0, 0
+        self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), limits)
+        self.exact = Task(wanted.target(240), sampling(192, 64, wanted.is_whole), limits)
+        self.beams: dict[int, Kept] = {}
+        self.found: dict[int, list[FoundLinkage]] = {}
+        self.threads = ThreadPoolExecutor(thread_count())
+
+    def stages(self) -> Iterator[str]:
+        """Run the search, without end; yield a description of each stage when it is completed."""
+        done = 0
+        while True:
+            rng = np.random.default_rng((self.seed, done))
+            for dyads in range(1, min(START_DYADS, self.dyads) + 1):
+                self._start(dyads, rng)
+                yield f"round {done + 1}: random linkages of {2 + 2 * dyads} bars"
+            for dyads in range(1, self.dyads):
+                self._grow(dyads, rng)
+                yield f"round {done + 1}: linkages of {4 + 2 * dyads} bars"
+            for dyads in sorted(self.beams):
+                self._finish(dyads)
+            done += 1
+            yield f"round {done}: finished"
+
+    @property
+    def best(self) -> float:
+        """The smallest Chamfer distance so far; infinite before the first linkage is finished."""
+        return min((one.error for found in self.found.values() for one in found), default=np.inf)
+
+    def finish(self) -> None:
+        """Finish the best linkages of an incomplete round."""
+        for dyads in sorted(self.beams):
+            self._finish(dyads)
+
+    def _start(self, dyads: int, rng: np.random.Generator) -> None:
+        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][2], rng, self.geared)
+        family = self.families + np.arange(len(x))
+        self.families += len(x)
+        self._keep(dyads, self._improve(Kept(x, topology, np.zeros(len(x)), family), OF_STARTS))
+
+    def _grow(self, dyads: int, rng: np.random.Generator) -> None:
+        if dyads not in self.beams or not len(self.beams[dyads].x):
+            return
+        parents = self.beams[dyads]
+        x, topology = grown((parents.x, parents.topology), self.coarse.target, self.coarse.sample, TRIES, CHILDREN, rng)
+        children = Kept(x, topology, np.zeros(len(x)), np.repeat(parents.family, CHILDREN))
+        self._keep(dyads + 1, self._improve(children, OF_GROWTH))
+
+    def _keep(self, dyads: int, kept: Kept) -> None:
+        self.beams[dyads] = kept.with_others(self.beams.get(dyads)).best(BEAM, FAMILY)
+
+    def _improve(self, kept: Kept, parts: tuple[tuple[float, int, int], ...]) -> Kept:
+        for blur, steps, left in parts:
+            after = self._descend(kept.x, kept.topology, self.coarse, blur, steps)
+            loss = np.where(after.excess < SLACK, after.chamfer, np.inf if (blur, steps, left) == parts[-1] else after.loss)
+            kept = Kept(after.x, kept.topology, loss, kept.family)
+            kept = kept.take(np.argsort(loss, kind="stable")[:left])
+        return kept
+
+    def _descend(self, x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:
+        """Improve linkages in batches, on all threads."""
+        self.candidates += len(x)
+        batches = [slice(k, k + LANES) for k in range(0, len(x), LANES)]
+        results = list(self.threads.map(lambda part: descend(x[part], topology.take(part), task, blur, steps), batches))
+        return Descended(*(np.concatenate(a) for a in zip(*results, strict=True)))
+
+    def _finish(self, dyads: int) -> None:
+        kept = self.beams[dyads]
+        kept = kept.take(np.arange(min(FINISHED, len(kept.x))))
+        if not len(kept.x):
+            return
+        x = kept.x
+        for blur, steps in OF_FINISH:
+            after = self._descend(x, kept.topology, self.exact, blur, steps)
+            x = after.x
+        for k in range(len(x)):
+            one = self._verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
+            if one is not None:
+                self.found[one.dyads] = sorted([*self.found.get(one.dyads, []), one], key=lambda f: f.error)[:BEAM]
+
+    def _verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
+        """Return the linkage if it is within the limits over the whole turn."""
+        at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
+        joints = np.concatenate([at.origins[3::2], at.origins[4::2], at.ends, at.origins[1:2], at.pin[None]])
+        cosine = float(np.abs(at.cosines).max())
+        if not (cosine <= self.limits.cosine + SLACK and np.abs(joints).max() <= self.limits.size * (1 + SLACK)):
+            return None
+        return FoundLinkage(self.wanted.error(drawn(x, topology, self.wanted.is_whole)), x, topology, np.sqrt(1.0 - cosine**2))
+
+
+def drawn(x: np.ndarray, topology: Topology, is_whole: bool, count: int = 2001) -> np.ndarray:
+    """Return the drawn curve of one linkage by complex points; of a whole turn, the last one is the first."""
+    share = np.linspace(0.0, 1.0, count)
+    return positions(x[None], topology, x[None, 2:3] * share).pin[0]
+
+
+def without_idle_dyads(x: np.ndarray, topology: Topology) -> tuple[np.ndarray, Topology]:
+    """Return a linkage without the dyads that do not move the drawing pin."""
+    first, second = topology.first[0], topology.second[0]
+    needed = {topology.dyads - 1}
+    for d in range(topology.dyads - 1, -1, -1):
+        if d in needed:
+            needed |= {(link - BASE) // 2 for link in (int(first[d]), int(second[d])) if link >= BASE}
+    dyads = sorted(needed)
+    number = np.arange(BASE + 2 * topology.dyads)
+    for new, old in enumerate(dyads):
+        number[BASE + 2 * old : BASE + 2 * old + 2] = BASE + 2 * new, BASE + 2 * new + 1
+    parts = [x[:HEAD], *(x[HEAD + EACH * d : HEAD + EACH * (d + 1)] for d in dyads), x[-TAIL:]]
+    chosen = Topology(
+        number[topology.first[:, dyads]], number[topology.second[:, dyads]], topology.side[:, dyads], topology.ratio
+    )
+    return np.concatenate(parts), chosen

@@ -1,0 +1,179 @@
+"""Linkages of dyads in lanes: every position by an intersection of circles, derivatives by statics.
+
+Link 0 is the ground, link 1 the crank, link 2 a second crank that gears turn `ratio` times as fast. Dyad d adds the links
+3 + 2 d, from its joint P on one link to its joint R, and 4 + 2 d, from its joint Q on another link to R. The drawing pin is a
+point of the last dyad's first link. The frame of a link has its origin at O, P or Q, and its x axis points to R.
+
+The numbers x of a linkage are: the place of O (2), the part of the turn that draws the curve (rad), the place of the second
+crank's pin (2), for each dyad the places of P and Q on their links (4) and the lengths P-R and Q-R (2), and the place of the
+drawing pin on its link (2). Places are complex numbers.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+BASE = 3  # links without dyads
+HEAD, EACH, TAIL = 5, 6, 2  # numbers before the dyads, of each dyad, and after them
+SPAN = 2  # index of the part of the turn
+TINY = 1e-12  # keeps divisions finite where P and Q coincide; such linkages cannot be closed
+
+
+class Topology(NamedTuple):
+    """Structures of K linkages of D dyads.
+
+    Attributes:
+        first: number of the link that carries P (K, D).
+        second: number of the link that carries Q (K, D).
+        side: 1 or -1, the side of P-Q on which R is (K, D).
+        ratio: speed of the second crank relative to the first (K,).
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    side: np.ndarray
+    ratio: np.ndarray
+
+    def take(self, which: Any) -> "Topology":
+        """Return some of the linkages."""
+        return Topology(*(a[which] for a in self))
+
+    @property
+    def dyads(self) -> int:
+        """The number of dyads."""
+        return self.first.shape[1]
+
+
+class DyadPositions(NamedTuple):
+    """DyadPositions of K linkages at T angles of the crank.
+
+    Attributes:
+        origins: origins of all links (L, K, T).
+        turns: unit numbers exp(i angle) of all links (L, K, T).
+        ends: joints R (D, K, T).
+        cosines: cosines of the angles between the two links of each dyad, beyond 1 where it cannot be closed (D, K, T).
+        pin: the drawing pin (K, T).
+    """
+
+    origins: np.ndarray
+    turns: np.ndarray
+    ends: np.ndarray
+    cosines: np.ndarray
+    pin: np.ndarray
+
+
+def number_count(dyads: int) -> int:
+    """Return the number of numbers of a linkage."""
+    return HEAD + EACH * dyads + TAIL
+
+
+def _complex(x: np.ndarray, k: int) -> np.ndarray:
+    return (x[:, k] + 1j * x[:, k + 1])[:, None]
+
+
+def positions(x: np.ndarray, topology: Topology, theta: np.ndarray, least: float = 0.05) -> DyadPositions:
+    """Return the positions of linkages (K, numbers) at angles (K, T) of the crank.
+
+    Where a dyad cannot be closed, the sine of the angle between its links is replaced by `least`.
+    """
+    (K, T), D = theta.shape, topology.dyads
+    z, u = np.zeros((BASE + 2 * D, K, T), complex), np.ones((BASE + 2 * D, K, T), complex)
+    ends, cosines, lanes = np.empty((D, K, T), complex), np.empty((D, K, T)), np.arange(K)
+    z[1], z[2] = _complex(x, 0), _complex(x, 3)
+    u[1] = np.exp(1j * theta)
+    u[2] = np.exp(1j * (topology.ratio[:, None] * theta))
+    for d in range(D):
+        k = HEAD + EACH * d
+        A, B = topology.first[:, d], topology.second[:, d]
+        r1, r2 = x[:, k + 4, None], x[:, k + 5, None]
+        P = z[A, lanes] + u[A, lanes] * _complex(x, k)
+        Q = z[B, lanes] + u[B, lanes] * _complex(x, k + 2)
+        way = Q - P
+        square = np.real(way) ** 2 + np.imag(way) ** 2 + TINY
+        cosine = (r1 * r1 + r2 * r2 - square) / (2.0 * r1 * r2)
+        sine = np.sqrt(np.maximum(1.0 - cosine * cosine, least * least))
+        across = (topology.side[:, d, None] * r1 * r2) * sine / square
+        R = P + way * (0.5 + 0.5 * (r1 * r1 - r2 * r2) / square + 1j * across)
+        z[BASE + 2 * d], z[BASE + 2 * d + 1] = P, Q
+        u[BASE + 2 * d], u[BASE + 2 * d + 1] = (R - P) / r1, (R - Q) / r2
+        ends[d], cosines[d] = R, cosine
+    last = BASE + 2 * D - 2
+    return DyadPositions(z, u, ends, cosines, z[last] + u[last] * _complex(x, x.shape[1] - TAIL))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.real(a) * np.real(b) + np.imag(a) * np.imag(b)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.real(a) * np.imag(b) - np.imag(a) * np.real(b)
+
+
+def gradients(
+    x: np.ndarray,
+    topology: Topology,
+    at: DyadPositions,
+    share: np.ndarray,
+    pulls: np.ndarray,
+    pushes: np.ndarray,
+    squeeze: np.ndarray,
+) -> np.ndarray:
+    """Return derivatives (K, numbers, 3, T) of the pin's x and y, and of a third measure, with respect to all numbers.
+
+    The derivative of a point in a direction is the work of a unit force there, so that they follow from equilibrium, from the
+    last dyad to the crank.
+
+    Args:
+        x: the numbers of the linkages (K, numbers).
+        topology: their structures.
+        at: their positions.
+        share: derivative of the crank's angle with respect to the part of the turn that draws the curve (T,).
+        pulls: derivatives of the third measure with respect to the joints P and Q (2, D, K, T).
+        pushes: likewise, to the joints R (D, K, T).
+        squeeze: likewise, to the cosines (D, K, T).
+    """
+    z, u = at.origins, at.turns
+    L, K, T = z.shape
+    D, lanes = topology.dyads, np.arange(K)
+    force, moment = np.zeros((L, K, 3, T), complex), np.zeros((L, K, 3, T))
+    result = np.zeros((K, x.shape[1], 3, T))
+
+    def load(link: np.ndarray | int, point: np.ndarray, f: np.ndarray, k: int) -> None:
+        which = (link, lanes) if isinstance(link, np.ndarray) else link
+        arm, local = (point - z[which])[:, None], np.conj(f) * u[which][:, None]
+        force[which] += f
+        moment[which] += _cross(arm, f)
+        result[:, k] += np.real(local)
+        result[:, k + 1] -= np.imag(local)
+
+    unit = np.zeros((K, 3, T), complex)
+    unit[:, 0], unit[:, 1] = 1.0, 1j
+    load(L - 2, at.pin, unit, x.shape[1] - TAIL)
+    for d in range(D - 1, -1, -1):
+        k, one, two = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
+        r1, r2 = x[:, k + 4, None], x[:, k + 5, None]
+        e1, e2 = u[one][:, None], u[two][:, None]
+        P, Q, R = z[one], z[two], at.ends[d]
+        push = pushes[d]
+        force[one][:, 2] += push
+        moment[one][:, 2] += _cross(R - P, push)
+        result[:, k + 4, 2] += _dot(u[one], push)
+        sine, cosine = _cross(e1, e2), _dot(e1, e2)
+        a1, a2 = moment[one] / (r1[:, None] * sine), moment[two] / (r2[:, None] * sine)
+        g = a1 * e2 + a2 * e1
+        result[:, k + 4] -= a1 * cosine + a2
+        result[:, k + 5] += a1 + a2 * cosine
+        at_first, at_second = force[one] - g, force[two] + g
+        s, c = squeeze[d], at.cosines[d]
+        result[:, k + 4, 2] += s * (1.0 / r2 - c / r1)
+        result[:, k + 5, 2] += s * (1.0 / r1 - c / r2)
+        of_way = -s / (r1 * r2) * (Q - P)
+        at_first[:, 2] += pulls[0, d] - of_way
+        at_second[:, 2] += pulls[1, d] + of_way
+        load(topology.first[:, d], P, at_first, k)
+        load(topology.second[:, d], Q, at_second, k + 2)
+    for link, k in ((1, 0), (2, 3)):
+        result[:, k] += np.real(force[link])
+        result[:, k + 1] += np.imag(force[link])
+    result[:, SPAN] += (moment[1] + topology.ratio[:, None, None] * moment[2]) * share
+    return result

@@ -1,0 +1,116 @@
+"""Mechanisms with one motor whose pin draws a given curve."""
+
+import time
+from typing import Annotated
+
+import numpy as np
+
+from udkjax.annotations import Numbers
+from udkjax.argument_types import COUNT, NOT_NEGATIVE, NOT_NEGATIVE_COUNT
+from udkjax.progress import ProgressOption, report_progress
+from udkjax.requirements import require_choice
+from udkjax.scene.arguments import checked
+from udkjax.synthesis.curves.curve_designs import CurveDesigns, ranked
+from udkjax.synthesis.curves.curve_search import CurveSearch
+from udkjax.synthesis.curves.descent import LinkageLimits
+from udkjax.synthesis.curves.targets import CHAMFER_POINTS, WantedCurve
+
+FEWEST_BARS = 4
+SIZE = 3.0  # of a mechanism by default: largest distance of its pins from the middle of the curve, in extents of the curve
+TRANSMISSION = float(np.deg2rad(8.0))  # smallest transmission angle by default
+SHORTEST = 0.02  # smallest distance of two joints of a dyad's link, in extents of the curve
+WORTH = 0.03  # fraction by which two more bars must reduce the error to be worth it
+# Two samples of the same curve differ by a quarter of the distance of their points each way; a search ends when the rest is less.
+ENOUGH = 5e-4
+
+
+@checked
+def mechanisms_for(
+    curve: Numbers,
+    bars: Annotated[int, COUNT] = 12,
+    size: Annotated[float, NOT_NEGATIVE] | None = None,
+    results: Annotated[int, COUNT] = 5,
+    seconds: Annotated[float, NOT_NEGATIVE] = 60.0,
+    seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
+    part: str = "free",
+    transmission: Annotated[float, NOT_NEGATIVE] = TRANSMISSION,
+    rounds: Annotated[int, COUNT] | None = None,
+    progress: ProgressOption = None,
+) -> CurveDesigns:
+    """Find mechanisms with one motor and a pin that draws a curve: their structure and dimensions, without any data.
+
+    Random linkages of one to three dyads that turn are matched with the curve by shape, and the best are improved in lanes by
+    Levenberg-Marquardt steps towards a small Chamfer distance, which does not depend on the order of strokes. The best ones grow
+    by dyads, at first without a change of the curve, and are improved again, up to the number of bars.
+
+    Args:
+        curve: points (n, 2) (m), in order; the curve is closed if its ends nearly meet.
+        bars: largest number of links, with the ground; a dyad has two.
+        size: largest distance (m) of any pin from the middle of the curve, over the whole turn; by default three times the extent
+            of the curve.
+        results: largest number of designs to return.
+        seconds: time after which the search ends, with the best designs so far (s). It begins with one stage in any case, some
+            seconds, and ends earlier when the drawn curve is as near as samples of the same curve are to each other.
+        seed: seed of the random linkages. The result follows from the seed and the number of completed stages, which depends on
+            the time; give `rounds`, and enough seconds, for a result that does not.
+        part: "free": an open curve is drawn by any part of the turn; "whole": by the whole turn, forth and back.
+        transmission: smallest angle (rad) between the two links of a dyad, and between one and the other prolonged, over the
+            whole turn.
+        rounds: number of rounds after which the search ends.
+        progress: as for `sweep`: None shows progress after two seconds, False never; or a function of a `Progress`. Ctrl-C ends
+            the search with the best designs so far.
+
+    Returns:
+        `CurveDesigns`, ranked by error and simplicity. Every design turns fully, confirmed by `kinematics`.
+
+    Raises:
+        ValueError: the curve or a limit is invalid, or the limits contradict each other.
+    """
+    require_choice("part", part, ("free", "whole"))
+    wanted = WantedCurve(curve, part == "whole")
+    search = CurveSearch(wanted, _limits(wanted, size, float(transmission)), _dyads(int(bars)), int(seed))
+    begun = time.monotonic()
+    done = _run(search, float(seconds), rounds, begun, progress)
+    found = ranked(search.found, wanted, int(results), WORTH)
+    reason = "" if found else "no linkage turned within the limits: give more seconds, a larger size or a smaller transmission"
+    return CurveDesigns(tuple(found), done, search.candidates, time.monotonic() - begun, reason)
+
+
+def _run(search: CurveSearch, seconds: float, rounds: int | None, begun: float, progress: ProgressOption) -> int:
+    """Run stages until the time is over; return the number of completed rounds."""
+    done, longest, before = 0, 0.0, begun
+    enough = ENOUGH + 0.5 * search.wanted.length / CHAMFER_POINTS
+    try:
+        with report_progress(progress, seconds or None, "mechanisms_for") as report:
+            for stage in search.stages():
+                now = time.monotonic()
+                longest, before = max(longest, now - before), now
+                error = f", error {search.best:.4g}" if np.isfinite(search.best) else ""
+                report(min(now - begun, seconds), stage + error)
+                if stage.endswith("finished"):
+                    done += 1
+                    if search.best <= enough or done == rounds:
+                        return done
+                if now - begun + 2.0 * longest > seconds:
+                    break
+            search.finish()
+    except KeyboardInterrupt:
+        if not search.found:
+            search.finish()
+    return done
+
+
+def _dyads(bars: int) -> int:
+    if bars < FEWEST_BARS:
+        raise ValueError(f"bars must be at least {FEWEST_BARS}: the ground, a crank and a dyad; not {bars}")
+    return (bars - 2) // 2
+
+
+def _limits(wanted: WantedCurve, size: float | None, transmission: float) -> LinkageLimits:
+    if transmission >= np.pi / 2:
+        raise ValueError(f"transmission must be an angle below pi / 2 (rad), not {transmission:g}")
+    reach = SIZE * wanted.extent if size is None else float(size)
+    needed = wanted.scale * float(np.linalg.norm(wanted.fine, axis=1).max())
+    if reach <= needed:
+        raise ValueError(f"size must be more than {needed:g} m, the largest distance of the curve from its middle, not {reach:g}")
+    return LinkageLimits(float(np.cos(transmission)), reach / wanted.scale, SHORTEST * wanted.extent / wanted.scale)

@@ -1,0 +1,105 @@
+"""Random linkages whose crank turns.
+
+A dyad closes over the whole turn if the sum of its lengths exceeds the largest distance of P and Q, and their difference is below
+the smallest: lengths are drawn within these limits, so that no linkage is rejected because its crank cannot turn.
+"""
+
+import numpy as np
+
+from udkjax.synthesis.curves.descent import FULL_TURN, Sampling
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, TAIL, Topology, number_count, positions
+from udkjax.synthesis.curves.targets import CurveTarget
+
+TURN_VALUES = 72  # angles of the crank over a turn
+RATIOS = (1.0, -1.0, 2.0, -2.0, 3.0, -3.0)  # speeds of a second crank
+Linkages = tuple[np.ndarray, Topology]
+
+
+def turn_angles(K: int) -> np.ndarray:
+    """Return the angles (K, 72) of a turn."""
+    return np.broadcast_to(np.arange(TURN_VALUES) * (FULL_TURN / TURN_VALUES), (K, TURN_VALUES))
+
+
+def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: float = 0.0) -> Linkages:
+    """Return K random linkages with cranks of about unit length; a fraction `geared` of them has a second crank."""
+    x = np.zeros((K, number_count(dyads)))
+    x[:, SPAN] = FULL_TURN
+    has_gears = rng.random(K) < geared
+    first, second = np.ones((K, dyads), int), np.zeros((K, dyads), int)
+    topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)), np.where(has_gears, rng.choice(RATIOS, K), 1.0))
+    second[:, 0] = np.where(has_gears, 2, 0)
+    x[:, HEAD] = np.exp(rng.normal(0.0, 0.3, K))
+    far, towards = np.exp(rng.normal(0.7, 0.5, K)), np.exp(1j * rng.uniform(0.0, FULL_TURN, K))
+    pivot = np.where(has_gears, 0.4, 1.0) * far * towards
+    x[:, HEAD + 2], x[:, HEAD + 3] = np.real(pivot), np.imag(pivot)
+    x[:, 3:5] = rng.normal(0.0, 2.0, (K, 2))
+    for d in range(dyads):
+        k, links = HEAD + EACH * d, BASE + 2 * d
+        if d:
+            likely = np.array([1.0, 0.5, 0.0, *[1.0] * (2 * d - 2), 2.0, 2.0])  # rather the last links: deeper linkages
+            A, B = rng.choice(links, (2, K), p=likely / likely.sum())
+            A = np.where(A == B, np.where(links - 2 == B, links - 1, links - 2), A)
+            first[:, d], second[:, d] = A, B
+            x[:, k : k + 2], x[:, k + 2 : k + 4] = random_places(x, A, rng), random_places(x, B, rng)
+        x[:, k + 4 : k + 6] = closing_lengths(x, topology, turn_angles(K), d, rng)
+    length = x[:, -TAIL - 2]
+    x[:, -2], x[:, -1] = rng.uniform(-1.0, 2.0, K) * length, rng.normal(0.0, 1.0, K) * length
+    return x, topology
+
+
+def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int, rng: np.random.Generator) -> np.ndarray:
+    """Return random lengths (K, 2) of dyad d, with which it closes at all angles (K, T) of the crank."""
+    k = HEAD + EACH * (d + 1)
+    known = np.concatenate([x[:, :k], x[:, -TAIL:]], 1)
+    known[:, k - 2 : k] = 1.0
+    part = Topology(topology.first[:, : d + 1], topology.second[:, : d + 1], topology.side[:, : d + 1], topology.ratio)
+    at = positions(known, part, theta)
+    distance = np.abs(at.origins[-1] - at.origins[-2])
+    far, near = distance.max(1), distance.min(1)
+    total = far * (1.03 + rng.exponential(0.5, len(far)))
+    difference = near * rng.uniform(-0.97, 0.97, len(far))
+    return np.stack([0.5 * (total + difference), 0.5 * (total - difference)], 1)
+
+
+def random_places(x: np.ndarray, link: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a random place (K, 2) on a link of each linkage, in its frame."""
+    K = len(x)
+    dyad, other = np.divmod(np.maximum(link - BASE, 0), 2)
+    length = x[np.arange(K), np.minimum(HEAD + EACH * dyad + 4 + other, x.shape[1] - 1)]
+    between = np.stack([rng.uniform(-0.6, 1.6, K) * length, rng.normal(0.0, 0.5, K) * length], 1)
+    about = rng.normal(0.0, np.where(link == 0, 2.0, 0.8)[:, None], (K, 2))
+    return np.where((link >= BASE)[:, None], between, about)
+
+
+def grown(linkages: Linkages, target: CurveTarget, sample: Sampling, tries: int, keep: int, rng: np.random.Generator) -> Linkages:
+    """Return `keep` linkages with one more dyad for each of the given ones, the best of `tries`.
+
+    The P of the new dyad is the old drawing pin, so that with the new pin at P the curve is the old one; the place of the new pin
+    on the new link follows by least squares from the nearest points of curve and target.
+    """
+    x, topology = linkages
+    (K, D), n = topology.first.shape, len(x) * tries
+    parent, links = np.repeat(np.arange(K), tries), BASE + 2 * D
+    x, topology = x[parent], topology.take(parent)
+    A = np.full(n, links - 2)
+    B = rng.integers(0, links - 2, n)
+    B = np.where(B == 2, links - 1, B)
+    B = np.where(rng.random(n) < 0.3, 0, B)
+    k = HEAD + EACH * D
+    y = np.concatenate([x[:, :k], x[:, -TAIL:], random_places(x, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
+    side = rng.choice([-1.0, 1.0], (n, 1))
+    first, second, sides = (np.concatenate(pair, 1) for pair in zip(topology[:3], (A[:, None], B[:, None], side), strict=True))
+    new = Topology(first, second, sides, topology.ratio)
+    theta = sample.angles(y)
+    y[:, k + 4 : k + 6] = closing_lengths(y, new, theta, D, rng)
+    at = positions(y, new, theta)
+    c, u, rows = at.pin[:, : sample.drawing], at.turns[-2][:, : sample.drawing], np.arange(n)[:, None]
+    distance = np.abs(c[::tries, :, None] - target.points)
+    near, nearest = distance.argmin(2)[parent], distance.argmin(1)[parent]
+    one, two = target.points[near] - c, target.points - c[rows, nearest]
+    on_one, on_two = u, u[rows, nearest]
+    p = 0.5 * ((np.conj(on_one) * one).mean(1) + (np.conj(on_two) * two).mean(1))
+    y[:, -2], y[:, -1] = np.real(p), np.imag(p)
+    left = (np.abs(one - p[:, None] * on_one) ** 2).mean(1) + (np.abs(two - p[:, None] * on_two) ** 2).mean(1)
+    best = np.argsort(left.reshape(K, tries), 1, kind="stable")[:, :keep] + np.arange(K)[:, None] * tries
+    return y[best.ravel()], new.take(best.ravel())

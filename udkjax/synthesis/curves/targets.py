@@ -1,0 +1,110 @@
+"""The wanted curve, resampled at equal arc lengths, and the Chamfer distance of other curves from it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from udkjax.requirements import require_finite
+
+CHAMFER_POINTS = 2000  # points of each curve by which distances are measured
+FEWEST = 3  # points of a curve
+CLOSED = 0.02  # a curve whose ends are nearer, relative to its length, is closed
+
+
+def read_curve(curve: object) -> np.ndarray:
+    """Return the points (n, 2) of a curve (m) without repetitions.
+
+    Raises:
+        ValueError: they are not finite points, there are fewer than three, or all coincide.
+    """
+    require_finite("curve", curve)
+    points = np.asarray(curve, float)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"curve must have the shape (n, 2), one row x, y for each point, not {points.shape}")
+    if len(points) < FEWEST:
+        raise ValueError(f"curve must have at least {FEWEST} points, not {len(points)}")
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if not size > 4 * np.finfo(float).eps * np.abs(points).max():
+        raise ValueError("curve has no size: all of its points coincide")
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return points[np.concatenate([[True], step > np.finfo(float).eps * size])]
+
+
+def closes(points: np.ndarray) -> bool:
+    """Return True if the ends of a curve nearly meet."""
+    length = float(np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    return float(np.linalg.norm(points[0] - points[-1])) <= CLOSED * length
+
+
+def resampled(points: np.ndarray, count: int, is_closed: bool = False) -> np.ndarray:
+    """Return complex points (count,) at equal arc lengths along a polyline (n, 2); a closed one ends before its first point."""
+    if is_closed:
+        points = np.concatenate([points, points[:1]])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = np.linspace(0.0, way[-1], count + is_closed)[:count]
+    return np.interp(at, way, points[:, 0]) + 1j * np.interp(at, way, points[:, 1])
+
+
+def as_points(z: np.ndarray) -> np.ndarray:
+    """Return complex numbers (n,) as points (n, 2)."""
+    return np.stack([np.real(z), np.imag(z)], 1)
+
+
+def chamfer(curve: np.ndarray, target: np.ndarray) -> float:
+    """Return the Chamfer distance of two sets of points (n, 2).
+
+    It is the mean distance of the points of each set from the nearest point of the other, the sum for both.
+    """
+    return float(cKDTree(target).query(curve)[0].mean() + cKDTree(curve).query(target)[0].mean())
+
+
+class CurveTarget(NamedTuple):
+    """A wanted curve as a search sees it: centred, and scaled to an RMS radius of 1.
+
+    Attributes:
+        points: complex points at equal arc lengths (M,).
+        normals: complex unit normals at these points (M,).
+        spread: half of the distance of neighbours.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    spread: float
+
+
+class WantedCurve:
+    """A wanted curve in metres, and its normalized forms.
+
+    Args:
+        curve: points (n, 2) (m).
+        whole: whether the whole turn of the crank draws it, even if it is open.
+    """
+
+    def __init__(self, curve: object, whole: bool = False):
+        given = read_curve(curve)
+        self.is_closed = closes(given)
+        self.is_whole = self.is_closed or whole
+        z = resampled(given, CHAMFER_POINTS, self.is_closed)
+        self.middle = complex(z.mean())
+        self.scale = float(np.sqrt(np.mean(np.abs(z - self.middle) ** 2)))
+        self.extent = float(np.linalg.norm(np.ptp(given, axis=0)))
+        self.points = (given - as_points(np.array([self.middle]))) / self.scale
+        self.fine = as_points(resampled(self.points, CHAMFER_POINTS, self.is_closed))
+        self.length = float(np.abs(np.diff(resampled(self.points, CHAMFER_POINTS + 1))).sum())
+
+    def target(self, count: int) -> CurveTarget:
+        """Return the curve by `count` points."""
+        z = resampled(self.points, count, self.is_closed)
+        following, previous = np.roll(z, -1), np.roll(z, 1)
+        if not self.is_closed:
+            following[-1], previous[0] = z[-1], z[0]
+        chord = following - previous
+        chord = np.where(np.abs(chord) < 1e-9, following - z, chord)  # where the curve turns back
+        chord = np.where(np.abs(chord) < 1e-12, 1.0, chord)
+        return CurveTarget(z, 1j * chord / np.abs(chord), 0.5 * self.length / count)
+
+    def error(self, pin: np.ndarray) -> float:
+        """Return the Chamfer distance of a path (complex, normalized), of which whole turns are closed, from the curve."""
+        path = as_points(pin)
+        return chamfer(as_points(resampled(path, CHAMFER_POINTS, self.is_whole)), self.fine)
