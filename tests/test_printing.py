@@ -92,7 +92,7 @@ def objects() -> dict[str, object]:
 
 # In tests/study: they take a fit or a search, or are made within one.
 ELSEWHERE = {"Estimate", "GradientCheck", "Design", "Designs", "FoundDesign", "DesignSearch", "MotionPoint"}
-ELSEWHERE |= {"CompleteDesign", "CompleteDesigns"}
+ELSEWHERE |= {"CompleteDesign", "CompleteDesigns", "CurveDesign", "CurveDesigns"}
 ELSEWHERE |= {"SystemDiagnosis", "ConstraintState", "Posterior"}
 ABSTRACT = {"Constraint", "Joint", "RollingJoint", "Motion", "ForceElement"}
 ABSTRACT |= {"MatrixPseudoinverse", "PointwiseFormulation", "Stabilization"}

@@ -146,4 +146,4 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
 }
 # Public functions that take no model: they make parts of drawings, or choices of other functions, which rows above use.
 WITHOUT_MODEL = {"circles": "drawn", "polar": "drawn", "on_line": "drawings", "on_rail": "drawings", "stacked": "drawings"}
-WITHOUT_MODEL |= {"length": "Parameter"}
+WITHOUT_MODEL |= {"length": "Parameter", "mechanisms_for": "drawings"}
