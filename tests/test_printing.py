@@ -93,7 +93,7 @@ def objects() -> dict[str, object]:
 # In tests/study: they take a fit or a search, or are made within one.
 ELSEWHERE = {"Estimate", "GradientCheck", "Design", "Designs", "FoundDesign", "DesignSearch", "MotionPoint"}
 ELSEWHERE |= {"CompleteDesign", "CompleteDesigns", "CurveDesign", "CurveDesigns"}
-ELSEWHERE |= {"SystemDiagnosis", "ConstraintState", "Posterior"}
+ELSEWHERE |= {"SystemDiagnosis", "ConstraintState", "Posterior", "Comparison"}
 ABSTRACT = {"Constraint", "Joint", "RollingJoint", "Motion", "ForceElement"}
 ABSTRACT |= {"MatrixPseudoinverse", "PointwiseFormulation", "Stabilization"}
 RESULTS = "Mechanism Solution State Check Analysis Energy Kinematics Travel Equilibrium Modes Events PowerBalance InverseDynamics"

@@ -146,7 +146,9 @@ from udkjax.statics.modes import modes as modes
 from udkjax.statics.reaction_peaks import envelope as envelope
 from udkjax.statics.reaction_peaks import pin_reactions as pin_reactions
 from udkjax.statics.reaction_peaks import reaction_peaks as reaction_peaks
+from udkjax.study.belief import Comparison as Comparison
 from udkjax.study.belief import Posterior as Posterior
+from udkjax.study.belief import compare as compare
 from udkjax.study.belief import inference as inference
 from udkjax.study.belief import sample as sample
 from udkjax.study.channel_values import path as path

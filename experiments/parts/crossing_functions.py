@@ -126,6 +126,7 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "design_experiment": {"": studies.design_experiment},
     "inference": {"": studies.inference},
     "sample": {"": studies.sample},
+    "compare": {"": studies.compare},
     "tolerances": {"": studies.tolerances},
     "sweep": {"": studies.sweep, "names": studies.sweep_names},
     "design": {"": studies.design},

@@ -27,7 +27,7 @@ OTHERS = {
         State Coordinate Effort ConstraintState""",
     "results": """Result Solution Events Characteristics Reached Kinematics Travel MotionRanges PinMotion BatchPositions Workspace
         PositionBatch Animation Equilibrium HoldingEfforts Modes Diagnosis SystemDiagnosis Explanation Estimate GradientCheck
-        Posterior InverseDynamics PowerBalance Design Designs DesignSearch FoundDesign MotionPoint CompleteDesign
+        Posterior Comparison InverseDynamics PowerBalance Design Designs DesignSearch FoundDesign MotionPoint CompleteDesign
         CompleteDesigns CurveDesign CurveDesigns ToleranceAnalysis WorkedSolution""",
     "errors": "SimulationError AssemblyError SceneError IdentificationError SweepError",
     "studies": """Candidate Parameter Quantity Record Start Axis LatinHypercube Random Sobol Zipped EnergyGoal FrequencyGoal

@@ -4,7 +4,9 @@ from udkjax.study.accuracy import Accuracy as Accuracy
 from udkjax.study.accuracy import accuracy as accuracy
 from udkjax.study.accuracy import conserves_energy as conserves_energy
 from udkjax.study.accuracy import largest_violation as largest_violation
+from udkjax.study.belief import Comparison as Comparison
 from udkjax.study.belief import Posterior as Posterior
+from udkjax.study.belief import compare as compare
 from udkjax.study.belief import inference as inference
 from udkjax.study.belief import sample as sample
 from udkjax.study.channel_values import measure as measure

@@ -105,6 +105,22 @@ def test_sums_of_many_residuals_are_those_of_numpy(samples, members):
     assert_allclose(jax.jit(jax.vmap(lambda x: jnp.sum(problem.log_likelihoods(x))))(x), each.sum(1), rtol=1e-10)
 
 
+def test_other_measured_values_share_programs(problem):
+    """Also where the values are traced, and together with derivatives."""
+    x, values = points(problem, count=1)[0], problem.fit_problem.measured + 0.01
+    other = problem.with_measured(values)
+    both = jax.jit(jax.vmap(lambda y: jax.value_and_grad(problem.with_measured(y).log_density)(x)))
+    found, slopes = both(np.stack([problem.fit_problem.measured, values]))
+    assert_allclose(found, [problem.log_densities(x[None])[0], other.log_densities(x[None])[0]], rtol=1e-10)
+    assert_allclose(slopes[1], jax.jit(jax.grad(other.log_density))(x), rtol=1e-10)
+    assert other.programs is problem.programs and abs(found[1] - found[0]) > 1.0
+    count = problem.programs["densities"]._cache_size()
+    problem.with_measured(values + 0.01).log_densities(x[None])
+    assert problem.programs["densities"]._cache_size() == count
+    with pytest.raises(udk.IdentificationError, match="one number for each measured value"):
+        problem.with_measured(values[1:])
+
+
 def test_records_with_different_conditions_go_in_lanes():
     stiff = {"force.spring.stiffness": 5.0}
     both = udk.inference(pendulum(0.4), [record(ts=TS[:9]), record(ts=TS[:9], conditions=stiff)], NAMES[:1])

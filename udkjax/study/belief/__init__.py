@@ -4,8 +4,11 @@ inference   the public function that returns the density
 chains      Hamiltonian Monte Carlo: chunks of draws of all chains, and their tuning
 sampling    the public function that draws, `sample`, with its store
 posterior   the draws, their summary, and the data for ArviZ
+comparison  the public function that compares models, `compare`
 """
 
+from udkjax.study.belief.comparison import Comparison as Comparison
+from udkjax.study.belief.comparison import compare as compare
 from udkjax.study.belief.inference import inference as inference
 from udkjax.study.belief.posterior import Posterior as Posterior
 from udkjax.study.belief.sampling import sample as sample

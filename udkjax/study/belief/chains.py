@@ -10,6 +10,7 @@ R. M. Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carl
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -98,16 +99,16 @@ def first_state(positions: Float[np.ndarray, "C K"]) -> ChainState:
     return ChainState(positions, np.full(len(positions), -np.inf), np.zeros(positions.shape))
 
 
-def compile_draws(
-    problem: InferenceProblem, coordinates: ChainCoordinates
-) -> Callable[[Any, Tuning, ChainState], tuple[ChainState, dict[str, Array]]]:
-    """Return a compiled function of a key, the tuning and the state of chains that returns their next state, and draws."""
+def compile_draws(problem: InferenceProblem) -> Callable[..., tuple[ChainState, dict[str, Array]]]:
+    """Return a compiled function of coordinates, a key, the tuning and the state of chains; it returns their next state, and draws."""
     with OptionalImport():
         from blackjax.mcmc import hmc
     kernel = hmc.build_kernel()
-    density = lambda w: problem.log_density(coordinates.x(w, jnp)) + coordinates.log_slope(w)  # noqa: E731
 
-    def draw(tuning: Tuning, state: Any, key: Array) -> tuple[Any, dict[str, Array]]:
+    def draw(
+        problem: InferenceProblem, coordinates: ChainCoordinates, tuning: Tuning, state: Any, key: Array
+    ) -> tuple[Any, dict[str, Array]]:
+        density = lambda w: problem.log_density(coordinates.x(w, jnp)) + coordinates.log_slope(w)  # noqa: E731
         of_length, of_step, of_chains = jax.random.split(key, 3)
         step = tuning.step * jax.random.uniform(of_step, minval=STEP_FACTORS[0], maxval=STEP_FACTORS[1])
         length = LENGTH * jax.random.uniform(of_length, minval=LENGTHS[0], maxval=LENGTHS[1])
@@ -123,13 +124,14 @@ def compile_draws(
         }
         return state, found | {"divergent": info.is_divergent & ~failed, "steps": steps}
 
-    def chunk(key: Array, tuning: Tuning, state: ChainState) -> tuple[ChainState, dict[str, Array]]:
-        end, found = jax.lax.scan(
-            lambda s, k: draw(tuning, s, k), hmc.HMCState(*map(jnp.asarray, state)), jax.random.split(key, DRAWS)
-        )
+    def chunk(
+        problem: InferenceProblem, coordinates: ChainCoordinates, key: Array, tuning: Tuning, state: ChainState
+    ) -> tuple[ChainState, dict[str, Array]]:
+        begin, one = hmc.HMCState(*map(jnp.asarray, state)), partial(draw, problem, coordinates, tuning)
+        end, found = jax.lax.scan(one, begin, jax.random.split(key, DRAWS))
         return ChainState(*end), found
 
-    return jax.jit(chunk)
+    return problem.compiled("draws", chunk)
 
 
 def tuned(first: Tuning, warmup: Sequence[DrawChunk]) -> Tuning:

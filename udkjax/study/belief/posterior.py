@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -165,8 +165,8 @@ class Posterior:
 
     def _pointwise(self) -> tuple[np.ndarray, np.ndarray]:
         """Return log likelihoods and predictions (C, draws, R) of measured values."""
-        problem = self.problem
-        one = jax.jit(jax.vmap(lambda x: (problem.log_likelihoods(x), problem.predicted(x))))
+        both = lambda problem, x: (problem.log_likelihoods(x), problem.predicted(x))  # noqa: E731
+        one = self.problem.compiled("pointwise", lambda problem, x: jax.vmap(partial(both, problem))(x))
         parts = [jax.tree.map(np.asarray, one(x)) for x in self.x]
         likelihoods, predicted = zip(*parts, strict=True)
         return np.stack(likelihoods), np.stack(predicted)

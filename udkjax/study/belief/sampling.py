@@ -94,13 +94,13 @@ def sample(
         coordinates = coordinates_of(problem, start["mode"], start["covariance"])
         w = coordinates.w(start["x"])
         begin = tuning = Tuning(FIRST_STEP, np.cov(w.T).reshape(len(w.T), -1))
-        state, compute = first_state(w[:chains]), compile_draws(problem, coordinates)
+        state, compute = first_state(w[:chains]), compile_draws(problem)
         try:
             with report_progress(progress, total * DRAWS, "sample") as report, computing_on_host():
                 for k in range(1, total + 1):
                     if k not in stored:
                         key = jax.random.fold_in(jax.random.key(seed), k)
-                        state, found = jax.tree.map(np.asarray, compute(key, tuning, state))
+                        state, found = jax.tree.map(np.asarray, compute(coordinates, key, tuning, state))
                         stored_state = {name: getattr(state, name) for name in STATE}
                         done.append(finished(k, {**found, **stored_state}))
                     else:

@@ -1,6 +1,7 @@
 """The normal approximation of a posterior density at its mode, in the unconstrained vector.
 
-The curvature is that of Gauss and Newton, J^T J of the weighted residuals, with the exact one of the prior. Importance weights,
+The curvature is that of Gauss and Newton, J^T J of the weighted residuals, with the exact one of the prior and of the transforms
+where it is positive. Importance weights,
 the ratios of the density to the approximation at draws of the approximation, show whether it may be trusted: the exponent k of a
 generalized Pareto distribution of the largest weights is below 1 - 1 / log10(S) for S draws.
 A. Vehtari et al., Pareto smoothed importance sampling, Journal of Machine Learning Research 25 (2024) 72; the estimate of k:
@@ -110,7 +111,15 @@ def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int 
         else:
             break
     _require_noise(problem, x)
-    root = _root(problem, curvature)
+    return weigh(problem, x, _root(problem, curvature), seed)
+
+
+def weigh(problem: InferenceProblem, x: Float[np.ndarray, "K"], root: Float[np.ndarray, "K K"], seed: int = 0) -> Laplace:
+    """Compare a density with a normal one of this center and root of its covariance, by importance weights.
+
+    Raises:
+        IdentificationError: the density is zero at the center.
+    """
     normal = np.random.default_rng(int(seed)).standard_normal((DRAWS, len(x)))
     trials = x + normal @ root.T
     densities = np.asarray(problem.log_densities(np.concatenate([x[None], trials])))
@@ -141,7 +150,7 @@ def expand(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> tuple[float,
     least_squares = problem.fit_problem
     K, rows = least_squares.K, len(least_squares.index)
     prior, gradient, second = (np.array(part, float) for part in problem.prior_curvature(x))
-    curvature = -second
+    curvature, prior_gradient = -second, gradient.copy()
     blocks = list(least_squares.row_blocks(x[None, :K], problem.tol))
     if not all(block.ok[0] for block in blocks) or not np.isfinite(prior):
         return -np.inf, gradient, curvature
@@ -160,6 +169,10 @@ def expand(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> tuple[float,
             curvature[K + g, K + g] += 2.0 * r @ r
             curvature[:K, K + g] -= 2.0 * J.T @ r
             curvature[K + g, :K] -= 2.0 * J.T @ r
+    # Second derivatives of the transforms: of a number near zero, whose logarithm is the unknown, nearly all of the curvature.
+    u, z = least_squares.unknowns, x[: len(least_squares.unknowns.names)]
+    bend = -(gradient - prior_gradient)[: len(z)] * u.d2x_dz2(z) / np.maximum(u.dx_dz(z), np.finfo(float).tiny)
+    curvature[np.arange(len(z)), np.arange(len(z))] += np.maximum(bend, 0.0)
     return float(value), gradient, curvature
 
 

@@ -9,8 +9,9 @@ The transforms are those of `identify`: a positive number is the exponential of 
 dx/dz is their Jacobian, so that priors are densities of the numbers themselves.
 """
 
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from copy import copy
+from functools import partial
 from typing import Any
 
 import jax
@@ -70,9 +71,8 @@ class InferenceProblem:
         self.max_steps = int(problem.settings.get("max_steps", MOST_STEPS * steps))
         settings = {**problem.settings, "max_steps": self.max_steps}
         self.predictor = Predictor(problem.mechanism, problem.unknowns.targets, problem.channels, settings)
-        self._density = jax.custom_jvp(self._log_density)
-        self._density.defjvp(self._slope)
         self._require_support()
+        self.programs: dict[str, Any] = {}  # compiled functions, which copies for other measured values share
 
     def _scale_noise(self, z: np.ndarray) -> int:
         """Set the standard deviations of noise that is not given to those of the residuals at z; return the steps of a run."""
@@ -116,7 +116,24 @@ class InferenceProblem:
             x: the unconstrained vector (K,): zero at the start; a positive number is its start times exp(x), a bounded one a
                 logistic function, others their start plus a scale times x. The Jacobian of these transforms is included.
         """
-        return self._density(jnp.asarray(x, float))
+        density = jax.custom_jvp(self._log_density)
+        density.defjvp(self._slope)
+        return density(jnp.asarray(x, float))
+
+    def with_measured(self, measured: Float[Array, "R"] | Numbers) -> "InferenceProblem":
+        """Return the density for other measured values, in the order of record, time and channel, as of a repeated experiment.
+
+        It starts from the same numbers, and shares compiled functions. The values may be traced by JAX.
+        """
+        other = copy(self)
+        other.fit_problem = copy(self.fit_problem)
+        wanted, values = self.fit_problem.measured.shape, measured if isinstance(measured, Array) else np.asarray(measured, float)
+        if values.shape != wanted:
+            raise IdentificationError(
+                [f"measured: must be of shape {wanted}, one number for each measured value, not {values.shape}"]
+            )
+        other.fit_problem.measured = values
+        return other
 
     def log_prior(self, x: Float[Array, "K"] | Numbers) -> Float[Array, ""]:
         """Return the part of `log_density` that does not depend on the records, including the Jacobian of the transforms."""
@@ -158,16 +175,24 @@ class InferenceProblem:
         value, slopes = jax.value_and_grad(self._log_density)(primals[0])
         return value, jnp.dot(jnp.where(jnp.isfinite(value), slopes, 0.0), tangents[0])
 
-    @cached_property
-    def prior_curvature(self) -> Any:
-        """A compiled function that returns `log_prior`, its gradient and its second derivatives."""
-        gradient = jax.grad(self.log_prior)
-        return jax.jit(lambda x: (self.log_prior(x), gradient(x), jax.jacfwd(gradient)(x)))
+    def prior_curvature(self, x: Float[Array, "K"] | Numbers) -> tuple[Array, Array, Array]:
+        """Return `log_prior`, its gradient and its second derivatives, by a compiled function."""
 
-    @cached_property
-    def log_densities(self) -> Any:
-        """A compiled function that returns `log_density` of several vectors (B, K)."""
-        return jax.jit(jax.vmap(self.log_density))
+        def curvature(problem: "InferenceProblem", x: Array) -> tuple[Array, Array, Array]:
+            gradient = jax.grad(problem.log_prior)
+            return problem.log_prior(x), gradient(x), jax.jacfwd(gradient)(x)
+
+        return self.compiled("prior", curvature)(x)
+
+    def log_densities(self, x: Float[Array, "B K"] | Numbers) -> Float[Array, "B"]:
+        """Return `log_density` of several vectors (B, K), by a compiled function."""
+        return self.compiled("densities", lambda problem, x: jax.vmap(problem.log_density)(x))(x)
+
+    def compiled(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of a problem and other arguments, compiled for this problem and others with its `programs`."""
+        if name not in self.programs:
+            self.programs[name] = jax.jit(lambda measured, *args: function(self.with_measured(measured), *args))
+        return partial(self.programs[name], self.fit_problem.measured)
 
 
 def _all_unknowns(problem: FitProblem, scales: Mapping[str, tuple[float, int]]) -> Unknowns:
