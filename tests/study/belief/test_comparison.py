@@ -112,7 +112,7 @@ def swinging(law: str, viscous: float = 0.1, dry: float = 0.2) -> udk.Mechanism:
 
 @pytest.mark.slow
 def test_the_right_law_of_friction_is_found():
-    """Of data with each law, and four seeds; all problems share compiled programs."""
+    """Four data sets of each law are compared; all problems share compiled programs."""
     inertia, right = {"body.rod.inertia": (0.375, 0.1)}, 0
     start = udk.Record(SECONDS, {ANGLE: np.zeros(len(SECONDS))}, SIGMA)
     problems = {

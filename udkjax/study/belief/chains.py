@@ -100,7 +100,7 @@ def first_state(positions: Float[np.ndarray, "C K"]) -> ChainState:
 
 
 def compile_draws(problem: InferenceProblem) -> Callable[..., tuple[ChainState, dict[str, Array]]]:
-    """Return a compiled function of coordinates, a key, the tuning and the state of chains; it returns their next state, and draws."""
+    """Return a compiled function of coordinates, a key, the tuning and the state; it returns the next state, and draws."""
     with OptionalImport():
         from blackjax.mcmc import hmc
     kernel = hmc.build_kernel()

@@ -27,10 +27,11 @@ from udkjax.study.identify.records.records import IdentificationError
 from udkjax.wording import join_names, quote
 
 DRAWS = 1024  # largest number of draws from which the prediction of each value is computed
+EQUAL = np.log(2.0)  # weights with a smaller log ratio of the largest to the mean have a reliable mean, whatever their tail
 DECIDED = 0.95  # probability from which a model counts as the right one
 LEAST_ERRORS = 2.0  # number of standard errors from which two predictions differ
 
-Model: TypeAlias = InferenceProblem | Estimate | Laplace | Posterior
+ComparedModel: TypeAlias = InferenceProblem | Estimate | Laplace | Posterior
 Score: TypeAlias = Literal["evidence", "loo"]
 
 MODELS = ArgumentRequirement(
@@ -96,7 +97,7 @@ class Comparison(NamedTuple):
 
 @checked
 @concrete_only()
-def compare(models: Annotated[Mapping[str, Model], MODELS], by: Score = "evidence") -> Comparison:
+def compare(models: Annotated[Mapping[str, ComparedModel], MODELS], by: Score = "evidence") -> Comparison:
     """Compare models of the same records, by their evidence or by leaving out each measured value.
 
     Args:
@@ -131,7 +132,7 @@ def compare(models: Annotated[Mapping[str, Model], MODELS], by: Score = "evidenc
     return Comparison(by, tuple(list(found)[k] for k in order), *(column[order] for column in columns))
 
 
-def _with_draws(model: Model) -> Laplace | Posterior:
+def _with_draws(model: ComparedModel) -> Laplace | Posterior:
     if isinstance(model, InferenceProblem):
         return approximate(model, model.start)
     return model.laplace() if isinstance(model, Estimate) else model
@@ -179,7 +180,8 @@ def _left_out(model: Laplace | Posterior) -> tuple[Float[np.ndarray, "R"], float
     likelihoods = np.asarray(compiled(x)).T
     inverse = weights - np.where(np.isfinite(weights), likelihoods, 0.0)
     each = np.logaddexp.reduce(np.broadcast_to(weights, len(x))) - np.logaddexp.reduce(inverse, axis=1)
-    return each, max(map(pareto_exponent, inverse))
+    rest = inverse[inverse.max(1) > np.logaddexp.reduce(inverse, axis=1) - np.log(len(x)) + EQUAL]
+    return each, max(map(pareto_exponent, rest), default=-np.inf)
 
 
 def _error_of_sum(each: Float[np.ndarray, "N R"]) -> Float[np.ndarray, "N"]:
