@@ -90,9 +90,9 @@ def objects() -> dict[str, object]:
     return {type(one).__name__: one for one in found}
 
 
-# In tests/study: they take a fit or a search, or are made within one.
+# In tests/study: they take a fit or a search, are made within one, or print each line of a solution.
 ELSEWHERE = {"Estimate", "GradientCheck", "Design", "Designs", "FoundDesign", "DesignSearch", "MotionPoint"}
-ELSEWHERE |= {"CompleteDesign", "CompleteDesigns", "CurveDesign", "CurveDesigns"}
+ELSEWHERE |= {"CompleteDesign", "CompleteDesigns", "CurveDesign", "CurveDesigns", "WorkedSolution"}
 ELSEWHERE |= {"SystemDiagnosis", "ConstraintState", "Posterior", "Comparison"}
 ABSTRACT = {"Constraint", "Joint", "RollingJoint", "Motion", "ForceElement"}
 ABSTRACT |= {"MatrixPseudoinverse", "PointwiseFormulation", "Stabilization"}
