@@ -29,3 +29,17 @@ def test_a_reversal_that_tolerances_show_is_found():
     tight = udk.simulate(creeping(2e3), [0.0, 0.8], rtol=1e-10, atol=1e-10)
     assert tight.events is not None and [tight.events.names[int(k)] for k in tight.events.index] == ["guide turns round"]
     assert float(tight.v[-1, 0, 0]) < 0.0
+
+
+def test_joints_that_turn_round_together_are_all_listed():
+    """A motor turns a crank back: all joints of the linkage stop at that instant, whatever the tolerance."""
+    linkage = udk.library.four_bar(angle=1.2)
+    names = list(linkage.joints)
+    motor = udk.Driver(("ground", "crank"), "angle", udk.Sine(0.3, np.pi, offset=1.2))
+    rubs = {f"friction {name}": udk.Friction(name, radius=0.01, coefficient=0.1, law="set-valued") for name in names}
+    driven = udk.Mechanism(linkage.bodies, linkage.joints, {"motor": motor}, rubs)
+    for tol in (1e-6, 1e-9, 1e-11):
+        run = udk.simulate(driven, [0.0, 1.0], rtol=tol, atol=tol)
+        assert run.events is not None
+        assert sorted(run.events.names[int(k)] for k in run.events.index) == sorted(f"{name} turns round" for name in names)
+        np.testing.assert_allclose(run.events.time, 0.5, atol=1e-6)

@@ -69,7 +69,7 @@ def test_machine_code_passes_events_as_the_loop_does(case, monkeypatch):
         found, calls, _ = counted(context, run)
     by_the_loop(monkeypatch)
     expected, more_calls, _ = counted(monkeypatch, run)
-    assert calls <= most_calls and more_calls >= int(expected.events.count)
+    assert calls <= most_calls and more_calls >= len(np.unique(expected.events.time))
     np.testing.assert_array_equal(found.events.index, expected.events.index)
     np.testing.assert_allclose(found.events.time, expected.events.time, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.q, expected.q, atol=1e-8)

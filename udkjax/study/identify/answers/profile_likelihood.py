@@ -39,14 +39,24 @@ FitOthers: TypeAlias = Callable[[int, float, np.ndarray], tuple[np.ndarray, floa
 
 
 class ProfileLikelihood(NamedTuple):
-    """The curve of an unknown, from its smallest value to its largest, and the confidence interval."""
+    """The curve of an unknown, from its smallest value to its largest, and the confidence interval.
+
+    Attributes:
+        name: name of the parameter.
+        values: values x of the parameter.
+        costs: costs r.r / 2 of the fits of all others.
+        z: all unknowns of these fits.
+        interval: confidence interval; an end is infinite if the curve does not rise to the limit.
+        best: index of the lowest cost: that of the estimate, unless a better fit was found.
+        text: the interval, and why an end is open, in words.
+    """
 
     name: str
-    values: Float[np.ndarray, "N"]  # x
-    costs: Float[np.ndarray, "N"]  # r.r / 2
-    z: Float[np.ndarray, "N K"]  # all unknowns
-    interval: tuple[float, float]  # an end is infinite if the curve does not rise to the limit
-    best: int  # index of the lowest cost; that of the estimate unless a better fit was found
+    values: Float[np.ndarray, "N"]
+    costs: Float[np.ndarray, "N"]
+    z: Float[np.ndarray, "N K"]
+    interval: tuple[float, float]
+    best: int
     text: str
 
 
