@@ -40,6 +40,7 @@ def aim(module: Module, f: Function, s: Lane):
             splits = splits & (s.trial <= 0.0)
         if module.pieces:
             splits = splits & s.aim.is_not(float(AIM_ACROSS))
+        is_output = None
         if module.plan.stiff:
             # A jump at the breakpoint beside a stiff damper is over at once, and its acceleration says nothing of states between
             # the ends of a step: the first outputs are ends of steps.
@@ -49,12 +50,12 @@ def aim(module: Module, f: Function, s: Lane):
             splits = splits & ~is_output
         reached = t1 >= stop - s.smallest * 2.0
         halved = t1 if module.pieces else halve(f, s, t1, f.min(stop, s.end), begin | last | splits | reached)
-        if module.plan.stiff:
+        if is_output is not None:
             halved = where(is_output, t1, halved)
         t1 = where(splits, split, halved)
         reaches = (t1 >= stop - s.smallest * 2.0) & (stop < s.end - s.smallest) & ~begin
         last = last & ~reaches & ~splits
-        if module.plan.stiff:
+        if is_output is not None:
             last = last & ~is_output
         final = s.end - f.max(s.end - end, 0.0)
         t1 = where(reaches, stop, where(last, final, t1))

@@ -127,7 +127,8 @@ class InferenceProblem:
         """
         other = copy(self)
         other.fit_problem = copy(self.fit_problem)
-        wanted, values = self.fit_problem.measured.shape, measured if isinstance(measured, Array) else np.asarray(measured, float)
+        wanted = self.fit_problem.measured.shape
+        values: Any = measured if isinstance(measured, Array) else np.asarray(measured, float)
         if values.shape != wanted:
             raise IdentificationError(
                 [f"measured: must be of shape {wanted}, one number for each measured value, not {values.shape}"]
