@@ -70,7 +70,7 @@ def listing(
         transition = xp.where((kind == 1) | (began & ~stays), SLIPS, xp.where(stays, STICKS, TURNS))
         index = xp.where(of_joint, 3 * own + len(TRANSITIONS) * i + transition, index)
         is_hidden = is_hidden | (is_event & of_joint & (kind == 1) & stays)  # another joint holds it now
-        # Joints that move together stop together: one event of a joint decides about all that are at rest.
+        # Joints that move together also stop together: the decision at one joint's event covers every joint at rest.
         also = (is_event & of_joint)[:, None] & (np.arange(F) != i[:, None]) & _turn(phases, found, ~after, xp)
         last = xp.searchsorted(found.event_time, ts, side="right") - 1
         held = xp.where((last >= 0)[:, None], after[xp.maximum(last, 0)], first[0])
