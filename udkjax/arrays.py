@@ -4,8 +4,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from functools import partial
-from types import MethodType, ModuleType
+from functools import partial, update_wrapper
+from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import equinox as eqx
@@ -133,22 +133,36 @@ def solve_each(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(is_finite[:, None], x, np.nan)
 
 
-class QuickMethods(eqx.Module):
-    """A module whose methods are looked up in the same time however many numbers it has.
+class _TreeMethod:
+    """A method that is looked up on an instance as a tree."""
 
-    Its methods are trees, as those of every Equinox module, so that `jax.jit(module.method)` traces its numbers; Equinox makes
-    them with a check that visits all leaves each time.
+    def __init__(self, function: FunctionType):
+        self._function = function
+        update_wrapper(self, function)  # pyright: ignore[reportArgumentType]
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self._function
+        method = Partial(function := self._function, instance)
+        vars(method).update({key: getattr(function, key) for key in _DESCRIPTION})
+        return method
+
+
+class QuickMethods(eqx.Module):
+    """A module whose numbers and methods are looked up in the same time however many numbers it has.
+
+    Its methods are trees, as those of every Equinox module, so that `jax.jit(module.method)` traces its numbers. Equinox looks at
+    each attribute for that, in Python, and makes methods with a check that visits all leaves each time.
     """
 
     if not TYPE_CHECKING:
+        __getattribute__ = object.__getattribute__  # without a call of Python
 
-        def __getattribute__(self, name: str, /) -> Any:
-            found = object.__getattribute__(self, name)
-            if type(found) is MethodType and found.__self__ is self and not name.startswith("__"):
-                method = Partial(function := found.__func__, self)
-                vars(method).update({key: getattr(function, key) for key in _DESCRIPTION})
-                return method
-            return found
+        def __init_subclass__(cls, **given: Any):
+            super().__init_subclass__(**given)
+            for name, value in list(vars(cls).items()):
+                if isinstance(value, FunctionType) and not name.startswith("__"):
+                    setattr(cls, name, _TreeMethod(value))
 
 
 _DESCRIPTION = "__doc__", "__name__", "__qualname__", "__module__"

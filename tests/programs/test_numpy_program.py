@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from udkjax.programs.deferred import WORTH, deferred, deferred_if_traced, deferred_p
 from udkjax.programs.numpy_program import Meter, numpy_program
@@ -170,6 +171,16 @@ def _count(function, *arguments):
     meter = Meter(10**6)
     numpy_program(jax.jit(function).trace(*arguments).jaxpr)(meter, [np.asarray(x) for x in arguments])
     return meter.count
+
+
+def test_constants_are_computed_once_and_calls_are_no_operations():
+    """A trace repeats the arithmetic of constants, and calls functions that JAX has compiled."""
+
+    def scaled(x):
+        return jax.jit(lambda x: jax.lax.stop_gradient(jnp.sum(2.0 * jnp.sqrt(jnp.arange(5.0))) * jax.jit(jnp.sin)(x)))(x)
+
+    assert _count(scaled, X) == 2  # the sine, and the product
+    assert_allclose(numpy_program(jax.jit(scaled).trace(X).jaxpr)(Meter(10), [X])[0], scaled(X), rtol=1e-15)
 
 
 def test_the_same_operations_are_evaluated_once_and_unused_ones_never():

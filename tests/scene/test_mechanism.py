@@ -297,3 +297,36 @@ def test_numbers_do_not_change_with_the_arrays_they_were_given_as():
     body = udk.Body(1.0, 0.1, position)
     position[...] = 7.0
     assert np.array_equal(body.position, [0.0, 0.0])
+
+
+def test_methods_are_trees_of_the_numbers_of_their_mechanism():
+    """As those of every Equinox module: a program of a method takes the numbers as arguments."""
+    mechanism = library.compound_pendulum()
+    for method in (mechanism.parameters, mechanism.with_drivers, mechanism._table):  # of `Model`, of `Mechanism`, replaced there
+        assert [id(x) for x in jax.tree.leaves(method)] == [id(x) for x in jax.tree.leaves(mechanism)]
+        assert method.__name__ and method.__doc__ == getattr(type(mechanism), method.__name__).__doc__
+        assert pickle.loads(pickle.dumps(method)).__name__ == method.__name__
+    traced = jax.jit(lambda method: method()["body.rod.mass"])
+    for mass in (1.0, 2.0):
+        assert_allclose(traced(mechanism.with_parameters({"body.rod.mass": mass}).parameters), mass)
+    assert traced._cache_size() == 1
+
+
+def test_methods_of_users_elements_may_be_replaced_and_abstract():
+    class Pull(udk.ForceElement):
+        law: Any = eqx.field(static=True, default=np.sin)  # a function that is a number's default is no method
+
+        def size(self, t):
+            return self.law(t)
+
+        def loads(self, t, frame):
+            return [(self.size(t), 0.0, 0.0)]
+
+    class Twice(Pull):
+        def size(self, t):
+            return 2.0 * super().size(t)
+
+    assert_allclose(Twice(["b"]).loads(0.3, None)[0][0], 2.0 * np.sin(0.3))
+    assert jax.tree.leaves(Twice(["b"]).size) == []
+    with pytest.raises(TypeError, match="abstract"):
+        udk.Motion()

@@ -59,7 +59,8 @@ def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         if jax.config.jax_disable_jit:
             return function(*args, **kwargs)
-        if any(varies(x) for x in jax.tree.leaves((args, kwargs))):  # within `shard_map`, which the types of its values show
+        leaves = jax.tree.leaves((args, kwargs))
+        if any(map(varies, filter(_is_traced, leaves))):  # within `shard_map`, which the types of its values show
             return by_jit(*args, **kwargs)
         try:
             program, leaves, out = trace_once(function, args, kwargs)
@@ -77,11 +78,11 @@ def trace_once(
     function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
 ) -> "tuple[Any, list[Any], ResultForm]":
     """Return the program of a function, traced once per structure of its arguments, their arrays, and the form of the result."""
-    dynamic, static = eqx.partition((args, kwargs or {}), _is_array)
-    leaves, tree = jax.tree.flatten(dynamic)
-    fixed, fixed_tree = jax.tree.flatten(static)
-    types = tuple(jax.typeof(x) for x in leaves)
-    program, out = _trace(function, tree, tuple(fixed), fixed_tree, types, jax.config.jax_enable_x64)
+    given, tree = jax.tree.flatten((args, kwargs or {}))
+    are_arrays = tuple([isinstance(x, _ARRAYS) for x in given])
+    leaves = [x for x, is_array in zip(given, are_arrays, strict=True) if is_array]
+    fixed = tuple([x for x, is_array in zip(given, are_arrays, strict=True) if not is_array])
+    program, out = _trace(function, tree, are_arrays, fixed, tuple(map(jax.typeof, leaves)), jax.config.jax_enable_x64)
     return program, leaves, out
 
 
@@ -164,8 +165,11 @@ def _is_traced(x: Any) -> bool:
     return isinstance(x, Tracer)
 
 
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
+
+
 def _is_array(x: Any) -> bool:
-    return isinstance(x, jax.Array | np.ndarray | np.generic)
+    return isinstance(x, _ARRAYS)
 
 
 class _ClosesOverError(Exception):
@@ -185,14 +189,20 @@ class ResultForm:
 
 @lru_cache(maxsize=128)
 def _trace(
-    function: Callable[..., Any], tree: Any, fixed: tuple[Hashable, ...], fixed_tree: Any, types: tuple[Any, ...], x64: bool
+    function: Callable[..., Any],
+    tree: Any,
+    are_arrays: tuple[bool, ...],
+    fixed: tuple[Hashable, ...],
+    types: tuple[Any, ...],
+    x64: bool,
 ) -> tuple[Any, ResultForm]:
+    """Return the program of a function of the arrays among the leaves of a tree; the others are fixed."""
     del x64  # only part of the key of the cache
     out = ResultForm()
 
     def flat(*leaves: Array) -> list[Array]:
-        static = jax.tree.unflatten(fixed_tree, fixed)
-        args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
+        arrays, others = iter(leaves), iter(fixed)
+        args, kwargs = jax.tree.unflatten(tree, [next(arrays if is_array else others) for is_array in are_arrays])
         dynamic, out.static = eqx.partition(function(*args, **kwargs), _is_array)
         outputs, out.tree = jax.tree.flatten(dynamic)
         return outputs

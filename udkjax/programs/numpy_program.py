@@ -13,11 +13,10 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, Literal, Primitive, jaxprs_in_params
 
-from udkjax.programs.numpy_rules import RULES
+from udkjax.programs.numpy_rules import PRESERVED, RULES, plain_step
 
-Step = tuple[Callable[..., Any], list[int], Any]  # a function, and the indices of its arguments and of its result or results
+Step = tuple[Callable[..., Any], list[int], Any]  # a function, and the places of its arguments and of its result or results
 ENTRIES = 2_000  # number of array entries that take as long as the overhead of an operation
-PLAIN = (np.dtype(float), np.dtype(int), np.dtype(bool))  # dtypes that every NumPy operation preserves
 
 _EXPANSIONS: dict[Primitive, Callable[..., Callable[..., Any]]] = {}
 _EVALUATIONS: dict[Primitive, Callable[..., Any]] = {}
@@ -60,61 +59,95 @@ class Meter:
 
 
 class NumpyProgram:
-    """A JAX program as NumPy steps."""
+    """A JAX program as NumPy steps.
+
+    The programs that it calls are part of it, and what does not depend on its inputs is computed once.
+    """
 
     def __init__(self, jaxpr: Jaxpr, constants: Sequence[Any]):
-        self._places: dict[Any, int] = {}
-        self._memory: list[Any] = []
-        self._inputs = [self._place(v) for v in jaxpr.invars]
-        for v, x in zip(jaxpr.constvars, constants, strict=True):
-            self._places[v] = self._place_of_value(np.asarray(x))
+        self._memory: list[Any] = [None]  # the meter, then constants, inputs and results
+        self._constants: dict[Any, int] = {}  # the places of constants by their content
+        self._fixed: set[int] = set()
         self._steps: list[Step] = []
         self._cost = 0
-        known: dict[Any, list[int]] = {}  # the places of the results, by operation
-        for equation in _needed(jaxpr):
-            inputs = [self._place(v) for v in equation.invars]
-            key = _operation(equation, inputs)
-            if key in known:  # functions that are called one after another compute the same: JAX traces each of them anew
-                self._places.update(zip(equation.outvars, known[key], strict=True))
-                continue
-            outputs = [self._place(v) for v in equation.outvars]
-            function = _step_of(equation)
-            self._steps.append((function, inputs, outputs if equation.primitive.multiple_results else outputs[0]))
-            self._cost += 1 + sum(_type(v).size for v in equation.outvars) // ENTRIES
-            if key is not None:
-                known[key] = outputs
-        self._outputs = [self._place(v) for v in jaxpr.outvars]
+        self._known: dict[Any, list[int]] = {}  # the places of the results, by operation
+        self._inputs = [self._new() for _ in jaxpr.invars]
+        self._outputs = self._add(jaxpr, constants, self._inputs)
+        del self._known, self._constants, self._fixed
 
-    def _place(self, v: Any) -> int:
-        if isinstance(v, Literal):
-            return self._place_of_value(np.asarray(v.val, _type(v).dtype)[()])
-        if v not in self._places:
-            self._places[v] = len(self._memory)
-            self._memory.append(None)
-        return self._places[v]
+    def _add(self, jaxpr: Jaxpr, constants: Sequence[Any], inputs: Sequence[int]) -> list[int]:
+        """Add the steps of a program, and return the places of its results."""
+        places: dict[Any, int] = dict(zip(jaxpr.invars, inputs, strict=True))
+        places.update((v, self._place_of_value(np.asarray(x))) for v, x in zip(jaxpr.constvars, constants, strict=True))
+
+        def place(v: Any) -> int:
+            return self._place_of_value(np.asarray(v.val, _type(v).dtype)[()]) if isinstance(v, Literal) else places[v]
+
+        for equation in _needed(jaxpr):
+            given = [place(v) for v in equation.invars]
+            places.update(zip(equation.outvars, self._results_of(equation, given), strict=True))
+        return [place(v) for v in jaxpr.outvars]
+
+    def _results_of(self, equation: Any, given: list[int]) -> list[int]:
+        """Add the steps of one operation, and return the places of its results."""
+        if (called := _called_program(equation)) is not None:
+            return self._add(*called, given)
+        if equation.primitive.name in _IDENTITIES:
+            return given
+        key = _operation(equation, given)
+        if key in self._known:  # functions that are called one after another compute the same: JAX traces each of them anew
+            return self._known[key]
+        function = plain_step(equation.primitive.name, equation.params, [_type(v) for v in (*equation.invars, *equation.outvars)])
+        if function is not None and self._fixed.issuperset(given) and _type(equation.outvars[0]).size <= ENTRIES:
+            with np.errstate(all="ignore"):
+                results = [self._place_of_value(np.asarray(function(*[self._memory[k] for k in given])))]
+        else:
+            results = [self._new() for _ in equation.outvars]
+            if function is None:
+                function, given = _step_of(equation), [0, *given]
+            self._cost += 1 + sum(_type(v).size for v in equation.outvars) // ENTRIES
+            self._steps.append((function, given, results if equation.primitive.multiple_results else results[0]))
+        if key is not None:
+            self._known[key] = results
+        return results
+
+    def _new(self) -> int:
+        self._memory.append(None)
+        return len(self._memory) - 1
 
     def _place_of_value(self, value: Any) -> int:
         """Return the place of a constant, the same for the same content."""
         key = value.dtype, value.shape, value.tobytes()
-        if key not in self._places:
-            self._places[key] = len(self._memory)
-            self._memory.append(value)
-        return self._places[key]
+        if key not in self._constants:
+            self._constants[key] = place = self._new()
+            self._memory[place] = value
+            self._fixed.add(place)
+        return self._constants[key]
 
     def __call__(self, meter: Meter, inputs: Sequence[Any]) -> list[Any]:
         """Return the results for inputs that are NumPy arrays."""
         meter.add(self._cost)
         memory = self._memory.copy()
+        memory[0] = meter
         for place, x in zip(self._inputs, inputs, strict=True):
             memory[place] = x
         for function, places, results in self._steps:
-            values = function(meter, *[memory[k] for k in places])
+            values = function(*[memory[k] for k in places])
             if type(results) is int:
                 memory[results] = values
             else:
                 for k, x in zip(results, values, strict=True):
                     memory[k] = x
         return [memory[k] for k in self._outputs]
+
+
+def _called_program(equation: Any) -> tuple[Jaxpr, Sequence[Any]] | None:
+    """Return the program that an operation only calls, with its constants; None if it does anything else."""
+    primitive = equation.primitive
+    if primitive in _EVALUATIONS or primitive.name not in _CALLS:
+        return None
+    called = equation.params[_CALLS[primitive.name]]
+    return (called.jaxpr, called.consts) if hasattr(called, "consts") else (called, ())
 
 
 def _needed(jaxpr: Jaxpr) -> list[Any]:
@@ -154,7 +187,7 @@ def has_rules(jaxpr: Any) -> bool:
 
     def has_rule(equation: Any) -> bool:
         primitive = equation.primitive
-        if primitive in _EVALUATIONS or primitive.name in _CONTROL or primitive.name in RULES:
+        if primitive in _EVALUATIONS or primitive.name in _CALLS or primitive.name in _CONTROL or primitive.name in RULES:
             return all(map(has_rules, jaxprs_in_params(equation.params)))
         expanded = _Expanded(equation).trace()
         return expanded is not None and has_rules(expanded)
@@ -178,6 +211,7 @@ def numpy_program(jaxpr: Any) -> NumpyProgram:
 
 
 def _step_of(equation: Any) -> Callable[..., Any]:
+    """Return an operation as a function of the meter and its arguments."""
     primitive, parameters = equation.primitive, equation.params
     if primitive in _EVALUATIONS:
         return lambda _, *xs: _EVALUATIONS[primitive](*xs, **parameters)
@@ -192,7 +226,7 @@ def _step_of(equation: Any) -> Callable[..., Any]:
 def _by_rule(equation: Any, rule: Callable[..., Any]) -> Callable[..., Any]:
     primitive, parameters = equation.primitive, equation.params
     dtypes = [v.aval.dtype for v in equation.outvars]
-    exact = all(dtype in PLAIN for dtype in dtypes)
+    exact = all(dtype in PRESERVED for dtype in dtypes)
 
     def step(_: Meter, *xs: Any) -> Any:
         try:
@@ -245,11 +279,6 @@ class _Expanded:
         if isinstance(impl, partial) or impl.__module__.startswith(("jax.", "jaxlib")):
             return None
         return lambda *xs: impl(*xs, **parameters)
-
-
-def _call(jaxpr: Any) -> Callable[..., Any]:
-    program = numpy_program(jaxpr)
-    return lambda meter, *xs: program(meter, xs)
 
 
 def _while(cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int, **_: Any) -> Callable[..., Any]:
@@ -311,15 +340,19 @@ def _linear_solve(const_lengths: Any, jaxprs: Any, **_: Any) -> Callable[..., An
     return lambda meter, *xs: program(meter, [*xs[start:end], *xs[right_sides:]])
 
 
+# Operations that only call a program, and the parameter that has it.
+_CALLS = {
+    "jit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "eval_jaxpr": "call_jaxpr",
+    "deferred_program": "call_jaxpr",
+    "custom_vmap_call": "call",
+    "remat2": "jaxpr",
+}
+_IDENTITIES = ("stop_gradient", "copy", "copy_p")
 _CONTROL: dict[str, Callable[..., Callable[..., Any]]] = {
-    "jit": lambda jaxpr, **_: _call(jaxpr),
-    "closed_call": lambda call_jaxpr, **_: _call(call_jaxpr),
-    "custom_jvp_call": lambda call_jaxpr, **_: _call(call_jaxpr),
-    "custom_vjp_call": lambda call_jaxpr, **_: _call(call_jaxpr),
-    "eval_jaxpr": lambda call_jaxpr, **_: _call(call_jaxpr),
-    "deferred_program": lambda call_jaxpr, **_: _call(call_jaxpr),
-    "custom_vmap_call": lambda call, **_: _call(call),
-    "remat2": lambda jaxpr, **_: _call(jaxpr),
     "while": _while,
     "cond": _cond,
     "scan": _scan,

@@ -436,7 +436,10 @@ def _check_without_derivatives(mechanism: Mechanism, values: dict[str, Any]) -> 
     """Raise the errors of `with_parameters` with concrete numbers, if the numbers are traced only by derivatives."""
     if is_within_jit():
         return
-    plain, known = without_derivatives((mechanism, values))
+    known, plain = without_derivatives(values), mechanism
+    if not mechanism.is_concrete:
+        plain = without_derivatives(mechanism)
+        plain = _checked(plain) if _is_checked(mechanism) else plain
     if plain.is_concrete and not is_traced(known):
         plain.with_parameters(known)
 

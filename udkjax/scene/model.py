@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers, NumericArray, Time
+from udkjax.arrays import QuickMethods
 from udkjax.requirements import ArgumentError
 from udkjax.scene.numbers.number_fields import NumberField, must_be_positive
 from udkjax.scene.numbers.units import units_of
@@ -19,7 +19,7 @@ from udkjax.scene.numbers.units import units_of
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
-class RunModel(eqx.Module):
+class RunModel(QuickMethods):
     """The questions that a run asks of a model. By default it has coordinates alone: no bodies, elements or sampled numbers.
 
     Attributes:
