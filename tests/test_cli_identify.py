@@ -67,6 +67,7 @@ def test_it_draws_from_the_posterior_and_continues(tmp_path, capsys, data):
     assert found["converged"] and row["units"] == "kg m2" and row["rhat"] < 1.01
     assert abs(row["mean"] - estimate["value"]) < 0.3 * estimate["standard_error"]
     with xarray.open_dataset(folder / "draws.nc", group="posterior", engine="h5netcdf") as draws:
+        assert {file.name for file in folder.glob("*.png")} == {"corner.png", "predictions.png"}
         assert draws[INERTIA].shape == (8, 1000) and draws[INERTIA].attrs["units"] == "kg m2"
 
 

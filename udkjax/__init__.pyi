@@ -136,6 +136,7 @@ from udkjax.scene import with_length as with_length
 from udkjax.show.player import Animation as Animation
 from udkjax.show.player import animate as animate
 from udkjax.show.player import animate_modes as animate_modes
+from udkjax.show.posterior_figures import plot_posterior as plot_posterior
 from udkjax.statics.equilibrium import Equilibrium as Equilibrium
 from udkjax.statics.equilibrium import equilibria as equilibria
 from udkjax.statics.equilibrium import equilibrium as equilibrium

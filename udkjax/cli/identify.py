@@ -78,8 +78,8 @@ def identify(
         tol: tolerance of the integration.
         seed: seed of the further first guesses.
         profile: parameters for which to compute confidence intervals by profile likelihood, which does not assume a linear model.
-        posterior: folder for draws from the posterior density, as draws.nc, and their summary, as summary.json. An interrupted
-            command continues from the draws that are there.
+        posterior: folder for draws from the posterior density, as draws.nc, their summary, as summary.json, and pictures. An
+            interrupted command continues from the draws that are there.
         json: write the results as JSON, as in estimate.json.
     """
     for folder in filter(None, (out, posterior)):
@@ -111,9 +111,12 @@ def identify(
     files = _write(estimate, profiles, results, out)
     lines = [str(estimate), *(likelihood.text for likelihood in profiles), f"wrote {', '.join(files)} to {out}"]
     if posterior is not None:
+        from udkjax.show.posterior_figures import save_posterior_pictures
+
         drawn = udk.sample(estimate, seed=seed, out=posterior, progress=False if quiet else None)
         results |= _write_draws(drawn, posterior)
-        lines += [str(drawn), f"wrote draws.nc and summary.json to {posterior}"]
+        drawings = [*save_posterior_pictures(drawn, estimate, posterior)]
+        lines += [str(drawn), f"wrote draws.nc, summary.json, {' and '.join(drawings)} to {posterior}"]
     show(results | {"files": [out / name for name in files]}, "\n".join(lines), json)
     if not estimate.success:
         fail("the fit has not converged" if not estimate.converged else "the measurements do not determine every parameter")
@@ -139,14 +142,14 @@ def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], result
 
     import udkjax as udk
     from udkjax.show.identify_figures import save_fit_pictures
-    from udkjax.study.identify.answers.estimate import Row
     from udkjax.study.report import plain
 
     out.mkdir(exist_ok=True)
     udk.save(estimate.mechanism, out / "identified.toml")
     (out / "estimate.json").write_text(json.dumps(plain(results), indent=1) + "\n", encoding="utf-8")
     with (out / "estimate.csv").open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows([Row._fields, *estimate.rows()])
+        rows = estimate.rows()
+        csv.writer(file).writerows([rows[0]._fields, *rows])
     dataset = estimate.to_xarray(profiles)
     dataset.to_netcdf(out / "fit.nc", engine="h5netcdf")
     return ["identified.toml", "estimate.json", "estimate.csv", "fit.nc", *save_fit_pictures(dataset, out)]

@@ -15,6 +15,8 @@ from udkjax.show.player.marks.measure_curves import ShownMotion as ShownMotion
 from udkjax.show.player.marks.measure_curves import measures_of as measures_of
 from udkjax.show.player.run_files import read_run as read_run
 from udkjax.show.plots import trajectory as trajectory
+from udkjax.show.posterior_figures import plot_posterior as plot_posterior
+from udkjax.show.posterior_figures import save_posterior_pictures as save_posterior_pictures
 from udkjax.show.summary import check_summary as check_summary
 from udkjax.show.summary import run_summary as run_summary
 from udkjax.show.summary import table as table

@@ -32,7 +32,6 @@ from udkjax.study.identify import check_gradients as check_gradients
 from udkjax.study.identify import design_experiment as design_experiment
 from udkjax.study.identify import identify as identify
 from udkjax.study.identify import length as length
-from udkjax.study.identify.answers.estimate import Row as Row
 from udkjax.study.identify.answers.profile_likelihood import ProfileLikelihood as ProfileLikelihood
 from udkjax.study.identify.problem.parameters import unknowns_of as unknowns_of
 from udkjax.study.identify.records.record_reader import records_of as records_of

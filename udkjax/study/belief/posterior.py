@@ -1,7 +1,7 @@
 """Draws from a posterior density: by name, as a table, and as data for ArviZ."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from udkjax.wording import join_names, plural
 INTERVAL = 0.03, 0.97  # quantiles at the ends of an interval
 MOST_RHAT = 1.01  # largest R-hat of chains that agree
 LEAST_EFFECTIVE = 100  # least number of effective draws of a chain, for which R-hat and quantiles are reliable
+PREDICTIONS = 400  # number of draws that show the range of predictions: its ends have errors of a tenth of the noise
 EFFECTIVE: tuple[dict[str, Any], ...] = {"method": "bulk"}, {"method": "tail", "prob": (0.05, 0.95)}
 MOST_BAD = 0.01  # share of divergent or failed proposals above which it is reported
 # R-hat and effective numbers: A. Vehtari et al., Rank-normalization, folding, and localization: an improved R-hat, Bayesian
@@ -162,6 +163,26 @@ class Posterior:
             groups["posterior_predictive"] = dataset({"y": predicted + noise}, ("measurement",))
         older: Any = arviz
         return older.InferenceData(**groups) if arviz.__version__.startswith("0.") else xarray.DataTree.from_dict(groups)
+
+    def prediction_intervals(self, draws: int = PREDICTIONS, seed: int = 0) -> tuple[dict[str, Float[np.ndarray, "3 T"]], ...]:
+        """Return the range of 94 % of repeated measurements of each record: lower end, median and upper end, by channel.
+
+        Args:
+            draws: largest number of draws that are simulated again, each with noise of its own.
+            seed: seed of the noise.
+        """
+        fewer = self._thinned(draws)
+        predicted = fewer._pointwise()[1]
+        noise = np.random.default_rng(int(seed)).standard_normal(predicted.shape) * fewer._sigma()
+        ends = np.quantile(predicted + noise, (INTERVAL[0], 0.5, INTERVAL[1]), axis=(0, 1))
+        records = zip(*(self.problem.fit_problem.by_record(rows) for rows in ends), strict=True)
+        return tuple({name: np.stack([table[name] for table in tables]) for name in tables[0]} for tables in records)
+
+    def _thinned(self, draws: int) -> "Posterior":
+        """Return about so many of the draws, equally from all chains."""
+        every = max(1, -(-self.x.shape[0] * self.x.shape[1] // draws))
+        fields = {name: getattr(self, name)[:, ::every] for name in ("x", *PER_DRAW)}
+        return replace(self, **fields, steps=self.steps[::every])
 
     def _pointwise(self) -> tuple[np.ndarray, np.ndarray]:
         """Return log likelihoods and predictions (C, draws, R) of measured values."""

@@ -16,6 +16,7 @@ from udkjax.positions.assembling.assembly import State
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.arguments import checked
 from udkjax.study.identify.answers.gradient_check import GradientCheck, compare_gradients
+from udkjax.study.identify.answers.joint_profile import JointProfile, confidence_ellipse, joint_profile, require_two
 from udkjax.study.identify.answers.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
 from udkjax.study.identify.answers.uncertainty import Uncertainty
 from udkjax.study.identify.density.laplace import Laplace, approximate
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     import xarray
 
 FORMAT = "udkjax identification 1"  # format of the dataset
+PRINTED_CORRELATION = 0.9  # correlation above which a table names it: the errors of a combination are four times those of another
 
 
 class Row(NamedTuple):
@@ -166,6 +168,37 @@ class Estimate:
         evaluate = weighted_residuals(self.problem, self.tol, self.loss)
         return profile_likelihood(evaluate, self.problem.unknowns, self.z, self.uncertainty, name, level)
 
+    def joint_profile(self, one: str, other: str, level: float = CONFIDENCE) -> JointProfile:
+        """Compute the joint confidence region of two parameters by their profile likelihood, without a linear model.
+
+        Args:
+            one: a parameter, as in `names`.
+            other: another one. Both are fixed at values around the estimate, and all others are refitted.
+            level: confidence level.
+
+        Raises:
+            IdentificationError: a parameter was not identified, is the same as the other, or is not determined by the records.
+        """
+        evaluate = weighted_residuals(self.problem, self.tol, self.loss)
+        return joint_profile(evaluate, self.problem.unknowns, self.z, self.uncertainty, (one, other), level)
+
+    def ellipse(self, one: str, other: str, level: float = CONFIDENCE) -> Float[np.ndarray, "N 2"]:
+        """Return points on the edge of the joint confidence region of two parameters in the linear model.
+
+        Args:
+            one: a parameter, as in `names`.
+            other: another one.
+            level: confidence level. 0.39 is that of the ellipse whose extents are the standard errors.
+
+        Returns:
+            Values of the two parameters along an ellipse; NaN if the records do not determine them.
+
+        Raises:
+            IdentificationError: a parameter was not identified, or is the same as the other.
+        """
+        require_two((one, other), self.names)
+        return confidence_ellipse(self.uncertainty, (one, other), level)
+
     @checked
     def check_gradients(self, order: Literal[1, 2] = 1, directions: Directions | None = None) -> GradientCheck:
         """Compare the derivatives at the estimate with finite differences.
@@ -245,6 +278,8 @@ class Estimate:
             found.append(f"{channel.name} {np.nanmedian(self.noise[record][channel.name]):.3g} {channel.units}".rstrip())
         if found:
             facts["estimated noise"] = join_names(found)
+        if pairs := [f"{a} and {b} {rho:.2f}" for a, b, rho in uncertainty.correlated(PRINTED_CORRELATION)]:
+            facts["correlated errors"] = ", ".join(pairs)
         return facts
 
     def __str__(self) -> str:

@@ -59,6 +59,9 @@ class ProfileLikelihood(NamedTuple):
     best: int
     text: str
 
+    def __str__(self) -> str:
+        return self.text
+
 
 class _Side(NamedTuple):
     """One side of a profile."""
@@ -94,7 +97,7 @@ def profile_likelihood(
     def fit(index: int, fixed: float, z0: np.ndarray) -> tuple[np.ndarray, float]:
         others = np.delete(z0, index)
         if not others.size:
-            return z0, _cost(evaluate(z0[None]))
+            return z0, residual_cost(evaluate(z0[None]))
         refitted = minimize_squares(fix_unknown(evaluate, index, fixed), others, step_tol=FINE_STEP)
         return np.insert(refitted.z, index, fixed), refitted.cost
 
@@ -105,13 +108,13 @@ def profile_likelihood(
 
     error = float(uncertainty.standard_errors[k] / abs(unknowns.dx_dz(z[:P])[k]))
     noise, freedom = estimated_noise(uncertainty)
-    least, units = _cost(evaluate(z[None])), unknowns.units[k]
+    least, units = residual_cost(evaluate(z[None])), unknowns.units[k]
     return trace_profile(
         fit, k, z, least, error, level=level, noise=noise, degrees_of_freedom=freedom, value=value, name=name, units=units
     )
 
 
-def _cost(blocks: Iterable[Residuals]) -> float:
+def residual_cost(blocks: Iterable[Residuals]) -> float:
     """Return r.r / 2 of the first set of unknowns; infinite if it cannot be computed."""
     r, ok = residual_vector(blocks)
     return float(0.5 * r @ r) if ok else np.inf
@@ -163,6 +166,7 @@ def trace_profile(
     level: float = CONFIDENCE,
     noise: float = 1.0,
     degrees_of_freedom: float | None = None,
+    count: int = 1,
     bounds: tuple[float, float] = (-FARTHEST_UNKNOWN, FARTHEST_UNKNOWN),
     value: Callable[[float], float] = lambda z: z,
     name: str = "z",
@@ -178,10 +182,11 @@ def trace_profile(
         step: standard error of the unknown, approximately.
         noise: ratio of the estimated to the assumed noise.
         degrees_of_freedom: degrees of freedom of the estimated noise, for the quantile of F; None if the noise is known.
+        count: number of parameters that the interval is for; more than one for a ray of a joint region.
         value: x as a function of z_k, increasing between the `bounds` of z_k.
         steps: maximum number of fits on each side.
     """
-    limit = quantile(level, degrees_of_freedom)
+    limit = quantile(level, degrees_of_freedom, count)
     rise = limit * noise**2
     sides = []
     for sign, bound in zip((-1.0, 1.0), bounds, strict=True):
@@ -201,9 +206,10 @@ def trace_profile(
     return ProfileLikelihood(name, values, costs, unknowns, ends, best if better else len(low.fixed), text)
 
 
-def quantile(level: float, degrees_of_freedom: float | None) -> float:
-    """Return psi^2 at the ends of the interval: the quantile of chi^2 with one degree of freedom, or of F for estimated noise."""
-    return float(chdtri(1, 1.0 - level) if degrees_of_freedom is None else fdtri(1, degrees_of_freedom, level))
+def quantile(level: float, degrees_of_freedom: float | None, count: int = 1) -> float:
+    """Return psi^2 at the ends: the quantile of chi^2 with `count` degrees of freedom, or that of F for estimated noise."""
+    known = degrees_of_freedom is None
+    return float(chdtri(count, 1.0 - level) if known else count * fdtri(count, degrees_of_freedom, level))
 
 
 def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, bound: float, rise: float, steps: int) -> _Side:
