@@ -143,3 +143,28 @@ def test_a_crossing_within_rounding_errors_is_found_once(windows, from_the_start
     found = run()
     assert windows and found.events.count == expected.events.count == 2
     np.testing.assert_allclose(found.events.time, expected.events.time, rtol=0, atol=1e-7 * end)
+
+
+def test_contacts_at_rest_beside_stiff_dampers_need_no_windows(windows: list[float]):
+    """Velocities within the tolerance times a damping of 2e7 N m s are torques much larger than the force of the contact."""
+    bodies = {
+        "lower": udk.Body(1.56, 0.166, (0.10615263197169834, 0.5132920240034046), 1.3822542012872183),
+        "middle": udk.Body(0.744, 0.143, (0.21319123686581543, 1.0437507751312538), 1.606283282431972),
+        "upper": udk.Body(0.833, 0.0218, (0.7372926695745062, 1.4257170881110792), 0.0),
+    }
+    joints = {
+        "foot": udk.Revolute(("ground", "lower"), ((0.0, 0.0), (-0.524, 0.008))),
+        "knee": udk.Revolute(("lower", "middle"), ((0.363, -0.133), (-0.202, -0.085))),
+        "hip": udk.Revolute(("middle", "upper"), ((0.28, -0.067), (-0.467, -0.101))),
+    }
+    forces = {
+        "spring": udk.Spring(("ground", "lower"), ((1.345, -1.026), (-0.023, -0.285)), stiffness=270.0, length=0.22),
+        "damper": udk.TorsionSpring(("ground", "upper"), stiffness=0.0, damping=2e7),
+    }
+    wall = udk.Contact("lower", (-0.16, 0.073), (0.0, 0.158), (0.0, 1.0), restitution=0.0)
+    mechanism = udk.Mechanism(bodies, joints, forces=forces)
+    run, exact = (
+        udk.simulate(mechanism, [0.0, 0.2, 0.4], rtol=tol, atol=tol, events=[wall], max_steps=2000) for tol in (1e-6, 1e-10)
+    )
+    assert [run.events.count, exact.events.count, windows] == [2, 2, []]
+    assert np.abs(run.q - exact.q).max() < 1e-4

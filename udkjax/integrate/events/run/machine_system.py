@@ -29,6 +29,9 @@ from udkjax.native.runs import RunStates
 
 STATUS, TIME, COUNTS, WRITTEN, IMPLICIT = 0, 1, slice(2, 5), 5, 7  # of `RunStates.info_names`
 INFO = len(RunStates.info_names)
+# Where forces vary too quickly, tolerances are tightened by factors of `TIGHTER`, at most to `TIGHTEST`, where errors of steps
+# are rounding errors. A thousandth leaves two tries at most at usual tolerances; each costs the steps of a start alone.
+TIGHTER, TIGHTEST = 1e-3, 1e-12
 
 
 class MachinePlan(NamedTuple):
@@ -84,6 +87,7 @@ class MachineSystem:
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
         (B, _), n = ts.shape, inverse_mass.shape[1]
         self._windows: dict[int, Window] = {}  # of the members that go on window by window
+        self._tightened = np.ones(B)  # factors of tolerances
         self.end, self.rate, self.unresolved, self._all = ts[:, -1], units.rate, np.zeros(B, bool), np.arange(B)
         units_of_body = np.stack([units.length, units.length, np.ones(B)], axis=1)  # all are one without bodies
         self.coordinates = np.tile(units_of_body, -(-n // 3))[:, :n]
@@ -240,7 +244,9 @@ class MachineSystem:
         times = np.empty((count, output.shape[1] + 2))
         times[:, 0], times[:, -1] = start, ts[:, -1]
         times[:, 1:-1] = np.where(output < T - 1, ts[np.arange(count)[:, None], np.minimum(output, T - 1)], np.inf)
-        stretch = self._phases[which].run(members, times, runs.state(members), self._watch(runs, which, members))
+        stretch = self._phases[which].run(
+            members, times, runs.state(members), self._watch(runs, which, members), self._tightened[members]
+        )
         status, counts = stretch.info[:, STATUS], stretch.info[:, COUNTS].astype(int)
         rows = (np.arange(times.shape[1]) <= stretch.info[:, WRITTEN, None]) & (times <= stretch.t[:, None])
         rows[:, -1] = status == Status.DONE
@@ -267,12 +273,13 @@ class MachineSystem:
         known, watched = ((status == Status.CROSSED) | (status == Status.DONE)) & ~drifts, self._watched[which]
         event = np.where(stretch.event >= 0, watched[stretch.event.astype(int)], NO_EVENT)
         runs.put(members, t=stretch.t, q=stretch.q_end, v=stretch.v_end, event=event, running=known)
+        self._tightened[members[known]] = 1.0
         if known.all():
             runs.sides[members[:, None], watched] = stretch.sides
         else:
             sure = known | ((status == Status.UNRESOLVED) & ~drifts)
             runs.sides[members[sure, None], watched] = stretch.sides[sure]
-            self._fail(runs, members, stretch, known, drifts)
+            self._fail(runs, which, members, stretch, known, drifts)
         if drifts.any():  # return to the last state close enough to the manifold
             last_kept, drifting = np.where(kept, times, -np.inf).argmax(1)[drifts], members[drifts]
             runs.t[drifting], runs.q[drifting], runs.v[drifting] = (x[drifts, last_kept] for x in (times, stretch.q, stretch.v))
@@ -303,9 +310,22 @@ class MachineSystem:
         if passed.locked.shape[2]:
             put_locks(plan, self._added, runs.joints, ended, passed.locks[b[last]])
 
+    def _tighten(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"]) -> Bool[np.ndarray, "b"]:
+        """Tighten the tolerances of members until their next event, and return a mask of those where that may help.
+
+        Where a damper is stiff, velocities within the tolerance have forces that are much less exact, and contacts at rest seem
+        to let go and to hold in turn.
+        """
+        holds = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, self.plan.count :].any(axis=1)
+        tighter = TIGHTER * self._tightened[members]
+        helps = holds & (self._phases[which].tolerances(members) * tighter >= TIGHTEST)
+        self._tightened[members[helps]] = tighter[helps]
+        return helps
+
     def _fail(
         self,
         runs: MemberRuns,
+        which: int,
         members: Int[np.ndarray, "b"],
         stretch: StretchEnd,
         known: Bool[np.ndarray, "b"],
@@ -314,6 +334,9 @@ class MachineSystem:
         """Store the results and ends of the runs that stop."""
         status, (n, fails) = stretch.info[:, STATUS], (runs.q.shape[1], ~known)
         unresolved = (status == Status.UNRESOLVED) & ~drifts
+        repeated = unresolved & self._tighten(runs, which, members)
+        runs.running[members[repeated]] = True
+        fails, unresolved = fails & ~repeated, unresolved & ~repeated
         if self.plan.has_kinks:  # perhaps a force that chatters: the run goes on with its comparisons
             of_kinks = runs.joints[-1][:, self.plan.first_kink_side :]
             chatters = unresolved & np.isfinite(of_kinks[members]).all(1)

@@ -164,6 +164,7 @@ class PhaseCode:
     ):
         self.plan, (self._numbers, self._settings, self._rows, self._breaks, self._tol, *self._samples) = plan, arrays
         names = plan.run.all_settings
+        self._tolerances = [names.index(name) for name in ("rtol", "atol")]
         self._of_states = self._settings[:, [names.index(name) for name in plan.states.all_settings]]
         self._of_marking = [] if plan.marking is None else [names.index(name) for name in plan.marking.all_settings]
         self._event_numbers, self._joints = event_numbers, joints
@@ -191,16 +192,33 @@ class PhaseCode:
         """Return the absolute tolerance of members, in units of the scene."""
         return _of(self._settings, members)[:, [self.plan.run.all_settings.index("atol")]]
 
-    def run(self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray) -> StretchEnd:
-        """Run members over times (b, T) to the first crossing; `watch` describes the conditions, with room for their numbers."""
+    def tolerances(self, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b"]:
+        """Return the smaller tolerance of members, in units of the scene."""
+        return np.broadcast_to(_of(self._settings, members)[:, self._tolerances].min(axis=1), len(members))
+
+    def run(
+        self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray, tightened: Float[np.ndarray, "b"]
+    ) -> StretchEnd:
+        """Run members over times (b, T) to the first crossing.
+
+        Args:
+            members: the members.
+            ts: the times.
+            state: their states.
+            watch: describes the conditions, with room for their numbers.
+            tightened: factors of their tolerances.
+        """
         _, q, v, *_ = state
         conditions = self.plan.run.conditions
         assert conditions is not None  # this code has conditions
         numbers = self._with_marks(members, state)
-        further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
+        settings, *further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
+        if (tightened != 1.0).any():
+            settings = _spread(settings, len(members)).copy()
+            settings[:, self._tolerances] *= tightened[:, None]
         watch[:, : conditions.number_count] = _of(self._event_numbers, members)
         self._put_sides(watch, members)
-        inputs = numbers, ts, q, v, *further, watch
+        inputs = numbers, ts, q, v, settings, *further, watch
         qs, vs, violation, info, crossing, *record = self._run(*inputs, times=ts.shape[1])
         last_side, n = Conditions.head + conditions.count, q.shape[1]
         (event, t, worst), sides = crossing[:, :3].T, crossing[:, Conditions.head : last_side]
