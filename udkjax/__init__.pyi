@@ -30,6 +30,7 @@ from udkjax.integrate import Solution as Solution
 from udkjax.integrate import Stabilization as Stabilization
 from udkjax.integrate import Verner65 as Verner65
 from udkjax.integrate import export_c as export_c
+from udkjax.integrate import export_fmu as export_fmu
 from udkjax.integrate import simulate as simulate
 from udkjax.integrate import step as step
 from udkjax.integrate.events import Attach as Attach

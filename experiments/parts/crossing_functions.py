@@ -135,6 +135,7 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "loads": {"": studies.dumps},
     "save": {"": studies.save},
     "export_c": {"": studies.export_c},
+    "export_fmu": {"": studies.export_fmu},
     "export_compiled": {"": studies.export_compiled},
     "load_exported": {"": studies.export_compiled},
     "load": {"": studies.save},

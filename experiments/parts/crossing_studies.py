@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -249,6 +250,14 @@ def export_c(case: Case) -> str:
         found = udk.export_c(case.model, folder, ["accelerations"])
         a = accelerations_by_c(Path(folder), found.prefix, found.memory["accelerations"], case)
     return agree(a, np.ravel(udk.accelerations(case.model, 0.0, case.state.q, case.state.v)), "udk.accelerations", 1e-9)
+
+
+def export_fmu(case: Case) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        found = udk.export_fmu(case.model, Path(folder) / "a.fmu", ["co-simulation"], (), (), platforms=[])
+        with zipfile.ZipFile(found.file) as archive:
+            start = re.findall(r'name="state.*start="(.*)"', archive.read("modelDescription.xml").decode())
+    return agree(np.array(start, float), np.ravel([case.state.q, case.state.v]), "the state", 1e-9)
 
 
 def export_compiled(case: Case) -> str:

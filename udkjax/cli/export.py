@@ -1,18 +1,24 @@
 """`udkjax export`."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from udkjax.cli.common import Json, Scene, load, output_times, refuse, show
 from udkjax.cli.datasets import check_folder
+
+FUNCTIONS = "run", "accelerations"  # of C by default
 
 
 def export(
     scene: Scene,
     /,
-    c: Path,
-    what: tuple[Literal["run", "accelerations", "projection", "positions"], ...] = ("run", "accelerations"),
-    parameters: tuple[str, ...] = (),
+    c: Path | None = None,
+    fmu: Path | None = None,
+    what: tuple[Literal["run", "accelerations", "projection", "positions"], ...] = FUNCTIONS,
+    kinds: tuple[Literal["co-simulation", "model-exchange"], ...] = ("co-simulation", "model-exchange"),
+    parameters: tuple[str, ...] | None = None,
+    inputs: tuple[str, ...] | None = None,
+    platforms: tuple[str, ...] | None = None,
     t1: float = 20.0,
     dt: float = 0.05,
     t0: float = 0.0,
@@ -21,21 +27,35 @@ def export(
     stiff: bool = True,
     json: Json = False,
 ) -> None:
-    """Write a scene as C99, which runs without Python.
+    """Write a scene as C99 or as an FMU, which run without Python.
 
     Args:
         scene: the mechanism.
         c: folder to write; `cc -O2 -std=c99 *.c -lm` compiles it to a program that prints the motion as a table.
-        what: functions to write.
-        parameters: numbers of the scene that can be set at run time, such as body.link1.mass or pin.A.
-        t1: end of the program's run (s).
-        dt: time between its outputs (s).
-        t0: start of its run (s).
+        fmu: FMU to write, by FMI 3.0.
+        what: functions of C to write.
+        kinds: interfaces of the FMU.
+        parameters: numbers of the scene that can be set before a run, such as body.link1.mass or pin.A; by default none in C, and
+            all in an FMU.
+        inputs: numbers of the scene that can be set during a run of an FMU; by default those of torques and forces.
+        platforms: platforms of the FMU, such as x86_64-linux; by default this one. Others need the package ziglang.
+        t1: end of the program's run, or of the FMU's default experiment (s).
+        dt: time between outputs, or the step of the default experiment (s).
+        t0: start of the run (s).
         rtol: relative tolerance of a step.
         atol: absolute tolerance of a step, in units of the scene's characteristic length and time.
         stiff: whether a run goes on by an implicit method where it is stiff; without, it needs less memory.
     """
+    if (c is None) == (fmu is None):
+        refuse("give --c FOLDER for C99, or --fmu FILE for an FMU")
     ts = output_times(t0, t1, dt)
+    if fmu is not None:
+        if fmu.suffix != ".fmu" or not fmu.parent.is_dir() or fmu.is_dir():
+            refuse(f"--fmu {fmu}: give the name of a file that ends in .fmu, in a folder that exists")
+        mech, _ = load(scene)
+        _fmu(mech, fmu, (kinds, parameters, inputs, t0, t1, dt, rtol, atol, stiff, platforms), json)
+        return
+    assert c is not None
     check_folder(c)
     if not what:
         refuse("--what: name at least one function")
@@ -44,7 +64,7 @@ def export(
     import udkjax as udk
     from udkjax.show.summary import table
 
-    found = udk.export_c(mech, c, what, ts, parameters, rtol, atol, stiff)
+    found = udk.export_c(mech, c, what, ts, parameters or (), rtol, atol, stiff)
     lines = {
         "functions": ", ".join(f"{found.prefix}_{name}" for name in found.memory),
         "memory": ", ".join(f"{name} {size} bytes" for name, size in found.memory.items()),
@@ -53,3 +73,19 @@ def export(
         "compile": f"cd {c} && cc -O2 -std=c99 *.c -o run -lm",
     }
     show(found._asdict(), table(f"{mech.name or 'mechanism'}, C99", lines), json)
+
+
+def _fmu(mech: Any, fmu: Path, options: tuple[Any, ...], json: bool) -> None:
+    import udkjax as udk
+    from udkjax.show.summary import table
+
+    found = udk.export_fmu(mech, fmu, *options)
+    lines = {
+        "interfaces": ", ".join(found.kinds),
+        "outputs": f"{len(found.outputs)}, from {found.outputs[0]} to {found.outputs[-1]}",
+        "parameters": str(len(found.parameters)),
+        "inputs": ", ".join(found.inputs) or "none",
+        "libraries": ", ".join(found.platforms) or "none: importers compile the sources",
+        "wrote": str(found.file),
+    }
+    show(found._asdict(), table(f"{mech.name or 'mechanism'}, FMI 3.0", lines), json)

@@ -21,6 +21,7 @@ from udkjax.integrate.portable import portable_engine as portable_engine
 from udkjax.integrate.portable import scalar_parameters as scalar_parameters
 from udkjax.integrate.portable import unknown_friction as unknown_friction
 from udkjax.integrate.portable.c import export_c as export_c
+from udkjax.integrate.portable.fmi import export_fmu as export_fmu
 from udkjax.integrate.projection import Projection as Projection
 from udkjax.integrate.simulate import simulate as simulate
 from udkjax.integrate.solution import CAUSES as CAUSES

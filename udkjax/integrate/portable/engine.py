@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
 
-import jax
 import numpy as np
 
 from udkjax.annotations import JsonObject
@@ -18,7 +17,7 @@ from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events.law.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
-from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
+from udkjax.integrate.portable.parameters import NumberProgram, guess_of, places_of_numbers, scalar_parameters
 from udkjax.integrate.portable.portable_events import PortableEvents, unknown_friction
 from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
@@ -186,18 +185,12 @@ def _operation(operation: Operation) -> JsonObject:
 
 def _places(mechanism: Mechanism, pull: bool) -> JsonObject:
     """Return the places in the vector of all numbers of the guess and of the pulls."""
-    leaves, tree = jax.tree.flatten(mechanism.without_origin.without_samples)
-    starts = np.cumsum([0, *(np.size(x) for x in leaves)])
-    numbered = [np.arange(k, k + np.size(x)).reshape(np.shape(x)) for k, x in zip(starts, leaves, strict=False)]
-    places: Mechanism = jax.tree.unflatten(tree, numbered)
-    guess = {"q": [], "v": []}
-    for body in places.bodies.values():
-        guess["q"] += [*np.ravel(body.position).tolist(), int(body.angle)]
-        guess["v"] += [*np.ravel(body.velocity).tolist(), int(body.angular_velocity)]
+    places = places_of_numbers(mechanism)
+    guess = guess_of(places)
     pulls = [places.forces[PREFIX + name] for name in places.body_names] if pull else []
     held = [[*e.point.tolist(), *e.target.tolist(), int(e.stiffness), int(e.damping)] for e in pulls]
     masses = [[int(body.mass), int(body.inertia)] for body in places.bodies.values()]
-    return {"guess": guess, "pulls": held, "masses": masses}
+    return {"guess": {x: y.tolist() for x, y in guess.items()}, "pulls": held, "masses": masses}
 
 
 def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float) -> Problem:

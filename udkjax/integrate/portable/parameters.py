@@ -98,6 +98,23 @@ class NumberProgram:
         return numbers
 
 
+def places_of_numbers(mechanism: Mechanism) -> Mechanism:
+    """Return a mechanism that has places in the vector of all numbers instead of the numbers."""
+    leaves, tree = jax.tree.flatten(mechanism.without_origin.without_samples)
+    starts = np.cumsum([0, *(np.size(x) for x in leaves)])
+    numbered = [np.arange(k, k + np.size(x)).reshape(np.shape(x)) for k, x in zip(starts, leaves, strict=False)]
+    return jax.tree.unflatten(tree, numbered)
+
+
+def guess_of(mechanism: Mechanism) -> dict[str, np.ndarray]:
+    """Return the initial guesses q and v of all bodies, as they are in the mechanism."""
+    bodies = mechanism.bodies.values()
+    return {
+        "q": np.concatenate([[*np.ravel(body.position), body.angle] for body in bodies]),
+        "v": np.concatenate([[*np.ravel(body.velocity), body.angular_velocity] for body in bodies]),
+    }
+
+
 def _numbers(mechanism: Mechanism) -> list[Array | np.ndarray]:
     """Return all numbers, with zeros instead of samples, and the breakpoints."""
     breakpoints = mechanism.breakpoints

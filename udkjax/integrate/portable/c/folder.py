@@ -105,19 +105,25 @@ def export_c(
     if unknown or not what:
         raise ArgumentError(f"what must be a list of {', '.join(FUNCTIONS)}, not {', '.join(unknown) or 'empty'}")
     scene = SceneCode(mechanism, times, rtol, atol, stiff)
-    units = {name: FUNCTIONS[name](scene) for name in FUNCTIONS if name in what}
-    names = scene.parameters(parameters)
-    header, found = _header(scene, {name: unit for name, (_, unit) in units.items()}, names[1]), {}
-    found |= {f"{scene.prefix}.h": header, f"{scene.prefix}_numbers.c": _numbers(scene, names)}
-    found |= {f"{scene.prefix}_{name}.c": text for name, (text, _) in units.items()}
+    found, units = scene_files(scene, what, parameters)
     if "run" in units:
         found["main.c"] = _main(scene)
     to = Path(folder)
     to.mkdir(parents=True, exist_ok=True)
     for name, text in found.items():
         (to / name).write_text(text, encoding="ascii", errors="backslashreplace")
-    flops = max((unit.flops.get("accelerations", 0) for _, unit in units.values()), default=0)
-    return ExportedCode([to / name for name in found], scene.prefix, {k: 8 * u.memory for k, (_, u) in units.items()}, flops)
+    flops = max((unit.flops.get("accelerations", 0) for unit in units.values()), default=0)
+    return ExportedCode([to / name for name in found], scene.prefix, {k: 8 * u.memory for k, u in units.items()}, flops)
+
+
+def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]) -> tuple[dict[str, str], dict[str, CUnit]]:
+    """Return the texts of the files of a scene's functions, by name, and the units of the functions."""
+    units = {name: FUNCTIONS[name](scene) for name in FUNCTIONS if name in what}
+    names = scene.parameters(parameters)
+    header = _header(scene, {name: unit for name, (_, unit) in units.items()}, names[1])
+    files = {f"{scene.prefix}.h": header, f"{scene.prefix}_numbers.c": _numbers(scene, names)}
+    files |= {f"{scene.prefix}_{name}.c": text for name, (text, _) in units.items()}
+    return files, {name: unit for name, (_, unit) in units.items()}
 
 
 def _header(scene: SceneCode, units: dict[str, CUnit], parameters: dict[str, float]) -> str:

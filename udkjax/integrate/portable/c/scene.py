@@ -18,6 +18,7 @@ from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, may_stick, 
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solution import Result
+from udkjax.integrate.stepping import MOST_STEPS_OF_INTERVAL
 from udkjax.native.c import CUnit, c_function, c_unit, number_text
 from udkjax.native.module.steps import SMALLEST_STEP, Status
 from udkjax.native.operations import Operation, StateOperation
@@ -39,7 +40,6 @@ RESULTS = {
     Status.MISSING_RANK: Result.missing_rank,
 }
 INFO = {name: k for k, name in enumerate(RunStates.info_names)}  # places in the result "info"
-STEPS_OF_INTERVAL = 1_000  # most steps of `step`, as of `udkjax.step`
 
 
 class SceneCode:
@@ -150,7 +150,8 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
     double ts[2], qs[{2 * self.n}], vs[{2 * self.n}], violation[2], info[{len(INFO) + 2 * self.n}];
     ts[0] = t;
     ts[1] = t + dt;
-    const int result = integrate(numbers, ts, 2, q, v, qs, vs, violation, info, memory, dt, {number_text(STEPS_OF_INTERVAL)});
+    const double most_steps = {number_text(MOST_STEPS_OF_INTERVAL)};
+    const int result = integrate(numbers, ts, 2, q, v, qs, vs, violation, info, memory, dt, most_steps);
     if (!result) {{
         memcpy(q, qs + {self.n}, {self.n} * sizeof *q);
         memcpy(v, vs + {self.n}, {self.n} * sizeof *v);
@@ -164,13 +165,13 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
         """Return `accelerations`."""
         state = "const double *numbers, double t, const double *q, const double *v"
         head = f"void {self.prefix}_accelerations({state}, double *a, double *memory)"
-        return self._of_state(self._evaluation, head, {"found": "a"})
+        return self._of_state(self.evaluation, head, {"found": "a"})
 
     def projection(self) -> tuple[str, CUnit]:
         """Return `project`."""
         head = f"void {self.prefix}_project(const double *numbers, double t, double *q, double *v, double *memory)"
         copied = f"    memcpy(q, found, {self.n} * sizeof *q);\n    memcpy(v, found + {self.n}, {self.n} * sizeof *v);\n"
-        return self._of_state(self._evaluation.projection, head, {"found": "found"}, f"    double found[{2 * self.n}];\n", copied)
+        return self._of_state(self.evaluation.projection, head, {"found": "found"}, f"    double found[{2 * self.n}];\n", copied)
 
     def positions(self) -> tuple[str, CUnit]:
         """Return `close`."""
@@ -194,7 +195,7 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
         return self._of_state(operation, head, {"numbers": "own", **results}, before, after, settings)
 
     @property
-    def _evaluation(self) -> StateOperation:
+    def evaluation(self) -> StateOperation:
         operation = evaluation_of(self.compiled.equations)
         if operation is None:
             raise ArgumentError("no C for accelerations and projections of a scene without constraints: export its run")

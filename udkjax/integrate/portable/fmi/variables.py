@@ -1,0 +1,113 @@
+"""The variables of an FMU: names, units and places, in the order of their value references in sources/fmu.c."""
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from udkjax.integrate.portable.c.scene import SceneCode
+from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
+from udkjax.requirements import ArgumentError
+from udkjax.scene.elements.forces import Force, Torque
+from udkjax.scene.elements.held import Held
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
+
+COLUMNS = ("x", "y", "angle"), ("vx", "vy", "omega"), ("ax", "ay", "alpha")  # of a body, as in tables of runs
+UNITS = ("m", "m", "rad"), ("m/s", "m/s", "rad/s"), ("m/s2", "m/s2", "rad/s2")
+CONTROLLED = {Torque: "value", Force: "vector"}  # numbers of force elements that are inputs unless others are named
+FIELDS = ("value", "vector", "torque", "force")  # their names in scenes and in drawings
+POSES = ("position", "angle", "velocity", "angular_velocity")  # of a body: the start values of states
+
+
+class FMUVariable(NamedTuple):
+    """A variable: a number."""
+
+    name: str
+    unit: str
+    start: float | None = None
+
+
+class FMUVariables:
+    """The variables of an FMU of a scene.
+
+    Attributes:
+        coordinates: positions, velocities and accelerations, one list after the other.
+        states: the integrated state, positions before velocities, with start values.
+        rates: the derivatives of the states.
+        parameters: numbers that can be set before a run.
+        inputs: numbers that can be set during a run.
+    """
+
+    def __init__(self, scene: SceneCode, parameters: Sequence[str] | None, inputs: Sequence[str] | None):
+        bodies, given = scene.mechanism.body_names, scene.mechanism
+        self.coordinates = [
+            FMUVariable(f"body.{body}.{name}", unit)
+            for names, units in zip(COLUMNS, UNITS, strict=True)
+            for body in bodies
+            for name, unit in zip(names, units, strict=True)
+        ]
+        start = np.concatenate([scene.inputs["q"], scene.inputs["v"]])
+        n = len(start) // 2
+        states, rates = self.coordinates[: 2 * n], self.coordinates[n:]
+        self.states = [FMUVariable(f"state.{x.name}", x.unit, float(y)) for x, y in zip(states, start, strict=True)]
+        self.rates = [FMUVariable(f"der(state.{x.name})", y.unit) for x, y in zip(states, rates, strict=True)]
+        named = _controlled(given) if inputs is None else inputs
+        chosen = scalar_parameters(given, named)
+        values = _parameters(given) if parameters is None else scalar_parameters(given, parameters)
+        both = sorted(set(chosen) & set(values)) if parameters is not None else []
+        if both:
+            raise ArgumentError(f"{', '.join(both)}: an input is no parameter as well; name it in one of the two")
+        self.inputs = [FMUVariable(name, _unit(given, name), value) for name, value in chosen.items()]
+        kept = {name: value for name, value in values.items() if name not in chosen}
+        self.parameters = [FMUVariable(name, _unit(given, name), value) for name, value in kept.items()]
+
+    @property
+    def values(self) -> list[FMUVariable]:
+        """The parameters and the inputs."""
+        return [*self.parameters, *self.inputs]
+
+
+def least_of(mechanism: Mechanism, name: str) -> str:
+    """Return the constant of fmu.c for the values that a parameter may have."""
+    if not mechanism.must_be_positive(name):
+        return "ANY_NUMBER"
+    try:
+        mechanism.with_parameters({name: 0.0})
+    except SceneError:
+        return "POSITIVE"
+    return "NOT_NEGATIVE"
+
+
+def _unit(mechanism: Mechanism, name: str) -> str:
+    unit = mechanism.unit_of(name)
+    return "" if unit == "1" else unit
+
+
+def _controlled(mechanism: Mechanism) -> list[str]:
+    """Return the names of the constant torques and forces, by which a controller acts on the scene."""
+    found = []
+    for name in mechanism.independent_parameters():
+        section, _, rest = name.partition(".")
+        owner, _, field = rest.rpartition(".")
+        element = mechanism.forces.get(owner)
+        own = CONTROLLED.get(type(element)) if section in ("force", "load") else None
+        if own and field in FIELDS and not isinstance(getattr(element, own), Held):
+            found.append(name)
+    return found
+
+
+def _parameters(mechanism: Mechanism) -> dict[str, float]:
+    """Return the scene's parameters but for guesses of poses, and for those that move times where the motion is not smooth."""
+    found = scalar_parameters(mechanism)
+    values = {k: x for k, x in found.items() if not re.match(rf"body\..*\.({'|'.join(POSES)})(\[|$)", k)}
+    values = {k: x for k, x in values.items() if not k.endswith(".velocity") and ".velocity[" not in k}
+    if _moves_times(mechanism, values):
+        values = {k: x for k, x in values.items() if not _moves_times(mechanism, {k: x})}
+    return values
+
+
+def _moves_times(mechanism: Mechanism, values: dict[str, float]) -> bool:
+    program = NumberProgram(mechanism, values, lambda given: given.without_origin)
+    return any(k >= program.count for k in program.changing)
