@@ -83,6 +83,8 @@ def objects() -> dict[str, object]:
             (batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])),
             batch({"gravity": np.zeros((2, 2))}, np.array([0.1])),
         ),
+        *(close := udk.gaps(linkage, "body.crank.angle", shapes=dict.fromkeys(linkage.body_names, 2.0)), close.least),
+        *(close.contacts[0], udk.layers(linkage, "body.crank.angle", shapes=dict.fromkeys(linkage.body_names, 2.0))),
         *(udk.Tolerance(0.1, "mm"), udk.PinClearance("0.1 mm")),
         udk.tolerances(linkage, {"length(crank)": 1e-3}, ["range(body.rocker.angle)"], drive="body.crank.angle", samples=10),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),

@@ -81,6 +81,12 @@ from udkjax.positions.following.kinematics import kinematics as kinematics
 from udkjax.positions.following.kinematics import travel as travel
 from udkjax.positions.following.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.following.position_batch import PositionBatch as PositionBatch
+from udkjax.positions.gaps.gaps import LeastGap as LeastGap
+from udkjax.positions.gaps.gaps import LeastGaps as LeastGaps
+from udkjax.positions.gaps.gaps import Touch as Touch
+from udkjax.positions.gaps.gaps import gaps as gaps
+from udkjax.positions.gaps.layers import Layers as Layers
+from udkjax.positions.gaps.layers import layers as layers
 from udkjax.scene import GROUND as GROUND
 from udkjax.scene import Angle as Angle
 from udkjax.scene import Body as Body

@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "simulate": ("SCENE", *SHORT, "--out", "OUT.nc", "--json"),
     "animate": ("SCENE", *SHORT, "--out", "OUT.html", "--json"),
     "kinematics": ("SCENE", "--driver", "DRIVER", "--from", "FIRST", "--to", "LAST", "--count", "5", "--json"),
+    "gaps": ("SCENE", "--driver", "DRIVER", "--from", "FIRST", "--to", "LAST", "--width", "WIDTH", "--layers", "--json"),
     "inverse": ("SCENE", *SHORT, "--json"),
     "reactions": ("SCENE", *SHORT, "--json"),
     "tolerances": (
@@ -73,7 +74,7 @@ def _words(name: str, case: Case, folder: Path) -> dict[str, str]:
     first, last = (f"{float(x)!r} rad" for x in case.values()[[0, -1]])
     if case.driver in case.model.driver_names and case.model.drivers[case.driver].coordinate != "angle":
         first, last = (f"{float(x)!r} m" for x in case.values()[[0, -1]])
-    words = {"DRIVER": str(case.driver), "NUMBER": case.number, "FIRST": first, "LAST": last}
+    words = {"DRIVER": str(case.driver), "NUMBER": case.number, "FIRST": first, "LAST": last, "WIDTH": "10 mm"}
     if name == "tolerances":
         words["TOLERANCE"] = f"{case.number}=1e-3 {case.model.unit_of(case.number)}"
         words["MEASURE"] = f"range(body.{case.model.body_names[-1]}.angle)"
@@ -135,6 +136,12 @@ def read_tolerances(case: Case, scene: Any, results: Any, folder: Path) -> str:
 
 def read_inverse(case: Case, scene: Any, results: Any, folder: Path) -> str:
     return same(results["efforts"], udk.inverse_dynamics(scene, TS).efforts, "udk.inverse_dynamics", 1e-6)
+
+
+def read_gaps(case: Case, scene: Any, results: Any, folder: Path) -> str:
+    found = udk.gaps(case.model, case.driver, values=case.values()[[0, -1]], shapes=dict.fromkeys(case.model.body_names, 0.01))
+    wanted = [[gap.distance, gap.bound] for gap in found.pairs]
+    return same([[gap["distance"], gap["bound"]] for gap in results["gaps"]], wanted, "udk.gaps", 1e-6)
 
 
 def read_reactions(case: Case, scene: Any, results: Any, folder: Path) -> str:

@@ -101,6 +101,8 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
     "instant_centres": {"": positions.instant_centres},
     "travel": {"": positions.travel},
     "motion_ranges": {"": positions.motion_ranges},
+    "gaps": {"": positions.gaps},
+    "layers": {"": positions.layers},
     "motion_at": {"": positions.motion_at},
     "worked_solution": {"": positions.worked_solution},
     "pin_motion": {"": positions.pin_motion, "transformed": transformed(driven(lambda m, k: udk.pin_motion(m, k).links))},

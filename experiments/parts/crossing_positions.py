@@ -1,5 +1,6 @@
 """Rows of the table of functions by models: positions, statics, and answers to the questions of a course."""
 
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -162,6 +163,32 @@ def motion_ranges(case: Case) -> str:
         agree(stroke, np.hypot(*np.ptp(way, axis=0)), f"the places of {name}", 1e-5)
     others = udk.motion_ranges(case.twin[0], motion, case.driver)
     return agree(found, others, f"the positions, {case.twin[1]}")
+
+
+SQUARE = 0.01 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def gaps(case: Case) -> str:
+    """Squares on the centres of bodies: no gap of a pose is below the bound, and the least one is that of the distance."""
+    m, run = case.model, case.alone
+    pairs = list(combinations(bodies_of(m), 2))[:6]
+    shapes = dict.fromkeys(bodies_of(m), SQUARE)
+    found = udk.gaps(m, pairs=pairs, run=run, shapes=shapes)
+    q = np.asarray(run.q)
+    for gap in found.pairs:
+        i, j = (m.body_names.index(name) for name in gap.pair)
+        apart = np.hypot(*(q[:, i, :2] - q[:, j, :2]).T)
+        claim(gap.bound <= gap.distance <= apart.min() + 1e-12, "a pose has a smaller gap")
+        claim(apart.min() - 2 * np.sqrt(2) * 0.01 <= gap.distance + 1e-3 + 0.2 * apart.max(), "the gap is too small")
+    return by_twin(lambda case, m: [x.distance for x in udk.gaps(m, pairs=pairs, run=run, shapes=shapes).pairs])(case)
+
+
+def layers(case: Case) -> str:
+    m, run = case.model, case.alone
+    shapes = dict.fromkeys(bodies_of(m), SQUARE)
+    found = udk.layers(m, run=run, shapes=shapes)
+    claim(all(found.of[one] != found.of[other] for one, other in found.conflicts), "links of one layer hit each other")
+    return by_twin(lambda case, m: list(udk.layers(m, run=run, shapes=shapes).of.values()))(case)
 
 
 def pin_motion(case: Case) -> str:

@@ -244,6 +244,10 @@ def targets() -> list[tuple[str, Callable[..., Any], dict[str, Any]]]:
                 given["mechanism"] = chain()
             if name == "inverse_dynamics":
                 given |= {"motion": fitting()["motion"], "drivers": ["body.b.angle"]}
+            if name in ("gaps", "layers"):
+                given |= {"run": fitting()["solution"], "shapes": {"b": 0.1, "c": 0.1, "ground": np.ones((1, 2))}}
+            if name == "gaps":
+                given["pairs"] = [("ground", "c")]
             found += [(name, function, given)] * (1 if name in SELDOM else 12)
     found += [("simulate", udk.simulate, {"mechanism": scene(), "ts": fitting()["ts"]})] * 60
     found += [(f"library.{name}", getattr(udk.library, name), {}) for name in udk.library.__all__] * 4

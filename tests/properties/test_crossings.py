@@ -28,7 +28,7 @@ OTHERS = {
     "results": """Result Solution Events Characteristics Reached Kinematics Travel MotionRanges PinMotion BatchPositions Workspace
         PositionBatch Animation Equilibrium HoldingEfforts Modes Diagnosis SystemDiagnosis Explanation Estimate GradientCheck
         Posterior Comparison InverseDynamics PowerBalance Design Designs DesignSearch FoundDesign MotionPoint CompleteDesign
-        CompleteDesigns CurveDesign CurveDesigns ToleranceAnalysis WorkedSolution""",
+        CompleteDesigns CurveDesign CurveDesigns ToleranceAnalysis WorkedSolution LeastGap LeastGaps Touch Layers""",
     "errors": "SimulationError AssemblyError SceneError IdentificationError SweepError",
     "studies": """Candidate Parameter Quantity Record Start Axis LatinHypercube Random Sobol Zipped EnergyGoal FrequencyGoal
         FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal ToleranceGoal TorqueGoal Tolerance

@@ -21,6 +21,7 @@ COMMANDS = (
     "identify",
     "design",
     "kinematics",
+    "gaps",
     "solve",
     "exercise",
     "inverse",

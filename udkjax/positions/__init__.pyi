@@ -76,5 +76,11 @@ from udkjax.positions.following.position_batch import BatchPositions as BatchPos
 from udkjax.positions.following.position_batch import PositionBatch as PositionBatch
 from udkjax.positions.following.position_batch import compile_programs as compile_programs
 from udkjax.positions.following.position_batch import position_code as position_code
+from udkjax.positions.gaps.gaps import LeastGap as LeastGap
+from udkjax.positions.gaps.gaps import LeastGaps as LeastGaps
+from udkjax.positions.gaps.gaps import Touch as Touch
+from udkjax.positions.gaps.gaps import gaps as gaps
+from udkjax.positions.gaps.layers import Layers as Layers
+from udkjax.positions.gaps.layers import layers as layers
 
 __all__: list[str]

@@ -1,0 +1,197 @@
+"""`gaps`: the least gap between links over a motion, proven between samples, with derivatives, and where links touch."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from udkjax.annotations import NumberLike, Numbers
+from udkjax.argument_types import BY_NAME, HISTORY, NUMBERS_BY_NAME, ArgumentRequirement, of_kind
+from udkjax.arrays import is_traced, without_derivatives
+from udkjax.positions.assembling.channels import StateHistory
+from udkjax.positions.following.drive import Drive, only_driver
+from udkjax.positions.gaps.derivatives import differentiable_gaps
+from udkjax.positions.gaps.motion import motion_of_drive, motion_of_run
+from udkjax.positions.gaps.pairs import LinkPair, pairs_to_check
+from udkjax.positions.gaps.search import search
+from udkjax.positions.gaps.shapes import parts_of
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, has_numbers, prints_table
+from udkjax.requirements import ArgumentError, ArgumentTypeError, GivenArguments, array, describe, require_finite
+from udkjax.scene.arguments import checked
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.mechanism import Mechanism
+
+_require_layers = of_kind(
+    'map links to numbers or names of layers, such as {"crank": 0}',
+    lambda x: isinstance(x, Mapping) and all(isinstance(k, str) and isinstance(y, str | int | float) for k, y in x.items()),
+)
+_require_pairs = of_kind(
+    'be pairs of names of links, such as [("crank", "rocker")]',
+    lambda x: isinstance(x, Sequence) and not isinstance(x, str) and all(map(_is_pair, x)),
+)
+
+
+def _require_range(name: str, value: Any, given: GivenArguments) -> None:
+    values = array(name, value)
+    require_finite(name, value)
+    if values.ndim != 1 or len(values) < 2 or (not is_traced(value) and np.ptp(np.asarray(values)) == 0):
+        raise ArgumentError(f"{name} must contain at least two different values of the driver, {describe(value)}")
+
+
+RANGE = ArgumentRequirement("at least two different values", _require_range)
+LAYERS = ArgumentRequirement("by name", _require_layers)
+PAIRS = ArgumentRequirement("pairs of names", _require_pairs)
+
+
+def _is_pair(x: Any) -> bool:
+    return isinstance(x, Sequence) and not isinstance(x, str) and len(x) == 2 and all(isinstance(name, str) for name in x)
+
+
+@prints_table
+class LeastGap(NamedTuple):
+    """The least gap between two links over a motion.
+
+    Attributes:
+        pair: the names of the links.
+        value: the value of the driver (rad, m) or the time (s) at which it is least.
+        distance: the gap (m); negative if the links overlap, by the way on which they come apart soonest.
+        bound: the gap (m) below which none is, between samples either.
+        points: the closest points of the outlines (m), the first on the first link.
+    """
+
+    pair: LinkPair
+    value: float
+    distance: Any
+    bound: float
+    points: Numbers
+
+
+@prints_table
+class Touch(NamedTuple):
+    """A stretch of a motion over which two links touch or overlap.
+
+    Attributes:
+        pair: the names of the links.
+        begins: the value of the driver (rad, m) or the time (s) at which it begins; the first one if they touch from there.
+        ceases: the value at which it ceases; the last one if they still touch.
+    """
+
+    pair: LinkPair
+    begins: float
+    ceases: float
+
+
+class LeastGaps(PrintsTable):
+    """The least gaps of pairs of links over a motion.
+
+    Attributes:
+        pairs: the least gap of each pair, the smallest first.
+        contacts: the stretches over which pairs touch, in the order of values.
+        unit: of the values.
+        missing: the share of the range that is not reached, or in which a run has failed: nothing is known there.
+    """
+
+    pairs: tuple[LeastGap, ...]
+    contacts: tuple[Touch, ...] = eqx.field(static=True)
+    unit: str = eqx.field(static=True, default="")
+    missing: float = eqx.field(static=True, default=0.0)
+
+    @property
+    def least(self) -> LeastGap:
+        """The smallest gap of all pairs."""
+        return self.pairs[0]
+
+    def _table(self) -> PrintedTable:
+        if not has_numbers(self) or np.ndim(self.least.distance):
+            return fields_table(self, {}, "gaps between links")
+        size = max(float(np.max(np.abs(np.asarray(gap.points)))) for gap in self.pairs)
+        rows = [
+            (" and ".join(gap.pair), format_number(gap.distance, "m", size), "at", format_number(gap.value, self.unit))
+            for gap in self.pairs
+        ]
+        says = [
+            f"{' and '.join(x.pair)} touch from {format_number(x.begins, self.unit)} to {format_number(x.ceases, self.unit)}"
+            for x in self.contacts
+        ]
+        if self.missing:
+            says.append(f"{100 * self.missing:.3g} % of the range is not reached")
+        return PrintedTable("least gaps between links", rows, remarks=says)
+
+
+@checked
+def gaps(
+    mechanism: Mechanism,
+    drive: Drive = None,
+    layers: Annotated[Mapping[str, Any], LAYERS] | None = None,
+    pairs: Annotated[Sequence[Sequence[str]], PAIRS] | None = None,
+    values: Annotated[Float[ArrayLike, "T"] | Sequence[float], RANGE] | None = None,
+    run: Annotated[StateHistory, HISTORY] | None = None,
+    shapes: Annotated[Mapping[str, Any], BY_NAME] | None = None,
+    held: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
+) -> LeastGaps:
+    """Return the least gap of each pair of links over a motion, proven between samples.
+
+    The signed distance of two convex outlines is max over n of min n . (b - a), with n from the first to the second. From the
+    speeds and accelerations of the outlines follows how far it can fall between two samples; where it could fall below the least
+    gap, more positions are computed. `bound` is what is proven, as a rule to 1e-9 of the mechanism's size. Between samples of a
+    drive, positions are polynomials of degree five, compared with computed ones halfway; between output times of a run, they are
+    the cubics through its positions and velocities.
+
+    Links are drawn bars with round ends (`width`), discs, plates and outlines, and cams (for a roller, the path of its centre).
+    Outlines that are not convex are cut into convex parts; an overlap of links is the largest one of their parts.
+
+    Distances have exact first and second derivatives with respect to every number of the mechanism, of `shapes` and of a run, by
+    `jax.grad`, `jax.hessian` and the like; values and contacts are constants there.
+
+    Args:
+        mechanism: a mechanism of one degree of freedom once its drivers hold, or any mechanism with a `run`.
+        drive: a driver or coordinate, as for `kinematics`; by default the only driver.
+        layers: the layer of each link; all pairs of a layer are measured. By default all pairs that share no joint.
+        pairs: pairs of names of links, instead of layers.
+        values: values of the driver (rad, m) between whose least and largest it moves; by default one turn, or from toggle to
+            toggle.
+        run: a `Solution` or `Kinematics`, instead of a driver.
+        shapes: outlines by link or "ground", instead of the drawn ones: a width (m) around the pins, corners (n, 2) in the frame
+            of the link (m), or a tuple of corners and a width around them.
+        held: values that other drivers or coordinates hold, by name, as for `kinematics`.
+
+    Returns:
+        `LeastGaps`, which print as a table.
+
+    Raises:
+        SceneError: a link has no outline, a name is unknown, links of one layer share a joint, or positions do not follow from
+            the driver.
+        ArgumentError: both a run and a driver, values or held are given.
+        ArgumentTypeError: numbers are traced by `jax.jit` or `jax.vmap`.
+    """
+    if run is not None and not (drive is None and values is None and held is None):
+        raise ArgumentError("run is given with drive, values or held: leave out either")
+    checked_pairs = pairs_to_check(mechanism, layers, pairs, shapes)
+    names = list(dict.fromkeys(name for pair in checked_pairs for name in pair))
+    driver = None if run is not None else only_driver(mechanism) if drive is None else drive
+    given = (mechanism, driver, values, run, shapes, held)
+    now = without_derivatives(given)
+    if is_traced(now):
+        cure = "call it outside of jax.jit and jax.vmap; jax.grad and jax.hessian can trace it"
+        raise ArgumentTypeError(f"gaps needs concrete numbers, since it decides which positions to compute: {cure}")
+    concrete, driver_now, values_now, run_now, shapes_now, held_now = now
+    parts = parts_of(concrete, shapes_now, names)
+    motion = motion_of_run(run_now) if run is not None else motion_of_drive(concrete, driver_now, values_now, held_now)
+    least, touches = search(parts, [*mechanism.body_names, GROUND], checked_pairs, motion)
+    distances: Sequence[Any] = [x.distance for x in least]
+    if is_traced(given):
+        order = [*mechanism.body_names, GROUND]
+        moving = parts_of(mechanism, shapes, names)
+        distances = differentiable_gaps(mechanism, driver, run, held, moving, order, least, motion)
+    contacts = [
+        Touch(pair, *motion.value(np.array(ends)).tolist()) for pair, x in zip(checked_pairs, touches, strict=True) for ends in x
+    ]
+    found = [
+        LeastGap(pair, float(motion.value(x.u)), d, x.bound, x.places)
+        for pair, x, d in zip(checked_pairs, least, distances, strict=True)
+    ]
+    order = np.argsort([x.distance for x in least], kind="stable")
+    contacts.sort(key=lambda x: (x.begins, x.ceases))
+    return LeastGaps(tuple(found[k] for k in order), tuple(contacts), motion.unit, motion.missing)

@@ -1,0 +1,175 @@
+"""Motions of bodies as polynomials between poses, in the form of Bezier, whose control points bound their derivatives.
+
+The parameter u of a motion is the value of the driver; where the driver's range ends at toggles, the angle of
+s = lower + (upper - lower) (1 - cos u) / 2, of which positions are smooth functions there; for a run, time.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from udkjax.positions.assembling.channels import StateHistory
+from udkjax.positions.assembling.coordinates import Coordinate, value_of
+from udkjax.positions.following.kinematics import FULL_TURN, kinematics, travel
+from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
+
+FIRST_POSES = 361  # of a drive: a degree apart over a turn
+FOLLOWED = 1e-11  # of the mechanism's size: error of a polynomial halfway between poses, above which a pose is computed there
+MOST_HALVINGS = 8
+PosesAndRates = Float[np.ndarray, "n 3 bodies 3"]  # positions of bodies and, last, of the ground, with two derivatives by u
+
+
+class PolynomialMotion(NamedTuple):
+    """A motion.
+
+    Attributes:
+        u: the parameters at which its polynomials meet.
+        points: their control points; NaN where nothing is known.
+        unit: unit of its values.
+        value: the value of the driver (rad, m) or the time (s) at parameters.
+        toggles: whether the range ends at toggles.
+    """
+
+    u: Float[np.ndarray, "pieces+1"]
+    points: Float[np.ndarray, "degree+1 pieces bodies 3"]
+    unit: str
+    value: Callable[[Any], Any] = np.asarray
+    toggles: bool = False
+
+    @property
+    def known(self) -> Bool[np.ndarray, "pieces"]:
+        """A mask of the polynomials that are known."""
+        return np.isfinite(self.points).all((0, 2, 3)) & (np.diff(self.u) > 0)
+
+    @property
+    def missing(self) -> float:
+        """The share of the range in which nothing is known."""
+        return max(0.0, 1.0 - float(np.diff(self.u)[self.known].sum() / (self.u[-1] - self.u[0])))
+
+    @property
+    def nodes(self) -> Float[np.ndarray, "pieces+1 bodies 3"]:
+        """The poses at which polynomials meet."""
+        return np.concatenate([self.points[0], self.points[-1, -1:]])
+
+    def at(self, u: Any, piece: Int[np.ndarray, "n"], body: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Return the poses of bodies in pieces, and their derivatives by u."""
+        stage, h = self.points[:, piece, body], np.diff(self.u)[piece]
+        t, h = (x.reshape(-1, *[1] * (stage.ndim - 2)) for x in ((u - self.u[piece]) / h, h))
+        while len(stage) > 2:  # de Casteljau
+            stage = stage[:-1] + t * (stage[1:] - stage[:-1])
+        way = stage[1] - stage[0]
+        return stage[0] + t * way, (len(self.points) - 1) * way / h
+
+    def largest_derivatives(self) -> Float[np.ndarray, "2 2 pieces bodies"]:
+        """Return bounds of speed and angular velocity, and of acceleration and angular acceleration, over each piece."""
+        h, found, stage = np.diff(self.u)[:, None, None], [], self.points
+        for _ in range(2):
+            stage = (len(stage) - 1) * np.diff(stage, axis=0) / h
+            found.append([np.hypot(stage[..., 0], stage[..., 1]).max(0), np.abs(stage[..., 2]).max(0)])
+        return np.array(found)
+
+
+def motion_of_run(run: StateHistory) -> PolynomialMotion:
+    """Return the motion of a run: between output times, the cubics through positions and velocities."""
+    ts, q, v = (np.asarray(x, float) for x in (run.ts, run.q, run.v))
+    rate = getattr(run, "rate", None)
+    v = v if rate is None else v / np.broadcast_to(np.asarray(rate, float), ts.shape)[:, None, None]
+    q, v = (np.concatenate([x, 0.0 * x[:, :1]], 1) for x in (q, v))
+    third = np.diff(ts)[:, None, None] / 3
+    points = np.stack([q[:-1], q[:-1] + third * v[:-1], q[1:] - third * v[1:], q[1:]])
+    motion = PolynomialMotion(ts, points, getattr(run, "unit", "") or "s")
+    if not motion.known.any():
+        raise ValueError("the run has no two states after each other, so that nothing moves between them")
+    return motion
+
+
+def motion_of_drive(mechanism: Mechanism, driver: str | Coordinate, values: Any, held: Any) -> PolynomialMotion:
+    """Return the motion over the range of a driver, or between the least and the largest of given values."""
+    sample = partial(_poses, mechanism, driver, held)
+    if values is None:
+        limits = travel(mechanism, driver, None, held)
+        lower, upper = float(limits.lower), float(limits.upper)
+        if np.isfinite([lower, upper]).all():
+            return _between_toggles(sample, lower, upper, np.stack([limits.lower_q, limits.upper_q]), limits.unit)
+        if limits.unit != "rad" or np.isfinite([lower, upper]).any():
+            problem = f"the range of {driver!r} from {lower:.6g} to {upper:.6g} {limits.unit} has an end that is not known"
+            raise SceneError([f"{problem}; give the first and the last value, values=[first, last]"], mechanism.name)
+        lower, unit = float(value_of(mechanism, driver)(mechanism.q0)), limits.unit
+        upper = lower + FULL_TURN
+    else:
+        lower, upper = float(np.min(np.asarray(values))), float(np.max(np.asarray(values)))
+        unit = kinematics(mechanism, driver, np.array([lower]), held=held).unit
+    return _follow(sample, np.linspace(lower, upper, FIRST_POSES), unit)
+
+
+def _poses(mechanism: Mechanism, driver: Any, held: Any, values: Float[np.ndarray, "n"]) -> PosesAndRates:
+    motion = kinematics(mechanism, driver, values, held=held)
+    x = np.stack([np.asarray(x) for x in (motion.q, motion.v, motion.a)], 1)
+    return np.concatenate([x, 0.0 * x[:, :, :1]], 2)
+
+
+def _between_toggles(
+    sample: Callable[[Any], PosesAndRates], lower: float, upper: float, ends: np.ndarray, unit: str
+) -> PolynomialMotion:
+    half = 0.5 * (upper - lower)
+
+    def value(u: Any) -> Any:
+        return lower + half * (1 - np.cos(u))
+
+    def by_angle(u: Float[np.ndarray, "n"]) -> PosesAndRates:
+        x, (slope, bend) = sample(value(u)), half * np.array([np.sin(u), np.cos(u)])[:, :, None, None]
+        return np.stack([x[:, 0], x[:, 1] * slope, x[:, 2] * slope**2 + x[:, 1] * bend], 1)
+
+    places = np.concatenate([ends, np.zeros((2, 1, 3))], 1)
+    motion = _follow(by_angle, np.linspace(0.0, np.pi, FIRST_POSES), unit, places)
+    return motion._replace(value=value, toggles=True)
+
+
+def _follow(
+    sample: Callable[[Any], PosesAndRates], u: Float[np.ndarray, "n"], unit: str, toggles: Any = None
+) -> PolynomialMotion:
+    """Return the motion through poses at parameters, and between them, until its polynomials describe it."""
+    x = sample(u if toggles is None else u[1:-1])
+    if toggles is not None:
+        x = np.concatenate([np.zeros_like(x[:1]), x, np.zeros_like(x[:1])])
+    places = x[np.isfinite(x).all((1, 2, 3)), 0, :-1, :2]
+    size = np.array([*[float(np.ptp(places, axis=(0, 1)).max()) or 1.0] * 2, 1.0]) if len(places) else 1.0
+    check = np.arange(len(u) - 1)
+    for turn in range(MOST_HALVINGS + 1):
+        if toggles is not None:
+            x[0], x[-1] = _toggle(u[1] - u[0], x[1], toggles[0]), _toggle(u[-2] - u[-1], x[-2], toggles[1])
+        motion = PolynomialMotion(u, _control_points(np.diff(u)[:, None, None], x[:-1], x[1:]), unit)
+        check = check[motion.known[check]]
+        if turn == MOST_HALVINGS or not len(check):
+            break
+        middle = u[check] + 0.5 * np.diff(u)[check]
+        between = sample(middle)
+        off = (np.abs(motion.at(middle, check)[0] - between[:, 0]).max(1) / size).max(1)
+        u, x = np.insert(u, check + 1, middle), np.insert(x, check + 1, between, axis=0)
+        far = np.flatnonzero(off > 64 * FOLLOWED)  # half the length has 1/64 of the error
+        check = np.sort(np.concatenate([check[far] + far, check[far] + far + 1]))
+    if not motion.known.any():
+        raise ValueError("no two neighbouring values of the driver are reached")
+    return motion
+
+
+def _control_points(h: Any, one: PosesAndRates, other: PosesAndRates) -> Float[np.ndarray, "6 pieces bodies 3"]:
+    """Return the control points of polynomials of degree five by positions and two derivatives at both ends."""
+    (q0, v0, a0), (q1, v1, a1) = np.moveaxis(one, 1, 0), np.moveaxis(other, 1, 0)
+    b1, b4 = q0 + h * v0 / 5, q1 - h * v1 / 5
+    return np.stack([q0, b1, 2 * b1 - q0 + h * h * a0 / 20, 2 * b4 - q1 + h * h * a1 / 20, b4, q1])
+
+
+def _toggle(h: float, near: Float[np.ndarray, "3 bodies 3"], q: Float[np.ndarray, "bodies 3"]) -> np.ndarray:
+    """Return the pose at a toggle: its derivatives are those of the cubic through it and the next pose, h away."""
+    place = q.copy()
+    place[:, 2] += 2 * np.pi * np.round((near[0, :, 2] - place[:, 2]) / (2 * np.pi))
+    # near = place + h c1 + h^2 c2 + h^3 c3, and its two derivatives
+    d0, d1, d2 = near[0] - place, h * near[1], h * h * near[2]
+    c3 = d0 - d1 + d2 / 2
+    c2 = d2 / 2 - 3 * c3
+    return np.stack([place, (d1 - 2 * c2 - 3 * c3) / h, 2 * c2 / h**2])
