@@ -180,6 +180,9 @@ def test_pages_have_the_equations_in_mathml_and_need_no_other_file(solutions, tm
 def test_other_elements_and_places_out_of_reach_are_refused():
     with pytest.raises(udk.SceneError, match="a worked solution has pins, slides and slots"):
         udk.worked_solution(geared(), "10 deg")
+    still = udk.Drawing(pins={"O": (0, 0), "A": (40, 0)}, links={"bar": {"pins": ["O", "A"], "mass": 1}}, ground=["O"])
+    with pytest.raises(udk.SceneError, match="worked solution needs a motor: add one"):
+        udk.worked_solution(still.mechanism(), "10 deg")
     with pytest.raises(udk.SceneError, match="worked solution needs a drawing"):
         udk.worked_solution(udk.loads(udk.dumps(four_bar("left").with_parameters({"body.crank.mass": 2.0}))), 0.5)
     toggling = four_bar("left").with_parameters({"pin.B.length[0]": 0.025})

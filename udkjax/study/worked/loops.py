@@ -69,6 +69,13 @@ class VectorLoop(NamedTuple):
     slides: list[str]
 
 
+def drawing_of(mechanism: Mechanism) -> Drawing:
+    """Return the drawing of a mechanism; raise `SceneError` if it was not drawn."""
+    if not isinstance(mechanism.drawing, Drawing):
+        raise SceneError(["a worked solution needs a drawing: pins and links, in format 2"], mechanism.name)
+    return mechanism.drawing
+
+
 class Geometry:
     """Points, lines and angles of a drawn mechanism in one position.
 
@@ -79,9 +86,7 @@ class Geometry:
     """
 
     def __init__(self, mechanism: Mechanism, q: np.ndarray, driven: Coordinate):
-        drawing = mechanism.drawing
-        if not isinstance(drawing, Drawing):
-            raise SceneError(["a worked solution needs a drawing: pins and links, in format 2"], mechanism.name)
+        drawing = drawing_of(mechanism)
         self.mechanism, self.drawing, self.driven = mechanism, drawing, driven
         self.frames = dict(zip(mechanism.body_names, q, strict=True)) | {GROUND: np.zeros(3)}
         self.connections = list(_connections(mechanism, drawing))

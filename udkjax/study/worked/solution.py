@@ -24,7 +24,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.statics import resting_forces
 from udkjax.study.worked.equations import LoopSolution, PositionRates, PositionSymbols, solution_of
 from udkjax.study.worked.figures import PolygonSide
-from udkjax.study.worked.loops import Geometry, loops_of
+from udkjax.study.worked.loops import Geometry, drawing_of, loops_of
 from udkjax.study.worked.page import page_of
 from udkjax.study.worked.terms import EquationLine, EquationTerm, NamedQuantity, NumberStyle, ProductOfTerms, total
 
@@ -102,8 +102,13 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
         The `WorkedSolution`.
 
     Raises:
-        SceneError: the drawing has other elements than pins, slides and slots, or no position there.
+        SceneError: there is no drawing, not one motor, other elements than pins, slides and slots, or no position there.
     """
+    drawing_of(mechanism)
+    if not mechanism.driver_names:
+        raise SceneError(
+            ["a worked solution needs a motor: add one, such as [[motor]] with the pin of the crank"], mechanism.name
+        )
     driver = only_driver(mechanism)
     count, rate = Count.of(mechanism, driver), usual_rate(mechanism, driver)
     value = count.nearest(count.read(at, "at"), float(value_of(mechanism, driver)(mechanism.q0)))
