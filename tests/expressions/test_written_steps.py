@@ -5,7 +5,6 @@ import math
 
 import pytest
 
-from udkjax.expressions.loops import float_loops
 from udkjax.expressions.scalars import scalar_program
 from udkjax.expressions.scalars.written_steps import PythonFunction
 
@@ -16,7 +15,6 @@ FUNCTIONS = {
         for name, f in scalar_program._NUMBER_FUNCTIONS.items()
         if name in ("max", "min", "square", "lt", "ge", "eq", "ne")
     },
-    **{f"update {name}": f for name, f in float_loops._UPDATES_OF_FLOATS.items()},
     "select": scalar_program._SELECT_OF_TWO,
 }
 

@@ -23,7 +23,7 @@ from udkjax.native import records
 from udkjax.native.code import interrupts, machine, processor
 from udkjax.native.gpu import host_handler
 from udkjax.native.gpu.launch import kernel_target
-from udkjax.native.host import host_program
+from udkjax.native.host import host_program, state_loops
 from udkjax.native.host.ffi import handler
 from udkjax.native.language.text import text_of_module
 from udkjax.native.module.layout import INFO, INPUTS, OUTPUTS
@@ -423,3 +423,7 @@ evaluate_as(scales_p, _scales_of_batch)
 # --- programs that users wait for, by the primitive of programs/deferred.py
 
 host_program.register()
+
+# --- programs of loops that Python runs often, by expressions/loops/compiled_loops.py
+
+state_loops.register()

@@ -256,15 +256,18 @@ def _settle(
     by, xp, scale = curve.by, curve.by.xp, near.scale(t, q)
     units = _step_units(curve.units[:-1], q, xp)
 
+    def length(force: Float[Array, "f"]) -> Float[Array, ""]:
+        return xp.sqrt(force @ force)  # in a third of the time of a norm
+
     def is_unsettled(state: Settling) -> IsTrue:
         _, current, k, better = state
-        return better & (k < MOST_NEWTON_STEPS) & (xp.linalg.norm(current.force) > FORCE_ROUNDING * scale.force)
+        return better & (k < MOST_NEWTON_STEPS) & (length(current.force) > FORCE_ROUNDING * scale.force)
 
     def body(state: Settling) -> Settling:
         q, current, k, _ = state
         step = current.directions @ _towards_rest(current, scale, stable, curve)
-        step = step * CLOSURE.shortening(xp.max(xp.abs(step / units)), xp)
-        size = xp.linalg.norm(current.force)
+        step = step * CLOSURE.shortening(abs(step / units).max(), xp)
+        size = length(current.force)
 
         def trial(state: Trial) -> Trial:
             share, j, *_ = state
@@ -273,7 +276,7 @@ def _settle(
             trial = near.linearize(t, new)
             # A position is better if the loads do work (by the trapezoidal rule), or the unbalanced loads decrease.
             work = 0.5 * (current.loads + trial.loads) @ (new - q)
-            better = (work > 0 if stable else False) | (xp.linalg.norm(trial.force) < size)
+            better = (work > 0 if stable else False) | (length(trial.force) < size)
             return 0.5 * share, j + 1, closed & better, new, trial
 
         def worse(state: Trial) -> IsTrue:

@@ -1,8 +1,8 @@
-"""Newton steps to Psi = 0 by elimination, on Python's floats: three times as fast as by singular values, for small scenes.
+"""Newton steps to Psi = 0 by elimination, by machine code: three times as fast as by singular values, for small scenes.
 
 The steps are the smallest in units of the scene's coordinates, as those by singular values of the same rows. Elimination is used
-only where rows are clearly independent, and for structures that have been corrected often enough: its function of floats takes
-as long to generate as some hundred corrections by singular values.
+only where rows are clearly independent, and for structures that have been corrected often enough: its program takes as long to
+write and to compile as some hundred corrections by singular values.
 """
 
 from functools import lru_cache

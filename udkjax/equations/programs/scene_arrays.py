@@ -39,6 +39,10 @@ class SceneArrays(Generic[AnyArray]):
     def _constant_list(self) -> list[float]:
         return self._constants.tolist()
 
+    @cached_property
+    def _constants_address(self) -> int:
+        return np.asarray(self._constants).__array_interface__["data"][0]
+
     def psi(self, t: Time, q: AnyArray) -> AnyArray:
         """Return Psi (m,)."""
         return self._run(("psi",), t, q, q)["psi"]
@@ -77,16 +81,16 @@ class SceneArrays(Generic[AnyArray]):
     def newton_step(self, t: Time, q: AnyArray) -> tuple[AnyArray, AnyArray, float] | None:
         """Return q (n,) after a Newton step to Psi = 0 by elimination, Psi (m,) at q, and the distance from dependent rows.
 
-        The step is the smallest in the metric of M. It is computed on Python's floats; None if that is not possible.
+        The step is the smallest in the metric of M. It is by machine code, or on Python's floats; None if neither is possible.
         """
-        found = self._run_on_floats(("q1", "distance", "psi"), t, q, q, {}, often=True)
+        found = self._run_at_state(("q1", "distance", "psi"), t, q, q, {}, often=True)
         return None if found is None else (found["q1"], found["psi"], float(found["distance"][0]))
 
     def _run(self, outputs: tuple[str, ...], t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
         """Run the program of some outputs; its loops have independent iterations."""
         xp = self._xp
         many = q.shape[1:]
-        if not many and xp is np and (found := self._run_on_floats(outputs, t, q, v, given)) is not None:
+        if not many and xp is np and (found := self._run_at_state(outputs, t, q, v, given)) is not None:
             return found
         evaluate, sizes, _ = self._evaluator(outputs)
         blank = {x: xp.zeros((size, *many)) for x, size in sizes.items()}
@@ -94,17 +98,23 @@ class SceneArrays(Generic[AnyArray]):
         state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}
         return evaluate(blank | state | given)
 
-    def _run_on_floats(
+    def _run_at_state(
         self, outputs: tuple[str, ...], t: Any, q: AnyArray, v: AnyArray, given: Mapping[str, AnyArray], often: bool = False
     ) -> dict[str, AnyArray] | None:
-        """Run a program at one state on Python's floats, and return its results alone; None if that is not possible."""
+        """Run a program at one state by machine code, if that is worth it, or on Python's floats, and return its results alone.
+
+        None if neither is possible.
+        """
         evaluate, sizes, results = self._evaluator(outputs)
-        needed = evaluate.needed
-        lists: dict[str, Any] = {x: [0.0] * size for x, size in sizes.items() if needed is None or x in needed or x in results}
-        lists |= {"constants": self._constant_list, "t": [float(t)], "q": q.tolist(), "v": v.tolist()}
-        if given:
-            lists |= {x: value.tolist() for x, value in given.items()}
-        return {x: self._xp.array(lists[x]) for x in results} if evaluate.on_lists(lists, often) else None
+        state = {"t": t, "q": q, "v": v, **given}
+        if evaluate.compiled is None and evaluate.is_worth_compiling(often):
+            evaluate.compile(sizes | {name: np.size(x) for name, x in state.items()})
+        if evaluate.compiled is not None:
+            return evaluate.compiled(self._constants_address, state)
+        lists: dict[str, Any] = {x: [0.0] * size for x, size in sizes.items()}
+        lists |= {"constants": self._constant_list, "t": [float(t)]}
+        lists |= {x: value.tolist() for x, value in state.items() if x != "t"}
+        return {x: self._xp.array(lists[x]) for x in results} if evaluate.on_lists(lists) else None
 
 
 def arrays_in_time(mechanism: Mechanism) -> Callable[[Time], SceneArrays[np.ndarray]]:

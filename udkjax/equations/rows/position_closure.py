@@ -49,8 +49,10 @@ class ClosingRule(NamedTuple):
     aside: StepAside = StepAside()  # from a position that may be singular
     halvings: int = 12  # maximum for one step: if 2^-12 of a step does not lower the residual, the position cannot be closed
 
-    def shortening(self, size: AnyArray, xp: ArrayLibrary) -> AnyArray:
+    def shortening(self, size: Any, xp: ArrayLibrary) -> Any:
         """Return the factor that makes a step of this size as long as `longest_step`; 1 for a shorter one."""
+        if xp is np:  # in a tenth of the time
+            return self.longest_step / size if size > self.longest_step else 1.0
         too_long = size > self.longest_step
         return xp.where(too_long, self.longest_step / xp.where(too_long, size, 1.0), 1.0)
 

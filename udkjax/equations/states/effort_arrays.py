@@ -20,6 +20,7 @@ from udkjax.scene.mechanism import Mechanism
 # Efforts (T, k), rates of their coordinates (T, k), unbalanced parts of the loads (T,).
 EffortArrays: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]
 Slopes: TypeAlias = Callable[[np.ndarray], np.ndarray]
+ALONG = 64 * float(np.finfo(float).eps)  # largest |J u| of a motion u that satisfies J u = 0 up to rounding, relative to J
 CLEARLY = 0.1  # rank tolerance over the rank tolerance at which rows would count as dependent, for which a bound is known
 
 
@@ -50,6 +51,9 @@ def efforts_by_numpy(
     return efforts, rates, unbalanced
 
 
+_Found: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 class _Units(NamedTuple):
     """Weights of rows and units, by NumPy."""
 
@@ -75,27 +79,67 @@ def _efforts_at(
 ) -> EffortArrays:
     q, v, a = motion
     scale = _units_of(analysis)
-    units, share = scale.coordinates, 1 / np.sqrt(w)
-    rows, C, (force, sizes) = equations.jacobian(t, q), slopes(q), equations.force_and_sizes(t, q, v)
-    J = rows * (scale.weights[:, None] * units)
-    missing = units * (equations.mass * a - force)
-    rates = (C @ v[:, :, None])[:, :, 0]
-    reached = np.isfinite(rows).all((1, 2)) & np.isfinite(C).all((1, 2)) & np.isfinite(missing).all(1)
+    units, share, (rows, columns) = scale.coordinates, 1 / np.sqrt(w), equations.entries
+    entries = equations.jacobian_entries(t, q) * (scale.weights[rows] * units[columns])[:, None]
+    C, (force, sizes) = slopes(q), equations.force_and_sizes(t, q, v)
+    missing, pull = units * (equations.mass * a - force), C * (share[:, None] * units)
+    reached = np.isfinite(entries).all(0) & np.isfinite(missing).all(1) & np.isfinite(pull).reshape(len(t), -1).all(1)
     # Relative to the single terms, since their sum may be a rounding error.
     size = np.maximum((units * (equations.mass * np.abs(a) + sizes)).max(1), scale.inertial_load)
-    pull = C * (share[:, None] * units)
+    rates = (C * v[:, None]).sum(2)
     if not reached.all():
-        J, pull, missing = (np.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0) for x in (J, pull, missing))
-        rates, size = np.where(reached[:, None], rates, np.nan), np.where(reached, size, np.nan)
-    f, unbalanced, regular = _regular_efforts(scale, J, pull, missing)
-    if not regular.all():
-        k = ~regular
-        f[k], unbalanced[k], determined = _any_efforts(analysis, J[k], pull[k], missing[k], v[k] / units)
-        f[k] = np.where((determined & reached[k])[:, None], f[k], np.nan)
+        pull, missing = (np.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0) for x in (pull, missing))
+        rates, size, entries = np.where(reached[:, None], rates, np.nan), np.where(reached, size, np.nan), entries * 1.0
+        entries[:, ~reached] = 0.0
+    f, unbalanced, found = _efforts_along(analysis, rows, columns, entries, pull, missing, v / units)
+    if not found.all():
+        k = ~found
+        J = equations.dense(entries[:, k])
+        f[k], unbalanced[k] = _efforts_of_rows(scale, analysis, J, pull[k], missing[k], v[k] / units)
+        f[~reached] = np.nan
     return share * f, rates, unbalanced / np.where(size == 0, 1.0, size)
 
 
-_Found: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+def _efforts_along(
+    analysis: Analysis,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    entries: np.ndarray,
+    pull: np.ndarray,
+    missing: np.ndarray,
+    u: np.ndarray,
+) -> _Found:
+    """Return efforts (T, k), unbalanced loads (T,), and a mask of the times for which the motion determines them.
+
+    With one degree of freedom the direction u of the motion spans the null space of J, if it satisfies J u = 0: the drivers have
+    the power that the loads lack. They must be able to move the mechanism. `entries` (entries, T) are those of J.
+    """
+    T, k = pull.shape[:2]
+    speed = np.sqrt((u * u).sum(1))
+    if analysis.degrees_of_freedom != 1 or not speed.any():
+        return np.zeros((T, k)), np.zeros(T), np.zeros(T, bool)
+    u = u / np.where(speed > 0, speed, 1.0)[:, None]
+    rates, power = (pull * u[:, None]).sum(2), (missing * u).sum(1)
+    square = (rates * rates).sum(1)
+    found = (speed > 0) & (square > RANK_TOL**2 * (pull * pull).reshape(T, -1).sum(1))
+    if len(entries):
+        products = np.ascontiguousarray(u.T)[columns] * entries
+        off = [np.abs(products[rows == row].sum(0)) for row in np.unique(rows)]
+        found &= np.max(off, axis=0) <= ALONG * np.abs(entries).max(0)
+    f = rates * (power / np.where(square > 0, square, 1.0))[:, None]
+    return f, np.abs(u).max(1) * np.abs(power - (rates * f).sum(1)), found
+
+
+def _efforts_of_rows(
+    scale: _Units, analysis: Analysis, J: np.ndarray, pull: np.ndarray, missing: np.ndarray, u: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return efforts (T, k), NaN where they are undetermined, and unbalanced loads (T,), from the rows J (T, m, n) of joints."""
+    f, unbalanced, regular = _regular_efforts(scale, J, pull, missing)
+    if not regular.all():
+        k = ~regular
+        found, unbalanced[k], determined = _any_efforts(analysis, J[k], pull[k], missing[k], u[k])
+        f[k] = np.where(determined[:, None], found, np.nan)
+    return f, unbalanced
 
 
 def _regular_efforts(scale: _Units, J: np.ndarray, pull: np.ndarray, missing: np.ndarray) -> _Found:

@@ -124,7 +124,11 @@ class StateArrays:
 
     def jacobian(self, t: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return Psi_q (T, m, n)."""
-        return self.dense(self._evaluate(lambda t, q, v: self._at.jacobian(t, q), t, q, q))
+        return self.dense(self.jacobian_entries(t, q))
+
+    def jacobian_entries(self, t: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return the entries (entries, T) of Psi_q, at the rows and columns `entries`."""
+        return self._evaluate(lambda t, q, v: self._at.jacobian(t, q), t, q, q)
 
     def dense(self, entries: np.ndarray) -> np.ndarray:
         """Return matrices (T, m, n) from their entries (entries, T)."""

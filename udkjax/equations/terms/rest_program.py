@@ -15,7 +15,7 @@ from udkjax.equations.terms.scene_layout import BODIES, BODY_COORDINATES, ROW, C
 from udkjax.equations.terms.scene_terms import ProgramParts, SceneTerms
 from udkjax.expressions import KernelWriter, LoopProgram, Scalar, tangents
 
-LOADS, STIFFNESS, DAMPING, CURVATURE = "loads at rest", "stiffness", "damping", "curvature"
+LOADS, STIFFNESS, DAMPING, CURVATURE = "loads_at_rest", "stiffness", "damping", "curvature"
 OF_LOADS = LOADS, STIFFNESS, DAMPING
 
 

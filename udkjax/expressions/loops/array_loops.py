@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.expressions.loops.compiled_loops import CompiledLoops, compiled_loops
 from udkjax.expressions.loops.float_loops import FloatLoops, LaidOutPart, Lists
 from udkjax.expressions.loops.loop_program import ADD, ALL, MAXIMUM, SET, Address, KernelLoop, LoopProgram, Reset
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
@@ -17,6 +18,7 @@ from udkjax.expressions.scalars.scalar_program import ScalarProgram
 _BY_ARRAYS = {ADD: np.add, MAXIMUM: np.maximum, ALL: np.minimum}
 _NEUTRAL = {ADD: 0.0, MAXIMUM: -math.inf, ALL: math.inf}
 _NOT_USED = np.zeros(1)  # value of an input that a program does not use
+WORTH_COMPILING = 100  # runs row by row on Python's floats that take as long as compiling a program quickly
 MAX_UPDATES = 8  # number of updates of one place that JAX unrolls; more become a loop
 
 
@@ -33,31 +35,40 @@ class ArrayLoops:
     """
 
     def __init__(self, program: LoopProgram, xp: ModuleType, results: Collection[str] | None = None):
-        self._parts, self._xp = list(map(_lay_out, program.parts)), xp
+        self._parts, self._xp, self._program, self._results = list(map(_lay_out, program.parts)), xp, program, results
+        self._calls = 0
+        self.compiled: CompiledLoops | None = None  # the same at single states, by machine code
         self._written = {name for part in self._parts for name, *_ in part.outputs}
         self._read = {name for part in self._parts for name, _ in part.inputs if name}
         self._on_floats = FloatLoops(self._parts, results) if xp is np and FloatLoops.support(self._parts) else None
 
-    @property
-    def needed(self) -> Collection[str] | None:
-        """The names of the lists that `on_lists` needs; None: all."""
-        return self._on_floats and self._on_floats.needed
-
-    def on_lists(self, lists: Lists, often: bool = False) -> bool:
+    def on_lists(self, lists: Lists) -> bool:
         """Change the lists of the numbers of arrays by a run at one state; return False if that is not possible.
 
         It is not if loops have many rows, or a number is not finite; the lists are then of no more use. Rows may read what
-        earlier rows have written. The function that takes a third of the time is generated at once if the runs are `often`.
+        earlier rows have written.
         """
         if self._on_floats is None:
             return False
-        if often and not self._on_floats.is_written:
-            self._on_floats.write(lists.keys())
         try:
             self._on_floats(lists)
         except (ArithmeticError, ValueError):
             return False
         return True
+
+    def is_worth_compiling(self, often: bool) -> bool:
+        """Return True once: at the call of this method after which a program that runs at single states is worth compiling.
+
+        That is the first call if the runs are `often`.
+        """
+        if self._calls >= WORTH_COMPILING or self._on_floats is None:
+            return False
+        self._calls = WORTH_COMPILING if often else self._calls + 1
+        return self._calls == WORTH_COMPILING
+
+    def compile(self, sizes: Mapping[str, int]) -> None:
+        """Make `compiled`, if there is a compiler that supports the program; `sizes` has the lengths of all its arrays."""
+        self.compiled = compiled_loops(self._program, sizes, tuple(self._results or ()))
 
     def __call__(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
         """Return the arrays after a run of the program; the given arrays do not change."""

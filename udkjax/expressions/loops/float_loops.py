@@ -1,7 +1,7 @@
-"""Loops of few operations on Python's floats: run row by row at first, and as one generated Python function once they run often.
+"""Loops of few operations on Python's floats, row by row; for many states at once by a generated function of NumPy's arrays.
 
-In the function each number of an array is a variable, from the row that writes it to those that read it. For many states at once
-these variables are NumPy arrays, one number for each state.
+In that function each number of an array is a variable, from the row that writes it to those that read it: an array with one
+number for each state.
 """
 
 import operator
@@ -12,19 +12,17 @@ import numpy as np
 
 from udkjax.expressions.loops.loop_program import ADD, ALL, MAXIMUM, SET
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
-from udkjax.expressions.scalars.written_steps import PythonFunction, written_as
+from udkjax.expressions.scalars.written_steps import PythonFunction
 
 _UPDATES_OF_FLOATS = {  # NaN propagates
     ADD: operator.add,
-    MAXIMUM: written_as("{0} if {0} >= {1} or {0} != {0} else {1}", lambda a, b: a if a >= b or a != a else b),
-    ALL: written_as("{0} if {0} <= {1} or {0} != {0} else {1}", lambda a, b: a if a <= b or a != a else b),
+    MAXIMUM: lambda a, b: a if a >= b or a != a else b,
+    ALL: lambda a, b: a if a <= b or a != a else b,
 }
 _UPDATES_OF_ARRAYS = {ADD: operator.add, MAXIMUM: np.maximum, ALL: np.minimum}
 FEW_ROWS = 8  # up to this, Python floats (0.05 us per operation and row) are faster than NumPy arrays (0.6 us per operation)
 FEW_OPERATIONS = 2_000  # of all rows, up to which they are faster however many rows a loop has: NumPy takes 20 us for each loop
-# Runs row by row that take as long as generating a Python function (20 us per operation); it runs three times as fast.
-_WORTH_WRITING = 100
-_WORTH_WRITING_FOR_MANY = 20  # the same for runs at many states, each of which takes longer
+_WORTH_WRITING = 20  # runs at many states that take as long as generating a function (20 us per operation)
 
 Lists: TypeAlias = dict[str, list[Any]]  # the numbers of each array: floats, or arrays of one number for each state
 
@@ -50,18 +48,7 @@ class FloatLoops:
     def __init__(self, parts: Sequence[LaidOutPart], results: Collection[str] | None = None):
         self._results = results
         self._parts, self._has_few_rows = [_with_lists(part) for part in parts if part.outputs], _has_few_rows(parts)
-        self._runs, self._function = 0, None
-        self.needed: Collection[str] | None = None  # names of the lists at one state that are needed; None: all
         self._runs_of_many, self._function_of_many = 0, None
-
-    @property
-    def is_written(self) -> bool:
-        """True if the function of lists at one state has been generated."""
-        return self._function is not None
-
-    def write(self, names: Collection[str]) -> None:
-        """Generate the function of the lists of these names now."""
-        self._function, self.needed = _write(self._parts, names, self._results)
 
     @staticmethod
     def support(parts: Sequence[LaidOutPart]) -> bool:
@@ -72,20 +59,14 @@ class FloatLoops:
         return _has_few_rows(parts) or sum(rows * len(run.order) for run, rows in programs) <= FEW_OPERATIONS
 
     def __call__(self, lists: Lists) -> None:
-        if self._function is not None:
-            self._function(lists)
-            return
         for part in self._parts:
             _run(part, lists)
-        self._runs += 1
-        if self._runs == _WORTH_WRITING:
-            self.write(lists.keys())
 
     def of_many(self, names: Collection[str]) -> Callable[[Lists], None] | None:
         """Return the function of the lists of these names at many states; None until it has run so often that it is worth it."""
         self._runs_of_many += self._has_few_rows
-        if self._runs_of_many == _WORTH_WRITING_FOR_MANY:
-            self._function_of_many, _ = _write(self._parts, names, self._results, many=True)
+        if self._runs_of_many == _WORTH_WRITING:
+            self._function_of_many = _write(self._parts, names, self._results)
         return self._function_of_many
 
 
@@ -115,14 +96,8 @@ def _run(part: LaidOutPart, lists: Lists) -> None:
             target[place] = x if update == SET else _UPDATES_OF_FLOATS[update](target[place], x)
 
 
-def _write(
-    parts: Sequence[LaidOutPart], names: Collection[str], results: Collection[str] | None, many: bool = False
-) -> tuple[Callable[[Lists], None], Collection[str]]:
-    """Return the parts as one function of the lists, which have the given names, and the names that it uses.
-
-    The lists have floats, or arrays for `many` states.
-    """
-    updates = _UPDATES_OF_ARRAYS if many else _UPDATES_OF_FLOATS
+def _write(parts: Sequence[LaidOutPart], names: Collection[str], results: Collection[str] | None) -> Callable[[Lists], None]:
+    """Return the parts as one function of the lists of arrays, which have the given names."""
     text = PythonFunction("lists")
     lists = {name: text.assign(f"lists[{name!r}]") for name in names}
     known: dict[tuple[str, int], str] = {}  # the variables of numbers
@@ -136,14 +111,13 @@ def _write(
     for part in parts:
         for k in range(part.count):
             if isinstance(part.run, ScalarProgram):
-                program = part.run.on_arrays if many else part.run.on_floats
-                row = program.write(text, [read(name, places[k]) if name else "0.0" for name, places in part.inputs])
+                row = part.run.on_arrays.write(text, [read(name, places[k]) if name else "0.0" for name, places in part.inputs])
             else:
                 row = [text.assign(repr(part.run))]
             for x, (name, places, update) in zip(row, part.outputs, strict=True):
                 place = places[k]
-                known[name, place] = x if update == SET else text.call(updates[update], read(name, place), x)
+                known[name, place] = x if update == SET else text.call(_UPDATES_OF_ARRAYS[update], read(name, place), x)
                 written[name, place] = None
     text.lines += [f"{lists[name]}[{k}] = {known[name, k]}" for name, k in written if results is None or name in results]
-    used = text.drop_unused()
-    return text.compile(), {name for name, x in lists.items() if x in used}
+    text.drop_unused()
+    return text.compile()

@@ -62,8 +62,8 @@ class PythonFunction:
         self._known[key] = function
         return self.assign(f"{key}({', '.join(arguments)})")
 
-    def drop_unused(self) -> set[str]:
-        """Drop the lines whose values no later line uses; return the names that are used."""
+    def drop_unused(self) -> None:
+        """Drop the lines whose values no later line uses."""
         used, lines = set[str](), []
         for line in reversed(self.lines):
             name, is_assigned, expression = line.partition(" = ")
@@ -71,7 +71,6 @@ class PythonFunction:
                 used.update(_NAME.findall(expression if is_assigned else line), _NAME.findall(name))
                 lines.append(line)
         self.lines = lines[::-1]
-        return used
 
     def compile(self) -> Callable[[Any], Any]:
         """Return the function that the written steps define."""
