@@ -17,6 +17,7 @@ from udkjax.expressions.loops.loop_derivative import SECOND as SECOND
 from udkjax.expressions.loops.loop_derivative import TANGENT as TANGENT
 from udkjax.expressions.loops.loop_derivative import TWICE as TWICE
 from udkjax.expressions.loops.loop_derivative import LoopDerivative as LoopDerivative
+from udkjax.expressions.loops.compiled_loops import compile_by as compile_by
 from udkjax.expressions.loops.loop_program import ADD as ADD
 from udkjax.expressions.loops.loop_program import ALL as ALL
 from udkjax.expressions.loops.loop_program import MAXIMUM as MAXIMUM

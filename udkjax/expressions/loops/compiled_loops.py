@@ -14,7 +14,7 @@ class CompiledLoops(Protocol):
     def __call__(self, constants: int, given: Mapping[str, np.ndarray | float], /) -> dict[str, Any]: ...
 
 
-# Of a program, the lengths of its arrays except `constants`, and the names of its results; None if machine code cannot hold it.
+# Compiles a program, given the lengths of its arrays except `constants`, and the names of its results; None if it cannot.
 LoopCompiler: TypeAlias = Callable[[LoopProgram, Mapping[str, int], Sequence[str]], CompiledLoops | None]
 _COMPILERS: list[LoopCompiler] = []
 
