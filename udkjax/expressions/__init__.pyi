@@ -8,6 +8,7 @@ from udkjax.expressions.algebra.elimination import SymbolicFactors as SymbolicFa
 from udkjax.expressions.algebra.sparse_ldl import SparseLDL as SparseLDL
 from udkjax.expressions.algebra.sparse_ldl import factorize as factorize
 from udkjax.expressions.loops.array_loops import ArrayLoops as ArrayLoops
+from udkjax.expressions.loops.compiled_loops import compile_by as compile_by
 from udkjax.expressions.loops.loop_derivative import COTANGENT as COTANGENT
 from udkjax.expressions.loops.loop_derivative import FORWARD as FORWARD
 from udkjax.expressions.loops.loop_derivative import OTHER as OTHER
@@ -17,7 +18,6 @@ from udkjax.expressions.loops.loop_derivative import SECOND as SECOND
 from udkjax.expressions.loops.loop_derivative import TANGENT as TANGENT
 from udkjax.expressions.loops.loop_derivative import TWICE as TWICE
 from udkjax.expressions.loops.loop_derivative import LoopDerivative as LoopDerivative
-from udkjax.expressions.loops.compiled_loops import compile_by as compile_by
 from udkjax.expressions.loops.loop_program import ADD as ADD
 from udkjax.expressions.loops.loop_program import ALL as ALL
 from udkjax.expressions.loops.loop_program import MAXIMUM as MAXIMUM

@@ -9,11 +9,14 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.elements import BODIES, FORCES, JOINTS
+from udkjax.equations.programs import scene_arrays
 from udkjax.equations.programs.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.programs.scene_programs import scene_programs
+from udkjax.equations.terms.rest_program import CURVATURE, OF_LOADS
 from udkjax.expressions.loops import array_loops, compiled_loops
 from udkjax.native import primitive  # noqa: F401  # registers the compiler
 
+OUTPUTS = ("psi_q", "psi", "psi_dot"), ("terms",), ("energy",), OF_LOADS, (CURVATURE,)
 SCENES = {
     "joints and forces": lambda: udk.Mechanism(BODIES, JOINTS, forces=FORCES),
     "redundant rows": udk.library.parallelogram,
@@ -31,16 +34,11 @@ def values_at(at: SceneArrays, t: float, q: np.ndarray, v: np.ndarray) -> dict[s
 
 def evaluated(scene: udk.Mechanism, calls: int) -> tuple[list[dict[str, np.ndarray]], SceneArrays]:
     """Return values at several states by programs that are compiled after so many calls."""
-    fixed = arrays_in_time(scene)(0.0)
-    at = SceneArrays(scene_programs(scene), fixed.numbers, np)
-    at._evaluators = {}
+    at = SceneArrays(scene_programs(scene), arrays_in_time(scene)(0.0).numbers, np)
+    for outputs in OUTPUTS:  # evaluators of its own: others keep theirs
+        at._evaluators[outputs] = own = scene_arrays._evaluator.__wrapped__(at.programs, np, *outputs)  # pyright: ignore
+        own.loops._calls = calls
     rng, q, n = np.random.default_rng(3), np.array(scene.q0).ravel(), scene.q0.size
-    for outputs in (("psi_q", "psi", "psi_dot"), ("terms",), ("energy",)):
-        evaluator = at._evaluator(outputs)[0]
-        evaluator.compiled, evaluator._calls = None, calls
-    for outputs in (("loads_at_rest", "stiffness", "damping"), ("curvature",)):
-        evaluator = at._evaluator(outputs)[0]
-        evaluator.compiled, evaluator._calls = None, calls
     return [values_at(at, 0.1 * k, q + 0.1 * rng.standard_normal(n), rng.standard_normal(n)) for k in range(4)], at
 
 
