@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from udkjax.synthesis.curves.curve_search import CurveSearch
+from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.dyads import EACH, HEAD, SPAN, Topology, gradients, number_count, positions
 from udkjax.synthesis.curves.random_linkages import random_linkages, turn_angles
 from udkjax.synthesis.curves.targets import WantedCurve, as_points, chamfer
@@ -75,6 +77,18 @@ def test_what_is_no_curve_is_refused(curve, message):
 def test_limits_that_contradict_each_other_are_refused(limits, message):
     with pytest.raises(ValueError, match=message):
         udk.mechanisms_for(ELLIPSE, **limits)
+
+
+def test_linkages_that_end_at_a_limit_are_kept():
+    wanted = WantedCurve([[0, 6], [0, 0], [4, 0]])
+    search = CurveSearch(wanted, LinkageLimits(np.cos(np.deg2rad(25.0)), 3.0, 0.1), 2, seed=0)
+    stages = search.stages()
+    next(stages), next(stages)
+    best = search.beams[2]
+    assert len(best.x) >= 4
+    at = positions(best.x, best.topology, turn_angles(len(best.x)), 0.0)
+    cosine = np.abs(at.cosines).max((0, 2))
+    assert (cosine < np.cos(np.deg2rad(25.0))).all() and (cosine > np.cos(np.deg2rad(26.0))).sum() >= len(cosine) / 2
 
 
 def test_mechanisms_turn_draw_the_curve_and_repeat_with_the_seed():

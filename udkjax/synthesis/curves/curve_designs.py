@@ -6,12 +6,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.positions.following.drive import Drive, only_driver
+from udkjax.positions.following.drive import Drive, drive, only_driver
 from udkjax.printing import PrintedTable, PrintsTable, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.curve_search import FoundLinkage, drawn
-from udkjax.synthesis.curves.dyads import SPAN, positions
-from udkjax.synthesis.curves.linkage_drawing import PIN, drawing_of, turn_of
+from udkjax.synthesis.curves.dyads import SPAN
+from udkjax.synthesis.curves.linkage_drawing import PIN, drawing_of, is_closed_over_turn, states_of_turn
 from udkjax.synthesis.curves.targets import WantedCurve, as_points
 from udkjax.synthesis.found_mechanism import FoundMechanism
 
@@ -29,7 +29,7 @@ class CurveDesign(FoundMechanism):
         size: largest distance (m) of any pin from the middle of the curve over the whole turn.
         transmission: smallest angle (rad) between the two links of a dyad, or between one and the other prolonged.
         values: values of the driver (rad) at the ends of the curve.
-        turns: True: `kinematics` reached 720 positions of a whole turn.
+        turns: True: at 720 positions of a whole turn all constraints hold and no dyad nears its dead points.
         driver: the driver.
     """
 
@@ -95,16 +95,13 @@ class CurveDesigns(PrintsTable):
 
 
 def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str) -> CurveDesign | None:
-    """Return a linkage as a design; None if `kinematics` does not confirm its turn."""
+    """Return a linkage as a design; None if a constraint of its mechanism does not hold at 720 positions of a turn."""
     mechanism = drawing_of(found.x, found.topology, wanted, name).mechanism()
-    motion = turn_of(mechanism, found.x, found.topology, wanted)
-    if motion is None:
+    size = wanted.scale * found.size
+    if not is_closed_over_turn(mechanism, states_of_turn(mechanism, found.x, found.topology, wanted), size):
         return None
-    start = float(motion.values[0])
-    at = positions(found.x[None], found.topology, np.asarray(motion.values)[None] - start, 0.0)
-    joints = np.concatenate(
-        [at.origins[3::2].ravel(), at.origins[4::2].ravel(), at.ends.ravel(), at.origins[1].ravel(), at.pin.ravel()]
-    )
+    driver = only_driver(mechanism)
+    start = float(drive(mechanism, driver).value(mechanism.q0))
     path = wanted.middle + wanted.scale * drawn(found.x, found.topology, wanted.is_whole)
     return CurveDesign(
         error=found.error,
@@ -112,11 +109,11 @@ def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str) -> CurveDesig
         pin=PIN,
         curve=as_points(path),
         bars=2 + 2 * found.dyads,
-        size=wanted.scale * float(np.abs(joints).max()),
+        size=size,
         transmission=float(np.arcsin(found.sine)),
         values=start + np.array([0.0, found.x[SPAN]]),
         turns=True,
-        driver=only_driver(mechanism),
+        driver=driver,
     )
 
 

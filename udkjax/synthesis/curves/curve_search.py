@@ -18,13 +18,13 @@ SAMPLES = 6000  # random linkages of a stage
 START_DYADS = 3  # most dyads of random linkages; with more, few random curves resemble the target
 TRIES, CHILDREN = 200, 10  # random dyads for each linkage that grows, and how many of them are improved
 BEAM, FAMILY = 10, 3  # linkages of each number of dyads that are kept and grow, and most of them from the same start
-# blur (RMS radii), steps and linkages left of each part of a stage
-OF_STARTS = ((0.2, 10, 48), (0.1, 15, 24), (0.05, 25, 8))
-OF_GROWTH = ((0.05, 12, 40), (0.03, 20, 20), (0.02, 30, 10))
-OF_FINISH = ((0.01, 30), (0.004, 40))
+# blur (RMS radii), weight of violations, steps and linkages left of each part of a stage
+OF_STARTS = ((0.2, 2.0, 10, 48), (0.1, 5.0, 15, 24), (0.05, 20.0, 25, 8))
+OF_GROWTH = ((0.05, 5.0, 12, 40), (0.03, 10.0, 20, 20), (0.02, 30.0, 30, 10))
+OF_FINISH = ((0.01, 100.0, 30), (0.004, 300.0, 40))
 FINISHED = 4  # linkages of each number of dyads that are finished after a round
 CLOSE_TO = 1e-3  # losses that differ by less, relative, in the same structure are those of the same linkage
-SLACK = 1e-3  # violation below which a descent is not in vain: it may end at a limit
+SLACK = 1e-3  # largest violation at the end of a descent, which aims at limits that are tighter by twice as much
 CHECKED = 1440  # angles of a turn at which limits are verified
 
 
@@ -61,12 +61,21 @@ class Kept(NamedTuple):
 
 
 class FoundLinkage(NamedTuple):
-    """A linkage within the limits over the whole turn, its Chamfer distance, and its smallest sine between links of dyads."""
+    """A linkage within the limits over the whole turn.
+
+    Attributes:
+        error: its Chamfer distance.
+        x: its numbers.
+        topology: its structure.
+        sine: smallest sine of an angle between the links of a dyad.
+        size: largest distance of a pin from the middle of the curve.
+    """
 
     error: float
     x: np.ndarray
     topology: Topology
     sine: float
+    size: float
 
     @property
     def dyads(self) -> int:
@@ -88,8 +97,9 @@ class CurveSearch:
     def __init__(self, wanted: WantedCurve, limits: LinkageLimits, dyads: int, seed: int, geared: float = 0.0):
         self.wanted, self.limits, self.dyads, self.geared = wanted, limits, dyads, geared
         self.seed, self.families, self.candidates = seed, 0, 0
-        self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), limits)
-        self.exact = Task(wanted.target(240), sampling(192, 64, wanted.is_whole), limits)
+        inner = limits._replace(cosine=limits.cosine - 2 * SLACK, size=limits.size * (1.0 - 2 * SLACK))
+        self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), inner)
+        self.exact = Task(wanted.target(240), sampling(192, 64, wanted.is_whole), inner)
         self.beams: dict[int, Kept] = {}
         self.found: dict[int, list[FoundLinkage]] = {}
         self.threads = ThreadPoolExecutor(thread_count())
@@ -137,10 +147,11 @@ class CurveSearch:
     def _keep(self, dyads: int, kept: Kept) -> None:
         self.beams[dyads] = kept.with_others(self.beams.get(dyads)).best(BEAM, FAMILY)
 
-    def _improve(self, kept: Kept, parts: tuple[tuple[float, int, int], ...]) -> Kept:
-        for blur, steps, left in parts:
-            after = self._descend(kept.x, kept.topology, self.coarse, blur, steps)
-            loss = np.where(after.excess < SLACK, after.chamfer, np.inf if (blur, steps, left) == parts[-1] else after.loss)
+    def _improve(self, kept: Kept, parts: tuple[tuple[float, float, int, int], ...]) -> Kept:
+        for part in parts:
+            blur, weight, steps, left = part
+            after = self._descend(kept.x, kept.topology, self.coarse.weighed(weight), blur, steps)
+            loss = np.where(after.excess < SLACK, after.chamfer, np.inf if part == parts[-1] else after.loss)
             kept = Kept(after.x, kept.topology, loss, kept.family)
             kept = kept.take(np.argsort(loss, kind="stable")[:left])
         return kept
@@ -158,8 +169,8 @@ class CurveSearch:
         if not len(kept.x):
             return
         x = kept.x
-        for blur, steps in OF_FINISH:
-            after = self._descend(x, kept.topology, self.exact, blur, steps)
+        for blur, weight, steps in OF_FINISH:
+            after = self._descend(x, kept.topology, self.exact.weighed(weight), blur, steps)
             x = after.x
         for k in range(len(x)):
             one = self._verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
@@ -170,10 +181,11 @@ class CurveSearch:
         """Return the linkage if it is within the limits over the whole turn."""
         at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
         joints = np.concatenate([at.origins[3::2], at.origins[4::2], at.ends, at.origins[1:2], at.pin[None]])
-        cosine = float(np.abs(at.cosines).max())
-        if not (cosine <= self.limits.cosine + SLACK and np.abs(joints).max() <= self.limits.size * (1 + SLACK)):
+        cosine, size = float(np.abs(at.cosines).max()), float(np.abs(joints).max())
+        if not (cosine <= self.limits.cosine and size <= self.limits.size):
             return None
-        return FoundLinkage(self.wanted.error(drawn(x, topology, self.wanted.is_whole)), x, topology, np.sqrt(1.0 - cosine**2))
+        error = self.wanted.error(drawn(x, topology, self.wanted.is_whole))
+        return FoundLinkage(error, x, topology, np.sqrt(1.0 - cosine**2), size)
 
 
 def drawn(x: np.ndarray, topology: Topology, is_whole: bool, count: int = 2001) -> np.ndarray:

@@ -36,7 +36,7 @@ class LinkageLimits(NamedTuple):
     cosine: float
     size: float
     shortest: float
-    weight: float = 2.0
+    weight: float = 1.0
 
     def bounds(self, dyads: int, is_whole: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper bounds of the numbers of a linkage."""
@@ -77,6 +77,10 @@ class Task(NamedTuple):
     target: CurveTarget
     sample: Sampling
     limits: LinkageLimits
+
+    def weighed(self, weight: float) -> "Task":
+        """Return the task with another weight of violations."""
+        return self._replace(limits=self.limits._replace(weight=weight))
 
 
 class Descended(NamedTuple):
@@ -174,7 +178,7 @@ def _evaluate(x: np.ndarray, topology: Topology, task: Task, blur: float) -> tup
         beyond = J[active, :, 2]
         A[active] += beyond @ beyond.transpose(0, 2, 1)
         b[active] += (beyond @ excess[active][..., None])[..., 0]
-    return distance + 0.5 * (excess**2).sum(1), distance, excess.max(1), A, b
+    return distance + 0.5 * (excess**2).sum(1), distance, excess.max(1) / limits.weight, A, b
 
 
 def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:

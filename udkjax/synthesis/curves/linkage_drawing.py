@@ -1,25 +1,25 @@
-"""A linkage of dyads as a drawing, and the check of its whole turn by `kinematics`."""
+"""A linkage of dyads as a drawing, and the check of its whole turn by the equations of the mechanism."""
 
 from string import ascii_uppercase
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from udkjax.positions.answers.pin_motion import pin_motion
-from udkjax.positions.following.drive import drive, only_driver
-from udkjax.positions.following.kinematics import FULL_TURN, Kinematics, kinematics
+from udkjax.equations import violation
+from udkjax.positions.following.kinematics import FULL_TURN
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, TAIL, Topology, positions
 from udkjax.synthesis.curves.targets import WantedCurve
 
 PIN = "P"  # name of the drawing pin
-TURN_VALUES = 720  # positions of a turn that `kinematics` has to reach on the same branch
-AGREEMENT = 1e-9  # largest distance of a pin of the motion from its closed form, relative to the size of the linkage
+TURN_VALUES = 720  # positions of a turn at which the constraints must hold
+CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to the size of the linkage
 DENSITY = 7850.0  # kg/m^3, of steel
 WIDTH, THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
 THIN = 1e-3  # a plate with a smaller area, relative to the square of its longest side, is drawn as a bar of a given mass
-SPEED = "60 rpm"
+TURNS_PER_SECOND = 1.0
+SPEED = f"{60 * TURNS_PER_SECOND:g} rpm"
 LETTERS = [a for a in ascii_uppercase if a not in (PIN, "O")]
 
 LinkPoint = tuple[int, complex]  # number of a link, and a place in its frame
@@ -76,21 +76,29 @@ def _link(pins: list[str], places: dict[str, complex], extent: float) -> dict[st
     return named | {"mass": mass, "centre": (middle.real, middle.imag), "inertia": mass * float(sides.max()) ** 2 / 12}
 
 
-def turn_of(mechanism: Mechanism, x: np.ndarray, topology: Topology, wanted: WantedCurve) -> Kinematics | None:
-    """Return the motion over a turn of 720 steps; None if `kinematics` does not reach it on the branch of the closed form."""
-    driver = only_driver(mechanism)
-    drawn = float(drive(mechanism, driver).value(mechanism.q0))
+class TurnStates(NamedTuple):
+    """Positions of a mechanism over a turn at constant speed: times (T,) (s), q and v (T, bodies, 3)."""
+
+    ts: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+
+
+def states_of_turn(mechanism: Mechanism, x: np.ndarray, topology: Topology, wanted: WantedCurve) -> TurnStates:
+    """Return 721 positions of a mechanism over a turn, moved from its drawn position as the closed form of the linkage moves."""
     theta = np.linspace(0.0, FULL_TURN, TURN_VALUES + 1)
-    motion = kinematics(mechanism, driver, drawn + theta)
-    if not np.all(np.asarray(motion.reached)):
-        return None
-    moved, at = pin_motion(mechanism, motion).pins, positions(x[None], topology, theta[None], 0.0)
-    for pin, points in pins_of_linkage(x, topology).items():
-        if any(link == 0 for link, _ in points):
-            continue
-        place = np.asarray(moved[pin])[:, 0]
-        for link, local in points:
-            z = wanted.middle + wanted.scale * (at.origins[link, 0] + at.turns[link, 0] * local)
-            if not np.max(np.abs(place[:, 0] + 1j * place[:, 1] - z)) <= AGREEMENT * np.abs(z - wanted.middle).max():
-                return None
-    return motion
+    at = positions(x[None], topology, theta[None], 0.0)
+    numbers = {_link_name(k): k for k in range(1, len(at.turns)) if k != BASE - 1}
+    q0 = np.asarray(mechanism.q0).reshape(-1, 3)
+    q = np.empty((len(theta), len(q0), 3))
+    for k, body in enumerate(mechanism.bodies):
+        z, turn = at.origins[numbers[body], 0], at.turns[numbers[body], 0]
+        turn, places = turn / turn[0], wanted.middle + wanted.scale * z
+        moved = places + turn * (complex(*q0[k, :2]) - places[0])
+        q[:, k] = np.stack([moved.real, moved.imag, q0[k, 2] + np.unwrap(np.angle(turn))], 1)
+    return TurnStates(theta / (FULL_TURN * TURNS_PER_SECOND), q, np.zeros_like(q))
+
+
+def is_closed_over_turn(mechanism: Mechanism, states: TurnStates, size: float) -> bool:
+    """Return whether the mechanism's own constraints, with those of its motor, hold at all positions of a turn."""
+    return bool(np.abs(violation(mechanism, states)).max() <= CLOSED_TO * size)
