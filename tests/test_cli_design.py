@@ -131,3 +131,37 @@ def test_mistakes_of_complete_goals_are_told(folder, capsys, old, new, says):
     (folder / "goal.toml").write_text(POSES.replace(old, new))
     assert udkjax("design", folder / "goal.toml") == 2
     assert says in capsys.readouterr().err
+
+
+def test_a_curve_is_drawn_by_mechanisms_shown_and_written(tmp_path, capsys):
+    file = tmp_path / "arc.csv"
+    file.write_text("x,y\n" + "\n".join(f"{30 * np.cos(t)},{20 * np.sin(t)}" for t in np.linspace(0.0, 3.0, 30)))
+    options = ("--bars", 4, "--seconds", 0, "--results", 1, "--out", tmp_path / "out", "--json")
+    assert udkjax("design", "--curve", file, *options) == 0
+    best = json.loads(capsys.readouterr().out)["designs"][0]
+    assert best["error"] < 0.1 and best["bars"] == 4 and best["turns"] and best["size"] < 0.2
+    mechanism = udk.load(tmp_path / "out" / "design1.toml")
+    assert dict(mechanism.drawing.units) == {"length": "mm"}
+    np.testing.assert_allclose(mechanism.drawing.pins["O"], best["pins"]["O"], atol=1e-12)
+    assert "<html" in (tmp_path / "out" / "design1.html").read_text()[:200]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "give either"),
+        (("--curve", "curve.csv", "--unit", "parsec"), "--unit parsec"),
+        (("--curve", "absent.csv"), "cannot read absent.csv"),
+        (("--curve", "curve.csv", "--bars", 3), "bars must be at least 4"),
+        (("--curve", "curve.csv", "--size", 1), "size must be more than"),
+        (("--curve", "point.csv"), "coincide"),
+        (("--curve", "wrong.svg"), "no SVG file"),
+    ],
+)
+def test_curves_and_options_with_mistakes(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "curve.csv").write_text("0,0\n9,0\n9,9\n")
+    (tmp_path / "point.csv").write_text("1,1\n1,1\n1,1\n")
+    (tmp_path / "wrong.svg").write_text("no picture")
+    assert udkjax("design", *arguments) == 2
+    assert message in capsys.readouterr().err

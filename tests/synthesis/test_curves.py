@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.synthesis.curves.curve_search import CurveSearch
+from udkjax.synthesis.curves.curve_search import CurveSearch, OutOfTimeError
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.dyads import EACH, HEAD, SPAN, Topology, gradients, number_count, positions
 from udkjax.synthesis.curves.random_linkages import random_linkages, turn_angles
@@ -14,13 +14,13 @@ ELLIPSE = np.array([[3.0 + 0.2 * np.cos(t), 1.0 + 0.1 * np.sin(t)] for t in np.l
 
 
 def test_derivatives_of_linkages_are_those_of_their_positions():
-    x, topology = random_linkages(12, 3, np.random.default_rng(0), geared=0.5)
+    x, topology = random_linkages(12, 3, np.random.default_rng(0))
     share = np.arange(20) / 20
     x[:, SPAN] = 5.0
 
     def measures(y):
         at = positions(y, topology, y[:, SPAN, None] * share)
-        joints = np.stack([at.origins[3::2], at.origins[4::2], at.ends])
+        joints = np.stack([at.origins[2::2], at.origins[3::2], at.ends])
         third = np.sum(at.cosines**2, 0) + np.sum(np.abs(joints) ** 2, (0, 1))
         return at, joints, np.stack([at.pin.real, at.pin.imag, third], 1)
 
@@ -43,9 +43,9 @@ def test_random_linkages_close_over_the_whole_turn():
 def test_a_four_bar_has_the_positions_of_the_drawing():
     x = np.zeros((1, number_count(1)))
     x[0, HEAD : HEAD + EACH], x[0, -2:] = [1.0, 0.0, 3.0, 0.0, 2.5, 2.0], [1.0, 0.5]
-    topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]), np.ones(1))
+    topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]))
     at = positions(x, topology, np.array([[0.0, 1.0]]))
-    P, R, Q = at.origins[3, 0], at.ends[0, 0], at.origins[4, 0]
+    P, R, Q = at.origins[2, 0], at.ends[0, 0], at.origins[3, 0]
     np.testing.assert_allclose(np.abs(R - P), 2.5, rtol=1e-12)
     np.testing.assert_allclose(np.abs(R - Q), 2.0, rtol=1e-12)
     np.testing.assert_allclose(P, np.exp(1j * np.array([0.0, 1.0])), rtol=1e-12)
@@ -84,7 +84,7 @@ def test_linkages_that_end_at_a_limit_are_kept():
     search = CurveSearch(wanted, LinkageLimits(np.cos(np.deg2rad(25.0)), 3.0, 0.1), 2, seed=0)
     stages = search.stages()
     next(stages), next(stages)
-    best = search.beams[2]
+    best = search.fresh[2]
     assert len(best.x) >= 4
     at = positions(best.x, best.topology, turn_angles(len(best.x)), 0.0)
     cosine = np.abs(at.cosines).max((0, 2))
@@ -98,6 +98,7 @@ def test_mechanisms_turn_draw_the_curve_and_repeat_with_the_seed():
     assert best.error < 0.02 and best.bars == 4 and best.size <= 3.0 * wanted.extent * 1.001
     normalized = (best.curve - as_points(np.array([wanted.middle]))) / wanted.scale
     assert chamfer(normalized[:-1], wanted.fine) == pytest.approx(best.error, rel=0.5)
+    assert best.size < 3.0 * wanted.extent and best.transmission > np.deg2rad(8.0)
     motion = best.motion(721)
     assert np.asarray(motion.reached).all()
     open_by = [np.abs(np.asarray(udk.equations.psi(best.mechanism, 0.0, q)))[:-1].max() for q in np.asarray(motion.q)[::60]]
@@ -107,5 +108,28 @@ def test_mechanisms_turn_draw_the_curve_and_repeat_with_the_seed():
 
 
 def test_without_time_there_is_the_best_so_far():
-    found = udk.mechanisms_for(ELLIPSE, bars=4, seconds=0, results=1, progress=False)
-    assert len(found) == 1 and "1 mechanisms" in str(found)
+    found = udk.mechanisms_for(ELLIPSE, seconds=0, results=1, progress=False)
+    assert len(found) == 1 and found[0].bars == 4 and found.rounds == 0 and "1 mechanisms" in str(found)
+
+
+def test_an_interruption_ends_with_the_best_so_far():
+    seen = []
+
+    def interrupt(progress):
+        seen.append(progress)
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+
+    found = udk.mechanisms_for(ELLIPSE, bars=4, seconds=1e9, results=1, progress=interrupt)
+    assert len(found) == 1 and found[0].error < 0.1
+
+
+def test_a_search_ends_in_the_middle_of_a_stage():
+    search = CurveSearch(WantedCurve(ELLIPSE), LinkageLimits(0.98, 10.0, 0.02), 2, seed=0)
+    next(search.stages())
+    search.until = 0.0
+    with pytest.raises(OutOfTimeError):
+        search._grow(search.fresh, 1, np.random.default_rng(0))
+    search.until = np.inf
+    search.finish(0.0)
+    assert 0.0 < search.best < 0.1 and set(search.found) == {1}

@@ -12,27 +12,36 @@ from udkjax.extras import OptionalImport
 with OptionalImport():
     import tyro
 
-Goal = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GOAL.toml")]
+Goal = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="GOAL.toml")]
 
 TURN_INSTANTS = 241  # of a turn on a page
+NOT_A_FIT = 0.1  # error of a mechanism, in RMS radii of its curve, beyond which it draws another curve
 
 
 def design(
-    goal: Goal,
+    goal: Goal = None,
     /,
     starts: int = 300,
     seed: int = 0,
     results: int = 5,
     out: Path | None = None,
+    curve: Path | None = None,
+    bars: int = 12,
+    size: float | None = None,
+    seconds: float = 60.0,
+    unit: str = "mm",
     json: Json = False,
 ) -> None:
-    """Find mechanisms for a prescribed path, poses, or function.
+    """Find mechanisms for a prescribed path, poses, or function; or, with --curve, for a drawn curve.
 
     The command exits with 1 if no mechanism is found, and with 3 if the best one is not a fit: it misses a target by more than a
-    tenth of their extent.
+    tenth of their extent, or a curve by more than a tenth of its RMS radius.
 
     The loss of a design is the weighted sum of squares of its residuals, the distances from the goal. With `complete = true` in
     the file, all four-bars through nine points, or five poses, are found, and --starts and --seed are ignored.
+
+    With --curve no drawing is needed: structure and dimensions of linkages with one motor are found. Ctrl-C ends this search with
+    the best designs so far.
 
     Args:
         goal: file with the mechanism, the goal and the limits.
@@ -40,10 +49,20 @@ def design(
         seed: seed of the random mechanisms; the same seed gives the same designs.
         results: maximum number of designs to return.
         out: folder for each design as a drawing (design1.toml) and as an animated page (design1.html).
+        curve: file with a curve instead of a goal: rows x, y (.csv), or a drawing with one path (.svg).
+        bars: largest number of links for a curve, with the ground.
+        size: for a curve, the largest distance of any pin from its middle, in its unit; by default three times its extent.
+        seconds: time after which the search for a curve ends (s).
+        unit: unit of the curve and of the drawings.
     """
     for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
         if value < minimum:
             refuse(f"--{name} {value}: must be at least {minimum}")
+    if goal is None and curve is not None:
+        _show_curve(curve, {"bars": bars, "seed": seed, "results": results, "seconds": seconds}, size, unit, out, json)
+        return
+    if goal is None or curve is not None:
+        refuse("give either a goal file or --curve FILE")
     from udkjax.show.summary import table
     from udkjax.synthesis.complete.complete_design import CompleteSearch
     from udkjax.synthesis.fit import design_lines, deviation_of
@@ -84,6 +103,38 @@ def design(
         fail(f"no mechanism was found: {designs.reason}")
     if not deviation_of(designs[0], search.problem.goal).is_fit:
         fail(reports[0]["deviation"], NO_FIT)
+
+
+def _show_curve(file: Path, options: dict[str, Any], size: float | None, unit: str, out: Path | None, json: bool) -> None:
+    """Find mechanisms for a curve of a file, and show them."""
+    import udkjax as udk
+    from udkjax.scene.drawing.drawn_quantities import Units
+    from udkjax.synthesis.curves.curve_file import read_curve_file
+
+    if unit not in Units.sizes("m"):
+        refuse(f"--unit {unit}: must be one of {', '.join(Units.sizes('m'))}")
+    metres = Units.sizes("m")[unit]
+    try:
+        points = metres * read_curve_file(file)
+        limits = {"size": None if size is None else metres * size}
+        found = udk.mechanisms_for(points, unit=unit, **limits, **options)
+    except (OSError, UnicodeDecodeError) as problem:
+        refuse(f"cannot read {file}: {problem}")
+    except ValueError as problem:
+        refuse(f"{file}: {problem}")
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        for k, candidate in enumerate(found):
+            udk.save(candidate.mechanism, out / f"design{k + 1}.toml")
+            _moving_page(candidate, [candidate.pin], points).save(out / f"design{k + 1}.html")
+    names = ("error", "bars", "size", "transmission", "turns", "values", "pins", "curve")
+    listed = [{name: getattr(candidate, name) for name in names} for candidate in found]
+    text = "\n\n".join(map(str, (found, *found)))
+    show({"rounds": found.rounds, "seconds": found.seconds, "reason": found.reason, "designs": listed}, text, json)
+    if not len(found):
+        fail(f"no mechanism was found: {found.reason}")
+    if found[0].error > NOT_A_FIT:
+        fail(f"not a fit: the best mechanism misses the curve by {found[0].error:.3g} of its RMS radius", NO_FIT)
 
 
 def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
@@ -147,6 +198,13 @@ def _write(designs: Iterable[Any], goal: Any, out: Path) -> str:
 
 
 def _page(candidate: Any, goal: Any) -> Any:
+    import udkjax as udk
+
+    traces = [goal.point] if isinstance(goal, udk.PathGoal) and goal.at is None else None
+    return _moving_page(candidate, traces, goal.targets[:, :2] if goal.has_place else None)
+
+
+def _moving_page(candidate: Any, traces: list[str] | None, targets: Any) -> Any:
     """Return a design as a page with the targets: live for one turn of its motor, or else the motion over the driver's values."""
     import numpy as np
 
@@ -154,8 +212,6 @@ def _page(candidate: Any, goal: Any) -> Any:
     from udkjax.positions.following.drive import constant_speed
 
     mech, driver = candidate.mechanism, candidate.driver
-    traces = [goal.point] if isinstance(goal, udk.PathGoal) and goal.at is None else None
-    targets = goal.targets[:, :2] if goal.has_place else None
     speed = constant_speed(mech, driver) if isinstance(driver, str) else 0.0
     if candidate.turns and speed:
         sol = udk.simulate(mech, np.linspace(0.0, 2 * np.pi / abs(speed), TURN_INSTANTS), throw=False)

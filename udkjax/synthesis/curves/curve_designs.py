@@ -94,9 +94,9 @@ class CurveDesigns(PrintsTable):
         return PrintedTable(f"{len(self.found)} mechanisms for a curve", rows)
 
 
-def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str) -> CurveDesign | None:
+def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str, unit: str) -> CurveDesign | None:
     """Return a linkage as a design; None if a constraint of its mechanism does not hold at 720 positions of a turn."""
-    mechanism = drawing_of(found.x, found.topology, wanted, name).mechanism()
+    mechanism = drawing_of(found.x, found.topology, wanted, name, unit).mechanism()
     size = wanted.scale * found.size
     if not is_closed_over_turn(mechanism, states_of_turn(mechanism, found.x, found.topology, wanted), size):
         return None
@@ -117,7 +117,7 @@ def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str) -> CurveDesig
     )
 
 
-def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int, worth: float) -> list[CurveDesign]:
+def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int, worth: float, unit: str) -> list[CurveDesign]:
     """Return the best different designs by error and simplicity: each dyad more must reduce the error by the fraction `worth`."""
     every = sorted((one for of_size in found.values() for one in of_size), key=lambda one: one.error / (1.0 - worth) ** one.dyads)
     chosen: list[CurveDesign] = []
@@ -126,7 +126,7 @@ def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int
         structure = one.topology.first.tobytes() + one.topology.second.tobytes()
         if len(chosen) == count or any(s == structure and abs(e - one.error) < 0.02 * e for s, e in errors):
             continue
-        design = confirmed(one, wanted, f"curve {len(chosen) + 1}")
+        design = confirmed(one, wanted, f"curve {len(chosen) + 1}", unit)
         if design is not None:
             chosen.append(design)
             errors.append((structure, one.error))

@@ -1,5 +1,6 @@
 """The search for linkages that draw a curve: random ones, matched, improved in lanes, and grown by dyads, in rounds."""
 
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -7,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.descent import Descended, LinkageLimits, Task, descend, sampling
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, TAIL, Topology, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, TAIL, Topology, positions
 from udkjax.synthesis.curves.matching import find_starts
 from udkjax.synthesis.curves.random_linkages import grown
 from udkjax.synthesis.curves.targets import WantedCurve
@@ -21,8 +22,8 @@ BEAM, FAMILY = 10, 3  # linkages of each number of dyads that are kept and grow,
 # blur (RMS radii), weight of violations, steps and linkages left of each part of a stage
 OF_STARTS = ((0.2, 2.0, 10, 48), (0.1, 5.0, 15, 24), (0.05, 20.0, 25, 8))
 OF_GROWTH = ((0.05, 5.0, 12, 40), (0.03, 10.0, 20, 20), (0.02, 30.0, 30, 10))
-OF_FINISH = ((0.01, 100.0, 30), (0.004, 300.0, 40))
-FINISHED = 4  # linkages of each number of dyads that are finished after a round
+OF_FINISH = ((0.01, 100.0, 20), (0.004, 300.0, 20))
+FINISHED = 3  # linkages of each number of dyads that are finished after a round
 CLOSE_TO = 1e-3  # losses that differ by less, relative, in the same structure are those of the same linkage
 SLACK = 1e-3  # largest violation at the end of a descent, which aims at limits that are tighter by twice as much
 CHECKED = 1440  # angles of a turn at which limits are verified
@@ -60,6 +61,10 @@ class Kept(NamedTuple):
         return self.take(np.array(chosen, int))
 
 
+class OutOfTimeError(Exception):
+    """The time of a search is over."""
+
+
 class FoundLinkage(NamedTuple):
     """A linkage within the limits over the whole turn.
 
@@ -91,32 +96,39 @@ class CurveSearch:
         limits: the limits.
         dyads: the largest number of dyads.
         seed: seed of all random numbers.
-        geared: the fraction of random linkages with a second crank.
     """
 
-    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, dyads: int, seed: int, geared: float = 0.0):
-        self.wanted, self.limits, self.dyads, self.geared = wanted, limits, dyads, geared
+    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, dyads: int, seed: int):
+        self.wanted, self.limits, self.dyads = wanted, limits, dyads
         self.seed, self.families, self.candidates = seed, 0, 0
         inner = limits._replace(cosine=limits.cosine - 2 * SLACK, size=limits.size * (1.0 - 2 * SLACK))
         self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), inner)
         self.exact = Task(wanted.target(240), sampling(192, 64, wanted.is_whole), inner)
-        self.beams: dict[int, Kept] = {}
+        self.beams: dict[int, Kept] = {}  # of all rounds, by the number of dyads
+        self.fresh: dict[int, Kept] = {}  # of this round
+        self.finished: set[float] = set()  # losses of linkages that are finished
         self.found: dict[int, list[FoundLinkage]] = {}
         self.threads = ThreadPoolExecutor(thread_count())
+        self.until = np.inf  # time (`time.monotonic`) at which descents end with an `OutOfTimeError`
 
     def stages(self) -> Iterator[str]:
-        """Run the search, without end; yield a description of each stage when it is completed."""
+        """Run the search, without end; yield a description of each stage when it is completed.
+
+        A round begins anew, since what grows best is not known from its start; then the best linkages of all rounds grow again.
+        """
         done = 0
         while True:
             rng = np.random.default_rng((self.seed, done))
+            self.fresh = fresh = {}
             for dyads in range(1, min(START_DYADS, self.dyads) + 1):
-                self._start(dyads, rng)
+                self._start(fresh, dyads, rng)
                 yield f"round {done + 1}: random linkages of {2 + 2 * dyads} bars"
-            for dyads in range(1, self.dyads):
-                self._grow(dyads, rng)
-                yield f"round {done + 1}: linkages of {4 + 2 * dyads} bars"
-            for dyads in sorted(self.beams):
-                self._finish(dyads)
+            for beams in (fresh, self.beams)[: 2 if done else 1]:
+                for dyads in range(1, self.dyads):
+                    self._grow(beams, dyads, rng)
+                    yield f"round {done + 1}: linkages of {4 + 2 * dyads} bars"
+                self._merge()
+            self.finish()
             done += 1
             yield f"round {done}: finished"
 
@@ -125,27 +137,35 @@ class CurveSearch:
         """The smallest Chamfer distance so far; infinite before the first linkage is finished."""
         return min((one.error for found in self.found.values() for one in found), default=np.inf)
 
-    def finish(self) -> None:
-        """Finish the best linkages of an incomplete round."""
-        for dyads in sorted(self.beams):
-            self._finish(dyads)
+    def finish(self, until: float = np.inf) -> None:
+        """Finish the best linkages, the most promising first, also of an incomplete round; after a time only the first ones."""
+        self._merge()
+        for dyads in sorted((d for d, kept in self.beams.items() if len(kept.x)), key=lambda d: self.beams[d].loss[0]):
+            if time.monotonic() < until or not self.found:
+                self._finish(dyads)
 
-    def _start(self, dyads: int, rng: np.random.Generator) -> None:
-        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][2], rng, self.geared)
+    def _start(self, beams: dict[int, Kept], dyads: int, rng: np.random.Generator) -> None:
+        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng)
         family = self.families + np.arange(len(x))
         self.families += len(x)
-        self._keep(dyads, self._improve(Kept(x, topology, np.zeros(len(x)), family), OF_STARTS))
+        self._keep(beams, dyads, self._improve(Kept(x, topology, np.zeros(len(x)), family), OF_STARTS))
 
-    def _grow(self, dyads: int, rng: np.random.Generator) -> None:
-        if dyads not in self.beams or not len(self.beams[dyads].x):
+    def _grow(self, beams: dict[int, Kept], dyads: int, rng: np.random.Generator) -> None:
+        if dyads not in beams or not len(beams[dyads].x):
             return
-        parents = self.beams[dyads]
+        parents = beams[dyads]
         x, topology = grown((parents.x, parents.topology), self.coarse.target, self.coarse.sample, TRIES, CHILDREN, rng)
         children = Kept(x, topology, np.zeros(len(x)), np.repeat(parents.family, CHILDREN))
-        self._keep(dyads + 1, self._improve(children, OF_GROWTH))
+        self._keep(beams, dyads + 1, self._improve(children, OF_GROWTH))
 
-    def _keep(self, dyads: int, kept: Kept) -> None:
-        self.beams[dyads] = kept.with_others(self.beams.get(dyads)).best(BEAM, FAMILY)
+    def _keep(self, beams: dict[int, Kept], dyads: int, kept: Kept) -> None:
+        beams[dyads] = kept.with_others(beams.get(dyads)).best(BEAM, FAMILY)
+
+    def _merge(self) -> None:
+        """Add the linkages of this round to those of all rounds."""
+        for dyads, kept in self.fresh.items():
+            self._keep(self.beams, dyads, kept)
+        self.fresh = {}
 
     def _improve(self, kept: Kept, parts: tuple[tuple[float, float, int, int], ...]) -> Kept:
         for part in parts:
@@ -158,6 +178,8 @@ class CurveSearch:
 
     def _descend(self, x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:
         """Improve linkages in batches, on all threads."""
+        if time.monotonic() > self.until:
+            raise OutOfTimeError
         self.candidates += len(x)
         batches = [slice(k, k + LANES) for k in range(0, len(x), LANES)]
         results = list(self.threads.map(lambda part: descend(x[part], topology.take(part), task, blur, steps), batches))
@@ -165,9 +187,11 @@ class CurveSearch:
 
     def _finish(self, dyads: int) -> None:
         kept = self.beams[dyads]
-        kept = kept.take(np.arange(min(FINISHED, len(kept.x))))
-        if not len(kept.x):
+        new = [k for k, loss in enumerate(kept.loss) if k < FINISHED and loss not in self.finished]
+        if not new:
             return
+        kept = kept.take(np.array(new))
+        self.finished.update(kept.loss)
         x = kept.x
         for blur, weight, steps in OF_FINISH:
             after = self._descend(x, kept.topology, self.exact.weighed(weight), blur, steps)
@@ -180,7 +204,7 @@ class CurveSearch:
     def _verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
         """Return the linkage if it is within the limits over the whole turn."""
         at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
-        joints = np.concatenate([at.origins[3::2], at.origins[4::2], at.ends, at.origins[1:2], at.pin[None]])
+        joints = np.concatenate([at.origins[BASE:], at.ends, at.origins[1:2], at.pin[None]])
         cosine, size = float(np.abs(at.cosines).max()), float(np.abs(joints).max())
         if not (cosine <= self.limits.cosine and size <= self.limits.size):
             return None
@@ -191,7 +215,7 @@ class CurveSearch:
 def drawn(x: np.ndarray, topology: Topology, is_whole: bool, count: int = 2001) -> np.ndarray:
     """Return the drawn curve of one linkage by complex points; of a whole turn, the last one is the first."""
     share = np.linspace(0.0, 1.0, count)
-    return positions(x[None], topology, x[None, 2:3] * share).pin[0]
+    return positions(x[None], topology, x[None, SPAN : SPAN + 1] * share).pin[0]
 
 
 def without_idle_dyads(x: np.ndarray, topology: Topology) -> tuple[np.ndarray, Topology]:
@@ -206,7 +230,5 @@ def without_idle_dyads(x: np.ndarray, topology: Topology) -> tuple[np.ndarray, T
     for new, old in enumerate(dyads):
         number[BASE + 2 * old : BASE + 2 * old + 2] = BASE + 2 * new, BASE + 2 * new + 1
     parts = [x[:HEAD], *(x[HEAD + EACH * d : HEAD + EACH * (d + 1)] for d in dyads), x[-TAIL:]]
-    chosen = Topology(
-        number[topology.first[:, dyads]], number[topology.second[:, dyads]], topology.side[:, dyads], topology.ratio
-    )
+    chosen = Topology(number[topology.first[:, dyads]], number[topology.second[:, dyads]], topology.side[:, dyads])
     return np.concatenate(parts), chosen

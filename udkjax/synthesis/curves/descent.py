@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.synthesis.curves.dyads import EACH, HEAD, SPAN, DyadPositions, Topology, gradients, number_count, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, DyadPositions, Topology, gradients, number_count, positions
 from udkjax.synthesis.curves.targets import CurveTarget
 
 FULL_TURN = 2.0 * np.pi
@@ -119,7 +119,7 @@ class _Violation(NamedTuple):
 
 
 def _joints(at: DyadPositions) -> np.ndarray:
-    return np.stack([at.origins[3::2], at.origins[4::2], at.ends])
+    return np.stack([at.origins[BASE::2], at.origins[BASE + 1 :: 2], at.ends])
 
 
 def _violation(at: DyadPositions, limits: LinkageLimits) -> _Violation:

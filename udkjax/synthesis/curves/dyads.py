@@ -1,20 +1,20 @@
 """Linkages of dyads in lanes: every position by an intersection of circles, derivatives by statics.
 
-Link 0 is the ground, link 1 the crank, link 2 a second crank that gears turn `ratio` times as fast. Dyad d adds the links
-3 + 2 d, from its joint P on one link to its joint R, and 4 + 2 d, from its joint Q on another link to R. The drawing pin is a
+Link 0 is the ground, link 1 the crank. Dyad d adds the links 2 + 2 d, from its joint P on one link to its joint R, and 3 + 2 d,
+from its joint Q on another link to R. The drawing pin is a
 point of the last dyad's first link. The frame of a link has its origin at O, P or Q, and its x axis points to R.
 
-The numbers x of a linkage are: the place of O (2), the part of the turn that draws the curve (rad), the place of the second
-crank's pin (2), for each dyad the places of P and Q on their links (4) and the lengths P-R and Q-R (2), and the place of the
-drawing pin on its link (2). Places are complex numbers.
+The numbers x of a linkage are: the place of O (2), the part of the turn that draws the curve (rad), for each dyad the places of P
+and Q on their links (4) and the lengths P-R and Q-R (2), and the place of the drawing pin on its link (2). Places are complex
+numbers.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-BASE = 3  # links without dyads
-HEAD, EACH, TAIL = 5, 6, 2  # numbers before the dyads, of each dyad, and after them
+BASE = 2  # links without dyads
+HEAD, EACH, TAIL = 3, 6, 2  # numbers before the dyads, of each dyad, and after them
 SPAN = 2  # index of the part of the turn
 TINY = 1e-30  # keeps divisions finite where P and Q coincide; such linkages cannot be closed
 
@@ -26,13 +26,11 @@ class Topology(NamedTuple):
         first: number of the link that carries P (K, D).
         second: number of the link that carries Q (K, D).
         side: 1 or -1, the side of P-Q on which R is (K, D).
-        ratio: speed of the second crank relative to the first (K,).
     """
 
     first: np.ndarray
     second: np.ndarray
     side: np.ndarray
-    ratio: np.ndarray
 
     def take(self, which: Any) -> "Topology":
         """Return some of the linkages."""
@@ -79,9 +77,7 @@ def positions(x: np.ndarray, topology: Topology, theta: np.ndarray, least: float
     (K, T), D = theta.shape, topology.dyads
     z, u = np.zeros((BASE + 2 * D, K, T), complex), np.ones((BASE + 2 * D, K, T), complex)
     ends, cosines, lanes = np.empty((D, K, T), complex), np.empty((D, K, T)), np.arange(K)
-    z[1], z[2] = _complex(x, 0), _complex(x, 3)
-    u[1] = np.exp(1j * theta)
-    u[2] = np.exp(1j * (topology.ratio[:, None] * theta))
+    z[1], u[1] = _complex(x, 0), np.exp(1j * theta)
     for d in range(D):
         k = HEAD + EACH * d
         A, B = topology.first[:, d], topology.second[:, d]
@@ -172,8 +168,7 @@ def gradients(
         at_second[:, 2] += pulls[1, d] + of_way
         load(topology.first[:, d], P, at_first, k)
         load(topology.second[:, d], Q, at_second, k + 2)
-    for link, k in ((1, 0), (2, 3)):
-        result[:, k] += np.real(force[link])
-        result[:, k + 1] += np.imag(force[link])
-    result[:, SPAN] += (moment[1] + topology.ratio[:, None, None] * moment[2]) * share
+    result[:, 0] += np.real(force[1])
+    result[:, 1] += np.imag(force[1])
+    result[:, SPAN] += moment[1] * share
     return result

@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from udkjax.equations import violation
+from udkjax.equations.states.quantities import violation
 from udkjax.positions.following.kinematics import FULL_TURN
 from udkjax.scene.drawing import Drawing
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, TAIL, Topology, positions
 from udkjax.synthesis.curves.targets import WantedCurve
@@ -42,26 +43,29 @@ def _link_name(number: int) -> str:
     return "crank" if number == 1 else f"link{number - BASE + 1}"
 
 
-def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str) -> Drawing:
-    """Return the drawing of a normalized linkage at the beginning of its curve, in metres."""
+def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str, unit: str = "m") -> Drawing:
+    """Return the drawing of a normalized linkage at the beginning of its curve, with lengths in `unit`."""
     at = positions(x[None], topology, np.zeros((1, 1)), 0.0)
     pins = pins_of_linkage(x, topology)
+    size = Units({"length": unit}).size("m")
     places, members = {}, {}
     for pin, points in pins.items():
         link, local = points[0]
-        places[pin] = wanted.middle + wanted.scale * complex(at.origins[link, 0, 0] + at.turns[link, 0, 0] * local)
+        place = wanted.middle + wanted.scale * complex(at.origins[link, 0, 0] + at.turns[link, 0, 0] * local)
+        places[pin] = place / size
         for link, _ in points:
             members.setdefault(link, []).append(pin)
-    links = {_link_name(k): _link(members[k], places, wanted.extent) for k in sorted(members) if k}
+    links = {_link_name(k): _link(members[k], places, wanted.extent, size) for k in sorted(members) if k}
     written = {pin: (z.real, z.imag) for pin, z in places.items()}
-    return Drawing(written, links, ground=members[0], motors=[{"pin": "O", "speed": SPEED}], gravity=(0.0, 0.0), name=name)
+    motor, units = {"pin": "O", "speed": SPEED}, {"length": unit}
+    return Drawing(written, links, ground=members[0], motors=[motor], gravity=(0.0, 0.0), name=name, units=units)
 
 
-def _link(pins: list[str], places: dict[str, complex], extent: float) -> dict[str, Any]:
+def _link(pins: list[str], places: dict[str, complex], extent: float, size: float) -> dict[str, Any]:
     """Return the table of a link through pins: a bar, or a plate whose corners are in order about its middle."""
-    shape = {"density": DENSITY, "thickness": THICKNESS * extent}
+    shape = {"density": DENSITY, "thickness": THICKNESS * extent / size}
     if len(pins) == 2:
-        return {"pins": pins, "width": WIDTH * extent, **shape}
+        return {"pins": pins, "width": WIDTH * extent / size, **shape}
     z = np.array([places[pin] for pin in pins])
     order = np.argsort(np.angle(z - z.mean()), kind="stable")
     sides = np.abs(np.roll(z[order], -1) - z[order])
@@ -71,9 +75,9 @@ def _link(pins: list[str], places: dict[str, complex], extent: float) -> dict[st
     named = {"pins": [pins[k] for k in order]}
     if area > THIN * sides.max() ** 2:
         return named | shape
-    mass = DENSITY * THICKNESS * extent * WIDTH * extent * float(sides.max())
-    middle = z.mean()
-    return named | {"mass": mass, "centre": (middle.real, middle.imag), "inertia": mass * float(sides.max()) ** 2 / 12}
+    length, middle = size * float(sides.max()), z.mean()
+    mass = DENSITY * THICKNESS * extent * WIDTH * extent * length
+    return named | {"mass": mass, "centre": (middle.real, middle.imag), "inertia": f"{mass * length**2 / 12!r} kg m2"}
 
 
 class TurnStates(NamedTuple):
@@ -88,7 +92,7 @@ def states_of_turn(mechanism: Mechanism, x: np.ndarray, topology: Topology, want
     """Return 721 positions of a mechanism over a turn, moved from its drawn position as the closed form of the linkage moves."""
     theta = np.linspace(0.0, FULL_TURN, TURN_VALUES + 1)
     at = positions(x[None], topology, theta[None], 0.0)
-    numbers = {_link_name(k): k for k in range(1, len(at.turns)) if k != BASE - 1}
+    numbers = {_link_name(k): k for k in range(1, len(at.turns))}
     q0 = np.asarray(mechanism.q0).reshape(-1, 3)
     q = np.empty((len(theta), len(q0), 3))
     for k, body in enumerate(mechanism.bodies):

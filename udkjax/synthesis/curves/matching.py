@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.descent import FULL_TURN, LinkageLimits
-from udkjax.synthesis.curves.dyads import EACH, HEAD, SPAN, Topology, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, Topology, positions
 from udkjax.synthesis.curves.random_linkages import Linkages, random_linkages, turn_angles
 from udkjax.synthesis.curves.targets import WantedCurve, resampled
 
@@ -24,10 +24,10 @@ class _Matches(NamedTuple):
 
 
 def find_starts(
-    wanted: WantedCurve, limits: LinkageLimits, dyads: int, samples: int, keep: int, rng: np.random.Generator, geared: float
+    wanted: WantedCurve, limits: LinkageLimits, dyads: int, samples: int, keep: int, rng: np.random.Generator
 ) -> Linkages:
     """Return the linkages whose curves are most similar to the target, of `samples` random ones, moved onto it."""
-    x, topology = random_linkages(samples, dyads, rng, geared)
+    x, topology = random_linkages(samples, dyads, rng)
     at = positions(x, topology, turn_angles(samples))
     turns = (np.abs(at.cosines) < limits.cosine).all((0, 2))
     x, topology = x[turns], topology.take(turns)
@@ -102,13 +102,12 @@ def _moved(x: np.ndarray, topology: Topology, factor: np.ndarray, offset: np.nda
         x[:, k], x[:, k + 1] = np.real(p), np.imag(p)
 
     move(0, factor, offset)
-    move(3, factor, offset)
-    of_link = np.stack([factor, factor * np.exp(1j * start), factor * np.exp(1j * topology.ratio * start), size + 0j])
+    of_link = np.stack([factor, factor * np.exp(1j * start), size + 0j])
     rows = np.arange(len(x))
     for d in range(topology.dyads):
         k = HEAD + EACH * d
         for j, link in ((k, topology.first[:, d]), (k + 2, topology.second[:, d])):
-            move(j, of_link[np.minimum(link, 3), rows], np.where(link == 0, offset, 0.0))
+            move(j, of_link[np.minimum(link, BASE), rows], np.where(link == 0, offset, 0.0))
         x[:, k + 4 : k + 6] *= size[:, None]
     move(x.shape[1] - 2, size + 0j, 0.0)
     return x

@@ -10,8 +10,9 @@ from udkjax.argument_types import COUNT, NOT_NEGATIVE, NOT_NEGATIVE_COUNT
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.requirements import require_choice
 from udkjax.scene.arguments import checked
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.synthesis.curves.curve_designs import CurveDesigns, ranked
-from udkjax.synthesis.curves.curve_search import CurveSearch
+from udkjax.synthesis.curves.curve_search import CurveSearch, OutOfTimeError
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.targets import CHAMFER_POINTS, WantedCurve
 
@@ -22,6 +23,7 @@ SHORTEST = 0.02  # smallest distance of two joints of a dyad's link, in extents 
 WORTH = 0.03  # fraction by which two more bars must reduce the error to be worth it
 # Two samples of the same curve differ by a quarter of the distance of their points each way; a search ends when the rest is less.
 ENOUGH = 5e-4
+GROWING = 0.9  # fraction of the time after which linkages are only finished and verified
 
 
 @checked
@@ -35,6 +37,7 @@ def mechanisms_for(
     part: str = "free",
     transmission: Annotated[float, NOT_NEGATIVE] = TRANSMISSION,
     rounds: Annotated[int, COUNT] | None = None,
+    unit: str = "m",
     progress: ProgressOption = None,
 ) -> CurveDesigns:
     """Find mechanisms with one motor and a pin that draws a curve: their structure and dimensions, without any data.
@@ -57,6 +60,7 @@ def mechanisms_for(
         transmission: smallest angle (rad) between the two links of a dyad, and between one and the other prolonged, over the
             whole turn.
         rounds: number of rounds after which the search ends.
+        unit: unit of lengths of the drawings, such as "mm"; it does not change the mechanisms.
         progress: as for `sweep`: None shows progress after two seconds, False never; or a function of a `Progress`. Ctrl-C ends
             the search with the best designs so far.
 
@@ -67,36 +71,35 @@ def mechanisms_for(
         ValueError: the curve or a limit is invalid, or the limits contradict each other.
     """
     require_choice("part", part, ("free", "whole"))
+    require_choice("unit", unit, tuple(Units.sizes("m")))
     wanted = WantedCurve(curve, part == "whole")
     search = CurveSearch(wanted, _limits(wanted, size, float(transmission)), _dyads(int(bars)), int(seed))
     begun = time.monotonic()
     done = _run(search, float(seconds), rounds, begun, progress)
-    found = ranked(search.found, wanted, int(results), WORTH)
+    found = ranked(search.found, wanted, int(results), WORTH, unit)
     reason = "" if found else "no linkage turned within the limits: give more seconds, a larger size or a smaller transmission"
     return CurveDesigns(tuple(found), done, search.candidates, time.monotonic() - begun, reason)
 
 
 def _run(search: CurveSearch, seconds: float, rounds: int | None, begun: float, progress: ProgressOption) -> int:
     """Run stages until the time is over; return the number of completed rounds."""
-    done, longest, before = 0, 0.0, begun
-    enough = ENOUGH + 0.5 * search.wanted.length / CHAMFER_POINTS
+    done, enough = 0, ENOUGH + 0.5 * search.wanted.length / CHAMFER_POINTS
     try:
         with report_progress(progress, seconds or None, "mechanisms_for") as report:
             for stage in search.stages():
-                now = time.monotonic()
-                longest, before = max(longest, now - before), now
+                search.until = begun + GROWING * seconds
                 error = f", error {search.best:.4g}" if np.isfinite(search.best) else ""
-                report(min(now - begun, seconds), stage + error)
+                report(min(time.monotonic() - begun, seconds), stage + error)
                 if stage.endswith("finished"):
                     done += 1
                     if search.best <= enough or done == rounds:
                         return done
-                if now - begun + 2.0 * longest > seconds:
+                if time.monotonic() > search.until:
                     break
-            search.finish()
-    except KeyboardInterrupt:
-        if not search.found:
-            search.finish()
+    except (KeyboardInterrupt, OutOfTimeError):
+        pass
+    search.until = np.inf
+    search.finish(begun + seconds)
     return done
 
 

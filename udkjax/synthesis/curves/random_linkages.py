@@ -11,7 +11,6 @@ from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, TAIL, Topology
 from udkjax.synthesis.curves.targets import CurveTarget
 
 TURN_VALUES = 72  # angles of the crank over a turn
-RATIOS = (1.0, -1.0, 2.0, -2.0, 3.0, -3.0)  # speeds of a second crank
 Linkages = tuple[np.ndarray, Topology]
 
 
@@ -20,23 +19,19 @@ def turn_angles(K: int) -> np.ndarray:
     return np.broadcast_to(np.arange(TURN_VALUES) * (FULL_TURN / TURN_VALUES), (K, TURN_VALUES))
 
 
-def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: float = 0.0) -> Linkages:
-    """Return K random linkages with cranks of about unit length; a fraction `geared` of them has a second crank."""
+def random_linkages(K: int, dyads: int, rng: np.random.Generator) -> Linkages:
+    """Return K random linkages with cranks of about unit length."""
     x = np.zeros((K, number_count(dyads)))
     x[:, SPAN] = FULL_TURN
-    has_gears = rng.random(K) < geared
     first, second = np.ones((K, dyads), int), np.zeros((K, dyads), int)
-    topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)), np.where(has_gears, rng.choice(RATIOS, K), 1.0))
-    second[:, 0] = np.where(has_gears, 2, 0)
+    topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)))
     x[:, HEAD] = np.exp(rng.normal(0.0, 0.3, K))
-    far, towards = np.exp(rng.normal(0.7, 0.5, K)), np.exp(1j * rng.uniform(0.0, FULL_TURN, K))
-    pivot = np.where(has_gears, 0.4, 1.0) * far * towards
+    pivot = np.exp(rng.normal(0.7, 0.5, K)) * np.exp(1j * rng.uniform(0.0, FULL_TURN, K))
     x[:, HEAD + 2], x[:, HEAD + 3] = np.real(pivot), np.imag(pivot)
-    x[:, 3:5] = rng.normal(0.0, 2.0, (K, 2))
     for d in range(dyads):
         k, links = HEAD + EACH * d, BASE + 2 * d
         if d:
-            likely = np.array([1.0, 0.5, 0.0, *[1.0] * (2 * d - 2), 2.0, 2.0])  # rather the last links: deeper linkages
+            likely = np.array([1.0, 0.5, *[1.0] * (2 * d - 2), 2.0, 2.0])  # rather the last links: deeper linkages
             A, B = rng.choice(links, (2, K), p=likely / likely.sum())
             A = np.where(A == B, np.where(links - 2 == B, links - 1, links - 2), A)
             first[:, d], second[:, d] = A, B
@@ -52,7 +47,7 @@ def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int
     k = HEAD + EACH * (d + 1)
     known = np.concatenate([x[:, :k], x[:, -TAIL:]], 1)
     known[:, k - 2 : k] = 1.0
-    part = Topology(topology.first[:, : d + 1], topology.second[:, : d + 1], topology.side[:, : d + 1], topology.ratio)
+    part = Topology(topology.first[:, : d + 1], topology.second[:, : d + 1], topology.side[:, : d + 1])
     at = positions(known, part, theta)
     distance = np.abs(at.origins[-1] - at.origins[-2])
     far, near = distance.max(1), distance.min(1)
@@ -82,14 +77,14 @@ def grown(linkages: Linkages, target: CurveTarget, sample: Sampling, tries: int,
     parent, links = np.repeat(np.arange(K), tries), BASE + 2 * D
     x, topology = x[parent], topology.take(parent)
     A = np.full(n, links - 2)
-    B = rng.integers(0, links - 2, n)
-    B = np.where(B == 2, links - 1, B)
+    B = rng.integers(0, links - 1, n)
+    B += links - 2 == B
     B = np.where(rng.random(n) < 0.3, 0, B)
     k = HEAD + EACH * D
     y = np.concatenate([x[:, :k], x[:, -TAIL:], random_places(x, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
     side = rng.choice([-1.0, 1.0], (n, 1))
-    first, second, sides = (np.concatenate(pair, 1) for pair in zip(topology[:3], (A[:, None], B[:, None], side), strict=True))
-    new = Topology(first, second, sides, topology.ratio)
+    first, second, sides = (np.concatenate(pair, 1) for pair in zip(topology, (A[:, None], B[:, None], side), strict=True))
+    new = Topology(first, second, sides)
     theta = sample.angles(y)
     y[:, k + 4 : k + 6] = closing_lengths(y, new, theta, D, rng)
     at = positions(y, new, theta)
