@@ -19,9 +19,11 @@ def test_a_drawn_path_becomes_a_mechanism(studio):
     start = time.perf_counter()
     studio.page.get_by_role("button", name="find a mechanism with").click()
     studio.until("studio.wanted.designs.length > 0")
-    assert time.perf_counter() - start < 10.0  # about 1 s on a machine without other work
+    assert time.perf_counter() - start < 30.0  # about 3 s on a machine without other work
     assert studio.page.get_by_label("progress of the search").is_visible()
     assert " mm off, the crank turns, transmission angle at least " in studio.page.locator(".wanted").inner_text()
+    studio.until("studio.wanted.designs.length > 1")
+    studio.page.get_by_role("button", name="stop looking for mechanisms").click()
     studio.until("!studio.wanted.busy")
     assert studio.js(
         "studio.wanted.at === 0 && studio.wanted.designs.every((one, k, all) => !k || one.deviation >= all[k - 1].deviation)"

@@ -6,7 +6,6 @@
     POST /api/compile     {text, document?, engine?}                  -> {text, document, problems, scene, engine}
     POST /api/diagnose    {text, about?, end?}                        -> findings about the drawing
     POST /api/design      {path, unit?, seed?}                        -> mechanisms with a point on a wanted path
-                          {}                                          -> {}, once the search is compiled
 
 A refused request is answered by {problem} and an HTTP status.
 """
@@ -96,9 +95,7 @@ class Studio:
         return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
 
     def design(self, request: JsonObject) -> JsonObject:
-        """Return mechanisms with a point that passes along a wanted path; without a path, prepare for the next one."""
-        if "path" not in request:
-            return self.examiner.call("prepare_path_search", {}, DIAGNOSE_SECONDS)
+        """Return mechanisms with a pin that draws a wanted path."""
         path, unit, seed = request.get("path"), request.get("unit", "mm"), request.get("seed", 0)
         if not isinstance(path, list) or unit not in Units.sizes("m") or type(seed) is not int or seed < 0:
             raise RefusedError(400, "path: must be a list of places [x, y] in m; unit: a unit of lengths; seed: a natural number")

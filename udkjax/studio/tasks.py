@@ -205,18 +205,10 @@ def export(text: str, suffix: str) -> JsonObject:
 
 
 def find_path(path: object, unit: str = "mm", seed: int = 0) -> JsonObject:
-    """Return mechanisms with a point that passes along a wanted path."""
+    """Return mechanisms with a pin that draws a wanted path."""
     from udkjax.studio.path_search import find_mechanisms  # imports the synthesis, which other tasks need not
 
     return find_mechanisms(path, unit, seed)
-
-
-def prepare_path_search() -> JsonObject:
-    """Compile the search for mechanisms for a path, so that the first path does not wait for it."""
-    from udkjax.studio.path_search import prepared_search
-
-    prepared_search()
-    return {}
 
 
 def template_text(name: str) -> str:

@@ -148,7 +148,6 @@ class Studio {
     this.gestures.cancel();
     this.parts.entry.hidden = true;
     this.tool = name;
-    if (toolOf(name).kind === "stroke") this.wanted.prepare();
     this.say(name === "select" ? "" : toolOf(name).title);
     this.shown();
   }

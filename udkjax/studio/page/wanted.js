@@ -6,7 +6,7 @@ import {make} from "./player/elements.js";
 
 const CLOSE = 0.5;  // px: a stroke has no points closer to each other
 const FEWEST = 3;
-const ROUNDS = 4;  // of random mechanisms; the first one answers within a second
+const ROUNDS = 4;  // searches, each with more bars; the first one answers within seconds
 const MOST = 8;  // mechanisms to look through
 const ALIKE = 1e-3;  // pins whose places differ by less, relative to the extent of the path, are the same
 
@@ -24,7 +24,7 @@ export function merged(known, more, extent) {
   const all = [...known];
   for (const one of more) {
     const places = placesOf(one);
-    if (!all.some(other => placesOf(other).every((x, k) => Math.abs(x - places[k]) < ALIKE * extent))) all.push(one);
+    if (!all.some(other => placesOf(other).length === places.length && placesOf(other).every((x, k) => Math.abs(x - places[k]) < ALIKE * extent))) all.push(one);
   }
   return all.sort((a, b) => a.deviation - b.deviation).slice(0, MOST);
 }
@@ -36,9 +36,6 @@ export class WantedPath {
     this.input.addEventListener("change", () => this.read(this.input.files[0]));
     this.show();
   }
-
-  /** Let the server compile its search, while the path is being drawn. */
-  prepare() { this.prepared ??= ask("design").catch(() => { this.prepared = null; }); }
 
   /** Begin, continue and end a stroke. */
   begin(place) {
@@ -59,7 +56,6 @@ export class WantedPath {
 
   async read(file) {
     if (!file) return;
-    this.prepare();
     const {studio} = this, points = placesOfTable(await file.text(), lengthUnit(studio.document));
     this.input.value = "";
     if (!points) return void studio.say(`${file.name} has no two columns of numbers, x and y`, true);

@@ -98,7 +98,8 @@ def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str, unit: str) ->
     """Return a linkage as a design; None if a constraint of its mechanism does not hold at 720 positions of a turn."""
     mechanism = drawing_of(found.x, found.topology, wanted, name, unit).mechanism()
     size = wanted.scale * found.size
-    if not is_closed_over_turn(mechanism, states_of_turn(mechanism, found.x, found.topology, wanted), size):
+    states = states_of_turn(mechanism, found.x, found.topology, wanted)
+    if not is_closed_over_turn(mechanism, states, size + abs(wanted.middle)):
         return None
     driver = only_driver(mechanism)
     start = float(drive(mechanism, driver).value(mechanism.q0))

@@ -197,11 +197,11 @@ class CurveSearch:
             after = self._descend(x, kept.topology, self.exact.weighed(weight), blur, steps)
             x = after.x
         for k in range(len(x)):
-            one = self._verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
+            one = self.verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
             if one is not None:
                 self.found[one.dyads] = sorted([*self.found.get(one.dyads, []), one], key=lambda f: f.error)[:BEAM]
 
-    def _verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
+    def verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
         """Return the linkage if it is within the limits over the whole turn."""
         at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
         joints = np.concatenate([at.origins[BASE:], at.ends, at.origins[1:2], at.pin[None]])

@@ -155,7 +155,7 @@ def _compare(c: np.ndarray, task: Task, blur: float) -> tuple[np.ndarray, _Pairs
     return one + two, of_curve, of_target, nearest
 
 
-def _evaluate(x: np.ndarray, topology: Topology, task: Task, blur: float) -> tuple[np.ndarray, ...]:
+def evaluate(x: np.ndarray, topology: Topology, task: Task, blur: float) -> tuple[np.ndarray, ...]:
     """Return losses, Chamfer distances and largest violations (K,), and matrices and gradients of the step's equations."""
     K, sample, limits = len(x), task.sample, task.limits
     at = positions(x, topology, sample.angles(x))
@@ -193,7 +193,7 @@ def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: i
     """
     low, high = task.limits.bounds(topology.dyads, task.sample.is_whole)
     x = np.clip(x, low, high)
-    now = list(_evaluate(x, topology, task, blur))
+    now = list(evaluate(x, topology, task, blur))
     damping, places = np.full(len(x), 1e-2), np.arange(x.shape[1])
     for _ in range(steps):
         A, b = now[3].copy(), now[4]
@@ -203,7 +203,7 @@ def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: i
         dx = -np.linalg.solve(A, b[..., None])[..., 0]
         dx *= np.minimum(1.0, LONGEST_MOVE / np.maximum(np.abs(dx).max(1, keepdims=True), 1e-300))
         tried = np.clip(x + dx, low, high)
-        new = _evaluate(tried, topology, task, blur)
+        new = evaluate(tried, topology, task, blur)
         better = new[0] < now[0]
         damping = np.where(better, np.maximum(0.3 * damping, 1e-7), np.minimum(5.0 * damping, 1e6))
         x[better] = tried[better]

@@ -15,7 +15,7 @@ from udkjax.synthesis.curves.targets import WantedCurve
 
 PIN = "P"  # name of the drawing pin
 TURN_VALUES = 720  # positions of a turn at which the constraints must hold
-CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to the size of the linkage
+CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to coordinates of its pins
 DENSITY = 7850.0  # kg/m^3, of steel
 WIDTH, THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
 THIN = 1e-3  # a plate with a smaller area, relative to the square of its longest side, is drawn as a bar of a given mass

@@ -73,7 +73,7 @@ def mechanisms_for(
     require_choice("part", part, ("free", "whole"))
     require_choice("unit", unit, tuple(Units.sizes("m")))
     wanted = WantedCurve(curve, part == "whole")
-    search = CurveSearch(wanted, _limits(wanted, size, float(transmission)), _dyads(int(bars)), int(seed))
+    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), _dyads(int(bars)), int(seed))
     begun = time.monotonic()
     done = _run(search, float(seconds), rounds, begun, progress)
     found = ranked(search.found, wanted, int(results), WORTH, unit)
@@ -109,7 +109,8 @@ def _dyads(bars: int) -> int:
     return (bars - 2) // 2
 
 
-def _limits(wanted: WantedCurve, size: float | None, transmission: float) -> LinkageLimits:
+def curve_limits(wanted: WantedCurve, size: float | None, transmission: float) -> LinkageLimits:
+    """Return the limits of linkages in RMS radii of a curve, from a largest distance (m) and a smallest angle (rad)."""
     if transmission >= np.pi / 2:
         raise ValueError(f"transmission must be an angle below pi / 2 (rad), not {transmission:g}")
     reach = SIZE * wanted.extent if size is None else float(size)
