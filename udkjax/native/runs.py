@@ -7,10 +7,11 @@ from typing import Any, ClassVar
 from udkjax.native.derivatives import record
 from udkjax.native.derivatives.backpropagation import Reverse
 from udkjax.native.derivatives.second_tangents import ForwardTwice
+from udkjax.native.derivatives.state_tangents import StateTangents
 from udkjax.native.derivatives.tangents import Forward
 from udkjax.native.module.layout import INFO, INPUTS, Plan
 from udkjax.native.module.module import Module
-from udkjax.native.module.tableau import KVAERNO5, Method
+from udkjax.native.module.tableau import EULER, KVAERNO5, Method
 from udkjax.native.operations import Accelerate, Operation
 from udkjax.native.parts.formulations import FormulationCode
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -164,6 +165,23 @@ class RunTangents(RunStates):
         directions, n = inputs[-1].shape[1], self.code.coordinate_count
         changes = [(directions, times, 2 * n), (directions, 2 * n)]
         return [*super().outputs(inputs, times), *changes]
+
+
+@dataclass(frozen=True)
+class AccelerateTangents(Accelerate):
+    """Compute the accelerations of states, and their tangents along directions of all numbers of the scene and of states."""
+
+    @property
+    def tangents(self) -> int:
+        return 3
+
+    def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
+        code = self.code.for_derivatives
+        plan = Plan(code, EULER, projected=False, breaks=False, width=width, vector=vector, unrolled=code.is_small)
+        return StateTangents(plan, (True,) * code.number_count, max(width, tangent_lanes))
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
+        return [*super().outputs(inputs, times), (inputs[-1].shape[1], self.code.coordinate_count)]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -53,7 +54,7 @@ def scene_numbers(library, prefix):
 def pendulum(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pendulum")
     mechanism = udk.library.compound_pendulum()
-    what = ["run", "accelerations", "projection", "positions"]
+    what = ["run", "accelerations", "derivatives", "projection", "positions"]
     code = udk.export_c(mechanism, folder, what, TS, ["body.rod.mass", "gravity"])
     return mechanism, code, compiled(folder, fused())
 
@@ -77,6 +78,33 @@ def test_functions_of_a_state_equal_those_of_the_package(pendulum):
     getattr(library, f"{code.prefix}_project")(given, ctypes.c_double(0.0), numbers(p), numbers(w), numbers(memory["projection"]))
     assert np.abs(p - q).max() < 1e-3
     assert float(close(given, ctypes.c_double(0.0), numbers(p), numbers(w), numbers(memory["positions"]))) < 1e-9
+
+
+def derivative_in_c(library, code, numbers_of_scene, changes, q, v, dq, dv):
+    """Return accelerations and their derivative along changes, by C."""
+    found, memory = np.zeros((2, len(q))), np.full(code.memory["derivatives"] // 8, np.nan)
+    arrays = [numbers(x) for x in (q, v, changes, dq, dv)]
+    getattr(library, f"{code.prefix}_accelerations_along")(
+        numbers_of_scene, ctypes.c_double(0.0), *arrays, numbers(found[0]), numbers(found[1]), numbers(memory)
+    )
+    return found
+
+
+def test_derivatives_in_c_equal_those_of_jax(pendulum):
+    mechanism, code, library = pendulum
+    rng, state = np.random.default_rng(0), udk.assemble(mechanism)
+    q, v, dq, dv = *flat(state.q, state.v), *rng.normal(size=(2, 3))
+    parameters, changes = np.array([float(mechanism.bodies["rod"].mass), 0.0, -9.81]), rng.normal(size=3)
+    header = next(x for x in code.files if x.suffix == ".h").read_text()
+    dnumbers = np.full(int(re.search(r"_NUMBERS (\d+)", header)[1]), np.nan)
+    getattr(library, f"{code.prefix}_set_parameters_along")(numbers(np.concatenate([parameters, changes])), numbers(dnumbers))
+    found = derivative_in_c(library, code, scene_numbers(library, code.prefix), dnumbers, q, v, dq, dv)
+
+    def accelerations(p, q, v):
+        changed = mechanism.with_parameters({"body.rod.mass": p[0], "gravity": p[1:]})
+        return jax.numpy.ravel(udk.accelerations(changed, 0.0, q, v))
+
+    assert_allclose(found, jax.jvp(accelerations, (parameters, q, v), (changes, dq, dv)), rtol=1e-12, atol=1e-12)
 
 
 def test_a_step_with_other_parameters_equals_that_of_the_package(pendulum):
@@ -151,3 +179,20 @@ def test_every_scene_runs_in_c(name, tmp_path):
         assert_array_equal(found, wanted)
     else:
         assert_allclose(found[1], wanted[1], atol=1e-9 * np.abs(wanted).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*sorted(udk.library.__all__), *DRAWINGS], ids=lambda x: Path(x).stem)
+def test_every_scene_has_derivatives_in_c_along_its_motion(name, tmp_path):
+    """Along the motion, directions keep redundant constraints compatible."""
+    mechanism = udk.load(name) if name.endswith(".toml") else getattr(udk.library, name)(*([3] if name == "n_four_bar" else []))
+    code = udk.export_c(mechanism, tmp_path, ["derivatives"])
+    library, run = compiled(tmp_path), udk.simulate(mechanism, [0.0, 0.003, 0.006])
+    q, v = flat(run.q[1], run.v[1])
+    a = np.ravel(udk.accelerations(mechanism, 0.0, q, v))
+    found = derivative_in_c(library, code, scene_numbers(library, code.prefix), np.zeros(10_000), q, v, v, a)
+    wanted = jax.jvp(lambda q, v: jax.numpy.ravel(udk.accelerations(mechanism, 0.0, q, v)), (q, v), (v, a))
+    for x, y in zip(found, wanted, strict=True):
+        assert_allclose(x, y, rtol=0.0, atol=1e-11 * np.abs(wanted).max())
+    undefined = subprocess.run(["nm", "-u", "code.so"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout.split()
+    assert {x.partition("@")[0] for x in undefined if "@GLIBC" in x and not x.startswith("__")} <= OF_C

@@ -77,25 +77,38 @@ class NumberProgram:
         known = parts(mechanism)
         self.base = np.concatenate(known)
         self.count, self.knots = (len(x) for x in known[:2])
-        graph = Graph(np.float64)
-        inputs = [graph.input(k, "parameter") for k in range(len(values))]
-        outputs: list[Scalar] = []
-        if values:
-            shape = jax.ShapeDtypeStruct((len(values),), jnp.result_type(float))
-            (found,) = trace(numbers, shape)(graph, np.array(inputs, object))
-            outputs = list(found)
-        self.changing = [k for k, s in enumerate(outputs) if s.constant is None]
-        self._program = ScalarProgram(graph, inputs, [outputs[k] for k in self.changing])
+        self._numbers, self._parameters = numbers, len(values)
+        self._program, self.changing = _traced(numbers, len(values))
 
     def function(self) -> Function:
         """Return `numbers(parameters, numbers)`, which writes the numbers that depend on parameters."""
         return vector_function(self._program, "numbers", "parameters", "numbers", self.changing)
+
+    def function_along(self) -> Function:
+        """Return `numbers_along(parameters, numbers)`: from parameters, then their changes, the changes of numbers."""
+
+        def along(x: Array) -> Array:
+            return jax.jvp(self._numbers, (x[: self._parameters],), (x[self._parameters :],))[1]
+
+        program, changing = _traced(along, 2 * self._parameters)
+        return vector_function(program, "numbers_along", "parameters", "numbers", changing)
 
     def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
         """Return all numbers, by NumPy."""
         numbers = self.base.copy()
         numbers[self.changing] = [float(x) for x in self._program([float(x) for x in values])]
         return numbers
+
+
+def _traced(function: Callable[[Array], Array], count: int) -> tuple[ScalarProgram, list[int]]:
+    """Return a function of `count` numbers as a program of its outputs that depend on these, and the indices of the outputs."""
+    graph = Graph(np.float64)
+    inputs, outputs = [graph.input(k, "parameter") for k in range(count)], list[Scalar]()
+    if count:
+        (found,) = trace(function, jax.ShapeDtypeStruct((count,), jnp.result_type(float)))(graph, np.array(inputs, object))
+        outputs = list(found)
+    changing = [k for k, s in enumerate(outputs) if s.constant is None]
+    return ScalarProgram(graph, inputs, [outputs[k] for k in changing]), changing
 
 
 def places_of_numbers(mechanism: Mechanism) -> Mechanism:

@@ -65,11 +65,15 @@ class Forward(Differentiated):
     def write_derivatives(self):
         for derivative in self._linearizations:
             derivative.forward()
-        if self.count:
-            write_prologue_derivative(self, self.active, self.mode)
+        self.write_prologue_derivative()
         w = self.tangents
         write_differences(self, "tangent_differences", ("tangent", w))
         write_between(self, "tangent_between", ("tangent", w))
+
+    def write_prologue_derivative(self):
+        """Write the tangents of the constants, if numbers have any."""
+        if self.count:
+            write_prologue_derivative(self, self.active, self.mode)
 
     @contextmanager
     def _each_group(self, f: Function) -> Iterator[Value]:

@@ -17,7 +17,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 
-What = Literal["run", "accelerations", "projection", "positions"]
+What = Literal["run", "accelerations", "derivatives", "projection", "positions"]
 DOCUMENTED = {
     "run": """/* Integrate, and project each step onto the constraints: positions qs and velocities vs (times, {N})
    at the times ts, which increase (s), from the closed state q, v; the largest violation of the constraints at each
@@ -32,6 +32,14 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
     "accelerations": """/* Accelerations a of a state by the Udwadia-Kalaba equation. */
 void {p}_accelerations(const double *numbers, double t, const double *q, const double *v, double *a, double *memory);
 """,
+    "derivatives": """/* Accelerations a of a state, and their derivative da along changes dnumbers of the numbers,
+   dq of positions and dv of velocities. A column of a Jacobian is the derivative along a unit vector. */
+void {p}_accelerations_along(const double *numbers, double t, const double *q, const double *v, const double *dnumbers,
+    const double *dq, const double *dv, double *a, double *da, double *memory);
+
+/* Write changes of the numbers. `parameters` has the parameters, and then their changes. */
+void {p}_set_parameters_along(const double *parameters, double *dnumbers);
+""",
     "projection": """/* Return a state that has drifted to the constraints. */
 void {p}_project(const double *numbers, double t, double *q, double *v, double *memory);
 """,
@@ -42,7 +50,7 @@ double {p}_close(const double *numbers, double t, double *q, double *v, double *
 """,
 }
 FUNCTIONS = {"run": SceneCode.run, "accelerations": SceneCode.accelerations, "projection": SceneCode.projection}
-FUNCTIONS["positions"] = SceneCode.positions
+FUNCTIONS |= {"derivatives": SceneCode.derivatives, "positions": SceneCode.positions}
 
 
 class ExportedCode(NamedTuple):
@@ -83,8 +91,8 @@ def export_c(
     Args:
         mechanism: the scene, with concrete numbers. Its thresholds of rank follow from these numbers.
         folder: the folder to write, which is made if it does not exist.
-        what: functions to write: "run", a step with projection and whole runs; "accelerations"; "projection" of a state; and
-            "positions", closed from a guess, as for a mechanism that is driven.
+        what: functions to write: "run", a step with projection and whole runs; "accelerations"; their "derivatives" along a
+            direction; "projection" of a state; and "positions", closed from a guess, as for a mechanism that is driven.
         ts: output times of the program (s); by default 0 to 20 s in steps of 0.05 s.
         parameters: names of numbers that a function of the C changes, as in `with_parameters`.
         rtol: relative tolerance of a step.
@@ -123,6 +131,8 @@ def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]
     header = _header(scene, {name: unit for name, (_, unit) in units.items()}, names[1])
     files = {f"{scene.prefix}.h": header, f"{scene.prefix}_numbers.c": _numbers(scene, names)}
     files |= {f"{scene.prefix}_{name}.c": text for name, (text, _) in units.items()}
+    if "derivatives" in units:
+        files[f"{scene.prefix}_along.c"] = f'#include "{scene.prefix}.h"\n{scene.parameters_along(parameters)}'
     return files, {name: unit for name, (_, unit) in units.items()}
 
 

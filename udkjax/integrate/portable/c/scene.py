@@ -23,7 +23,7 @@ from udkjax.native.c import CUnit, c_function, c_unit, number_text
 from udkjax.native.module.steps import SMALLEST_STEP, Status
 from udkjax.native.operations import Operation, StateOperation
 from udkjax.native.position_operations import Close
-from udkjax.native.runs import RunStates
+from udkjax.native.runs import AccelerateTangents, RunStates
 from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.requirements import ArgumentError
 from udkjax.scene.elements.bodies import COORDINATES
@@ -167,6 +167,14 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
         head = f"void {self.prefix}_accelerations({state}, double *a, double *memory)"
         return self._of_state(self.evaluation, head, {"found": "a"})
 
+    def derivatives(self) -> tuple[str, CUnit]:
+        """Return `accelerations_along`."""
+        operation = AccelerateTangents(self.evaluation.code)
+        head = f"""void {self.prefix}_accelerations_along(const double *numbers, double t, const double *q, const double *v,
+    const double *dnumbers, const double *dq, const double *dv, double *a, double *da, double *memory)"""
+        along = {"directions": "1", "dnumbers": "dnumbers", "dq": "dq", "dv": "dv"}
+        return self._of_state(operation, head, {"found": "a", "changes": "da"} | along)
+
     def projection(self) -> tuple[str, CUnit]:
         """Return `project`."""
         head = f"void {self.prefix}_project(const double *numbers, double t, double *q, double *v, double *memory)"
@@ -214,7 +222,7 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
     def _of_state(
         self, operation: Operation, head: str, values: dict, before: str = "", after: str = "", settings: Any = None
     ) -> tuple[str, CUnit]:
-        unit = c_unit(operation)
+        unit = c_unit(operation, int(operation.tangents > 0))
         found = settings or scene_inputs(self.compiled.equations, self._numbered, operation.code.policy, np).settings
         given = np.array([float(found[name]) for name in operation.all_settings])
         record = {"numbers": "numbers", "ts": "ts", "q": "q", "v": "v", "settings": "settings", "rows": "rows", "times": "2"}
@@ -247,6 +255,15 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
         )
         head = f"void {self.prefix}_set_parameters(const double *parameters, double *values)"
         return f"{text if program.changing else ''}\n{head}\n{{\n{call}\n}}\n", values
+
+    def parameters_along(self, names: Sequence[str]) -> str:
+        """Return the function that turns changes of parameters into changes of the numbers."""
+        values, p = scalar_parameters(self.mechanism, names), self.prefix
+        program = NumberProgram(self.mechanism, values, lambda given: given.without_origin)
+        head = f"void {p}_set_parameters_along(const double *parameters, double *dnumbers)"
+        text = c_function(program.function_along()) if program.changing else "#include <string.h>\n"
+        call = "numbers_along((double *)(uintptr_t)parameters, dnumbers)" if program.changing else "(void)parameters"
+        return f"{text}\n{head}\n{{\n    memset(dnumbers, 0, {len(self.numbers)} * sizeof *dnumbers);\n    {call};\n}}\n"
 
 
 def scene_numbers(mechanism: Mechanism) -> np.ndarray:
