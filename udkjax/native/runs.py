@@ -75,6 +75,11 @@ class RunStates(Operation):
         """The operation that computes accelerations at single states by the same method."""
         return Accelerate(self.code, self.pseudoinverse, self.formulation)
 
+    @property
+    def acceleration_tangents(self) -> "AccelerateTangents":
+        """The operation that computes accelerations at single states with their tangents."""
+        return AccelerateTangents(self.code)
+
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
         """Return the operation with tangents along directions of the active numbers of the scene and of the initial state."""
         return RunTangents(**self._for_derivatives, active=active)

@@ -23,7 +23,7 @@ from udkjax.native.c import CUnit, c_function, c_unit, number_text
 from udkjax.native.module.steps import SMALLEST_STEP, Status
 from udkjax.native.operations import Operation, StateOperation
 from udkjax.native.position_operations import Close
-from udkjax.native.runs import AccelerateTangents, RunStates
+from udkjax.native.runs import RunStates
 from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.requirements import ArgumentError
 from udkjax.scene.elements.bodies import COORDINATES
@@ -168,8 +168,9 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
         return self._of_state(self.evaluation, head, {"found": "a"})
 
     def derivatives(self) -> tuple[str, CUnit]:
-        """Return `accelerations_along`."""
-        operation = AccelerateTangents(self.evaluation.code)
+        """Return the accelerations with their derivative along a direction."""
+        _ = self.evaluation  # raises an error for scenes without functions of single states
+        operation = self.operation.acceleration_tangents
         head = f"""void {self.prefix}_accelerations_along(const double *numbers, double t, const double *q, const double *v,
     const double *dnumbers, const double *dq, const double *dv, double *a, double *da, double *memory)"""
         along = {"directions": "1", "dnumbers": "dnumbers", "dq": "dq", "dv": "dv"}

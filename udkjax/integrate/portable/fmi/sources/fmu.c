@@ -66,6 +66,11 @@ static fmi3Status check_mode(const Instance *m, int allowed, const char *functio
     Instance *m = instance; \
     if (check_mode(m, allowed, __func__)) return fmi3Error
 
+#define SIMPLE(name, allowed, action) FMI fmi3Status name(fmi3Instance instance) { REQUIRE(allowed); action; return fmi3OK; }
+#define COUNT(name, count) FMI fmi3Status name(fmi3Instance instance, size_t *n) { REQUIRE(ANY); *n = count; return fmi3OK; }
+#define REFUSED(name, allowed, text) \
+    FMI fmi3Status name(fmi3Instance instance) { REQUIRE(allowed); return report(m, fmi3Error, "%s: " text, __func__); }
+
 static void forget(Instance *m) { m->has_closed = m->has_a = 0; }
 
 /* --- the scene */
@@ -161,21 +166,22 @@ static void reset(Instance *m)
     forget(m);
 }
 
+static void *refuse(fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, const char *text)
+{
+    if (log) log(environment, fmi3Error, "logStatusError", text);
+    return NULL;
+}
+
 static Instance *instantiate(const char *token, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, int exchange)
 {
-    Instance *m = calloc(1, sizeof *m), none = {0};
-    none.environment = environment;
-    none.log = log;
-    if (!token || strcmp(token, TOKEN)) {
-        report(&none, fmi3Error, "the instantiation token is not that of modelDescription.xml");
-        free(m);
-        return NULL;
-    }
+    Instance *m;
+    if (!token || strcmp(token, TOKEN))
+        return refuse(environment, log, "the instantiation token is not that of modelDescription.xml");
+    m = calloc(1, sizeof *m);
     if (m) m->memory = calloc(MEMORY, sizeof(double));
     if (!m || !m->memory) {
-        report(&none, fmi3Error, "no memory for an instance");
         free(m);
-        return NULL;
+        return refuse(environment, log, "no memory for an instance");
     }
     m->environment = environment;
     m->log = log;
@@ -197,11 +203,8 @@ FMI fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token,
 {
     (void)name, (void)resources, (void)visible, (void)logging;
 #ifndef MODEL_EXCHANGE
-    Instance none = {0};
-    none.environment = environment;
-    none.log = log;
-    report(&none, fmi3Error, "this FMU is for co-simulation only");
-    return NULL;
+    (void)token;
+    return refuse(environment, log, "this FMU is for co-simulation only");
 #else
     return instantiate(token, environment, log, 1);
 #endif
@@ -211,12 +214,8 @@ FMI fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String t
     fmi3Boolean logging, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3ClockUpdateCallback update,
     fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock)
 {
-    Instance none = {0};
     (void)name, (void)token, (void)resources, (void)visible, (void)logging, (void)update, (void)lock, (void)unlock;
-    none.environment = environment;
-    none.log = log;
-    report(&none, fmi3Error, "this FMU has no scheduled execution");
-    return NULL;
+    return refuse(environment, log, "this FMU has no scheduled execution");
 }
 
 FMI void fmi3FreeInstance(fmi3Instance instance)
@@ -250,19 +249,8 @@ FMI fmi3Status fmi3ExitInitializationMode(fmi3Instance instance)
     return fmi3OK;
 }
 
-FMI fmi3Status fmi3Terminate(fmi3Instance instance)
-{
-    REQUIRE(EVENT | CONTINUOUS | STEP);
-    m->now.mode = TERMINATED;
-    return fmi3OK;
-}
-
-FMI fmi3Status fmi3Reset(fmi3Instance instance)
-{
-    REQUIRE(ANY);
-    reset(m);
-    return fmi3OK;
-}
+SIMPLE(fmi3Terminate, EVENT | CONTINUOUS | STEP, m->now.mode = TERMINATED)
+SIMPLE(fmi3Reset, ANY, reset(m))
 
 /* --- variables */
 
@@ -320,20 +308,14 @@ FMI fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference re
     return fmi3OK;
 }
 
-#define NO_VARIABLES(type, T) \
-    FMI fmi3Status fmi3Get##type(fmi3Instance instance, const fmi3ValueReference references[], size_t n, T values[], size_t count) \
-    { \
-        REQUIRE(ANY); \
-        (void)references, (void)values; \
-        return n || count ? report(m, fmi3Error, "the FMU has no variables of type " #type) : fmi3OK; \
-    } \
-    FMI fmi3Status fmi3Set##type(fmi3Instance instance, const fmi3ValueReference references[], size_t n, const T values[], \
-        size_t count) \
+#define NO_VARIABLES_OF(access, type, T) \
+    FMI fmi3Status access(fmi3Instance instance, const fmi3ValueReference references[], size_t n, T values[], size_t count) \
     { \
         REQUIRE(ANY); \
         (void)references, (void)values; \
         return n || count ? report(m, fmi3Error, "the FMU has no variables of type " #type) : fmi3OK; \
     }
+#define NO_VARIABLES(type, T) NO_VARIABLES_OF(fmi3Get##type, type, T) NO_VARIABLES_OF(fmi3Set##type, type, const T)
 NO_VARIABLES(Float32, fmi3Float32)
 NO_VARIABLES(Int8, fmi3Int8)
 NO_VARIABLES(UInt8, fmi3UInt8)
@@ -416,11 +398,7 @@ FMI fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte byt
 
 /* --- co-simulation */
 
-FMI fmi3Status fmi3EnterStepMode(fmi3Instance instance)
-{
-    REQUIRE(STEP);
-    return report(m, fmi3Error, "fmi3EnterStepMode: the FMU has no event mode in co-simulation");
-}
+REFUSED(fmi3EnterStepMode, STEP, "the FMU has no event mode in co-simulation")
 
 FMI fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 t, fmi3Float64 dt, fmi3Boolean no_set_state, fmi3Boolean *event,
     fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *reached)
@@ -446,19 +424,11 @@ FMI fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 t, fmi3Float64 dt, 
 
 /* --- model exchange */
 
-FMI fmi3Status fmi3EnterEventMode(fmi3Instance instance)
-{
-    REQUIRE(CONTINUOUS);
-    m->now.mode = EVENT;
-    return fmi3OK;
-}
-
-FMI fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance)
-{
-    REQUIRE(EVENT);
-    m->now.mode = CONTINUOUS;
-    return fmi3OK;
-}
+SIMPLE(fmi3EnterEventMode, CONTINUOUS, m->now.mode = EVENT)
+SIMPLE(fmi3EnterContinuousTimeMode, EVENT, m->now.mode = CONTINUOUS)
+SIMPLE(fmi3EvaluateDiscreteStates, EVENT | INITIALIZATION, (void)m)
+COUNT(fmi3GetNumberOfContinuousStates, 2 * N)
+COUNT(fmi3GetNumberOfEventIndicators, 0)
 
 /* Return whether the state has drifted so far that it has to return to the constraints. */
 static int has_drifted(const Instance *m)
@@ -550,20 +520,6 @@ FMI fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Floa
     return fmi3OK;
 }
 
-FMI fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *n)
-{
-    REQUIRE(ANY);
-    *n = 2 * N;
-    return fmi3OK;
-}
-
-FMI fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *n)
-{
-    REQUIRE(ANY);
-    *n = 0;
-    return fmi3OK;
-}
-
 FMI fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 values[], size_t n)
 {
     REQUIRE(ANY);
@@ -571,21 +527,10 @@ FMI fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 values[
     return n ? report(m, fmi3Error, "the FMU has no event indicators") : fmi3OK;
 }
 
-FMI fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance)
-{
-    REQUIRE(EVENT | INITIALIZATION);
-    return fmi3OK;
-}
-
 /* --- what the FMU lacks */
 
-FMI fmi3Status fmi3EnterConfigurationMode(fmi3Instance instance)
-{
-    REQUIRE(ANY);
-    return report(m, fmi3Error, "the FMU has no structural parameters");
-}
-
-FMI fmi3Status fmi3ExitConfigurationMode(fmi3Instance instance) { return fmi3EnterConfigurationMode(instance); }
+REFUSED(fmi3EnterConfigurationMode, ANY, "the FMU has no structural parameters")
+REFUSED(fmi3ExitConfigurationMode, ANY, "the FMU has no structural parameters")
 
 #define REFERENCES const fmi3ValueReference references[], size_t n
 #pragma GCC diagnostic push
