@@ -14,6 +14,9 @@ import pytest
 import udkjax as udk
 from tests.elements import DRIVERS, FORCES, JOINTS
 from udkjax.printing import MOST_HTML_ROWS, MOST_ROWS, PrintedTable, format_number, format_numbers, html_table, text_table
+from udkjax.scene.outlines.contours import Contour
+from udkjax.scene.outlines.curves import circle
+from udkjax.scene.outlines.outline import outline_of_contours
 
 MOST_LINES = 20
 
@@ -78,13 +81,14 @@ def objects() -> dict[str, object]:
         *(drawing, drawing.links["bar"], udk.Held(ts, 0.1)),
         *(udk.PathGoal("P", [[0, 0], [1, 1]]), udk.PoseGoal("a", [[0, 0, 0.1]]), udk.FunctionGoal("a", [0.1], [0.2])),
         *(udk.TorqueGoal(most=1.0), udk.LoadGoal("a", most=1.0), udk.EnergyGoal(least=1.0), udk.FrequencyGoal(least=1.0)),
-        *(udk.ToleranceGoal("a", {}, most=1.0), udk.MotionGoal(anything, most=1.0)),
+        *(udk.GapGoal("a", "b", least=1.0), udk.ToleranceGoal("a", {}, most=1.0), udk.MotionGoal(anything, most=1.0)),
         *(
             (batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])),
             batch({"gravity": np.zeros((2, 2))}, np.array([0.1])),
         ),
         *(close := udk.gaps(linkage, "body.crank.angle", shapes=dict.fromkeys(linkage.body_names, 2.0)), close.least),
         *(close.contacts[0], udk.layers(linkage, "body.crank.angle", shapes=dict.fromkeys(linkage.body_names, 2.0))),
+        *(ring := outline_of_contours([Contour((circle((0, 0), r),), "") for r in (2.0, 0.5)], ""), ring.circles[0]),
         *(udk.Tolerance(0.1, "mm"), udk.PinClearance("0.1 mm")),
         udk.tolerances(linkage, {"length(crank)": 1e-3}, ["range(body.rocker.angle)"], drive="body.crank.angle", samples=10),
         *(driven.motion, udk.feed_forward(mech, driven).forces["motor effort"], udk.animate(free, run)),

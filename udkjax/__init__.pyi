@@ -108,6 +108,7 @@ from udkjax.scene import LiftProfile as LiftProfile
 from udkjax.scene import Link as Link
 from udkjax.scene import Mechanism as Mechanism
 from udkjax.scene import Motion as Motion
+from udkjax.scene import Outline as Outline
 from udkjax.scene import Point as Point
 from udkjax.scene import Polynomial as Polynomial
 from udkjax.scene import Prismatic as Prismatic
@@ -115,6 +116,7 @@ from udkjax.scene import Profile as Profile
 from udkjax.scene import Rack as Rack
 from udkjax.scene import Revolute as Revolute
 from udkjax.scene import RollingJoint as RollingJoint
+from udkjax.scene import RoundHole as RoundHole
 from udkjax.scene import SceneError as SceneError
 from udkjax.scene import Screw as Screw
 from udkjax.scene import Sine as Sine
@@ -136,6 +138,7 @@ from udkjax.scene import on_line as on_line
 from udkjax.scene import on_rail as on_rail
 from udkjax.scene import polar as polar
 from udkjax.scene import read_mjcf as read_mjcf
+from udkjax.scene import read_outline as read_outline
 from udkjax.scene import save as save
 from udkjax.scene import stacked as stacked
 from udkjax.scene import with_angle as with_angle
@@ -205,6 +208,7 @@ from udkjax.synthesis import EnergyGoal as EnergyGoal
 from udkjax.synthesis import FoundDesign as FoundDesign
 from udkjax.synthesis import FrequencyGoal as FrequencyGoal
 from udkjax.synthesis import FunctionGoal as FunctionGoal
+from udkjax.synthesis import GapGoal as GapGoal
 from udkjax.synthesis import LoadGoal as LoadGoal
 from udkjax.synthesis import MotionGoal as MotionGoal
 from udkjax.synthesis import MotionPoint as MotionPoint

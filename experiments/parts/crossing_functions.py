@@ -150,4 +150,4 @@ FUNCTIONS: dict[str, dict[str, Row]] = {
 }
 # Public functions that take no model: they make parts of drawings, or choices of other functions, which rows above use.
 WITHOUT_MODEL = {"circles": "drawn", "polar": "drawn", "on_line": "drawings", "on_rail": "drawings", "stacked": "drawings"}
-WITHOUT_MODEL |= {"plot_posterior": "sample", "length": "Parameter", "mechanisms_for": "drawings"}
+WITHOUT_MODEL |= {"read_outline": "Link", "plot_posterior": "sample", "length": "Parameter", "mechanisms_for": "drawings"}

@@ -28,10 +28,11 @@ OTHERS = {
     "results": """Result Solution Events Characteristics Reached Kinematics Travel MotionRanges PinMotion BatchPositions Workspace
         PositionBatch Animation Equilibrium HoldingEfforts Modes Diagnosis SystemDiagnosis Explanation Estimate GradientCheck
         Posterior Comparison InverseDynamics PowerBalance Design Designs DesignSearch FoundDesign MotionPoint CompleteDesign
-        CompleteDesigns CurveDesign CurveDesigns ToleranceAnalysis WorkedSolution LeastGap LeastGaps Touch Layers""",
+        CompleteDesigns CurveDesign CurveDesigns ToleranceAnalysis WorkedSolution LeastGap LeastGaps Touch Layers
+        Outline RoundHole""",
     "errors": "SimulationError AssemblyError SceneError IdentificationError SweepError",
     "studies": """Candidate Parameter Quantity Record Start Axis LatinHypercube Random Sobol Zipped EnergyGoal FrequencyGoal
-        FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal ToleranceGoal TorqueGoal Tolerance
+        GapGoal FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal ToleranceGoal TorqueGoal Tolerance
         PinClearance""",
     "bases of classes": "Constraint ForceElement Joint RollingJoint Motion Profile Frame Point Link Drawing Mechanism",
     "tested with all elements": "LiftProfile SwingProfile",

@@ -76,6 +76,7 @@ from udkjax.positions.following.position_batch import BatchPositions as BatchPos
 from udkjax.positions.following.position_batch import PositionBatch as PositionBatch
 from udkjax.positions.following.position_batch import compile_programs as compile_programs
 from udkjax.positions.following.position_batch import position_code as position_code
+from udkjax.positions.gaps.arithmetic import gap_in_position as gap_in_position
 from udkjax.positions.gaps.gaps import LeastGap as LeastGap
 from udkjax.positions.gaps.gaps import LeastGaps as LeastGaps
 from udkjax.positions.gaps.gaps import Touch as Touch

@@ -87,6 +87,9 @@ from udkjax.scene.numbers.sources import AbstractDrawing as AbstractDrawing
 from udkjax.scene.numbers.units import NUMBERS as NUMBERS
 from udkjax.scene.numbers.units import conversion_factor as conversion_factor
 from udkjax.scene.numbers.units import read_quantity as read_quantity
+from udkjax.scene.outlines.outline import Outline as Outline
+from udkjax.scene.outlines.outline import RoundHole as RoundHole
+from udkjax.scene.outlines.outline import read_outline as read_outline
 from udkjax.scene.reshaping import length_of as length_of
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length

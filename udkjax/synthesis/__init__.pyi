@@ -21,6 +21,7 @@ from udkjax.synthesis.goals import PathGoal as PathGoal
 from udkjax.synthesis.goals import PoseGoal as PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal as EnergyGoal
 from udkjax.synthesis.motion_goals import FrequencyGoal as FrequencyGoal
+from udkjax.synthesis.motion_goals import GapGoal as GapGoal
 from udkjax.synthesis.motion_goals import LoadGoal as LoadGoal
 from udkjax.synthesis.motion_goals import MotionGoal as MotionGoal
 from udkjax.synthesis.motion_goals import MotionPoint as MotionPoint

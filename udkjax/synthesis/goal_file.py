@@ -17,7 +17,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.complete.complete_design import CompleteSearch
 from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
-from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
+from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, GapGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
 from udkjax.wording import plural, quote, unknown_key
 
 TOP = (
@@ -57,9 +57,10 @@ MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
     "energy": (EnergyGoal, "J"),
     "frequency": (FrequencyGoal, "1/s"),
     "tolerance": (ToleranceGoal, "m"),
+    "gap": (GapGoal, "m"),
 }
 MOTION_KEYS = ("kind", "most", "least", "speed", "weight", "samples")
-OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances")}
+OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances"), "gap": ("one", "other")}
 
 
 def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:

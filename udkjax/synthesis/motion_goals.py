@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.equations import constraints, loads
+from udkjax.positions import gap_in_position
 from udkjax.positions.following.drive import Driven
 from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.printing import PrintedTable, PrintsTable
@@ -196,6 +197,33 @@ class FrequencyGoal(MotionTerm):
         F, slope = jax.jvp(force, (at.q.ravel(),), (u,))
         square = -(at.bend.ravel() @ F + u @ slope) / (u @ (mass * u))
         return jnp.sign(square) * _root(jnp.abs(square)) / (2.0 * jnp.pi)
+
+
+class GapGoal(MotionTerm):
+    """The gap (m) between two links stays above `least`; overlaps are negative gaps, as in `gaps`.
+
+    It is measured in `samples` positions; `gaps` proves the gap of a design between them.
+
+    Args:
+        one: the name of a link.
+        other: the name of the other link, or "ground" if `shapes` gives its shape.
+        shapes: shapes of links, as for `gaps`, if they are not drawn. Further arguments: see `MotionTerm`.
+    """
+
+    one: str = eqx.field(static=True)
+    other: str = eqx.field(static=True)
+    shapes: Mapping[str, Any] | None = None
+    samples: int = eqx.field(static=True, default=72, kw_only=True)
+
+    def __check_init__(self):
+        for name in ("one", "other"):
+            require_text(name, getattr(self, name))
+
+    def check(self, mechanism, driven, free):
+        gap_in_position(mechanism, self.shapes, (self.one, self.other), mechanism.q0)
+
+    def measure(self, at):
+        return gap_in_position(at.mechanism, self.shapes, (self.one, self.other), at.q)
 
 
 class ToleranceGoal(MotionTerm):

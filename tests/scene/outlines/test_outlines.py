@@ -1,0 +1,202 @@
+"""Outlines from DXF files: areas, centroids and inertias against closed forms, pins from circles, and mistakes by name."""
+
+import numpy as np
+import pytest
+
+import udkjax as udk
+
+ezdxf = pytest.importorskip("ezdxf")
+MM = 1e-3
+
+
+def document(unit=4):
+    file = ezdxf.new("R2010")
+    file.header["$INSUNITS"] = unit
+    return file, file.modelspace()
+
+
+def read(file, tmp_path, **options):
+    file.saveas(tmp_path / "link.dxf")
+    return udk.read_outline(tmp_path / "link.dxf", **options)
+
+
+def disc(r, at):
+    return np.pi * r**2, np.array(at, float), r**2 / 2
+
+
+def slot(length, r, at, angle):
+    """A rectangle with two half discs: area, centre, squared radius of gyration about it."""
+    half = 4 * r / (3 * np.pi)
+    area = 2 * length * r + np.pi * r**2
+    moment = 2 * length * r * (length**2 + 4 * r**2) / 12
+    moment += np.pi * r**2 * (r**2 / 2 - half**2 + (length / 2 + half) ** 2)
+    return area, np.array(at, float), moment / area
+
+
+def segment(R, angle, at, turn):
+    """The part of a disc beyond a chord."""
+    area = R**2 * (angle - np.sin(angle)) / 2
+    d = 4 * R * np.sin(angle / 2) ** 3 / (3 * (angle - np.sin(angle)))
+    about_centre = R**4 / 4 * (angle - np.sin(angle) * (2 + np.cos(angle)) / 3)
+    return area, np.array(at) + d * np.array([np.cos(turn), np.sin(turn)]), about_centre / area - d**2
+
+
+def rectangle(a, b, at):
+    return a * b, np.array(at, float), (a**2 + b**2) / 12
+
+
+def combined(parts):
+    """Area, centroid and squared radius of gyration of figures with signs."""
+    area = sum(sign * A for sign, (A, _, _) in parts)
+    centre = sum(sign * A * c for sign, (A, c, _) in parts) / area
+    moment = sum(sign * A * (k + (c - centre) @ (c - centre)) for sign, (A, c, k) in parts)
+    return area, centre, moment / area
+
+
+def add_slot(space, length, r, at, angle, bulged, rng):
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    p = [np.array(at) + turn @ x for x in ([-length / 2, -r], [length / 2, -r], [length / 2, r], [-length / 2, r])]
+    if bulged:
+        space.add_lwpolyline([(*p[0], 0), (*p[1], 1), (*p[2], 0), (*p[3], 1)], format="xyb", close=True)
+        return
+    deg = np.rad2deg(angle)
+    pieces = [
+        lambda: space.add_line(p[0], p[1]),
+        lambda: space.add_line(p[2], p[3]),
+        lambda: space.add_arc(np.array(at) + turn @ [length / 2, 0], r, deg - 90, deg + 90),
+        lambda: space.add_arc(np.array(at) - turn @ [length / 2, 0], r, deg + 90, deg + 270),
+    ]
+    for k in rng.permutation(4):
+        pieces[k]()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_areas_centroids_and_inertias_are_those_of_closed_forms(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    (file, space), at, kind = document(), rng.uniform(-500, 500, 2), seed % 4
+    if kind == 0:  # a bar with round ends, by bulges or by loose lines and arcs
+        length, r, angle = rng.uniform(60, 200), rng.uniform(15, 30), rng.uniform(0, 2 * np.pi)
+        add_slot(space, length, r, at, angle, seed % 8 == 0, rng)
+        outer, along = slot(length, r, at, angle), np.array([np.cos(angle), np.sin(angle)])
+        places = [at - along * length / 2, at + along * length / 2]
+    elif kind == 1:  # a rectangle with bulged sides
+        a, b, bulge = rng.uniform(80, 120), rng.uniform(50, 70), rng.uniform(0.001, 0.9)
+        corners = at + 0.5 * np.array([[-a, -b], [a, -b], [a, b], [-a, b]])
+        order = corners if seed % 8 == 1 else corners[::-1]
+        sign = 1 if seed % 8 == 1 else -1
+        space.add_lwpolyline([(*p, sign * bulge) for p in order], format="xyb", close=True)
+        outer, angle = [(1, rectangle(a, b, at))], 4 * np.arctan(bulge)
+        for k, (side, off) in enumerate(((b, a / 2), (a, b / 2), (b, a / 2), (a, b / 2))):
+            R, turn = side / (2 * np.sin(angle / 2)), k * np.pi / 2
+            way = np.array([np.cos(turn), np.sin(turn)])
+            outer.append((1, segment(R, angle, at + way * (off - R * np.cos(angle / 2)), turn)))
+        outer, places = combined(outer), [at - [a / 3, 0], at + [a / 3, 0]]
+    elif kind == 2:  # an ellipse
+        a, b = rng.uniform(60, 90), rng.uniform(30, 50)
+        space.add_ellipse(at, major_axis=(a, 0), ratio=b / a)
+        outer, places = (np.pi * a * b, at, (a**2 + b**2) / 4), [at - [a / 2, 0], at + [a / 2, 0]]
+    else:  # a disc
+        r = rng.uniform(50, 100)
+        space.add_circle(at, r)
+        outer, places = disc(r, at), [at - [r / 2, 0], at + [r / 2, 0]]
+    radii, parts = rng.uniform(3, 8, 2), [(1, outer)]
+    for place, radius in zip(places, radii, strict=True):
+        space.add_circle(place, radius)
+        parts.append((-1, disc(radius, place)))
+    add_slot(space, 8.0, 2.0, at, 0.3, seed % 2 == 0, rng)
+    area, centre, square = combined([*parts, (-1, slot(8.0, 2.0, at, 0.3))])
+    found = read(file, tmp_path)
+    assert found.area == pytest.approx(area * MM**2, rel=1e-12)
+    np.testing.assert_allclose(found.centroid, centre * MM, rtol=0, atol=1e-12 * (np.sqrt(area) + np.abs(at).max()) * MM)
+    assert found.square_radius == pytest.approx(square * MM**2, rel=1e-12)
+    assert len(found.holes) == 3 and len(found.circles) == 2
+    want = sorted(zip(places, radii, strict=True), key=lambda x: tuple(x[0]))
+    for circle, (place, radius) in zip(found.circles, want, strict=True):
+        np.testing.assert_allclose([*circle.centre, circle.radius], np.array([*place, radius]) * MM, rtol=1e-12)
+    assert "round hole" in repr(found)
+
+
+def test_a_spline_has_the_area_of_its_polynomials(tmp_path):
+    """Under x = 3 t^2 - 2 t^3, y = 3 t (1 - t) the area is the integral of y dx/dt = 18 t^2 (1 - t)^2, 0.6."""
+    file, space = document(6)
+    space.add_open_spline([(0, 0), (0, 1), (1, 1), (1, 0)])
+    space.add_line((0, 0), (1, 0))
+    found = read(file, tmp_path)
+    assert found.area == pytest.approx(0.6, rel=1e-13) and found.centroid[0] == pytest.approx(0.5, rel=1e-13)
+    polygon = found.polygon(1e-4)
+    x, y = polygon.T
+    assert 0 < 0.6 - abs(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) < 2e-4
+
+
+def test_a_link_has_the_mass_of_its_outline_and_its_gaps(tmp_path):
+    file, space = document()
+    add_slot(space, 100.0, 10.0, (50.0, 0.0), 0.0, True, None)
+    for x in (0.0, 100.0):
+        space.add_circle((x, 0.0), 3.0)
+    outline = read(file, tmp_path)
+    pins = {"O": outline.circles[0].centre, "A": outline.circles[1].centre, "D": [0.2, 0.05]}
+    links = {
+        "arm": outline.link(["O", "A"], density=7850, thickness=0.005, chord=1e-7),
+        "wheel": udk.Link(["D"], mass=1, width=0.1),
+    }
+    motors = {name: {"pin": pin, "speed": 1.0} for name, pin in (("motor", "O"), ("other", "D"))}
+    mech = udk.Drawing(pins=pins, links=links, ground=["O", "D"], motors=motors).mechanism()
+    area, _, square = combined([(1, slot(100, 10, (50, 0), 0)), (-1, disc(3, (0, 0))), (-1, disc(3, (100, 0)))])
+    mass = 7850 * 0.005 * area * MM**2
+    assert float(mech.bodies["arm"].mass) == pytest.approx(mass, rel=1e-12)
+    assert float(mech.bodies["arm"].inertia) == pytest.approx(mass * square * MM**2, rel=1e-12)
+    gap = udk.gaps(mech, "motor", values=[0, 2 * np.pi]).least.distance
+    assert gap == pytest.approx(np.hypot(0.2, 0.05) - 0.1 - 0.01 - 0.05, abs=2e-7)
+
+
+def open_contour(space):
+    space.add_line((0, 0), (10, 0))
+    space.add_line((10, 0), (10, 5))
+    space.add_line((10, 5.2), (0, 0))
+
+
+def branching(space):
+    space.add_lwpolyline([(0, 0), (10, 0), (10, 5)])
+    space.add_line((10, 5), (0, 0))
+    space.add_line((10, 5), (5, 8))
+
+
+MISTAKES = {
+    "open": (open_contour, {}, r"contour 1 \(LINE in layer '0'\) is open at \(10, 5\) mm: the nearest other end is 0.2 mm away"),
+    "branch": (branching, {}, r"contour 1 .* branches at \(10, 5\) mm, where 3 ends meet"),
+    "bow": (lambda s: s.add_lwpolyline([(0, 0), (10, 10), (10, 0), (0, 10)], close=True), {}, r"crosses itself at \(5, 5\) mm"),
+    "crossing": (lambda s: [s.add_circle((x, 0), 5) for x in (0, 6)], {}, r"contour 1 .* and contour 2 .* cross at \(2\.99"),
+    "apart": (lambda s: [s.add_circle((0, 0), 5), s.add_circle((20, 0), 2)], {}, "contour 2 .* lies outside of contour 1"),
+    "island": (
+        lambda s: [s.add_circle((0, 0), r) for r in (5, 3, 1)],
+        {},
+        "contour 3 .* lies within a hole: a link is one piece",
+    ),
+    "empty": (lambda s: s.add_text("link"), {}, "there are no lines, arcs or other curves"),
+    "layer": (lambda s: s.add_circle((0, 0), 5), {"layers": ["cut"]}, r"in the layers \['cut'\]"),
+    "unit": (lambda s: s.add_circle((0, 0), 5), {"unit": "in"}, 'the file\'s unit is "mm", not "in"'),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_mistakes_name_the_contour_and_the_place(case, tmp_path):
+    draw, options, message = MISTAKES[case]
+    file, space = document()
+    draw(space)
+    with pytest.raises(udk.SceneError, match=message):
+        read(file, tmp_path, **options)
+
+
+def test_a_file_without_unit_is_asked_for_it(tmp_path):
+    file, space = document(0)
+    space.add_circle((0, 0), 5)
+    with pytest.raises(udk.SceneError, match='no unit of length in its header; give it, unit="mm"'):
+        read(file, tmp_path)
+    assert read(file, tmp_path, unit="in").area == pytest.approx(np.pi * (5 * 0.0254) ** 2, rel=1e-13)
+    with pytest.raises(udk.SceneError, match="unit: "):
+        read(file, tmp_path, unit="kg")
+    with pytest.raises(udk.SceneError, match=r"must be a file \.dxf"):
+        udk.read_outline(tmp_path / "link.step")
+    (tmp_path / "damaged.dxf").write_text("0\nSECTION\n2\nHEADER\nnonsense\n")
+    with pytest.raises(udk.SceneError, match="not a DXF file that can be read"):
+        udk.read_outline(tmp_path / "damaged.dxf")
