@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from udkjax.programs import identity_cache
-from udkjax.programs.identity_cache import cached_by_identity, cached_within_trace
+from udkjax.programs.identity_cache import cached_by_identity
 
 
 class Tree(eqx.Module):
@@ -77,7 +77,7 @@ def test_results_of_traced_trees_hold_within_their_trace():
     """One computation for concrete numbers, and one in each trace. A trace within another one stores nothing of its own."""
     calls = []
 
-    @cached_within_trace
+    @cached_by_identity(within_trace=True)
     def doubled(tree):
         calls.append(0)
         return Tree(2 * tree.x)

@@ -1,5 +1,6 @@
 """JAX programs evaluated by NumPy equal XLA's: operation by operation, in loops, branches and under transformations."""
 
+from functools import partial
 from importlib import import_module
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from udkjax.programs.deferred import WORTH, deferred, deferred_if_traced, deferred_p
+from udkjax.programs.deferred import WORTH, deferred, deferred_p
 from udkjax.programs.numpy_program import Meter, numpy_program
 
 X = np.random.default_rng(3).uniform(-2.0, 2.0, (4, 5))
@@ -250,7 +251,7 @@ def test_static_parts_and_trees_come_through():
 def test_concrete_numbers_among_traced_ones_stay_concrete_and_are_traced_once_for_their_content():
     seen = []
 
-    @deferred_if_traced
+    @partial(deferred, keeps_concrete=True)
     def scaled(x, by, names):
         seen.append(by)
         if by[0] < 0:

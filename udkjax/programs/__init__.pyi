@@ -8,13 +8,11 @@ from udkjax.programs.control_flow import cond_of_batch as cond_of_batch
 from udkjax.programs.control_flow import sequential as sequential
 from udkjax.programs.control_flow import solve as solve
 from udkjax.programs.deferred import deferred as deferred
-from udkjax.programs.deferred import deferred_if_traced as deferred_if_traced
 from udkjax.programs.deferred import deferred_p as deferred_p
 from udkjax.programs.deferred import trace_once as trace_once
 from udkjax.programs.deferred import traced_once as traced_once
 from udkjax.programs.identity_cache import cached_by_identity as cached_by_identity
 from udkjax.programs.identity_cache import cached_by_size as cached_by_size
-from udkjax.programs.identity_cache import cached_within_trace as cached_within_trace
 from udkjax.programs.identity_cache import is_concrete as is_concrete
 from udkjax.programs.numpy_program import Meter as Meter
 from udkjax.programs.numpy_program import TooLongError as TooLongError
@@ -26,7 +24,6 @@ from udkjax.programs.numpy_program import numpy_program as numpy_program
 from udkjax.programs.numpy_rules import RULES as RULES
 from udkjax.programs.numpy_rules import UFUNCS as UFUNCS
 from udkjax.programs.numpy_rules import exact_rule as exact_rule
-from udkjax.programs.structure_cache import cached_by_structure as cached_by_structure
 from udkjax.programs.undefined import at_each as at_each
 from udkjax.programs.undefined import defined as defined
 from udkjax.programs.undefined import defined_along as defined_along

@@ -10,13 +10,10 @@ the host runs it, if it has loops or factorizations (native/host/host_program.py
 All means of avoiding repeated work in the package, and their uses:
 
     deferred                        a program that users wait for: NumPy evaluates it at first
-    deferred_if_traced              likewise, for a function that checks or branches on concrete numbers
     traced_once                     a function that larger programs call many times: one trace, compiled within each of them
     control_flow.solve              an algorithm too long to trace: Python loops if everything is concrete, else one program
     native call_seldom              a rarely reached part of a compiled program: NumPy evaluates it there
-    cached_by_identity              a result that does not depend on numbers: cached by the identity of objects
-    cached_by_structure             a result for all values of numbers: cached by the structure of objects
-    cached_within_trace             a result whose numbers may be traced: cached likewise, within the trace
+    cached_by_identity              a result of objects that do not change: cached by their identity, also within a trace
     cached_by_size                  programs and machine code, which take megabytes: bounded by their memory in all
 """
 
@@ -46,11 +43,18 @@ MOST = 2_000_000  # operations evaluated by NumPy before any program is compiled
 _SPENT: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # operations evaluated by NumPy so far, by program
 
 
-def deferred(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def deferred(function: Callable[Arguments, Result], keeps_concrete: bool = False) -> Callable[Arguments, Result]:
     """Return a deferred version of a function of trees of arrays and static values, traced once per structure (`filter_jit`).
 
     Outside of compiled programs, NumPy evaluates it, its derivatives and its batches at first.
+
+    Args:
+        function: the function.
+        keeps_concrete: for a function that checks or branches on concrete numbers: they stay concrete within it, and results that
+            depend only on them are concrete as well. If nothing is traced, the function itself is called.
     """
+    if keeps_concrete:
+        return _deferred_if_traced(function)
     by_jit = on_host(eqx.filter_jit(function))
     if deferred_p is None:
         return by_jit
@@ -86,12 +90,7 @@ def trace_once(
     return program, leaves, out
 
 
-def deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Like `deferred`, for a function that checks or branches on concrete numbers, which stay concrete within it.
-
-    Results that depend only on concrete numbers are concrete as well. If nothing is traced, the function itself is called.
-    """
-
+def _deferred_if_traced(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     call: Callable[..., Any] = function
 
     def with_concrete(leaves: list[Any], tree: Any, concrete: tuple["ConcreteLeaf", ...]) -> Any:

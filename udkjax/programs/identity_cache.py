@@ -10,21 +10,19 @@ dropped together. The latest result always stays.
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from functools import _CacheInfo, wraps
+from functools import _CacheInfo, partial, wraps
 from threading import RLock
-from typing import Any, ParamSpec, Protocol, TypeVar, cast
+from typing import Any, ParamSpec, Protocol, TypeVar, cast, overload
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
 from udkjax.arrays import is_traced
+from udkjax.programs.structure_key import Structure
 
 Arguments = ParamSpec("Arguments")
-Argument = TypeVar("Argument")
 Result = TypeVar("Result")
-Argument_contra = TypeVar("Argument_contra", contravariant=True)
-Known = TypeVar("Known")
 Produced_co = TypeVar("Produced_co", covariant=True)
 
 MOST_BYTES = 3 * 2**24  # of all results of functions that are `cached_by_size` together, by the estimates of these functions
@@ -34,21 +32,50 @@ CACHE_SIZE = 64  # results stored per function; the least recently used one is d
 _BY_VALUE = (bool, int, float, str, np.generic, type(None))  # isinstance of an Equinox module takes a microsecond
 
 
-def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+class CachedFunction(Protocol[Arguments, Produced_co]):
+    """A function with a cache."""
+
+    def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Produced_co: ...
+
+    def know(self, argument: Any, result: Any) -> None:
+        """Store a result of a function of one tree that is known without being computed."""
+        ...
+
+
+@overload
+def cached_by_identity(function: Callable[Arguments, Result], /) -> CachedFunction[Arguments, Result]: ...
+@overload
+def cached_by_identity(*, within_trace: bool) -> Callable[[Callable[Arguments, Result]], CachedFunction[Arguments, Result]]: ...
+def cached_by_identity(function: Any = None, /, *, within_trace: bool = False) -> Any:
     """Cache the results of a function by its arguments: numbers and strings by value, others by identity.
 
     A result is stored as long as its arguments exist and it is one of the `CACHE_SIZE` most recently used results. Arguments must
-    be concrete and must not change; a result with traced numbers, which functions may hold in their closures, is not stored.
+    not change. Results with traced numbers, which functions may hold in their closures, are stored only `within_trace`: if each
+    traced number belongs to a trace of the arguments' numbers, so that the result can be used wherever these can. Then the result
+    must not contain the arguments themselves.
     """
-    cache: OrderedDict[tuple[Hashable, ...], tuple[list[Any], Result]] = OrderedDict()
+    if function is None:
+        return partial(_cached_by_identity, within_trace=within_trace)
+    return _cached_by_identity(function, within_trace)
+
+
+def _cached_by_identity(function: Callable[..., Any], within_trace: bool) -> Any:
+    cache: OrderedDict[tuple[Hashable, ...], tuple[list[Any], Any]] = OrderedDict()
     lock = RLock()  # an object may be deleted at any time, also within the lock
 
     def forget(key: tuple[Hashable, ...]) -> None:
         with lock:
             cache.pop(key, None)
 
+    def store(key: tuple[Hashable, ...], objects: tuple[Any, ...], result: Any) -> None:
+        references = [_reference(x, lambda _: forget(key)) for x in objects]
+        with lock:
+            cache[key] = references, result
+            while len(cache) > CACHE_SIZE:
+                cache.popitem(last=False)
+
     @wraps(function)
-    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def call(*args: Any, **kwargs: Any) -> Any:
         objects = (*args, *kwargs.values())
         key = (*[(type(x), x) if issubclass(type(x), _BY_VALUE) else id(x) for x in objects], *kwargs)
         stored = cache.get(key)
@@ -58,68 +85,19 @@ def cached_by_identity(function: Callable[Arguments, Result]) -> Callable[Argume
                     cache.move_to_end(key)
             return stored[1]
         result = function(*args, **kwargs)
-        if is_traced(result):
-            return result
-        references = [_reference(x, lambda _: forget(key)) for x in objects]
-        with lock:
-            cache[key] = references, result
-            while len(cache) > CACHE_SIZE:
-                cache.popitem(last=False)
+        if not is_traced(result) or (within_trace and _traces(result) <= _traces(objects)):
+            store(key, objects, result)
         return result
 
-    return call
+    cached: Any = call
+    cached.know = lambda argument, result: store((id(argument),), (argument,), result)
+    return cached
 
 
 @cached_by_identity
 def is_concrete(*trees: Any) -> bool:
     """Return True if no number of immutable trees is traced; the answer is stored."""
     return not is_traced(trees)
-
-
-class FunctionOfTree(Protocol[Argument_contra, Known]):
-    """A function of one tree, with a cache."""
-
-    def __call__(self, argument: Argument_contra, /) -> Known: ...
-
-    def know(self, argument: Argument_contra, result: Known) -> None:
-        """Store a result that is known without being computed."""
-        ...
-
-
-def cached_within_trace(function: Callable[[Argument], Result]) -> FunctionOfTree[Argument, Result]:
-    """Cache the results of a function of one tree by its identity, like `cached_by_identity`, also while numbers are traced.
-
-    The result must not contain the tree itself. It is stored if each traced number of it belongs to a trace of the argument's
-    numbers, so that it can be used wherever the argument can.
-    """
-    cache: OrderedDict[int, tuple[Any, Result]] = OrderedDict()  # references and results
-    lock = RLock()
-
-    def forget(key: int) -> None:
-        with lock:
-            cache.pop(key, None)
-
-    def know(argument: Argument, result: Result) -> None:
-        key = id(argument)
-        with lock:
-            cache[key] = _reference(argument, lambda _: forget(key)), result
-            while len(cache) > CACHE_SIZE:
-                cache.popitem(last=False)
-
-    @wraps(function)
-    def call(argument: Argument) -> Result:
-        stored = cache.get(id(argument))
-        if stored is not None:
-            return stored[1]
-        result = function(argument)
-        given = _traces(argument)
-        if not given or _traces(result) <= given:
-            know(argument, result)
-        return result
-
-    found: Any = call
-    found.know = know
-    return found
 
 
 def _traces(tree: Any) -> set[int]:
@@ -157,16 +135,24 @@ _LOCK = RLock()
 
 
 def cached_by_size(
-    size: Callable[[Any], int],
+    size: Callable[[Any], int], by_structure: bool = False
 ) -> Callable[[Callable[Arguments, Produced_co]], SizedFunction[Arguments, Produced_co]]:
-    """Cache the results of a function of hashable arguments; `size` estimates the bytes of a result."""
+    """Cache the results of a function of hashable arguments; `size` estimates the bytes of a result.
+
+    If `by_structure`, arguments are trees of concrete numbers, and results are the same for all values of these: everything else
+    is compared (`structure_key.py`), functions among the leaves by identity. They may close over anything: results must not
+    depend on calling them.
+    """
 
     def decorate(function: Callable[Arguments, Produced_co]) -> SizedFunction[Arguments, Produced_co]:
         counts = {"hits": 0, "misses": 0}
 
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Produced_co:
-            key = function, args, tuple(kwargs.items())
+            try:
+                key = function, Structure(args) if by_structure else args, tuple(kwargs.items())
+            except TypeError:  # a static field cannot be compared
+                return function(*args, **kwargs)
             with _LOCK:
                 if key in _STORED:
                     counts["hits"] += 1

@@ -16,7 +16,7 @@ from udkjax.annotations import NumberLike, Numbers, NumericArray
 from udkjax.arrays import is_traced, is_within_jit, make_module, number, without_derivatives
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.programs.control_flow import ConvertsItself
-from udkjax.programs.identity_cache import cached_within_trace, is_concrete
+from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.scene.elements.bodies import Body, stack_coordinates
 from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.elements.forces import ForceElement
@@ -453,7 +453,7 @@ def _by_name(names: tuple[str, ...], elements: tuple[Element, ...]) -> Mapping[s
     return MappingProxyType(dict(zip(names, elements, strict=True)))
 
 
-@cached_within_trace
+@cached_by_identity(within_trace=True)
 def _without_origin(mechanism: Mechanism) -> Mechanism:
     found = _copy(mechanism, {"origin": None, "_source": mechanism._source.elements})
     return _checked(found) if _is_checked(mechanism) else found

@@ -24,7 +24,7 @@ from udkjax.equations.rows.dense_rows import DenseTerms, KinematicRows
 from udkjax.equations.rows.redundancy import holders_of_driver
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.assembling.coordinates import Coordinate, constant_motion, named_element, value_of
-from udkjax.programs.identity_cache import cached_by_identity, cached_within_trace
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.elements.drivers import Driver, Motion, Polynomial
 from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
@@ -147,7 +147,7 @@ def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | N
     return _without_drivers(mechanism) if forces is None else _with_forces_alone(mechanism, forces)
 
 
-@cached_within_trace  # so that later calls reuse its analysis
+@cached_by_identity(within_trace=True)  # so that later calls reuse its analysis
 def _without_drivers(mechanism: Mechanism) -> Mechanism:
     return _with_forces_alone(mechanism, None)
 

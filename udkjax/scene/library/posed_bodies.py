@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from udkjax.arrays import array_namespace, number
-from udkjax.programs.deferred import deferred_if_traced
+from udkjax.programs.deferred import deferred
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import bind_arguments, checked
 from udkjax.scene.elements.bodies import Body
@@ -31,7 +31,7 @@ COMPLEX_STEP = 1e-100  # the square is negligible relative to 1, and products wi
 
 def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
     """Decorate a function of the library: its arguments are checked, and numbers that are not traced arrive as NumPy arrays."""
-    parameters, build_deferred = signature(build), deferred_if_traced(build)
+    parameters, build_deferred = signature(build), deferred(build, keeps_concrete=True)
 
     @wraps(build)
     def build_with_concrete_numbers(*arguments: P.args, **named: P.kwargs) -> Mechanism:

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from udkjax.annotations import Numbers
 from udkjax.arrays import make_module, number
-from udkjax.programs.identity_cache import cached_within_trace
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.elements.fields import NOT_NEGATIVE, POSITIVE
 from udkjax.scene.elements.held import Held, given_sampled
 from udkjax.scene.numbers.named_numbers import NAMED_BY_OWNER
@@ -59,7 +59,7 @@ class NumberField(NamedTuple):
         return _at(groups[self.section][self.owner], self.path[:-1])
 
 
-@cached_within_trace  # a loop over values of a number asks for all names each time
+@cached_by_identity(within_trace=True)  # a loop over values of a number asks for all names each time
 def parameters_of(scene: Sections) -> Mapping[str, NumberField]:
     """Return every number of a mechanism by name, including absent ones; numbers of its drawing come first."""
     drawn = {} if scene.drawing is None else parameters_of_drawing(scene.drawing)
@@ -67,7 +67,7 @@ def parameters_of(scene: Sections) -> Mapping[str, NumberField]:
     return MappingProxyType({**gravity, **drawn, **parameters_in(scene.groups)})
 
 
-@cached_within_trace
+@cached_by_identity(within_trace=True)
 def parameters_of_drawing(drawing: ElementsOfDrawing) -> Mapping[str, NumberField]:
     """Return every number of a drawing by name, including absent ones."""
     return MappingProxyType(parameters_in(drawing.groups))

@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 from udkjax.annotations import TreeDef
 from udkjax.arrays import QuickMethods, is_traced, make_module
 from udkjax.printing import PrintsTable
-from udkjax.programs.deferred import deferred_if_traced
-from udkjax.programs.identity_cache import cached_within_trace
+from udkjax.programs.deferred import deferred
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.undefined import defined
 from udkjax.scene.elements.bodies import Body
 from udkjax.scene.elements.drivers import Driver
@@ -185,7 +185,7 @@ class Drawn(QuickMethods):
 Source = Elements | Drawn
 
 
-@cached_within_trace  # many mechanisms of one drawing differ in numbers that are given directly
+@cached_by_identity(within_trace=True)  # many mechanisms of one drawing differ in numbers that are given directly
 def _drawn_elements(drawing: AbstractDrawing) -> ElementGroups:
     """Return the elements that follow from a drawing, with the numbers taken from the initial guess."""
     groups = drawing.elements()
@@ -246,10 +246,10 @@ def is_number(leaf: object) -> bool:
     return isinstance(leaf, _NUMBERS)
 
 
-_derived = defined(deferred_if_traced(lambda source: source.derived()))
+_derived = defined(deferred(lambda source: source.derived(), keeps_concrete=True))
 
 
-@cached_within_trace
+@cached_by_identity(within_trace=True)
 def elements_of(source: Any) -> Elements:
     """Return the elements that follow from a source, computed once for concrete numbers, and once in each trace.
 

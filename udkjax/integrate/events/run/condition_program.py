@@ -20,8 +20,7 @@ from udkjax.integrate.events.law.phases import Switches
 from udkjax.integrate.events.law.sticking_joints import forces_of
 from udkjax.native.language.program import UnsupportedError, vector_function
 from udkjax.native.watching.conditions import Conditions
-from udkjax.programs.identity_cache import cached_by_identity, is_concrete
-from udkjax.programs.structure_cache import cached_by_structure
+from udkjax.programs.identity_cache import cached_by_identity, cached_by_size, is_concrete
 
 
 def condition_numbers(events: Sequence[Event]) -> list[Array]:
@@ -66,7 +65,12 @@ def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
     return Conditions(text, watched, at_state, len(numbers), by_velocity)
 
 
-_conditions_for_structure = cached_by_structure(_conditions)
+def _bytes_of(conditions: Conditions | None) -> int:
+    """Estimate the memory of conditions: of an operation in the programs and in their text."""
+    return 0 if conditions is None else 500 * (len(conditions.program.order) + len(conditions.at_state.order))
+
+
+_conditions_for_structure = cached_by_size(_bytes_of, by_structure=True)(_conditions)
 
 
 @cached_by_identity

@@ -31,9 +31,8 @@ from udkjax.integrate.events.run.plain_system import run_plain
 from udkjax.integrate.problem import Problem
 from udkjax.native.host.host_function import call_host
 from udkjax.native.watching.conditions import Conditions
-from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.programs.identity_cache import cached_by_identity, cached_by_size
 from udkjax.programs.numpy_program import Meter, numpy_program
-from udkjax.programs.structure_cache import cached_by_structure
 from udkjax.transforms.gradients import stop_gradients
 
 SHARED, NUMBERS = 9, 5  # number of arrays before those of the phases, and index of the numbers of conditions
@@ -153,7 +152,8 @@ def machine_plan(
     return MachinePlan(plan, tuple(plans), added, tuple(zip(phases.held, of_kinks.elements, strict=True)))
 
 
-_plan_for_structure = cached_by_structure(machine_plan)
+PLAN_BYTES = 2**16  # memory of the plan of a phase, with the programs of its conditions
+_plan_for_structure = cached_by_size(lambda plan: PLAN_BYTES * len(plan.phases), by_structure=True)(machine_plan)
 
 
 @cached_by_identity

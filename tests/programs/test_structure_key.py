@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udkjax.programs.structure_cache import cached_by_structure
+from udkjax.programs.identity_cache import cached_by_size
 
 
 class Part(eqx.Module):
@@ -22,7 +22,7 @@ class Part(eqx.Module):
 def counted():
     calls = []
 
-    @cached_by_structure
+    @cached_by_size(lambda _: 1, by_structure=True)
     def structure_of(*parts):
         calls.append(None)
         return len(parts)
