@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.arrays import is_traced
-from udkjax.programs.structure_key import Structure
+from udkjax.programs.structure_key import StructureKey
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -150,7 +150,7 @@ def cached_by_size(
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Produced_co:
             try:
-                key = function, Structure(args) if by_structure else args, tuple(kwargs.items())
+                key = function, StructureKey(args) if by_structure else args, tuple(kwargs.items())
             except TypeError:  # a static field cannot be compared
                 return function(*args, **kwargs)
             with _LOCK:

@@ -9,7 +9,7 @@ import jax
 from udkjax.programs.deferred import ConcreteLeaf
 
 
-class Structure:
+class StructureKey:
     """A tree of concrete numbers, compared by everything except the values of inexact arrays; functions by identity."""
 
     def __init__(self, tree: Any):
@@ -20,7 +20,7 @@ class Structure:
 
     def __eq__(self, other: object) -> bool:
         try:
-            return isinstance(other, Structure) and self._key == other._key
+            return isinstance(other, StructureKey) and self._key == other._key
         except (TypeError, ValueError):  # of static fields that cannot be compared, such as arrays
             return False
 

@@ -1,4 +1,4 @@
-"""Where in a step a piece ends: the last point of the step that is in it, and the polynomial on which that is looked for."""
+"""The search for the end of a piece within a step, and the polynomial of the step that it evaluates."""
 
 from collections.abc import Callable
 

@@ -24,8 +24,8 @@ from udkjax.native.run.piece_ends import interpolate_step, locate_end, moves_by_
 from udkjax.native.run.runge_kutta import stage_state
 
 
-class Decision(NamedTuple):
-    """What was found of a step, as masks of lanes."""
+class StepDecision(NamedTuple):
+    """Findings about a step, as masks of lanes."""
 
     stepping: Value
     is_accurate: Value
@@ -189,9 +189,9 @@ class _EndOfPiece:
             module.put(f, "state v", r, module.vector(f, "result v", r))
         aim, is_accurate = s.aim, s.error < 1.0
         repeats, shortens = leaves & again, can_leave & strays.value & ~leaves & again
-        self._aim(Decision(stepping, is_accurate, leaves, repeats, shortens, turns), aim, share, step)
+        self._aim(StepDecision(stepping, is_accurate, leaves, repeats, shortens, turns), aim, share, step)
 
-    def _aim(self, found: Decision, aim: Value, share: Value, step: Value):
+    def _aim(self, found: StepDecision, aim: Value, share: Value, step: Value):
         """Write: set where the next step ends, and which lanes repeat this one."""
         f, s, where = self._f, self._s, self._f.select
         stepping, is_accurate, leaves, repeats, shortens, turns = found
