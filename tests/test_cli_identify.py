@@ -53,7 +53,7 @@ def test_what_the_data_cannot_tell_is_said_and_all_is_written(tmp_path, capsys, 
 
 
 def test_it_draws_from_the_posterior_and_continues(tmp_path, capsys, data):
-    pytest.importorskip("blackjax")
+    pytest.importorskip("arviz")
     out, folder = tmp_path / "found", tmp_path / "posterior"
     arguments = ["identify", PENDULUM, data, "--parameters", INERTIA, "--ignore", "remark", "--starts", "0", "--tol", "1e-8"]
     texts = []

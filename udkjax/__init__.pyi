@@ -157,9 +157,12 @@ from udkjax.statics.modes import modes as modes
 from udkjax.statics.reaction_peaks import envelope as envelope
 from udkjax.statics.reaction_peaks import pin_reactions as pin_reactions
 from udkjax.statics.reaction_peaks import reaction_peaks as reaction_peaks
+from udkjax.study.belief import Candidate as Candidate
 from udkjax.study.belief import Comparison as Comparison
+from udkjax.study.belief import Design as Design
 from udkjax.study.belief import Posterior as Posterior
 from udkjax.study.belief import compare as compare
+from udkjax.study.belief import design_experiment as design_experiment
 from udkjax.study.belief import inference as inference
 from udkjax.study.belief import sample as sample
 from udkjax.study.channel_values import path as path
@@ -168,8 +171,6 @@ from udkjax.study.diagnosis import SystemDiagnosis as SystemDiagnosis
 from udkjax.study.diagnosis import diagnose as diagnose
 from udkjax.study.explain import explain as explain
 from udkjax.study.explanation import Explanation as Explanation
-from udkjax.study.identify import Candidate as Candidate
-from udkjax.study.identify import Design as Design
 from udkjax.study.identify import Estimate as Estimate
 from udkjax.study.identify import GradientCheck as GradientCheck
 from udkjax.study.identify import IdentificationError as IdentificationError
@@ -178,7 +179,6 @@ from udkjax.study.identify import Quantity as Quantity
 from udkjax.study.identify import Record as Record
 from udkjax.study.identify import Start as Start
 from udkjax.study.identify import check_gradients as check_gradients
-from udkjax.study.identify import design_experiment as design_experiment
 from udkjax.study.identify import identify as identify
 from udkjax.study.identify import length as length
 from udkjax.study.inverse_dynamics import Effort as Effort

@@ -9,7 +9,6 @@ EXTRAS = {
     "PIL": "plot",
     "anywidget": "notebook",
     "arviz": "bayes",
-    "blackjax": "bayes",
     "dask": "dask",
     "distributed": "dask",
     "ezdxf": "dxf",
@@ -40,7 +39,7 @@ BRINGS = {
 # The packages that write a pose or a film, by the suffix of its file.
 WRITERS = {".png": ("PIL",), ".gif": ("PIL",), ".mp4": ("PIL", "imageio_ffmpeg"), ".dxf": ("ezdxf",)}
 NETCDF = "xarray", "h5netcdf"  # the packages that read and write runs
-BAYES = "blackjax", "arviz"  # the packages that draw from posteriors and judge the draws
+BAYES = ("arviz",)  # the package that judges draws from posteriors
 EXPORT = ("flatbuffers",)  # the package with which JAX writes exported functions
 STUDIO = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
 

@@ -23,7 +23,8 @@ def test_the_corner_has_draws_and_ellipses(drawn):
     estimate, posterior = drawn
     figure = udk.plot_posterior(posterior, estimate)
     pair = figure.axes[2]
-    points, half, most = (np.asarray(line.get_xydata()) for line in pair.get_lines())
+    points = np.asarray(pair.collections[0].get_offsets())
+    half, most = (np.asarray(line.get_xydata()) for line in pair.get_lines())
     assert_allclose(points, np.stack([posterior.draws[name].ravel() for name in NAMES], axis=1))
     assert_allclose(half[:-1], estimate.ellipse(*NAMES, 0.5))
     assert_allclose(most[:-1], estimate.ellipse(*NAMES, 0.95))

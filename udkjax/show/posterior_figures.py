@@ -83,7 +83,7 @@ def draw_pair(axes: Axes, posterior: Posterior, one: str, other: str, estimate: 
     """Draw the draws of two numbers as points, and the joint confidence ellipses of an estimate."""
     x, y = (posterior.draws[name].ravel() for name in (one, other))
     every = -(-len(x) // MOST_POINTS)
-    axes.plot(x[::every], y[::every], ".", ms=2, mew=0, alpha=0.6, color=COLOURS[0], label="draws", rasterized=True)
+    axes.scatter(x[::every], y[::every], 3, COLOURS[4], lw=0, alpha=0.6, label="draws", rasterized=True)
     if estimate is not None and {one, other} <= {*estimate.names}:
         for level, dashes in LEVELS.items():
             ellipse = estimate.ellipse(one, other, level)

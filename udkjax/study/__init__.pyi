@@ -4,9 +4,12 @@ from udkjax.study.accuracy import Accuracy as Accuracy
 from udkjax.study.accuracy import accuracy as accuracy
 from udkjax.study.accuracy import conserves_energy as conserves_energy
 from udkjax.study.accuracy import largest_violation as largest_violation
+from udkjax.study.belief import Candidate as Candidate
 from udkjax.study.belief import Comparison as Comparison
+from udkjax.study.belief import Design as Design
 from udkjax.study.belief import Posterior as Posterior
 from udkjax.study.belief import compare as compare
+from udkjax.study.belief import design_experiment as design_experiment
 from udkjax.study.belief import inference as inference
 from udkjax.study.belief import sample as sample
 from udkjax.study.channel_values import measure as measure
@@ -19,8 +22,6 @@ from udkjax.study.diagnosis.configuration import RankedPositions as RankedPositi
 from udkjax.study.diagnosis.fixes import Fix as Fix
 from udkjax.study.explain import explain as explain
 from udkjax.study.explanation import Explanation as Explanation
-from udkjax.study.identify import Candidate as Candidate
-from udkjax.study.identify import Design as Design
 from udkjax.study.identify import Estimate as Estimate
 from udkjax.study.identify import GradientCheck as GradientCheck
 from udkjax.study.identify import IdentificationError as IdentificationError
@@ -29,7 +30,6 @@ from udkjax.study.identify import Quantity as Quantity
 from udkjax.study.identify import Record as Record
 from udkjax.study.identify import Start as Start
 from udkjax.study.identify import check_gradients as check_gradients
-from udkjax.study.identify import design_experiment as design_experiment
 from udkjax.study.identify import identify as identify
 from udkjax.study.identify import length as length
 from udkjax.study.identify.answers.profile_likelihood import ProfileLikelihood as ProfileLikelihood

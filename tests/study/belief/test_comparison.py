@@ -69,7 +69,7 @@ def test_each_value_is_predicted_from_the_others(models):
 
 @pytest.mark.parametrize("by", ["evidence", "loo"])
 def test_draws_give_the_same_scores(models, by):
-    pytest.importorskip("blackjax")
+    pytest.importorskip("arviz")
     drawn = udk.sample(models["damped"], chains=4, draws=100, warmup=100, progress=False)
     found = udk.compare({"drawn": drawn, "approximate": models["damped"]}, by=by)
     # For one parameter, a left-out score varies as chi^2 / 2 over the draws: by 0.08 for 400 and 1024 of these.

@@ -12,9 +12,9 @@ import udkjax as udk
 from tests.study.belief.test_log_density import record
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
 from udkjax.study.belief.chains import ChainCoordinates, Tuning, settled, tuned
+from udkjax.study.identify.density.laplace import weigh
 from udkjax.study.sweep.store import StoreError
 
-pytest.importorskip("blackjax")
 pytest.importorskip("arviz")
 FEW: dict[str, Any] = {"chains": 4, "draws": 200, "warmup": 100, "progress": False}
 
@@ -184,6 +184,43 @@ def test_bounds_that_exclude_the_optimum_hold():
     parameter = udk.Parameter(NAMES[0], bounds=(0.42, 0.6), guess=0.5)
     found = udk.sample(udk.inference(pendulum(0.5), record(0.2), parameter), **FEW)
     assert 0.42 < found.draws[NAMES[0]].min() < 0.425 and found.draws[NAMES[0]].max() < 0.6
+
+
+def narrow(low: float, high: float):
+    """A density that is zero except near the start, between two values."""
+    prior = {NAMES[0]: lambda x: jnp.where((x > low) & (x < high), 0.0, -jnp.inf)}
+    return udk.inference(pendulum(0.4), record(1.0), NAMES[:1], priors=prior)
+
+
+def test_a_density_that_is_zero_almost_everywhere_is_refused():
+    with pytest.raises(udk.IdentificationError, match="zero at all 255 vectors drawn around its mode: give a prior or bounds"):
+        udk.sample(narrow(0.4 - 1e-9, 0.4 + 1e-9), **FEW)
+
+
+def test_chains_that_never_move_are_refused(monkeypatch, problem):
+    from udkjax.study.belief import sampling
+
+    def stuck(all_fail: bool):
+        def compute(coordinates, root, randomness, state):
+            D, C = 25, len(state.position)
+            kept = state._replace(logdensity=np.full(C, -np.inf if all_fail else 0.0))
+            found = {"position": np.tile(state.position, (D, 1, 1)), "acceptance": np.zeros((D, C))}
+            return kept, found
+
+        return lambda problem: compute
+
+    for all_fail, text in ((True, "density is zero wherever the 25 first proposals"), (False, "no chain accepted any proposal")):
+        monkeypatch.setattr(sampling, "compile_draws", stuck(all_fail))
+        with pytest.raises(udk.IdentificationError, match=text):
+            udk.sample(problem, **FEW)
+
+
+def test_a_mode_without_density_is_named():
+    """No run takes as few steps as allowed with a thousandth of the inertia."""
+    steps = udk.inference(pendulum(0.6), record(), NAMES[:1]).max_steps // 20
+    free = udk.inference(pendulum(0.6), record(), NAMES[:1], max_steps=steps)
+    with pytest.raises(udk.IdentificationError, match="zero at its mode, where a run fails: give a prior or bounds"):
+        weigh(free, np.array([-7.0]), np.eye(1))
 
 
 def test_wrong_arguments_are_named(problem):

@@ -10,22 +10,21 @@ R. M. Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carl
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from scipy.special import ndtri
 
-from udkjax.extras import OptionalImport
 from udkjax.study.identify.density.log_density import InferenceProblem
 
 DRAWS = 25  # number of draws in a chunk, between which tuning, storing and interruptions take place
 LENGTH, LENGTHS = np.pi / 2, (0.6, 1.4)  # of trajectories for unit covariance, and the range of its random factor
 STEP_FACTORS = 0.8, 1.0  # range of the random factor of a step, which avoids periods of a trajectory that are multiples of it
 FIRST_STEP, LARGEST_STEP = 0.5, 1.5  # for unit covariance; leapfrog is unstable from 2
+DIVERGENT = 1000.0  # error of the energy of a trajectory that has left the density
 MOST_STEPS = 256  # largest number of steps of a trajectory
 ACCEPTANCE = 0.8  # mean acceptance to which the step is tuned
 ACCEPTANCE_RANGE = 0.01, 0.995  # means beyond say only that the step is far too large or small
@@ -80,6 +79,30 @@ class Tuning(NamedTuple):
     covariance: Float[np.ndarray, "K K"]
 
 
+class Randomness(NamedTuple):
+    """The random numbers of D draws of C chains, by NumPy: XLA would compile its own generator for longer than all of a chain.
+
+    Attributes:
+        momentum: standard normal numbers (D, C, K).
+        log_uniform: logarithms of uniform numbers (D, C), which decide acceptance.
+        steps: numbers of steps of the trajectories (D,).
+        size: their sizes, for unit covariance (D,).
+    """
+
+    momentum: Float[np.ndarray, "D C K"]
+    log_uniform: Float[np.ndarray, "D C"]
+    steps: Int[np.ndarray, "D"]
+    size: Float[np.ndarray, "D"]
+
+    @classmethod
+    def of_chunk(cls, seed: int, k: int, step: float, shape: tuple[int, int]) -> "Randomness":
+        """Return those of chunk k, for chains and unknowns of this shape (C, K)."""
+        random = np.random.default_rng([seed, k])
+        size = step * random.uniform(*STEP_FACTORS, DRAWS)
+        steps = np.clip(np.round(LENGTH * random.uniform(*LENGTHS, DRAWS) / size), 1, MOST_STEPS).astype(int)
+        return cls(random.standard_normal((DRAWS, *shape)), -random.standard_exponential((DRAWS, shape[0])), steps, size)
+
+
 class ChainState(NamedTuple):
     """The state of C chains: positions (C, K), logarithms of the density (C,), and their gradients (C, K).
 
@@ -100,36 +123,41 @@ def first_state(positions: Float[np.ndarray, "C K"]) -> ChainState:
 
 
 def compile_draws(problem: InferenceProblem) -> Callable[..., tuple[ChainState, dict[str, Array]]]:
-    """Return a compiled function of coordinates, a key, the tuning and the state; it returns the next state, and draws."""
-    with OptionalImport():
-        from blackjax.mcmc import hmc
-    kernel = hmc.build_kernel()
+    """Return a compiled function of coordinates, a root of the covariance, randomness and the state.
 
-    def draw(
-        problem: InferenceProblem, coordinates: ChainCoordinates, tuning: Tuning, state: Any, key: Array
-    ) -> tuple[Any, dict[str, Array]]:
-        density = lambda w: problem.log_density(coordinates.x(w, jnp)) + coordinates.log_slope(w)  # noqa: E731
-        of_length, of_step, of_chains = jax.random.split(key, 3)
-        step = tuning.step * jax.random.uniform(of_step, minval=STEP_FACTORS[0], maxval=STEP_FACTORS[1])
-        length = LENGTH * jax.random.uniform(of_length, minval=LENGTHS[0], maxval=LENGTHS[1])
-        steps = jnp.clip(jnp.round(length / step), 1, MOST_STEPS).astype(int)
-        one = lambda key, state: kernel(key, state, density, step, tuning.covariance, steps)  # noqa: E731
-        state, info = jax.vmap(one)(jax.random.split(of_chains, len(state.position)), state)
-        failed = ~jnp.isfinite(info.proposal.logdensity)
-        found = {
-            "position": state.position,
-            "log_density": state.logdensity - jax.vmap(coordinates.log_slope)(state.position),
-            "acceptance": info.acceptance_rate,
-            "failed": failed,
-        }
-        return state, found | {"divergent": info.is_divergent & ~failed, "steps": steps}
+    It returns the next state, and draws.
+    """
 
     def chunk(
-        problem: InferenceProblem, coordinates: ChainCoordinates, key: Array, tuning: Tuning, state: ChainState
+        problem: InferenceProblem,
+        coordinates: ChainCoordinates,
+        root: Float[Array, "K K"],
+        randomness: Randomness,
+        state: ChainState,
     ) -> tuple[ChainState, dict[str, Array]]:
-        begin, one = hmc.HMCState(*map(jnp.asarray, state)), partial(draw, problem, coordinates, tuning)
-        end, found = jax.lax.scan(one, begin, jax.random.split(key, DRAWS))
-        return ChainState(*end), found
+        density = lambda w: problem.log_density(coordinates.x(w, jnp)) + coordinates.log_slope(w)  # noqa: E731
+        densities = jax.vmap(jax.value_and_grad(density))
+
+        def draw(state: ChainState, random: Randomness) -> tuple[ChainState, dict[str, Array]]:
+            def leapfrog(_: Any, moving: tuple[Array, ChainState]) -> tuple[Array, ChainState]:
+                p = moving[0] + 0.5 * random.size * moving[1].logdensity_grad @ root
+                w = moving[1].position + random.size * p @ root.T
+                value, slope = densities(w)
+                return p + 0.5 * random.size * slope @ root, ChainState(w, value, slope)
+
+            p, proposal = jax.lax.fori_loop(0, random.steps, leapfrog, (random.momentum, state))
+            gain = proposal.logdensity - state.logdensity + 0.5 * jnp.sum(random.momentum**2 - p**2, axis=1)
+            failed = ~jnp.isfinite(proposal.logdensity)
+            gain = jnp.where(failed | jnp.isnan(gain), -jnp.inf, gain)
+            accepted = random.log_uniform < gain
+            chosen = lambda x, old: jnp.where(accepted.reshape(-1, *[1] * (x.ndim - 1)), x, old)  # noqa: E731
+            after = jax.tree.map(chosen, proposal, state)
+            found = {"position": after.position, "logdensity": after.logdensity, "acceptance": jnp.exp(jnp.minimum(gain, 0.0))}
+            return after, found | {"failed": failed, "divergent": ~failed & (gain < -DIVERGENT)}
+
+        end, found = jax.lax.scan(draw, ChainState(*map(jnp.asarray, state)), randomness)
+        found["log_density"] = found.pop("logdensity") - jax.vmap(jax.vmap(coordinates.log_slope))(found["position"])
+        return end, found
 
     return problem.compiled("draws", chunk)
 
@@ -146,7 +174,8 @@ def tuned(first: Tuning, warmup: Sequence[DrawChunk]) -> Tuning:
         mean = np.clip(warmup[k - 1]["acceptance"].mean(), *ACCEPTANCE_RANGE)
         change = np.clip(np.sqrt(ndtri(1.0 - ACCEPTANCE / 2) / ndtri(1.0 - mean / 2)), *STEP_CHANGE)
         step = min(float(previous.step * change), LARGEST_STEP)
-        covariance = _covariance(previous.covariance, warmup[k // 2 : k]) if k > 1 else previous.covariance
+        w = np.concatenate([chunk["position"].reshape(-1, len(previous.covariance)) for chunk in warmup[k // 2 : k]])
+        covariance = covariance_of(previous.covariance, w) if k > 1 else previous.covariance
         tunings.append(Tuning(step, covariance))
     return tunings[-1]
 
@@ -157,9 +186,8 @@ def settled(first: Tuning, warmup: Sequence[DrawChunk]) -> Tuning:
     return Tuning(float(np.exp(np.mean(np.log(later)))), tuned(first, warmup).covariance)
 
 
-def _covariance(previous: Float[np.ndarray, "K K"], chunks: Sequence[DrawChunk]) -> Float[np.ndarray, "K K"]:
-    """Return the covariance of draws; with few of them, partly the previous one."""
+def covariance_of(previous: Float[np.ndarray, "K K"], w: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "K K"]:
+    """Return the covariance of draws; with few of them, mostly the previous one."""
     K = len(previous)
-    w = np.concatenate([chunk["position"].reshape(-1, K) for chunk in chunks])
     weight = PRIOR_DRAWS * K / (PRIOR_DRAWS * K + len(w))
-    return (1.0 - weight) * np.cov(w.T).reshape(K, K) + weight * previous
+    return (1.0 - weight) * np.cov(w.T, ddof=0).reshape(K, K) + weight * previous

@@ -135,7 +135,7 @@ def compare(models: Annotated[Mapping[str, ComparedModel], MODELS], by: Score = 
 def _with_draws(model: ComparedModel) -> Laplace | Posterior:
     if isinstance(model, InferenceProblem):
         return approximate(model, model.start)
-    return model.laplace() if isinstance(model, Estimate) else model
+    return model.laplace(quick=False) if isinstance(model, Estimate) else model
 
 
 def _require_same_records(models: Mapping[str, Laplace | Posterior]) -> None:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from importlib.metadata import version
 from typing import Annotated
 
 import jax
@@ -20,9 +19,11 @@ from udkjax.study.belief.chains import (
     FIRST_STEP,
     ChainState,
     DrawChunk,
+    Randomness,
     Tuning,
     compile_draws,
     coordinates_of,
+    covariance_of,
     first_state,
     settled,
     tuned,
@@ -31,6 +32,7 @@ from udkjax.study.belief.posterior import Posterior
 from udkjax.study.identify.answers.estimate import Estimate
 from udkjax.study.identify.density.laplace import approximate
 from udkjax.study.identify.density.log_density import InferenceProblem
+from udkjax.study.identify.records.records import IdentificationError
 from udkjax.study.sweep.fingerprint import JsonValue, describe_function, describe_model, describe_value
 from udkjax.study.sweep.plan import Chunk as StoredChunk
 from udkjax.study.sweep.store import open_store
@@ -72,8 +74,8 @@ def sample(
         The draws, by name and in the units of the parameters, and how far they may be trusted.
 
     Raises:
-        IdentificationError: neither the records nor a prior determine some parameters, or records without given noise fit to
-            rounding.
+        IdentificationError: neither the records nor a prior determine some parameters, records without given noise fit to
+            rounding, or no chain moves.
         StoreError: `out` cannot be written to, or contains another posterior.
     """
     require(*BAYES)
@@ -93,20 +95,22 @@ def sample(
         start = finished(0, stored[0] if 0 in stored else _start(density, problem, chains, seed))
         coordinates = coordinates_of(problem, start["mode"], start["covariance"])
         w = coordinates.w(start["x"])
-        begin = tuning = Tuning(FIRST_STEP, np.cov(w.T).reshape(len(w.T), -1))
+        begin = tuning = Tuning(FIRST_STEP, covariance_of(start["covariance"], np.unique(w, axis=0)))
         state, compute = first_state(w[:chains]), compile_draws(problem)
         try:
             with report_progress(progress, total * DRAWS, "sample") as report, computing_on_host():
                 for k in range(1, total + 1):
                     if k not in stored:
-                        key = jax.random.fold_in(jax.random.key(seed), k)
-                        state, found = jax.tree.map(np.asarray, compute(coordinates, key, tuning, state))
+                        randomness = Randomness.of_chunk(seed, k, tuning.step, state.position.shape)
+                        root = np.linalg.cholesky(tuning.covariance)
+                        state, found = jax.tree.map(np.asarray, compute(coordinates, root, randomness, state))
                         stored_state = {name: getattr(state, name) for name in STATE}
-                        done.append(finished(k, {**found, **stored_state}))
+                        done.append(finished(k, {**found, "steps": randomness.steps, **stored_state}))
                     else:
                         done.append(stored[k])
                     state = ChainState(done[-1]["position"][-1], *(done[-1][name] for name in STATE))
                     if k <= first:
+                        _require_movement(done, k == first)
                         tuning = (settled if k == first else tuned)(begin, done)
                     report(k * DRAWS, "warm-up" if k <= first else "")
         except KeyboardInterrupt:
@@ -117,9 +121,20 @@ def sample(
 
 def _start(density: InferenceProblem | Estimate, problem: InferenceProblem, chains: int, seed: int) -> DrawChunk:
     """Return the mode, its covariance, and vectors that are nearly draws of the density, those of the chains first."""
-    approximation = density.laplace(seed) if isinstance(density, Estimate) else approximate(problem, problem.start, seed)
+    estimated = isinstance(density, Estimate)
+    approximation = density.laplace(seed, quick=False) if estimated else approximate(problem, problem.start, seed)
     starts = approximation.starts(max(chains, STARTS), seed)
     return {"x": starts, "mode": approximation.mode, "covariance": approximation.covariance}
+
+
+def _require_movement(warmup: list[DrawChunk], ended: bool) -> None:
+    """Raise an error if no chain has a density, or if none has moved when the warm-up ends."""
+    if not np.isfinite(warmup[-1]["logdensity"]).any():
+        cure = "give priors or bounds that keep the numbers where the mechanism runs, or a larger max_steps"
+        raise IdentificationError([f"the density is zero wherever the {DRAWS} first proposals of the chains went: {cure}"])
+    if ended and not any(chunk["acceptance"].any() for chunk in warmup):
+        cure = "use a longer warmup, or start nearer to the mode, as with the result of `identify`"
+        raise IdentificationError([f"no chain accepted any proposal of its warm-up: {cure}"])
 
 
 def _fingerprint(problem: InferenceProblem) -> Mapping[str, JsonValue]:
@@ -140,5 +155,5 @@ def _fingerprint(problem: InferenceProblem) -> Mapping[str, JsonValue]:
         "settings": {name: describe_value(x) for name, x in fit.settings.items() if name != "analysis"},
         "max_steps": problem.max_steps,
         "tol": list(problem.tol),
-        "versions": {**{k: v for k, v in versions().items() if k != "python"}, "blackjax": version("blackjax")},
+        "versions": {k: v for k, v in versions().items() if k != "python"},
     }

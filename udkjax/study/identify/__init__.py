@@ -3,15 +3,12 @@
 records/           measurements, from files and tables
 problem/           unknowns, predictions, and residuals with their Jacobian in blocks of rows
 search/            minimization, and the search for the global minimum
-answers/           the estimate, its uncertainty, gradient checks, and the design of experiments
+answers/           the estimate, its uncertainty, and gradient checks
 identification     the public function
 """
 
 from udkjax.positions.assembling.channels import Quantity as Quantity
 from udkjax.study.identify.answers.estimate import Estimate as Estimate
-from udkjax.study.identify.answers.experiment_design import Candidate as Candidate
-from udkjax.study.identify.answers.experiment_design import Design as Design
-from udkjax.study.identify.answers.experiment_design import design_experiment as design_experiment
 from udkjax.study.identify.answers.gradient_check import GradientCheck as GradientCheck
 from udkjax.study.identify.answers.gradient_check import check_gradients as check_gradients
 from udkjax.study.identify.identification import identify as identify

@@ -1,1 +1,1 @@
-"""Answers of an identification: the estimate, its uncertainty, checks of gradients, and the design of further experiments."""
+"""Answers of an identification: the estimate, its uncertainty, profile likelihoods, and checks of gradients."""

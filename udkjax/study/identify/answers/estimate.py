@@ -209,7 +209,7 @@ class Estimate:
         """
         return compare_gradients(self.problem, self.z, self.tol, order=order, directions=directions)
 
-    def laplace(self, seed: int = 0) -> Laplace:
+    def laplace(self, seed: int = 0, quick: bool = True) -> Laplace:
         """Return the normal approximation of the posterior density near the estimate, and whether it may be trusted.
 
         Parameters without a prior are uniform, and noise that is not given is one more unknown for each channel: see
@@ -217,12 +217,13 @@ class Estimate:
 
         Args:
             seed: seed of the importance weights, which give the verdict.
+            quick: compute a quarter of the importance weights, and the others only if these leave the verdict open.
 
         Raises:
             IdentificationError: the records were fitted with another loss, or in pieces; or something is undetermined.
         """
         x = np.append(self.z, np.zeros(len(self.posterior.names) - len(self.z)))  # the noise is that of the residuals
-        return approximate(self.posterior, x, int(seed))
+        return approximate(self.posterior, x, int(seed), quick)
 
     @cached_property
     def posterior(self) -> InferenceProblem:

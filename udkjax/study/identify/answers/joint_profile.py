@@ -133,10 +133,10 @@ def _circle(count: int) -> Float[np.ndarray, "N 2"]:
 
 
 def _root(covariance: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-    """Return a root of a covariance, which may be singular to rounding."""
-    sizes = np.sqrt(np.diag(covariance))
-    s, v = np.linalg.eigh(covariance / np.outer(sizes, sizes))
-    return sizes[:, None] * (v * np.sqrt(np.maximum(s, 0.0)))
+    """Return the lower triangular root of a covariance, which may be singular to rounding."""
+    one, other = np.sqrt(np.diag(covariance))
+    rho = covariance[0, 1] / (one * other)
+    return np.array([[one, 0.0], [rho * other, np.sqrt(max(1.0 - rho**2, 0.0)) * other]])
 
 
 def _text(names: tuple[str, str], unknowns: Unknowns, edge: np.ndarray, level: float) -> str:

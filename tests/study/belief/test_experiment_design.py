@@ -5,7 +5,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.scene.elements.drivers import Sine
-from udkjax.study.identify.answers.experiment_design import Candidate, design_experiment
+from udkjax.study.belief.experiment_design import Candidate, design_experiment
 from udkjax.study.identify.records.records import Start
 
 NAMES = ("body.lower.inertia", "force.damper.damping")
@@ -125,3 +125,44 @@ def test_mistakes_are_told(candidates):
         design_experiment(scene(), [3], NAMES, [CHANNEL], TS, NOISE)  # pyright: ignore[reportArgumentType]
     with pytest.raises(udk.IdentificationError, match="of: mass is not among the parameters"):
         design_experiment(scene(), candidates, NAMES, [CHANNEL], TS, NOISE, of=["mass"])
+
+
+# --- by draws from a posterior
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    pytest.importorskip("arviz")
+    random, values = np.random.default_rng(2), [float(scene().parameters()[name]) for name in NAMES]
+    angle = prediction(*values, angle=0.3, amplitude=0.0) + NOISE * random.standard_normal(len(TS))
+    data = udk.Record(TS, {CHANNEL: angle}, NOISE, released(0.3), conditions={AMPLITUDE: 0.0})
+    problem = udk.inference(scene(0.3), data, NAMES, priors={name: (x, x) for name, x in zip(NAMES, values, strict=True)})
+    return udk.sample(problem, chains=4, draws=100, warmup=100, progress=False)
+
+
+def test_by_draws_the_score_is_the_mean_over_them(posterior, candidates):
+    """Against the information at each draw, by differences, added to the inverse of the draws' covariance."""
+    found = design_experiment(scene(), candidates[1:3], NAMES, [CHANNEL], TS, NOISE, given=posterior)
+    z = posterior.problem.fit_problem.unknowns.z_of(np.stack([posterior.draws[n].ravel() for n in NAMES], axis=1))
+    x, h, prior = np.exp(z) * [float(scene().parameters()[n]) for n in NAMES], 1e-5, np.linalg.inv(np.cov(z.T))
+    some = np.linspace(0, len(z) - 1, 32).round().astype(int)
+    scores, variances = np.zeros((2, 32)), np.zeros((2, 32, 2))
+    for j, k in enumerate(some):
+        for c, angle in enumerate(ANGLES[1:]):
+            slope = [
+                (prediction(*(x[k] * (1 + h * e)), angle, 0.0) - prediction(*(x[k] * (1 - h * e)), angle, 0.0)) / (2 * h * NOISE)
+                for e in np.eye(2)
+            ]
+            M = prior + np.array(slope) @ np.array(slope).T
+            scores[c, j], variances[c, j] = np.linalg.slogdet(M)[1], np.diag(np.linalg.inv(M)) * x[k] ** 2
+    np.testing.assert_allclose(found.scores, scores.mean(1), rtol=1e-4)
+    np.testing.assert_allclose(found.standard_errors, np.sqrt(variances.mean(1)), rtol=1e-3)
+    assert found.best == 1  # the higher release
+
+
+def test_draws_of_other_parameters_are_refused(posterior, candidates):
+    with pytest.raises(udk.IdentificationError, match="given: is a posterior of body"):
+        design_experiment(scene(), candidates[:1], NAMES[:1], [CHANNEL], TS, NOISE, given=posterior)
+    bounded = [udk.Parameter(NAMES[0], bounds=(1e-6, 1e-5), guess=5e-6), NAMES[1]]
+    with pytest.raises(udk.IdentificationError, match=f"the bounds of {NAMES[0]} exclude draws"):
+        design_experiment(scene(), candidates[:1], bounded, [CHANNEL], TS, NOISE, given=posterior)

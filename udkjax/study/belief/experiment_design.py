@@ -5,6 +5,10 @@ the Fisher information M: M^-1 is the covariance of an estimate, to first order 
 other parameters) are eliminated by projecting J on the complement of their columns. The best candidate has the largest det M
 (criterion "D"), the smallest trace M^-1 ("A"), or the largest smallest eigenvalue of M ("E"), in the dimensionless unknowns of
 `identify/problem/parameters.py`. F. Pukelsheim, Optimal Design of Experiments, 2006.
+
+J depends on the parameters. Draws from a posterior show which values are possible: with these, the criterion is its mean over the
+draws, with the inverse of their covariance as prior information. For "D", this is the expected gain of information, up to a
+factor and a constant. K. Chaloner & I. Verdinelli, Statistical Science 10 (1995) 273.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,6 +25,7 @@ from udkjax.printing import PrintedTable, prints_table
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
+from udkjax.study.belief.posterior import Posterior
 from udkjax.study.identify.answers.estimate import Estimate
 from udkjax.study.identify.answers.uncertainty import SMALLEST_PART
 from udkjax.study.identify.problem.fit_problem import FitProblem, build_problem
@@ -30,6 +35,8 @@ from udkjax.study.identify.problem.residuals import Reduction
 from udkjax.study.identify.problem.unknowns import INVISIBLE_RATIO
 from udkjax.study.identify.records.records import ChannelKey, IdentificationError, Noise, Record, Start
 from udkjax.wording import suggestion
+
+DRAWS = 32  # draws whose mean criterion ranks candidates: it then varies by a fifth of its deviation from draw to draw
 
 Criterion = Literal["D", "A", "E"]
 
@@ -59,7 +66,8 @@ class Design(NamedTuple):
         candidates: names of the candidates.
         scores: value of the criterion (larger is better): log det M, -trace M^-1, or the smallest eigenvalue; -inf or 0 if a
             combination of parameters is not determined.
-        standard_errors: standard errors in the units of the parameters; inf if a candidate does not determine the parameter.
+        standard_errors: standard errors in the units of the parameters; inf if a candidate does not determine the parameter. Of a
+            posterior, their root mean square over its draws.
         order: indices of the candidates, the best first.
         chosen: candidates to carry out together, the most useful first.
         together: standard errors after the first chosen candidate, the first two, and so on.
@@ -109,7 +117,7 @@ def design_experiment(
     criterion: Criterion = "D",
     pick: int = 1,
     of: str | Sequence[str] | None = None,
-    given: Estimate | None = None,
+    given: Estimate | Posterior | None = None,
     tol: Annotated[float, NOT_NEGATIVE] = MEDIUM_TOL,
     **settings: Any,
 ) -> Design:
@@ -125,7 +133,8 @@ def design_experiment(
         criterion: "D", the largest det M; "A", the smallest trace M^-1; "E", the largest smallest eigenvalue of M.
         pick: number of candidates to choose in sequence; each is the best addition to the previous ones.
         of: names of the parameters to determine; by default all.
-        given: an estimate, whose values are used and whose records count as prior information.
+        given: an estimate, whose values are used and whose records count as prior information; or draws from a posterior, over
+            which the criterion is averaged, and whose covariance counts as prior information.
         tol: tolerance of the integration.
         settings: further arguments of `simulate`.
 
@@ -148,17 +157,26 @@ def design_experiment(
         Record(ts, dict.fromkeys(channels, np.zeros(ts.shape)), noise, c.initial_state, None, c.conditions, c.name)
         for c in experiments
     ]
-    problem = build_problem(mechanism if given is None else given.mechanism, records, parameters, settings)
+    problem = build_problem(_mechanism(mechanism, given), records, parameters, settings)
     names = problem.unknowns.names
     wanted = _select_parameters(names, of)
-    prior_rows = _prior_information(problem, given)
-    dx_dz = problem.unknowns.dx_dz(np.zeros(len(names)))[wanted]
-    roots = _information_of_records(problem, (float(tol), float(tol)))
-    floor = INVISIBLE_RATIO * np.linalg.norm(np.concatenate([prior_rows, *roots]), 2)
+    drawn = _places(problem, given)
+    prior_rows = _covariance_rows(drawn) if isinstance(given, Posterior) else _prior_information(problem, given)
+    places = drawn[np.linspace(0, len(drawn) - 1, min(DRAWS, len(drawn))).round().astype(int)]
+    dx_dz = problem.unknowns.dx_dz(places)[:, wanted]
+    tols = float(tol), float(tol)
+    # Roots of the information of each record, at each place.
+    roots = [_information_of_records(problem, np.append(z, np.zeros(problem.K - len(z))), tols) for z in places]
+    floors = [INVISIBLE_RATIO * np.linalg.norm(np.concatenate([prior_rows, *own]), 2) for own in roots]
 
     def evaluate(which: Sequence[int]) -> tuple[tuple[int, float], np.ndarray]:
-        rows = np.concatenate([prior_rows, *(roots[k] for k in which)])
-        return _score(_eliminate(rows, np.setdiff1d(np.arange(len(names)), wanted), floor), criterion, floor)
+        """Return the number of determined directions and the score, and the standard errors, with some of the candidates."""
+        found = []
+        for own, floor in zip(roots, floors, strict=True):
+            rows = np.concatenate([prior_rows, *(own[k] for k in which)])
+            found.append(_score(_eliminate(rows, np.setdiff1d(np.arange(len(names)), wanted), floor), criterion, floor))
+        (ranks, scores), errors = np.array([score for score, _ in found]).T, np.stack([errors for _, errors in found])
+        return (int(ranks.min()), float(scores.mean())), np.sqrt(np.mean((errors * dx_dz) ** 2, axis=0))
 
     alone = [evaluate([k]) for k in range(len(experiments))]
     chosen: list[int] = []
@@ -172,10 +190,10 @@ def design_experiment(
         tuple(names[k] for k in wanted),
         tuple(c.name for c in experiments),
         np.array([score if rank == full else nothing for (rank, score), _ in alone]),
-        np.stack([errors * dx_dz for _, errors in alone]),
+        np.stack([errors for _, errors in alone]),
         tuple(sorted(range(len(experiments)), key=lambda k: alone[k][0], reverse=True)),
         tuple(chosen),
-        np.stack([evaluate(chosen[: n + 1])[1] * dx_dz for n in range(pick)]),
+        np.stack([evaluate(chosen[: n + 1])[1] for n in range(pick)]),
     )
 
 
@@ -198,11 +216,43 @@ def _select_parameters(names: Sequence[str], of: str | Sequence[str] | None) -> 
     return np.array([names.index(name) for name in wanted])
 
 
-def _information_of_records(problem: FitProblem, tol: TolerancePair) -> list[np.ndarray]:
+def _mechanism(mechanism: Mechanism, given: Estimate | Posterior | None) -> Mechanism:
+    if isinstance(given, Posterior):
+        fit: Any = given.problem.fit_problem
+        return fit.mechanism
+    return mechanism if given is None else given.mechanism
+
+
+def _require_same(names: Sequence[str], given: Sequence[str], what: str) -> None:
+    if tuple(given) != tuple(names):
+        raise IdentificationError([f"given: is {what} of {', '.join(given)}, not of {', '.join(names)}"])
+
+
+def _places(problem: FitProblem, given: Estimate | Posterior | None) -> Float[np.ndarray, "S P"]:
+    """Return the parameters' unknowns at which experiments are predicted: zero, those of the mechanism; or all draws."""
+    u = problem.unknowns
+    if not isinstance(given, Posterior):
+        return np.zeros((1, len(u.names)))
+    fit = given.problem.fit_problem
+    _require_same(u.names, fit.unknowns.names, "a posterior")
+    x = fit.unknowns.values(given.x[..., : len(u.names)]).reshape(-1, len(u.names))
+    z = u.z_of(x)
+    if not np.isfinite(z).all():
+        outside = [name for name, known in zip(u.names, np.isfinite(z).all(0), strict=True) if not known]
+        raise IdentificationError([f"parameters: the bounds of {name} exclude draws of the posterior" for name in outside])
+    return z
+
+
+def _covariance_rows(z: Float[np.ndarray, "S P"]) -> np.ndarray:
+    """Return rows J, with J^T J the inverse of the covariance of draws."""
+    return np.linalg.inv(np.linalg.cholesky(np.cov(z.T).reshape(z.shape[1], -1)))
+
+
+def _information_of_records(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair) -> list[np.ndarray]:
     """Return rows J (., P) for each record, whose information is J^T J; no rows if a record cannot be computed."""
     P, fine = len(problem.unknowns.names), np.ones(len(problem.records), bool)
     reduced = [Reduction(problem.K) for _ in problem.records]
-    for block in problem.row_blocks(np.zeros((1, problem.K)), tol):
+    for block in problem.row_blocks(z[None], tol):
         count = block.count_before(len(problem.index))
         record, J = problem.index[block.row_numbers[:count], 0], block.J[0, :count]
         for k in np.unique(record).tolist():
@@ -222,8 +272,7 @@ def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarra
     priors[np.arange(len(which)), which] = u.dx_dz(np.zeros(len(u.names)))[which] / u.sigma[which]
     if given is None:
         return priors
-    if given.names != u.names:
-        raise IdentificationError([f"given: is an estimate of {', '.join(given.names)}, not of {', '.join(u.names)}"])
+    _require_same(u.names, given.names, "an estimate")
     P, earlier = len(u.names), given.problem.unknowns
     scale = np.append(given.uncertainty.noise, 1.0)[given.problem.noise_groups()]
     reduced = Reduction(given.problem.K)
