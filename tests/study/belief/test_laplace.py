@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import quad
 
 import udkjax as udk
 from tests.study.belief.test_log_density import record
@@ -73,3 +74,16 @@ def test_the_exponent_is_that_of_pareto_distributions(k):
     assert abs(np.mean(found) - k) < 0.05 and np.std(found) < 0.15
     assert_allclose(pareto_exponent(weights[0] + 700.0), found[0], rtol=1e-9)
     assert pareto_exponent(np.zeros(100)) == -np.inf
+
+
+def test_errors_of_means_and_deviations_are_those_of_integrals():
+    """A skew density with short tails, whose mode is 1 and whose curvature there is 1."""
+    parameter = udk.Parameter(idle, guess=1.0, transform="free")
+    density = lambda y: -(y**2) / 2 - 0.4 * y**3 - 0.3 * y**4  # noqa: E731
+    problem = udk.inference(pendulum(0.4), record(), parameter, priors={"idle": lambda x: density(x - 1.0)})
+    found = approximate(problem, problem.start)
+    total, first, second = (quad(lambda y, n=n: y**n * np.exp(density(y)), -6.0, 6.0)[0] for n in range(3))
+    mean = first / total
+    assert_allclose(found.shift, abs(mean), atol=0.08)
+    assert_allclose(found.ratio, 1.0 / np.sqrt(second / total - mean**2), rtol=0.08)
+    assert found.k < 0.5 and not found.trusted and "deviations by a factor of" in found.message
