@@ -24,6 +24,7 @@ SLOW: set[str] = {
     "nine_points",
     "spread",
     "atlas",
+    "curves",
     "properties",  # a slice of it: tests/properties
 }
 LARGER = {"atlas.nc": 2_000_000}  # bytes of a hundred thousand runs
