@@ -133,17 +133,17 @@ def solve_each(A: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(is_finite[:, None], x, np.nan)
 
 
-class _TreeMethod:
+class TreeMethod:
     """A method that is looked up on an instance as a tree."""
 
     def __init__(self, function: FunctionType):
-        self._function = function
+        self.function = function
         update_wrapper(self, function)  # pyright: ignore[reportArgumentType]
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:
-            return self._function
-        method = Partial(function := self._function, instance)
+            return self.function
+        method = Partial(function := self.function, instance)
         vars(method).update({key: getattr(function, key) for key in _DESCRIPTION})
         return method
 
@@ -162,7 +162,7 @@ class QuickMethods(eqx.Module):
             super().__init_subclass__(**given)
             for name, value in list(vars(cls).items()):
                 if isinstance(value, FunctionType) and not name.startswith("__"):
-                    setattr(cls, name, _TreeMethod(value))
+                    setattr(cls, name, TreeMethod(value))
 
 
 _DESCRIPTION = "__doc__", "__name__", "__qualname__", "__module__"

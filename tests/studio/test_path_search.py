@@ -22,7 +22,7 @@ def test_the_mechanisms_of_a_closed_path_turn_and_stay_within_their_deviation():
     assert found["designs"][0]["document"]["units"] == {"length": "cm"}
     for design in found["designs"][:1]:
         mechanism = udk.loads(design["text"])
-        curve = np.asarray(udk.path(mechanism, udk.simulate(mechanism, np.linspace(0.0, 1.0, 721)), "P"))
+        curve = np.asarray(udk.path(mechanism, udk.simulate(mechanism, np.linspace(0.0, 1.0, 14401)), "P"))
         off = np.linalg.norm(BEAN[:, None] - curve[None], axis=2).min(1).max()
         assert design["turns"] and off == pytest.approx(design["deviation"], rel=0.02)
     assert found["designs"][0]["deviation"] < 0.02 * found["extent"]

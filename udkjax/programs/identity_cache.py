@@ -85,7 +85,8 @@ def _cached_by_identity(function: Callable[..., Any], within_trace: bool) -> Any
                     cache.move_to_end(key)
             return stored[1]
         result = function(*args, **kwargs)
-        if not is_traced(result) or (within_trace and _traces(result) <= _traces(objects)):
+        given = _traces(objects) if within_trace else set()
+        if (within_trace and not given) or (_traces(result) <= given if within_trace else not is_traced(result)):
             store(key, objects, result)
         return result
 

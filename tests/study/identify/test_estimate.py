@@ -70,6 +70,7 @@ def estimate() -> Estimate:
         chi2=39.5,
         degrees_of_freedom=35,
     )
+    known.correlated_beyond = lambda least: ()
     known.notes = lambda name: Uncertainty.notes(known, name)
     found = Estimate(
         names=names,

@@ -21,6 +21,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from udkjax.arrays import TreeMethod
+
 _KNOWN = frozenset("abc builtins collections equinox functools itertools jax jaxlib jaxtyping math numpy operator typing".split())
 _FOLDERS = ("equations/laws", "native/language", "native/lowering", "native/parts", "native/pseudoinverses", "pinv")
 _PACKAGE = Path(__file__).parents[2]
@@ -107,6 +109,8 @@ class _Source:
                 self.add_all((x.__func__, x.__self__))
             case property():
                 self.add_all((x.fget,))
+            case TreeMethod():
+                self.add_all((x.function,))
             case staticmethod() | classmethod():
                 self.add_all((x.__func__,))
             case partial():

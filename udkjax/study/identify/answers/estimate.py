@@ -279,7 +279,7 @@ class Estimate:
             found.append(f"{channel.name} {np.nanmedian(self.noise[record][channel.name]):.3g} {channel.units}".rstrip())
         if found:
             facts["estimated noise"] = join_names(found)
-        if pairs := [f"{a} and {b} {rho:.2f}" for a, b, rho in uncertainty.correlated(PRINTED_CORRELATION)]:
+        if pairs := [f"{a} and {b} {rho:.2f}" for a, b, rho in uncertainty.correlated_beyond(PRINTED_CORRELATION)]:
             facts["correlated errors"] = ", ".join(pairs)
         return facts
 

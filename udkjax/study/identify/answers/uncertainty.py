@@ -107,7 +107,12 @@ class Uncertainty:
         errors = enumerate(self.standard_errors)
         return tuple(self.values.names[k] for k, error in errors if POOR_ERROR * self.values.typical(k) < error < np.inf)
 
-    def correlated(self, least: float = HIGH_CORRELATION) -> tuple[tuple[str, str, float], ...]:
+    @property
+    def correlated(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of parameters that are hardly known apart, and the correlation of their errors."""
+        return self.correlated_beyond(HIGH_CORRELATION)
+
+    def correlated_beyond(self, least: float) -> tuple[tuple[str, str, float], ...]:
         """Return pairs of parameters whose errors have a larger correlation than this, of either sign, and the correlation."""
         with np.errstate(invalid="ignore"):
             pairs = np.argwhere(np.triu(np.abs(self.correlation) > least, 1))
@@ -256,7 +261,7 @@ def _sentences(result: Uncertainty) -> Iterator[str]:
         error, unit = result.standard_errors[k], f" {values.units[k]}".rstrip()
         percent = f" ({100 * error / abs(values.x[k]):.0f} %)" if values.x[k] else ""
         yield f"{name} is poorly determined: {values.x[k]:.4g}{unit} with a standard error of {error:.2g}{unit}{percent}"
-    for one, other, rho in result.correlated():
+    for one, other, rho in result.correlated:
         yield f"{one} and {other} are hard to distinguish: the correlation of their errors is {rho:.4f}"
     if not result.noise.size and result.degrees_of_freedom > 0:
         yield from _noise_sentence(result.chi2, result.degrees_of_freedom)
