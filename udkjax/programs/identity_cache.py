@@ -74,6 +74,12 @@ def _cached_by_identity(function: Callable[..., Any], within_trace: bool) -> Any
             while len(cache) > CACHE_SIZE:
                 cache.popitem(last=False)
 
+    def holds(objects: tuple[Any, ...], result: Any) -> bool:
+        if not within_trace:
+            return not is_traced(result)
+        given = _traces(objects)
+        return not given or _traces(result) <= given  # a result of concrete numbers is not looked at: stand-ins would refuse
+
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         objects = (*args, *kwargs.values())
@@ -85,8 +91,7 @@ def _cached_by_identity(function: Callable[..., Any], within_trace: bool) -> Any
                     cache.move_to_end(key)
             return stored[1]
         result = function(*args, **kwargs)
-        given = _traces(objects) if within_trace else set()
-        if (within_trace and not given) or (_traces(result) <= given if within_trace else not is_traced(result)):
+        if holds(objects, result):
             store(key, objects, result)
         return result
 

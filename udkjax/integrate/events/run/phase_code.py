@@ -193,7 +193,7 @@ class PhaseCode:
         return _of(self._settings, members)[:, [self.plan.run.all_settings.index("atol")]]
 
     def tolerances(self, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b"]:
-        """Return the smaller tolerance of members, in units of the scene."""
+        """Return the smaller one of the relative tolerance and the absolute one, in units of the scene, of members."""
         return np.broadcast_to(_of(self._settings, members)[:, self._tolerances].min(axis=1), len(members))
 
     def run(
