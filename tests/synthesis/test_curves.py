@@ -63,6 +63,8 @@ def test_the_distance_of_parallel_lines_is_twice_their_gap():
         ([[1, 1]] * 5, "coincide"),
         ([[0, 0], [1, np.nan], [2, 0]], "finite"),
         ([[0, 0, 0]] * 4, "shape"),
+        ([[0, 0], [1e200, 0], [0, 1e200]], "another unit"),
+        ([[0, 0], [1e-200, 0], [0, 1e-200]], "another unit"),
     ],
 )
 def test_what_is_no_curve_is_refused(curve, message):
@@ -72,11 +74,36 @@ def test_what_is_no_curve_is_refused(curve, message):
 
 @pytest.mark.parametrize(
     ("limits", "message"),
-    [({"size": 0.05}, "size"), ({"bars": 3}, "bars"), ({"transmission": 2.0}, "transmission"), ({"part": "half"}, "part")],
+    [
+        ({"size": 0.05}, "size"),
+        ({"size": 0.0}, "size"),
+        ({"seconds": np.nan}, "seconds"),
+        ({"results": 0}, "results"),
+        ({"bars": 3}, "bars"),
+        ({"transmission": 2.0}, "transmission"),
+        ({"part": "half"}, "part"),
+    ],
 )
 def test_limits_that_contradict_each_other_are_refused(limits, message):
     with pytest.raises(ValueError, match=message):
         udk.mechanisms_for(ELLIPSE, **limits)
+
+
+def test_a_polygon_of_many_points_whose_last_side_is_missing_is_closed():
+    angle = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    polygon = as_points(np.exp(1j * angle))
+    assert WantedCurve(polygon).is_closed and not WantedCurve(polygon[:-1]).is_closed
+    assert not WantedCurve([[0, 0], [1, 0], [0.5, 1]]).is_closed
+
+
+def test_limits_that_no_linkage_keeps_give_a_reason():
+    found = udk.mechanisms_for(ELLIPSE, bars=4, transmission=1.5, seconds=0, progress=False)
+    assert not len(found) and "smaller transmission" in found.reason
+
+
+def test_a_curve_of_any_size_is_drawn():
+    found = udk.mechanisms_for(1e-12 * ELLIPSE, bars=4, seconds=0, results=1, progress=False)
+    assert found[0].error < 0.02
 
 
 def test_linkages_that_end_at_a_limit_are_kept():
@@ -128,8 +155,9 @@ def test_a_search_ends_in_the_middle_of_a_stage():
     search = CurveSearch(WantedCurve(ELLIPSE), LinkageLimits(0.98, 10.0, 0.02), 2, seed=0)
     next(search.stages())
     search.until = 0.0
-    with pytest.raises(OutOfTimeError):
-        search._grow(search.fresh, 1, np.random.default_rng(0))
+    for interrupted in (lambda: search._grow(search.fresh, 1, np.random.default_rng(0)), search.finish):
+        with pytest.raises(OutOfTimeError):
+            interrupted()
     search.until = np.inf
     search.finish(0.0)
     assert 0.0 < search.best < 0.1 and set(search.found) == {1}

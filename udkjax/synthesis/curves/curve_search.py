@@ -148,7 +148,8 @@ class CurveSearch:
         x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng)
         family = self.families + np.arange(len(x))
         self.families += len(x)
-        self._keep(beams, dyads, self._improve(Kept(x, topology, np.zeros(len(x)), family), OF_STARTS))
+        if len(x):
+            self._keep(beams, dyads, self._improve(Kept(x, topology, np.zeros(len(x)), family), OF_STARTS))
 
     def _grow(self, beams: dict[int, Kept], dyads: int, rng: np.random.Generator) -> None:
         if dyads not in beams or not len(beams[dyads].x):
@@ -191,11 +192,10 @@ class CurveSearch:
         if not new:
             return
         kept = kept.take(np.array(new))
-        self.finished.update(kept.loss)
         x = kept.x
         for blur, weight, steps in OF_FINISH:
-            after = self._descend(x, kept.topology, self.exact.weighed(weight), blur, steps)
-            x = after.x
+            x = self._descend(x, kept.topology, self.exact.weighed(weight), blur, steps).x
+        self.finished.update(kept.loss)  # not if time was over in between
         for k in range(len(x)):
             one = self.verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
             if one is not None:

@@ -15,7 +15,7 @@ from udkjax.synthesis.curves.targets import WantedCurve
 
 PIN = "P"  # name of the drawing pin
 TURN_VALUES = 720  # positions of a turn at which the constraints must hold
-CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to coordinates of its pins
+CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to coordinates of its pins, or to a turn
 DENSITY = 7850.0  # kg/m^3, of steel
 WIDTH, THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
 THIN = 1e-3  # a plate with a smaller area, relative to the square of its longest side, is drawn as a bar of a given mass
@@ -105,4 +105,6 @@ def states_of_turn(mechanism: Mechanism, x: np.ndarray, topology: Topology, want
 
 def is_closed_over_turn(mechanism: Mechanism, states: TurnStates, size: float) -> bool:
     """Return whether the mechanism's own constraints, with those of its motor, hold at all positions of a turn."""
-    return bool(np.abs(violation(mechanism, states)).max() <= CLOSED_TO * size)
+    open_by = np.abs(violation(mechanism, states))
+    of_motor = len(mechanism.drivers)  # the last rows, in rad
+    return bool(open_by[:, :-of_motor].max() <= CLOSED_TO * size and open_by[:, -of_motor:].max() <= CLOSED_TO * FULL_TURN)

@@ -47,7 +47,7 @@ def mechanisms_for(
     by dyads, at first without a change of the curve, and are improved again, up to the number of bars.
 
     Args:
-        curve: points (n, 2) (m), in order; the curve is closed if its ends nearly meet.
+        curve: points (n, 2) (m), in order; the curve is closed if its ends nearly meet, as if one more of its steps joined them.
         bars: largest number of links, with the ground; a dyad has two.
         size: largest distance (m) of any pin from the middle of the curve, over the whole turn; by default three times the extent
             of the curve.

@@ -9,14 +9,16 @@ from udkjax.requirements import require_finite
 
 CHAMFER_POINTS = 2000  # points of each curve by which distances are measured
 FEWEST = 3  # points of a curve
+LARGEST = 1e30  # extent (m) of a curve, and one over the smallest: the fifth powers of both, in moments of inertia, are finite
 CLOSED = 0.02  # a curve whose ends are nearer, relative to its length, is closed
+SPACING, SPACED = 1.25, 12  # so is one of at least so many points whose ends are nearer than their usual distance, times this
 
 
 def read_curve(curve: object) -> np.ndarray:
     """Return the points (n, 2) of a curve (m) without repetitions.
 
     Raises:
-        ValueError: they are not finite points, there are fewer than three, or all coincide.
+        ValueError: they are not finite points, there are fewer than three, or all coincide, or squares of numbers would overflow.
     """
     require_finite("curve", curve)
     points = np.asarray(curve, float)
@@ -24,17 +26,20 @@ def read_curve(curve: object) -> np.ndarray:
         raise ValueError(f"curve must have the shape (n, 2), one row x, y for each point, not {points.shape}")
     if len(points) < FEWEST:
         raise ValueError(f"curve must have at least {FEWEST} points, not {len(points)}")
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    size = float(np.hypot(*np.ptp(points, axis=0)))
     if not size > 4 * np.finfo(float).eps * np.abs(points).max():
         raise ValueError("curve has no size: all of its points coincide")
+    if not 1.0 / LARGEST < size < LARGEST:
+        raise ValueError(f"curve has an extent of {size:.3g} m: give it in another unit, between {1 / LARGEST:g} and {LARGEST:g}")
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return points[np.concatenate([[True], step > np.finfo(float).eps * size])]
 
 
 def closes(points: np.ndarray) -> bool:
-    """Return True if the ends of a curve nearly meet."""
-    length = float(np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    return float(np.linalg.norm(points[0] - points[-1])) <= CLOSED * length
+    """Return True if the ends of a curve nearly meet, or if only the last side of a polygon of many points is missing."""
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    usual = SPACING * float(np.median(step)) if len(points) >= SPACED else 0.0
+    return float(np.linalg.norm(points[0] - points[-1])) <= max(CLOSED * float(step.sum()), usual)
 
 
 def resampled(points: np.ndarray, count: int, is_closed: bool = False) -> np.ndarray:
