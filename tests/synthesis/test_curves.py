@@ -139,6 +139,11 @@ def test_without_time_there_is_the_best_so_far():
     assert len(found) == 1 and found[0].bars == 4 and found.rounds == 0 and "1 mechanisms" in str(found)
 
 
+def test_a_curve_that_no_four_bar_draws_within_the_limits_has_a_design_even_without_time():
+    found = udk.mechanisms_for([[0, 6], [0, 0], [2, 4], [4, 0], [4, 6]], seconds=0, results=1, progress=False)
+    assert len(found) == 1 and found[0].bars == 6
+
+
 def test_an_interruption_ends_with_the_best_so_far():
     seen = []
 

@@ -138,11 +138,18 @@ class CurveSearch:
         return min((one.error for found in self.found.values() for one in found), default=np.inf)
 
     def finish(self, until: float = np.inf) -> None:
-        """Finish the best linkages, the most promising first, also of an incomplete round; after a time only the first ones."""
+        """Finish the best linkages, the most promising first, also of an incomplete round; after a time only the first ones.
+
+        While none is within the limits, the next ones are tried.
+        """
         self._merge()
-        for dyads in sorted((d for d, kept in self.beams.items() if len(kept.x)), key=lambda d: self.beams[d].loss[0]):
+        order = sorted((d for d, kept in self.beams.items() if len(kept.x)), key=lambda d: self.beams[d].loss[0])
+        for dyads in order:
             if time.monotonic() < until or not self.found:
                 self._finish(dyads)
+        for dyads in order:
+            while not self.found and self._finish(dyads):
+                pass
 
     def _start(self, beams: dict[int, Kept], dyads: int, rng: np.random.Generator) -> None:
         x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng)
@@ -166,7 +173,6 @@ class CurveSearch:
         """Add the linkages of this round to those of all rounds."""
         for dyads, kept in self.fresh.items():
             self._keep(self.beams, dyads, kept)
-        self.fresh = {}
 
     def _improve(self, kept: Kept, parts: tuple[tuple[float, float, int, int], ...]) -> Kept:
         for part in parts:
@@ -186,11 +192,13 @@ class CurveSearch:
         results = list(self.threads.map(lambda part: descend(x[part], topology.take(part), task, blur, steps), batches))
         return Descended(*(np.concatenate(a) for a in zip(*results, strict=True)))
 
-    def _finish(self, dyads: int) -> None:
+    def _finish(self, dyads: int) -> bool:
+        """Finish the best linkages of a number of dyads, or the next ones if there is no result; return False if all are."""
         kept = self.beams[dyads]
-        new = [k for k, loss in enumerate(kept.loss) if k < FINISHED and loss not in self.finished]
+        new = [k for k, loss in enumerate(kept.loss) if loss not in self.finished and (k < FINISHED or not self.found)]
+        new = new[:FINISHED]
         if not new:
-            return
+            return False
         kept = kept.take(np.array(new))
         x = kept.x
         for blur, weight, steps in OF_FINISH:
@@ -200,6 +208,7 @@ class CurveSearch:
             one = self.verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
             if one is not None:
                 self.found[one.dyads] = sorted([*self.found.get(one.dyads, []), one], key=lambda f: f.error)[:BEAM]
+        return True
 
     def verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
         """Return the linkage if it is within the limits over the whole turn."""

@@ -52,8 +52,8 @@ def mechanisms_for(
         size: largest distance (m) of any pin from the middle of the curve, over the whole turn; by default three times the extent
             of the curve.
         results: largest number of designs to return.
-        seconds: time after which the search ends, with the best designs so far (s). It begins with one stage in any case, some
-            seconds, and ends earlier when the drawn curve is as near as samples of the same curve are to each other.
+        seconds: time after which the search ends, with the best designs so far (s). It runs until there is a design in any
+            case, some seconds, and ends earlier when the drawn curve is as near as samples of the same curve are to each other.
         seed: seed of the random linkages. The result follows from the seed and the number of completed stages, which depends on
             the time; give `rounds`, and enough seconds, for a result that does not.
         part: "free": an open curve is drawn by any part of the turn; "whole": by the whole turn, forth and back.
@@ -87,7 +87,9 @@ def _run(search: CurveSearch, seconds: float, rounds: int | None, begun: float, 
     try:
         with report_progress(progress, seconds or None, "mechanisms_for") as report:
             for stage in search.stages():
-                search.until = begun + GROWING * seconds
+                if not search.found:  # from now on there is something to return
+                    search.finish()
+                search.until = begun + GROWING * seconds if search.found or done else np.inf
                 error = f", error {search.best:.4g}" if np.isfinite(search.best) else ""
                 report(min(time.monotonic() - begun, seconds), stage + error)
                 if stage.endswith("finished"):
