@@ -14,7 +14,9 @@ def export(
     /,
     c: Path | None = None,
     fmu: Path | None = None,
-    what: tuple[Literal["run", "accelerations", "derivatives", "projection", "positions"], ...] = FUNCTIONS,
+    what: tuple[
+        Literal["run", "accelerations", "derivatives", "projection", "positions", "position_derivatives"], ...
+    ] = FUNCTIONS,
     kinds: tuple[Literal["co-simulation", "model-exchange"], ...] = ("co-simulation", "model-exchange"),
     parameters: tuple[str, ...] | None = None,
     inputs: tuple[str, ...] | None = None,

@@ -184,14 +184,24 @@ def test_every_scene_runs_in_c(name, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*sorted(udk.library.__all__), *DRAWINGS], ids=lambda x: Path(x).stem)
 def test_every_scene_has_derivatives_in_c_along_its_motion(name, tmp_path):
-    """Along the motion, directions keep redundant constraints compatible."""
+    """Changes of the state are projected onto the constraints, which keeps redundant ones compatible."""
     mechanism = udk.load(name) if name.endswith(".toml") else getattr(udk.library, name)(*([3] if name == "n_four_bar" else []))
-    code = udk.export_c(mechanism, tmp_path, ["derivatives"])
+    code = udk.export_c(mechanism, tmp_path, ["derivatives", "position_derivatives"])
     library, run = compiled(tmp_path), udk.simulate(mechanism, [0.0, 0.003, 0.006])
-    q, v = flat(run.q[1], run.v[1])
-    a = np.ravel(udk.accelerations(mechanism, 0.0, q, v))
-    found = derivative_in_c(library, code, scene_numbers(library, code.prefix), np.zeros(10_000), q, v, v, a)
-    wanted = jax.jvp(lambda q, v: jax.numpy.ravel(udk.accelerations(mechanism, 0.0, q, v)), (q, v), (v, a))
+    q, v, given = *flat(run.q[1], run.v[1]), scene_numbers(library, code.prefix)
+    changes = np.random.default_rng(0).normal(size=(2, len(q)))
+    closed, memory = np.zeros((2, len(q))), np.full(code.memory["position_derivatives"] // 8, np.nan)
+    arrays = [numbers(x) for x in (q, v, np.zeros(10_000), *changes, closed, memory)]
+    getattr(library, f"{code.prefix}_close_along")(given, ctypes.c_double(run.ts[1]), *arrays)
+
+    def close(q, v):
+        state = udk.assemble(mechanism, run.ts[1], udk.State(q.reshape(-1, 3), v.reshape(-1, 3)))
+        return jax.numpy.stack([state.q.ravel(), state.v.ravel()])
+
+    wanted = jax.jvp(close, (q, v), tuple(changes))[1]
+    assert_allclose(closed, wanted, rtol=0.0, atol=1e-11 * np.abs([changes, wanted]).max())
+    found = derivative_in_c(library, code, given, np.zeros(10_000), q, v, *closed)
+    wanted = jax.jvp(lambda q, v: jax.numpy.ravel(udk.accelerations(mechanism, 0.0, q, v)), (q, v), tuple(closed))
     for x, y in zip(found, wanted, strict=True):
         assert_allclose(x, y, rtol=0.0, atol=1e-11 * np.abs(wanted).max())
     undefined = subprocess.run(["nm", "-u", "code.so"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout.split()

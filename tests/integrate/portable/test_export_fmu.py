@@ -7,6 +7,8 @@ import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -23,8 +25,8 @@ LOG = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, cty
 DRIVE = "force.motor.value"
 
 
-def options():
-    return ["-O1", *filter(None, [fused()])]
+def options(level="-O0"):
+    return [level, *filter(None, [fused()])]
 
 
 def pendulum() -> udk.Mechanism:
@@ -75,6 +77,14 @@ class Instance:
     def set(self, **values: float) -> int:
         return self._access("SetFloat64", [self.references[x] for x in values], np.array([*values.values()], float))
 
+    def derivative(self, kind: str, unknowns, knowns, seed) -> np.ndarray:
+        """Return the directional derivative along a seed of the knowns, or the adjoint one of a seed of the unknowns."""
+        lists = [np.array([self.references[x] for x in names], np.uint32) for names in (unknowns, knowns)]
+        found = np.zeros(len(unknowns if kind == "Directional" else knowns))
+        arrays = [(x.ctypes.data_as(ctypes.c_void_p), ctypes.c_size_t(len(x))) for x in (*lists, np.array(seed, float), found)]
+        assert self.call(f"Get{kind}Derivative", *(x for pair in arrays for x in pair)) == OK, self.messages
+        return found
+
     def step(self, t: float, dt: float) -> int:
         flags = [ctypes.byref(ctypes.c_bool()) for _ in range(3)]
         reached = ctypes.byref(ctypes.c_double())
@@ -100,7 +110,7 @@ def fmu(tmp_path_factory):
 
 @pytest.fixture
 def instance(fmu, tmp_path):
-    return lambda kind: Instance(fmu.file, tmp_path, kind)
+    return lambda kind: Instance(fmu.file, tmp_path / kind, kind)
 
 
 def states(mechanism: udk.Mechanism) -> list[str]:
@@ -219,6 +229,58 @@ def test_model_exchange_evaluates_the_projected_state_and_lets_drift_decay(insta
     assert_array_equal(one.vector("GetContinuousStates", 6), one.get(*names))
 
 
+def closed(mechanism: udk.Mechanism, state):
+    """Return a state near the constraints, projected onto them to first order, and its accelerations; by the textbook."""
+    (q, v), of = state.reshape(2, -1), udk.equations
+    mass = of.mass(mechanism)
+
+    def corrected(x, left, at):
+        rows = of.psi_q(mechanism, 0.0, at)
+        return x - (rows / mass).T @ jnp.linalg.solve((rows / mass) @ rows.T, left)
+
+    q = corrected(q, of.psi(mechanism, 0.0, q), q)
+    v = corrected(v, of.psi_dot(mechanism, 0.0, q, v), q)
+    return jnp.concatenate([q, v, jnp.ravel(udk.accelerations(mechanism, 0.0, q, v))])
+
+
+def test_derivatives_equal_those_of_jax_forward_and_adjoint(instance):
+    mechanism, rng, names = pendulum(), np.random.default_rng(0), states(pendulum())
+    knowns, a = [*(f"state.{x}" for x in names), DRIVE], ["body.rod.ax", "body.rod.ay", "body.rod.alpha"]
+    rates = [f"der(state.{x})" for x in names]
+    one, other = instance("ModelExchange"), instance("CoSimulation")
+    for x in (one, other):
+        assert x.set(**{"body.rod.mass": 1.7, "state.body.rod.angle": 0.3, "state.body.rod.omega": 2.0}) == OK
+
+    def begun(p):
+        given = {"body.rod.mass": p[0], DRIVE: p[1], "gravity": p[2:4], "body.rod.angle": p[4], "body.rod.angular_velocity": p[5]}
+        changed = mechanism.with_parameters(given)
+        state = udk.assemble(changed)
+        return jnp.concatenate([jnp.ravel(x) for x in (state.q, state.v, udk.accelerations(changed, 0.0, state.q, state.v))])
+
+    p, seed = np.array([1.7, 0.0, 0.0, -9.81, 0.3, 2.0]), rng.normal(size=6)
+    assert one.call("EnterInitializationMode", False, ctypes.c_double(0.0), ctypes.c_double(0.0), False, ctypes.c_double(0.0)) == OK
+    of = ["body.rod.mass", DRIVE, "gravity[0]", "gravity[1]", "state.body.rod.angle", "state.body.rod.omega"]
+    found, wanted = one.derivative("Directional", [*names, *a], of, seed), jax.jit(lambda p: jax.jvp(begun, (p,), (seed,)))(p)[1]
+    assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
+    assert one.call("ExitInitializationMode") == OK and one.update() == (False, None)
+    assert one.call("EnterContinuousTimeMode") == OK and other.begin() == OK
+
+    start = one.get(*(f"state.{x}" for x in names))
+    values = jax.jit(jax.jacfwd(lambda x: closed(mechanism.with_parameters({"body.rod.mass": 1.7, DRIVE: x[6]}), x[:6])))
+    jacobian = np.asarray(values(np.append(start, 0.0)))
+    drift = (one.derivative("Directional", rates, knowns, seed := rng.normal(size=7)) - jacobian[3:] @ seed) / (
+        jacobian[:6] @ seed - seed[:6]
+    )
+    assert_allclose(drift, drift[0], rtol=1e-9)  # the rate at which it decays
+    found = np.transpose([one.derivative("Directional", [*names, *a], knowns, x) for x in np.eye(7)])
+    assert_allclose(found, jacobian, rtol=0.0, atol=1e-12 * np.abs(jacobian).max())
+    assert_allclose(one.derivative("Adjoint", [*names, *a], knowns, seed := rng.normal(size=9)), seed @ found, rtol=1e-13, atol=1e-12)
+    step = other.derivative("Directional", [*names, *a], [DRIVE], [1.0])  # an input does not move the state at once
+    assert_allclose(step, [0.0] * 6 + [*jacobian[6:, 6]], rtol=0.0, atol=1e-12 * np.abs(jacobian).max())
+    with pytest.raises(AssertionError, match="no derivative with respect to variable 0"):
+        one.derivative("Directional", a, ["time"], [1.0])
+
+
 def test_a_drawing_s_pins_move_the_start(tmp_path):
     mechanism = udk.library.slider_crank()
     found = udk.export_fmu(mechanism, tmp_path / "a.fmu", ["co-simulation"], ["pin.P"], stiff=False, options=["-O0"])
@@ -261,7 +323,7 @@ def test_every_scene_runs_in_an_importer(name, tmp_path):
 
     mechanism, file = scene(name), str(tmp_path / "a.fmu")
     end = 0.03 if name == "andrews_squeezer" else 2.0
-    found = udk.export_fmu(mechanism, file, t1=end, dt=end / 40, options=options())
+    found = udk.export_fmu(mechanism, file, t1=end, dt=end / 40, options=options("-O1"))
     assert validate_fmu(file) == []
     names, dt = found.outputs[: 6 * len(mechanism.bodies)], end / 40
     given = {"stop_time": end, "output_interval": dt, "output": names}
@@ -284,7 +346,7 @@ def test_every_scene_runs_in_an_importer(name, tmp_path):
 def test_model_exchange_stays_closed_through_singular_poses(tmp_path):
     fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: pip install fmpy")
     mechanism = udk.library.parallelogram()
-    found = udk.export_fmu(mechanism, tmp_path / "a.fmu", options=options())
+    found = udk.export_fmu(mechanism, tmp_path / "a.fmu", options=options("-O1"))
     ts, names = np.linspace(0.0, 20.0, 401), found.outputs[:24]
     run, errors = udk.simulate(mechanism, ts, rtol=1e-12, atol=1e-12), []
     wanted = np.hstack([np.asarray(x).reshape(401, -1) for x in (run.q, run.v)])

@@ -17,7 +17,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 
-What = Literal["run", "accelerations", "derivatives", "projection", "positions"]
+What = Literal["run", "accelerations", "derivatives", "projection", "positions", "position_derivatives"]
 DOCUMENTED = {
     "run": """/* Integrate, and project each step onto the constraints: positions qs and velocities vs (times, {N})
    at the times ts, which increase (s), from the closed state q, v; the largest violation of the constraints at each
@@ -36,9 +36,6 @@ void {p}_accelerations(const double *numbers, double t, const double *q, const d
    dq of positions and dv of velocities. A column of a Jacobian is the derivative along a unit vector. */
 void {p}_accelerations_along(const double *numbers, double t, const double *q, const double *v, const double *dnumbers,
     const double *dq, const double *dv, double *a, double *da, double *memory);
-
-/* Write changes of the numbers. `parameters` has the parameters, and then their changes. */
-void {p}_set_parameters_along(const double *parameters, double *dnumbers);
 """,
     "projection": """/* Return a state that has drifted to the constraints. */
 void {p}_project(const double *numbers, double t, double *q, double *v, double *memory);
@@ -48,9 +45,19 @@ void {p}_project(const double *numbers, double t, double *q, double *v, double *
    below 1e-9 if the mechanism could be closed. */
 double {p}_close(const double *numbers, double t, double *q, double *v, double *memory);
 """,
+    "position_derivatives": """/* Derivative dstate (of the closed q, then of v) of {p}_close from a guess q, v, along changes dnumbers
+   of the numbers, dq and dv of the guess. At a closed state it is that of {p}_project as well. */
+void {p}_close_along(const double *numbers, double t, const double *q, const double *v, const double *dnumbers,
+    const double *dq, const double *dv, double *dstate, double *memory);
+""",
 }
+ALONG = """/* Write changes of the numbers. `parameters` has the parameters, and then their changes. */
+void {p}_set_parameters_along(const double *parameters, double *dnumbers);
+"""
+DIFFERENTIATED = {"derivatives", "position_derivatives"}
 FUNCTIONS = {"run": SceneCode.run, "accelerations": SceneCode.accelerations, "projection": SceneCode.projection}
 FUNCTIONS |= {"derivatives": SceneCode.derivatives, "positions": SceneCode.positions}
+FUNCTIONS |= {"position_derivatives": SceneCode.position_derivatives}
 
 
 class ExportedCode(NamedTuple):
@@ -92,7 +99,8 @@ def export_c(
         mechanism: the scene, with concrete numbers. Its thresholds of rank follow from these numbers.
         folder: the folder to write, which is made if it does not exist.
         what: functions to write: "run", a step with projection and whole runs; "accelerations"; their "derivatives" along a
-            direction; "projection" of a state; and "positions", closed from a guess, as for a mechanism that is driven.
+            direction; "projection" of a state; "positions", closed from a guess, as for a mechanism that is driven; and
+            "position_derivatives", the derivatives of these along a direction.
         ts: output times of the program (s); by default 0 to 20 s in steps of 0.05 s.
         parameters: names of numbers that a function of the C changes, as in `with_parameters`.
         rtol: relative tolerance of a step.
@@ -131,7 +139,7 @@ def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]
     header = _header(scene, {name: unit for name, (_, unit) in units.items()}, names[1])
     files = {f"{scene.prefix}.h": header, f"{scene.prefix}_numbers.c": _numbers(scene, names)}
     files |= {f"{scene.prefix}_{name}.c": text for name, (text, _) in units.items()}
-    if "derivatives" in units:
+    if DIFFERENTIATED & {*units}:
         files[f"{scene.prefix}_along.c"] = f'#include "{scene.prefix}.h"\n{scene.parameters_along(parameters)}'
     return files, {name: unit for name, (_, unit) in units.items()}
 
@@ -144,6 +152,7 @@ def _header(scene: SceneCode, units: dict[str, CUnit], parameters: dict[str, flo
         f"#define {big}_{k.upper()}_MEMORY {u.memory} /* numbers, {8 * u.memory} bytes */" for k, u in units.items()
     )
     documented = "\n".join(DOCUMENTED[name].format(**fill) for name in units)
+    documented += f"\n{ALONG.format(p=p)}" if DIFFERENTIATED & {*units} else ""
     bodies = ", ".join(scene.mechanism.body_names)
     return f"""/* {(scene.mechanism.name or "a mechanism").replace("*/", "")}: written by udkjax {versions()["udkjax"]}.
 

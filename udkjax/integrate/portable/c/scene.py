@@ -184,24 +184,38 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
 
     def positions(self) -> tuple[str, CUnit]:
         """Return `close`."""
-        operation = Close(scene_programs(self.mechanism).with_all_rows)
-        scales, m, n = self.analysis.scales, operation.code.row_count, self.n
-        tol = float(scales.rank_tol)
-        count = len(self._own_numbers)
+        n, m = self.n, self.operation.code.row_count
         head = f"double {self.prefix}_close(const double *numbers, double t, double *q, double *v, double *memory)"
-        before = f"""    double own[{count + 2}], found[{2 * n}], left[{2 * m or 1}], rank[1], largest = 0.0;
-    memcpy(own, numbers, {count} * sizeof *own);
-    own[{count}] = {number_text(tol**2)};
-    own[{count + 1}] = 0.0;
-"""
         after = f"""    memcpy(q, found, {n} * sizeof *q);
     memcpy(v, found + {n}, {n} * sizeof *v);
     for (int i = 0; i < {m}; i++) largest = fabs(left[i]) / rows[i] > largest ? fabs(left[i]) / rows[i] : largest;
     return largest;
 """
-        results = dict(zip(c_unit(operation).module.results, ("found", "left", "rank"), strict=True))
+        return self._closing(self._close, head, f"    double found[{2 * n}], largest = 0.0;\n", {"state": "found"}, after)
+
+    def position_derivatives(self) -> tuple[str, CUnit]:
+        """Return the derivative of `close` along a direction."""
+        operation = self._close.with_tangents((True,) * self._close.code.number_count)
+        head = f"""void {self.prefix}_close_along(const double *numbers, double t, const double *q, const double *v,
+    const double *dnumbers, const double *dq, const double *dv, double *dstate, double *memory)"""
+        along = {"directions": "1", "dnumbers": "dnumbers", "dq": "dq", "dv": "dv", "dstate": "dstate"}
+        return self._closing(operation, head, f"    double found[{2 * self.n}];\n", {"state": "found"} | along)
+
+    @property
+    def _close(self) -> Close:
+        return Close(scene_programs(self.mechanism).with_all_rows)
+
+    def _closing(self, operation: Close, head: str, before: str, values: dict, after: str = "") -> tuple[str, CUnit]:
+        m, scales = operation.code.row_count, self.analysis.scales
+        tol, count = float(scales.rank_tol), len(self._own_numbers)
+        before += f"""    double own[{count + 2}], left[{2 * m or 1}], rank[1];
+    memcpy(own, numbers, {count} * sizeof *own);
+    own[{count}] = {number_text(tol**2)};
+    own[{count + 1}] = 0.0;
+"""
         settings = {"length": scales.length, "fallback_tol": tol}
-        return self._of_state(operation, head, {"numbers": "own", **results}, before, after, settings)
+        results = {"numbers": "own", "residuals": "left", "rank": "rank"}
+        return self._of_state(operation, head, results | values, before, after, settings)
 
     @property
     def evaluation(self) -> StateOperation:

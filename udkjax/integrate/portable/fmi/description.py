@@ -9,6 +9,7 @@ from udkjax.integrate.solution import versions
 
 BASES = {"m": {"m": 1}, "kg": {"kg": 1}, "s": {"s": 1}, "rad": {"rad": 1}, "N": {"kg": 1, "m": 1, "s": -2}}
 ABLE = {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
+DIFFERENTIABLE = {"providesDirectionalDerivatives": "true", "providesAdjointDerivatives": "true"}
 KINDS = {  # in the order of the schema
     "model-exchange": ("ModelExchange", {"needsCompletedIntegratorStep": "true"}),
     "co-simulation": ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
@@ -30,7 +31,8 @@ def model_description(
         rtol: relative tolerance.
     """
     exchange = "model-exchange" in kinds
-    interfaces = [_tag(KINDS[kind][0], {"modelIdentifier": prefix} | KINDS[kind][1] | ABLE) for kind in kinds]
+    able = ABLE | (DIFFERENTIABLE if exchange else {})
+    interfaces = [_tag(KINDS[kind][0], {"modelIdentifier": prefix} | KINDS[kind][1] | able) for kind in kinds]
     start, stop, step = times
     experiment = {"startTime": start, "stopTime": stop, "tolerance": rtol, "stepSize": step}
     units = sorted({x.unit for x in (*variables.coordinates, *variables.rates, *variables.values)} - {""} | {"s"})

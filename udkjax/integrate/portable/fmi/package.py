@@ -30,6 +30,8 @@ ALIASES = {
     "positions": ("SCENE_CLOSE", "close"),
     "projection": ("SCENE_PROJECT", "project"),
     "accelerations": ("SCENE_ACCELERATIONS", "accelerations"),
+    "derivatives": ("SCENE_ACCELERATIONS_ALONG", "accelerations_along"),
+    "position_derivatives": ("SCENE_CLOSE_ALONG", "close_along"),
 }
 
 
@@ -72,7 +74,8 @@ def export_fmu(
     """Write a scene as an FMU by FMI 3.0, for co-simulation and model exchange, with its sources in C.
 
     In co-simulation, each step of the importer is an interval as by `step`. In model exchange the importer integrates; the FMU
-    evaluates the equations at the state projected onto the constraints, so that its outputs satisfy these.
+    evaluates the equations at the state projected onto the constraints, so that its outputs satisfy these. FMUs with model exchange
+    have directional and adjoint derivatives.
 
     Args:
         mechanism: the scene, with concrete numbers. Its thresholds of rank follow from these numbers.
@@ -130,7 +133,7 @@ def _further(scene: SceneCode, kinds: Sequence[str]) -> list[str]:
         _ = scene.evaluation
     except ArgumentError as error:
         raise ArgumentError(f"no model exchange: {error}; give kinds=['co-simulation']") from None
-    return [*closing, "projection", "accelerations"]
+    return [*closing, "projection", "accelerations", "derivatives", "position_derivatives"]
 
 
 def _model(scene: SceneCode, variables: FMUVariables, what: Sequence[str], memory: int, kinds: Sequence[str]) -> str:
@@ -138,7 +141,8 @@ def _model(scene: SceneCode, variables: FMUVariables, what: Sequence[str], memor
     p, big, values = scene.prefix, scene.prefix.upper(), variables.values
     lines = [f"#define {name} {p}_{function}" for key, (name, function) in ALIASES.items() if key in what]
     lines += [f"#define scene_{x} {p}_{x}" for x in ("numbers", "q0", "v0", "set_parameters", "result_name", "step")]
-    lines += ["#define MODEL_EXCHANGE"] if "model-exchange" in kinds else []
+    if "model-exchange" in kinds:
+        lines += ["#define MODEL_EXCHANGE", f"#define SCENE_SET_ALONG {p}_set_parameters_along"]
     breaks, scales = scene.inputs["breaks"], scene.analysis.scales
     length, rate = float(np.ravel(scales.length)[0]), float(np.ravel(scales.rate)[0])
     size = np.tile([length, length, 1.0], scene.n // 3)

@@ -23,7 +23,7 @@ enum { FIRST_Q = 1, FIRST_V = FIRST_Q + N, FIRST_A = FIRST_V + N, FIRST_STATE = 
 
 typedef struct {
     double t, state[2 * N], values[VALUES + 1], numbers[NUMBERS];
-    char given[2 * N]; /* whether the importer has set a state */
+    double given[2 * N]; /* start values that the importer has set, else NAN */
     int mode;
     int stale; /* whether `numbers` lack changes of `values` */
     int open;  /* whether the state is a guess that has to be closed */
@@ -81,7 +81,7 @@ static void begin_at_guess(State *s)
     int moved = 0;
     for (int k = 0; k < 2 * N; k++) moved |= s->numbers[guess[k]] != scene_numbers[guess[k]];
     for (int k = 0; k < 2 * N; k++)
-        if (moved && !s->given[k]) s->state[k] = s->numbers[guess[k]];
+        if (moved && isnan(s->given[k])) s->state[k] = s->numbers[guess[k]];
 }
 
 /* Bring numbers up to date, and close a guess. */
@@ -162,6 +162,7 @@ static void reset(Instance *m)
     memcpy(m->now.values, start_values, VALUES * sizeof *start_values);
     m->now.t = START_TIME;
     m->now.mode = INSTANTIATED;
+    for (int k = 0; k < 2 * N; k++) m->now.given[k] = NAN;
     m->stop = INFINITY;
     forget(m);
 }
@@ -298,7 +299,7 @@ FMI fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference re
     for (size_t i = 0; i < n; i++) {
         const fmi3ValueReference k = references[i];
         double *to = k < FIRST_RATE ? m->now.state + (k - FIRST_STATE) : m->now.values + (k - FIRST_VALUE);
-        if (k < FIRST_RATE) m->now.given[k - FIRST_STATE] = 1;
+        if (k < FIRST_RATE) m->now.given[k - FIRST_STATE] = values[i];
         if (*to == values[i]) continue;
         *to = values[i];
         m->now.open |= k < FIRST_VALUE + VALUES - INPUTS; /* an input moves no pose */
@@ -527,6 +528,81 @@ FMI fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 values[
     return n ? report(m, fmi3Error, "the FMU has no event indicators") : fmi3OK;
 }
 
+/* --- derivatives */
+
+#ifdef MODEL_EXCHANGE
+/* Turn changes d of the state and of values, at their value references, into those of all unknowns. Before the run, the state is
+   the guess, closed; in model exchange it is projected; in co-simulation it stays until the next step. */
+static fmi3Status push(Instance *m, double *d)
+{
+    State *s = &m->now;
+    const fmi3Status status = find_accelerations(m);
+    double values[2 * VALUES + 1], numbers[NUMBERS], guessed[2 * N], changes[2 * N], *change = d + FIRST_STATE;
+    if (status) return status;
+    memcpy(values, s->values, VALUES * sizeof *values);
+    memcpy(values + VALUES, d + FIRST_VALUE, VALUES * sizeof *values);
+    SCENE_SET_ALONG(values, numbers);
+    memcpy(guessed, m->closed, sizeof guessed);
+    memcpy(changes, change, sizeof changes);
+    for (int k = 0; k < 2 * N && s->mode & BEFORE; k++) {
+        const int is_given = !isnan(s->given[k]);
+        guessed[k] = is_given ? s->given[k] : s->numbers[guess[k]];
+        changes[k] += is_given ? 0.0 : numbers[guess[k]];
+    }
+    if (m->is_model_exchange || s->mode & BEFORE)
+        SCENE_CLOSE_ALONG(s->numbers, s->t, guessed, guessed + N, numbers, changes, changes + N, d + FIRST_Q, m->memory);
+    else
+        memcpy(d + FIRST_Q, changes, sizeof changes);
+    if (s->mode & BEFORE) memcpy(change, d + FIRST_Q, sizeof changes);
+    SCENE_ACCELERATIONS_ALONG(s->numbers, s->t, m->closed, m->closed + N, numbers, d + FIRST_Q, d + FIRST_V, guessed, d + FIRST_A,
+        m->memory);
+    for (int k = 0; k < 2 * N; k++) d[FIRST_RATE + k] = d[FIRST_V + k] + DECAY * (d[FIRST_Q + k] - change[k]);
+    return fmi3OK;
+}
+
+static fmi3Status check_variables(const Instance *m, const fmi3ValueReference unknowns[], size_t n_unknowns,
+    const fmi3ValueReference knowns[], size_t n_knowns)
+{
+    for (size_t i = 0; i < n_unknowns; i++)
+        if (unknowns[i] == 0 || unknowns[i] >= FIRST_VALUE)
+            return report(m, fmi3Error, "there is no derivative of variable %u", (unsigned)unknowns[i]);
+    for (size_t i = 0; i < n_knowns; i++)
+        if (knowns[i] < FIRST_STATE || (knowns[i] >= FIRST_RATE && knowns[i] < FIRST_VALUE) || knowns[i] >= END)
+            return report(m, fmi3Error, "there is no derivative with respect to variable %u", (unsigned)knowns[i]);
+    return fmi3OK;
+}
+
+#define DERIVATIVE(name, seeds, results) \
+    FMI fmi3Status name(fmi3Instance instance, const fmi3ValueReference unknowns[], size_t n_unknowns, \
+        const fmi3ValueReference knowns[], size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[], \
+        size_t n_sensitivity) \
+    { \
+        double d[END] = {0}; \
+        REQUIRE(ANY & ~INSTANTIATED); \
+        if (n_seed != seeds || n_sensitivity != results) return report(m, fmi3Error, "%s: wrong count of numbers", __func__); \
+        if (check_variables(m, unknowns, n_unknowns, knowns, n_knowns)) return fmi3Error;
+
+DERIVATIVE(fmi3GetDirectionalDerivative, n_knowns, n_unknowns)
+    for (size_t i = 0; i < n_knowns; i++) d[knowns[i]] += seed[i];
+    const fmi3Status status = push(m, d);
+    for (size_t i = 0; i < n_unknowns; i++) sensitivity[i] = d[unknowns[i]];
+    return status;
+}
+
+/* By the directional derivative along each known. */
+DERIVATIVE(fmi3GetAdjointDerivative, n_unknowns, n_knowns)
+    for (size_t j = 0; j < n_knowns; j++) {
+        memset(d, 0, sizeof d);
+        d[knowns[j]] = 1.0;
+        const fmi3Status status = push(m, d);
+        if (status) return status;
+        sensitivity[j] = 0.0;
+        for (size_t i = 0; i < n_unknowns; i++) sensitivity[j] += seed[i] * d[unknowns[i]];
+    }
+    return fmi3OK;
+}
+#endif
+
 /* --- what the FMU lacks */
 
 REFUSED(fmi3EnterConfigurationMode, ANY, "the FMU has no structural parameters")
@@ -542,10 +618,11 @@ UNSUPPORTED(fmi3SetClock, REFERENCES, const fmi3Clock values[])
 UNSUPPORTED(fmi3GetNumberOfVariableDependencies, fmi3ValueReference reference, size_t *n)
 UNSUPPORTED(fmi3GetVariableDependencies, fmi3ValueReference dependent, size_t elements[], fmi3ValueReference independents[],
     size_t others[], fmi3DependencyKind kinds[], size_t n)
-UNSUPPORTED(fmi3GetDirectionalDerivative, const fmi3ValueReference unknowns[], size_t n_unknowns, const fmi3ValueReference knowns[],
-    size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity)
-UNSUPPORTED(fmi3GetAdjointDerivative, const fmi3ValueReference unknowns[], size_t n_unknowns, const fmi3ValueReference knowns[],
-    size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity)
+#ifndef MODEL_EXCHANGE
+#define SEEDS const fmi3ValueReference knowns[], size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 found[]
+UNSUPPORTED(fmi3GetDirectionalDerivative, REFERENCES, SEEDS, size_t count)
+UNSUPPORTED(fmi3GetAdjointDerivative, REFERENCES, SEEDS, size_t count)
+#endif
 UNSUPPORTED(fmi3GetOutputDerivatives, REFERENCES, const fmi3Int32 orders[], fmi3Float64 values[], size_t count)
 UNSUPPORTED(fmi3GetIntervalDecimal, REFERENCES, fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
 UNSUPPORTED(fmi3GetIntervalFraction, REFERENCES, fmi3UInt64 counters[], fmi3UInt64 resolutions[],
