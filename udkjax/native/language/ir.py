@@ -215,8 +215,15 @@ class Function:
 
     def largest_of(self, x: Value) -> Value:
         """Return the maximum over lanes; NaN is not allowed."""
+        return self._halved(x, self.max)
+
+    def total(self, x: Value) -> Value:
+        """Return the sum of all lanes: of halves, as long as there are several lanes."""
+        return self._halved(x, lambda a, b: a + b)
+
+    def _halved(self, x: Value, join: Callable[[Value, Value], Value]) -> Value:
         if x.width & (x.width - 1):
-            return reduce(self.max, (self.op(f"extractelement {x.type} {x.name}, i64 {k}", x.base) for k in range(x.width)))
+            return reduce(join, (self.op(f"extractelement {x.type} {x.name}, i64 {k}", x.base) for k in range(x.width)))
         while x.width > 1:
             half, lanes = x.width // 2, range(x.width)
             shuffle = f"shufflevector {x.type} {x.name}, {x.type} poison, <{half} x i32>"
@@ -224,7 +231,7 @@ class Function:
             halves = [f"{shuffle} <{part}>" for part in parts]
             if half == 1:
                 halves = [f"extractelement {x.type} {x.name}, i64 {k}" for k in lanes]
-            x = self.max(*(self.op(text, x.base, half) for text in halves))
+            x = join(*(self.op(text, x.base, half) for text in halves))
         return x
 
     def reduce(self, name: str, x: Value) -> Value:
@@ -234,14 +241,6 @@ class Function:
         full = f"llvm.vector.reduce.{name}.v{x.width}{'f64' if x.base == DOUBLE else x.base}"
         self.declared.add(f"declare {x.base} @{full}({x.type})")
         return self.op(f"call {x.base} @{full}({x.type} {x.name})", x.base)
-
-    def total(self, x: Value) -> Value:
-        """Return the sum of all lanes, in any order."""
-        if x.width == 1:
-            return x
-        full = f"llvm.vector.reduce.fadd.v{x.width}f64"
-        self.declared.add(f"declare double @{full}(double, {x.type})")
-        return self.op(f"call reassoc double @{full}(double {self.const(0.0).name}, {x.type} {x.name})", DOUBLE)
 
     def any_of(self, mask: Value) -> Value:
         return self.reduce("or", mask)

@@ -13,6 +13,7 @@ from udkjax.native.module.memory import Memory
 
 UNROLLED = 16  # operations on this many registers are unrolled; operations on longer rows are loops over as many
 SUMS = 4  # independent partial sums of a scalar product, to hide the latency of additions
+ENTRIES = 16  # partial sums of a scalar product of one member, in all lanes: its bits do not depend on the count of lanes
 
 
 @dataclass(frozen=True)
@@ -237,21 +238,23 @@ class DenseMatrices:
 
     def sum(self, registers: int, term: Callable[[Operand, Value], Value]) -> Value:
         """Sum over registers and, for one member, over their entries: `term(r, sum)` adds the terms of register r."""
-        f, totals = self.f, [self.register(0.0)] * max(1, min(SUMS, registers))  # rows of a free body are empty
+        f, count = self.f, SUMS if self.f.width > 1 else max(1, ENTRIES // self.vector)
+        totals = [self.register(0.0)] * max(1, min(count, registers))  # rows of a free body are empty
         if registers <= UNROLLED:
             for r in range(registers):
                 totals[r % len(totals)] = term(r, totals[r % len(totals)])
         else:
-            variables = [f.variable(0.0, width=self.vector) for _ in range(SUMS)]
-            rounds = registers // SUMS
+            variables = [f.variable(0.0, width=self.vector) for _ in range(count)]
+            rounds = registers // count
             with f.each(rounds) as k:
                 for j, variable in enumerate(variables):
-                    variable.value = term(k * SUMS + j, variable.value)
+                    variable.value = term(k * count + j, variable.value)
             totals = [variable.value for variable in variables]
-            for j, r in enumerate(range(rounds * SUMS, registers)):
+            for j, r in enumerate(range(rounds * count, registers)):
                 totals[j] = term(r, totals[j])
         while len(totals) > 1:
-            totals = [a + b for a, b in zip(totals[::2], totals[1::2], strict=False)] + totals[len(totals) & ~1 :]
+            half = 1 << (len(totals) - 1).bit_length() - 1  # the largest power of two below the length
+            totals = [a + b for a, b in zip(totals, totals[half:], strict=False)] + totals[len(totals) - half : half]
         return totals[0] if f.width > 1 else f.total(totals[0])
 
     def dot(self, a: MatrixRow, b: MatrixRow) -> Value:
