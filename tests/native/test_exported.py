@@ -43,7 +43,12 @@ def test_functions_that_call_python_and_other_bytes_are_refused():
     def by_diffrax(mass):
         return udk.simulate(PENDULUM.with_parameters({"body.rod.mass": mass}), TS, throw=False, engine="diffrax").q
 
-    with pytest.raises(ValueError, match="cannot be exported, since it calls Python"):
+    with pytest.raises(ValueError, match=r"cannot be exported: it calls Python: .*machine code"):
         udk.export_compiled(by_diffrax, 1.0)
+    joint, state = next(iter(PENDULUM.joints)), udk.assemble(PENDULUM)
+    rub = udk.Friction(joint, coefficient=0.2, radius=0.01, law="set-valued")
+    sticking = udk.Mechanism(PENDULUM.bodies, PENDULUM.joints, {}, {"rub": rub}, PENDULUM.gravity)
+    with pytest.raises(ValueError, match=f'cannot be exported: joints stick \\("{joint}"\\): give their friction law="smooth"$'):
+        udk.export_compiled(lambda q: udk.simulate(sticking, TS, udk.State(q, state.v), throw=False).q, np.asarray(state.q))
     with pytest.raises(ValueError, match=r"the bytes that udkjax\.export_compiled returned"):
         udk.load_exported(b"something else")

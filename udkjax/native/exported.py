@@ -10,6 +10,7 @@ import jax
 import jax.export
 
 from udkjax.extras import EXPORT, require
+from udkjax.native.host.host_function import needed_by
 from udkjax.native.module import loading
 from udkjax.requirements import ArgumentError
 
@@ -42,9 +43,9 @@ def export_compiled(function: Callable[..., Any], *arguments: Any) -> bytes:
     lost = [name for name, code in own.items() if code is None]
     foreign = [name for name in names if "callback" in name or "host" in name]
     if lost or foreign:
-        why = f"it calls Python ({', '.join(lost + foreign)})"
-        cure = "export runs by machine code without events, or export_c"
-        raise ArgumentError(f"the function cannot be exported, since {why}: {cure}")
+        known = sorted({needed_by(name) for name in lost} - {""})
+        why = "; ".join(known) or 'it calls Python: export runs by machine code (engine="native") without events, or use export_c'
+        raise ArgumentError(f"the function cannot be exported: {why}")
     checks = [jax.export.DisabledSafetyCheck.custom_call(name) for name in own]
     artifact = jax.export.export(jitted, platforms=("cpu",), disabled_checks=checks)(*arguments)
     texts = json.dumps({name: code.texts() for name, code in own.items() if code is not None})

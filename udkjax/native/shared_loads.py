@@ -6,7 +6,7 @@ the same redundant rows are run together, by machine code for these rows. Member
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Array, Bool
@@ -60,6 +60,10 @@ class CallByRows:
     operation: Operation
     times: int
     of_member: tuple[tuple[int, ...], ...]  # shapes of the outputs of one member
+
+    needed_by: ClassVar[str] = (
+        "friction depends on loads that redundant rows share: remove the redundant constraint that udkjax.diagnose names"
+    )
 
     def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
         return call_by_rows(self.call, inputs, self.operation, self.times)

@@ -258,7 +258,9 @@ def test_derivatives_equal_those_of_jax_forward_and_adjoint(instance):
         return jnp.concatenate([jnp.ravel(x) for x in (state.q, state.v, udk.accelerations(changed, 0.0, state.q, state.v))])
 
     p, seed = np.array([1.7, 0.0, 0.0, -9.81, 0.3, 2.0]), rng.normal(size=6)
-    assert one.call("EnterInitializationMode", False, ctypes.c_double(0.0), ctypes.c_double(0.0), False, ctypes.c_double(0.0)) == OK
+    assert (
+        one.call("EnterInitializationMode", False, ctypes.c_double(0.0), ctypes.c_double(0.0), False, ctypes.c_double(0.0)) == OK
+    )
     of = ["body.rod.mass", DRIVE, "gravity[0]", "gravity[1]", "state.body.rod.angle", "state.body.rod.omega"]
     found, wanted = one.derivative("Directional", [*names, *a], of, seed), jax.jit(lambda p: jax.jvp(begun, (p,), (seed,)))(p)[1]
     assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
@@ -274,7 +276,9 @@ def test_derivatives_equal_those_of_jax_forward_and_adjoint(instance):
     assert_allclose(drift, drift[0], rtol=1e-9)  # the rate at which it decays
     found = np.transpose([one.derivative("Directional", [*names, *a], knowns, x) for x in np.eye(7)])
     assert_allclose(found, jacobian, rtol=0.0, atol=1e-12 * np.abs(jacobian).max())
-    assert_allclose(one.derivative("Adjoint", [*names, *a], knowns, seed := rng.normal(size=9)), seed @ found, rtol=1e-13, atol=1e-12)
+    assert_allclose(
+        one.derivative("Adjoint", [*names, *a], knowns, seed := rng.normal(size=9)), seed @ found, rtol=1e-13, atol=1e-12
+    )
     step = other.derivative("Directional", [*names, *a], [DRIVE], [1.0])  # an input does not move the state at once
     assert_allclose(step, [0.0] * 6 + [*jacobian[6:, 6]], rtol=0.0, atol=1e-12 * np.abs(jacobian).max())
     with pytest.raises(AssertionError, match="no derivative with respect to variable 0"):
@@ -345,16 +349,14 @@ def test_every_scene_runs_in_an_importer(name, tmp_path):
 @pytest.mark.slow
 def test_model_exchange_stays_closed_through_singular_poses(tmp_path):
     fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: pip install fmpy")
-    mechanism = udk.library.parallelogram()
-    found = udk.export_fmu(mechanism, tmp_path / "a.fmu", options=options("-O1"))
-    ts, names = np.linspace(0.0, 20.0, 401), found.outputs[:24]
-    run, errors = udk.simulate(mechanism, ts, rtol=1e-12, atol=1e-12), []
-    wanted = np.hstack([np.asarray(x).reshape(401, -1) for x in (run.q, run.v)])
+    mechanism = udk.library.parallelogram(angular_velocity=7.0)  # rad/s: it turns 16 times, through two singular poses each time
+    found = udk.export_fmu(mechanism, tmp_path / "a.fmu", ["model-exchange"], options=options("-O1"))
+    ts, names, errors = np.linspace(0.0, 20.0, 401), ["body.link1.angle", "body.coupler.x", "body.coupler.angle"], []
+    angle = udk.simulate(mechanism, ts, rtol=1e-12, atol=1e-12).q[:, 0, 2]
     for tolerance in (1e-8, 1e-10):
         given = {"stop_time": 20.0, "output_interval": 0.05, "output": names, "record_events": False}
         table = fmpy.simulate_fmu(str(found.file), fmi_type="ModelExchange", relative_tolerance=tolerance, **given)
-        values = np.array([[row[x] for x in names] for row in table])
-        errors.append(np.abs(values - wanted).max())
-        link, coupler = values[:, 0:3], values[:, 9:12]
-        assert np.abs(np.cos(link[:, 2]) - (coupler[:, 0] - np.cos(coupler[:, 2]))).max() < 1e-12  # m, at the pin B1
-    assert errors[0] < 1e-4 and errors[1] < 2e-6  # m, rad and their rates
+        link, x, coupler = (np.array([row[name] for row in table]) for name in names)
+        errors.append(np.abs(link - angle).max())
+        assert np.abs(np.cos(link) - (x - np.cos(coupler))).max() < 1e-12  # m, at the pin B1
+    assert errors[0] < 1e-3 and errors[1] < 1e-5  # rad; CVODE's errors with the pendulum equation of this motion are half of it

@@ -182,11 +182,18 @@ def _target(function: HostFunction) -> _Target:
     address = ctypes.cast(handle, ctypes.c_void_p)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
     _REGISTERED.append(handle)
+    _NEEDED_BY[name] = getattr(function, "needed_by", "")
     assert address.value
     return _Target(name, address.value)
 
 
 _REGISTERED: list[Any] = []  # XLA may call these for as long as the process runs
+_NEEDED_BY: dict[str, str] = {}
+
+
+def needed_by(name: str) -> str:
+    """Return what needs the function with a name in XLA, and how to do without, from its attribute `needed_by`; or ""."""
+    return _NEEDED_BY.get(name, "")
 
 
 def _word(address: int) -> int:

@@ -34,6 +34,7 @@ from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.identity_cache import cached_by_identity, cached_by_size
 from udkjax.programs.numpy_program import Meter, numpy_program
 from udkjax.transforms.gradients import stop_gradients
+from udkjax.wording import quote
 
 SHARED, NUMBERS = 9, 5  # number of arrays before those of the phases, and index of the numbers of conditions
 
@@ -99,6 +100,14 @@ class HostRun:
     times: int
     coordinates: int
     plain: PlainForm | None = None
+
+    @property
+    def needed_by(self) -> str:
+        """What needs Python in a run, and how to do without."""
+        joints = [quote(joint.name) for joint in self.plan.events.sticking if joint.contact < 0]
+        if joints:
+            return f'joints stick ({", ".join(joints)}): give their friction law="smooth"'
+        return "runs have events, contacts or forces with kinks of the state: leave out events, and make forces smooth"
 
     def shapes(self, members: int) -> list[tuple[int, ...]]:
         """Return the shapes of the fields of `EventRun`, with a leading axis of members."""
