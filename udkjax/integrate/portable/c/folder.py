@@ -45,8 +45,8 @@ void {p}_project(const double *numbers, double t, double *q, double *v, double *
    below 1e-9 if the mechanism could be closed. */
 double {p}_close(const double *numbers, double t, double *q, double *v, double *memory);
 """,
-    "position_derivatives": """/* Derivative dstate (of the closed q, then of v) of {p}_close from a guess q, v, along changes dnumbers
-   of the numbers, dq and dv of the guess. At a closed state it is that of {p}_project as well. */
+    "position_derivatives": """/* Derivative dstate (of the closed q, then of v) of {p}_close from a guess q, v, along
+   changes dnumbers of the numbers, dq and dv of the guess. At a closed state it is that of {p}_project as well. */
 void {p}_close_along(const double *numbers, double t, const double *q, const double *v, const double *dnumbers,
     const double *dq, const double *dv, double *dstate, double *memory);
 """,

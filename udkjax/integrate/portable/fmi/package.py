@@ -74,8 +74,8 @@ def export_fmu(
     """Write a scene as an FMU by FMI 3.0, for co-simulation and model exchange, with its sources in C.
 
     In co-simulation, each step of the importer is an interval as by `step`. In model exchange the importer integrates; the FMU
-    evaluates the equations at the state projected onto the constraints, so that its outputs satisfy these. FMUs with model exchange
-    have directional and adjoint derivatives.
+    evaluates the equations at the state projected onto the constraints, so that its outputs satisfy these. FMUs with
+    model exchange have directional and adjoint derivatives.
 
     Args:
         mechanism: the scene, with concrete numbers. Its thresholds of rank follow from these numbers.
