@@ -192,7 +192,7 @@ _NEEDED_BY: dict[str, str] = {}
 
 
 def needed_by(name: str) -> str:
-    """Return what needs the function with a name in XLA, and how to do without, from its attribute `needed_by`; or ""."""
+    """Return the reason why a program calls the function with this name in XLA, with the cure; "" if it is unknown."""
     return _NEEDED_BY.get(name, "")
 
 

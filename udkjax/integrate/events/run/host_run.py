@@ -103,7 +103,7 @@ class HostRun:
 
     @property
     def needed_by(self) -> str:
-        """What needs Python in a run, and how to do without."""
+        """The reason why the run calls Python, with the cure."""
         joints = [quote(joint.name) for joint in self.plan.events.sticking if joint.contact < 0]
         if joints:
             return f'joints stick ({", ".join(joints)}): give their friction law="smooth"'
