@@ -341,9 +341,9 @@ def test_every_scene_runs_in_an_importer(name, tmp_path):
         assert_allclose(values, wanted, rtol=0.0, atol=np.finfo(float).tiny)  # XLA's threads have no subnormal numbers
     else:
         assert_allclose(values[1], wanted[1], atol=1e-9 * np.abs(wanted).max())
-    tolerance = 1e-8 if name == "chain" else 1e-10  # FMPy takes at most 500 steps between two outputs
-    exchange = fmpy.simulate_fmu(file, fmi_type="ModelExchange", relative_tolerance=tolerance, record_events=False, **given)
-    error = np.abs(np.array([[row[x] for x in names] for row in exchange]) - wanted)
+    given |= {"output_interval": dt / 4}  # FMPy takes at most 500 steps between two outputs
+    exchange = fmpy.simulate_fmu(file, fmi_type="ModelExchange", relative_tolerance=1e-10, record_events=False, **given)
+    error = np.abs(np.array([[row[x] for x in names] for row in exchange])[::4] - wanted)
     assert error.max() < 1e-4 * np.abs(wanted).max()
 
 
