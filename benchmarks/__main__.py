@@ -24,6 +24,7 @@ NAMES = (
     "identification",
     "uniqueness",
     "live",
+    "export",
     "gpu",
     "peers",
 )

@@ -37,6 +37,9 @@ SMALL = {  # what must be true of the figures of a small run; most hold their pr
         and names(rows)[-1] == "two cores"
         and rows[-1]["speedup"] > 0
     ),
+    "export": lambda rows: (
+        names(rows)[0] == "C, compound_pendulum" and rows[0]["step_difference"] < 1e-12 and names(rows)[-1] == "receding horizon"
+    ),
     "sweep": lambda rows: (  # killed and resumed
         [rows[0][name] for name in ("kept_when_killed", "resumed_members", "members")] == [1, 64, 128] and 0 < rows[0]["gib"] < 4
     ),
