@@ -80,6 +80,7 @@ def objects() -> dict[str, object]:
         *(part for joint in JOINTS.values() for part in vars(joint).values() if isinstance(part, udk.Profile)),
         *(drawing, drawing.links["bar"], udk.Held(ts, 0.1)),
         *(udk.PathGoal("P", [[0, 0], [1, 1]]), udk.PoseGoal("a", [[0, 0, 0.1]]), udk.FunctionGoal("a", [0.1], [0.2])),
+        udk.CurveGoal("P", [[0, 0], [1, 1], [2, 0]]),
         *(udk.TorqueGoal(most=1.0), udk.LoadGoal("a", most=1.0), udk.EnergyGoal(least=1.0), udk.FrequencyGoal(least=1.0)),
         *(udk.GapGoal("a", "b", least=1.0), udk.ToleranceGoal("a", {}, most=1.0), udk.MotionGoal(anything, most=1.0)),
         *(

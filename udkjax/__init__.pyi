@@ -202,6 +202,7 @@ from udkjax.study.worked.solution import WorkedSolution as WorkedSolution
 from udkjax.study.worked.solution import worked_solution as worked_solution
 from udkjax.synthesis import CurveDesign as CurveDesign
 from udkjax.synthesis import CurveDesigns as CurveDesigns
+from udkjax.synthesis import CurveGoal as CurveGoal
 from udkjax.synthesis import Designs as Designs
 from udkjax.synthesis import DesignSearch as DesignSearch
 from udkjax.synthesis import EnergyGoal as EnergyGoal

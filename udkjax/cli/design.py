@@ -201,6 +201,7 @@ def _page(candidate: Any, goal: Any) -> Any:
     import udkjax as udk
 
     traces = [goal.point] if isinstance(goal, udk.PathGoal) and goal.at is None else None
+    traces = [goal.pin] if isinstance(goal, udk.CurveGoal) else traces
     return _moving_page(candidate, traces, goal.targets[:, :2] if goal.has_place else None)
 
 

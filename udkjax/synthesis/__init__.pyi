@@ -4,6 +4,7 @@ from udkjax.synthesis.complete import CompleteDesign as CompleteDesign
 from udkjax.synthesis.complete import CompleteDesigns as CompleteDesigns
 from udkjax.synthesis.complete import design_all as design_all
 from udkjax.synthesis.complete.complete_design import CompleteSearch as CompleteSearch
+from udkjax.synthesis.curve_goal import CurveGoal as CurveGoal
 from udkjax.synthesis.curves.curve_designs import CurveDesign as CurveDesign
 from udkjax.synthesis.curves.curve_designs import CurveDesigns as CurveDesigns
 from udkjax.synthesis.curves.curve_file import read_curve_file as read_curve_file

@@ -164,7 +164,8 @@ def design(
     Args:
         drawing: the structure: a drawing, or a mechanism with one degree of freedom when its drivers are removed. Free pins
             only define which links they join.
-        goal: a `PathGoal`, `PoseGoal` or `FunctionGoal`; or a list of one of these and motion goals: `TorqueGoal`, `LoadGoal`,
+        goal: a `PathGoal`, `PoseGoal`, `FunctionGoal` or `CurveGoal`; or a list of one of these and motion
+            goals: `TorqueGoal`, `LoadGoal`,
             `EnergyGoal`, `FrequencyGoal`, `GapGoal`, `ToleranceGoal` and `MotionGoal`.
         free: names of the free numbers, such as `pin.A` or `pin.C[0]`; by default all pins, with their
             lengths and angles.
@@ -196,7 +197,9 @@ def _split(goals: Goal | Sequence[Goal | MotionTerm]) -> tuple[Goal, list[Motion
     goals_in_order = [goals] if isinstance(goals, Goal) else list(goals)
     firsts, terms = [g for g in goals_in_order if isinstance(g, Goal)], [g for g in goals_in_order if isinstance(g, MotionTerm)]
     if len(firsts) != 1 or len(terms) != len(goals_in_order) - 1:
-        raise ValueError("goal must be a PathGoal, PoseGoal or FunctionGoal; in a list, one of them and any motion goals")
+        raise ValueError(
+            "goal must be a PathGoal, PoseGoal, FunctionGoal or CurveGoal; in a list, one of them and any motion goals"
+        )
     return firsts[0], terms
 
 

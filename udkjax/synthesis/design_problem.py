@@ -54,6 +54,10 @@ class DesignProblem:
         self.rotation = self.driven.is_angle if rotation is None else rotation
         if self.rotation and not self.driven.is_angle:
             raise SceneError(["rotation: the driver is not an angle and cannot turn; leave rotation out"], mechanism.name)
+        if goal.is_combined and not self.rotation:
+            raise SceneError(
+                ["goal: a CurveGoal needs a driver that turns: leave rotation out, or give a PathGoal"], mechanism.name
+            )
         self.shifted = goal.start == "free" and goal.values is not None
         self.unknowns = free.count + self.shifted + goal.extras
         self.coordinates = 3 * len(mechanism.body_names)
@@ -68,8 +72,9 @@ class DesignProblem:
         self.goal, self.data, self.scale = goal, goal.targets, goal_scale(goal, self.mechanism)
         length = self.scale if goal.has_place else float(self.driven.analysis.scales.length)
         self._unit = np.tile([length, length, 1.0], self.coordinates // 3)
-        wide = np.full(self.unknowns - self.free.count, np.inf)
-        self.low, self.high = np.append(bounds.low, -wide), np.append(bounds.high, wide)
+        wide = np.full(int(self.shifted), np.inf)
+        low, high = (np.full(goal.extras, end) for end in goal.bounds_of_extras)
+        self.low, self.high = np.concatenate([bounds.low, -wide, low]), np.concatenate([bounds.high, wide, high])
         self.first, self.last = bounds.first, bounds.last
         self.reach = float(np.max(bounds.last - bounds.first, initial=self.scale)) / 4
         self.sizes = np.maximum((bounds.last - bounds.first) / 4, 1e-12)  # scales of the free numbers
@@ -181,7 +186,8 @@ class DesignProblem:
     def residuals(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return the residuals (J, G) of positions (J, n) of a motion."""
         measured, extras = self._at(x, q)[:, : self._measured], x[self.free.count + self.shifted :]
-        return np.stack(self.goal.residual(measured, self.data, np.broadcast_to(extras, (len(q), len(extras))), np), 1)
+        each = self.goal.residual(measured, self.data, np.broadcast_to(extras, (len(q), len(extras))), np)
+        return self.goal.report(np.stack(each, 1))
 
     @property
     def _measured(self) -> int:
@@ -201,6 +207,10 @@ class DesignProblem:
         return float(np.min(np.abs(solved.out[0, :, -1])))
 
     # --- values of the driver
+
+    def values_at(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the driver's values (M, J) of trials, which may depend on further unknowns."""
+        return self.goal.values_at(x[:, self.free.count + self.shifted :], values)
 
     def value_drawn(self, x: np.ndarray) -> np.ndarray:
         """Return the driver's values (M,) in the drawn positions of trials."""
@@ -270,7 +280,7 @@ class DesignProblem:
     ) -> TrialResiduals:
         """Evaluate residuals and limits of trials. Closing of positions starts from the positions stored in the trials.
 
-        `worth` selects trials by residuals and limits of lengths before their turns are computed; the others are marked as not
+        `worth` selects trials by losses and limits of lengths before their turns are computed; the others are marked as not
         existing.
 
         The rows of limits are those of lengths, then margin (M,) - tau^2 with the transmission tau. The square is used because it
@@ -280,11 +290,11 @@ class DesignProblem:
         solved = self._fit_code(x, trials.s, self._unit, self.data, trials.q, threads=threads)
         G = len(self._fit.places) - 1
         table = solved.out.reshape(members, J, G + 1, 2 + self.unknowns)
-        r, by_value, by_unknowns = table[:, :, :G, 0], table[:, :, :G, 1], table[:, :, :G, 2:]
+        r, by_value, by_unknowns, rest = self.goal.combine(table[:, :, :G, 0], table[:, :, :G, 1], table[:, :, :G, 2:])
         limits, slopes = self.lengths(x)
         exists, tau = np.isfinite(solved.end).all(1), table[:, :, G, 0]
         if self.rotation:
-            which = exists if worth is None else exists & worth(r, limits)
+            which = exists if worth is None else exists & worth(np.einsum("mjg,mjg->m", r, r) + rest, limits)
             turns, more, more_slopes = np.zeros(members, bool), np.zeros((members, 1)), np.zeros((members, 1, self.unknowns))
             more[which], more_slopes[which], turns[which] = self._turn_limit(x[which], margin[which], threads)
             limits, slopes = np.concatenate([limits, more], 1), np.concatenate([slopes, more_slopes], 1)
@@ -295,7 +305,7 @@ class DesignProblem:
             by_x = table[:, :, G, 2:]  # derivatives at constant driver values: other residuals determine unknown ones
             slopes = np.concatenate([slopes, -2.0 * unit * tau[..., None] * by_x], 1)
         terms, by_terms = self._terms_of(x, exists, threads)
-        found = (r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes)
+        found = (r, by_value, by_unknowns, terms, by_terms, tau, limits, slopes, rest)
         for numbers in found:  # a link without length has positions, but no direction
             exists &= np.isfinite(numbers).reshape(members, -1).all(1)
         return TrialResiduals(solved.q, *found, exists)

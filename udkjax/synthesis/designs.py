@@ -13,6 +13,7 @@ from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.positions.following.kinematics import FULL_TURN, kinematics
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.found_mechanism import FoundMechanism
 
@@ -98,8 +99,11 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
     turns = problem.turns(x)
     if problem.rotation and not turns:
         return None
-    mechanism = problem.free.moved(jnp.asarray(x[: problem.free.count]))
-    mechanism = redrawn(problem, mechanism, q[0].reshape(-1, 3))
+    try:
+        mechanism = problem.free.moved(jnp.asarray(x[: problem.free.count]))
+        mechanism = redrawn(problem, mechanism, q[0].reshape(-1, 3))
+    except SceneError:  # without bounds, a pin may go so far away that no drawing has it
+        return None
     values = s + float(problem.goal.origin(mechanism)) + (x[problem.free.count] if problem.shifted else 0.0)
     drawn = float(problem.drawn(mechanism))
     if problem.driven.is_angle:

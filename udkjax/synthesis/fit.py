@@ -11,6 +11,7 @@ from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
+from udkjax.synthesis.curve_goal import CurveGoal
 from udkjax.synthesis.designs import FoundDesign
 from udkjax.synthesis.goals import FunctionGoal, Goal, PoseGoal
 
@@ -64,7 +65,8 @@ def deviation_of(design: FoundDesign, goal: Goal) -> Deviation:
         arm = float(np.max(np.ptp(places, axis=0))) if goal.arm is None else goal.arm
         angle = float(np.max(2.0 * np.arcsin(np.minimum(np.abs(residuals[:, 2]) / (2.0 * arm), 1.0))))
     way = float(np.sum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
-    off = float(np.max(np.linalg.norm(residuals[:, :2], axis=1)))
+    each = goal.distances(residuals) if isinstance(goal, CurveGoal) else np.linalg.norm(residuals[:, :2], axis=1)
+    off = float(np.max(each))
     return Deviation(off, way, angle, "m", float(np.linalg.norm(np.ptp(places, axis=0))))
 
 

@@ -15,6 +15,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import parse_toml
 from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.complete.complete_design import CompleteSearch
+from udkjax.synthesis.curve_goal import CurveGoal
+from udkjax.synthesis.curves.curve_file import read_curve_file
 from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, GapGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
@@ -47,6 +49,7 @@ GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
         FunctionGoal,
         {"output": "", "values": "value", "targets": "output", "start": "", "output_start": "", "line": ""},
     ),
+    "curve": (CurveGoal, {"pin": "", "points": "m", "part": "", "samples": ""}),
 }
 # Columns of a table of targets: x, y; x, y, angle; value of the driver, output.
 COLUMNS = {"path": 2, "poses": 3, "function": 2}
@@ -117,6 +120,11 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
 
 def _with_table(goal: Any, folder: Path, problems: list[str]) -> Any:
     """Return a goal with its targets as numbers, read from a table if it names one; a function's table has its values, too."""
+    if isinstance(goal, Mapping) and goal.get("kind") == "curve" and isinstance(goal.get("points"), str):
+        try:
+            return {**goal, "points": read_curve_file(folder / goal["points"]).tolist()}
+        except ValueError as problem:
+            problems.append(f"goal.points: {problem}")
     if not isinstance(goal, Mapping) or not isinstance(goal.get("targets"), str) or goal.get("kind") not in COLUMNS:
         return goal
     file, columns, rows = folder / goal["targets"], COLUMNS[goal["kind"]], []

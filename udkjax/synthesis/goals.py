@@ -7,7 +7,7 @@ design is the sum of the squares of all residuals.
 from abc import abstractmethod
 from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -53,6 +53,15 @@ def _values(value: Numbers | None) -> np.ndarray | None:
     return array
 
 
+class CombinedResiduals(NamedTuple):
+    """Residuals (M, J, G) of M trials, derivatives with respect to values and unknowns, and the rest of their losses (M,)."""
+
+    r: np.ndarray
+    by_value: np.ndarray
+    by_unknowns: np.ndarray
+    rest: np.ndarray
+
+
 class Goal(PrintsTable):
     """Targets for a motion; `targets` has a row for each position.
 
@@ -89,9 +98,31 @@ class Goal(PrintsTable):
         return 0
 
     @property
+    def bounds_of_extras(self) -> tuple[float, float]:
+        """The limits of the further unknowns."""
+        return -np.inf, np.inf
+
+    @property
     def has_place(self) -> bool:
         """True if the first two measures are x and y of a place that moves and scales with the mechanism."""
         return False
+
+    @property
+    def is_combined(self) -> bool:
+        """True if the loss of a position depends on the other positions."""
+        return False
+
+    def combine(self, r: np.ndarray, by_value: np.ndarray, by_unknowns: np.ndarray) -> CombinedResiduals:
+        """Return the residuals of trials (M, J, G) whose squares, with the rest, are the loss; by default those of positions."""
+        return CombinedResiduals(r, by_value, by_unknowns, np.zeros(len(r)))
+
+    def report(self, r: np.ndarray) -> np.ndarray:
+        """Return the residuals (J, G) of a design, whose squares are its loss."""
+        return r
+
+    def values_at(self, extras: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the driver's values (M, J) of trials with further unknowns (M, extras), from the values before."""
+        return values
 
     @abstractmethod
     def check(self, mechanism: Mechanism) -> None:

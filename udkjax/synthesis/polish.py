@@ -104,7 +104,7 @@ def _join(problem: DesignProblem, trials: Trials) -> tuple[np.ndarray, np.ndarra
 
 def _split(problem: DesignProblem, z: np.ndarray, trials: Trials) -> Trials:
     x = np.clip(z[:, : problem.unknowns], problem.low, problem.high)
-    return Trials(x, z[:, problem.unknowns :] if problem.local else trials.s, trials.q)
+    return Trials(x, z[:, problem.unknowns :] if problem.local else problem.values_at(x, trials.s), trials.q)
 
 
 def _gradient(
@@ -130,7 +130,8 @@ def _hessian(
     moves = DIFFERENCE * np.concatenate([np.diag(units), -np.diag(units)])  # (2 N, N)
     moved = (z[:, None] + moves).reshape(-1, N)
     repeated = Trials(*(np.repeat(a, 2 * N, 0) for a in trials))
-    split = Trials(moved[:, : problem.unknowns], moved[:, problem.unknowns :] if problem.local else repeated.s, repeated.q)
+    x = moved[:, : problem.unknowns]
+    split = Trials(x, moved[:, problem.unknowns :] if problem.local else problem.values_at(x, repeated.s), repeated.q)
     u, weight, margin, pressed = (np.repeat(a, 2 * N, 0) for a in limits)
     moved_trials = problem.evaluate(split, margin, threads)
     g = _gradient(problem, moved_trials, u, weight, pressed) * units

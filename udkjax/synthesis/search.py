@@ -76,8 +76,8 @@ class SearchState:
 
 
 def loss_of(found: TrialResiduals) -> np.ndarray:
-    """Return the sum of the squares of all residuals (M,)."""
-    return np.einsum("mjg,mjg->m", found.r, found.r) + np.einsum("mt,mt->m", found.terms, found.terms)
+    """Return the sum of the squares of all residuals (M,), and the rest of the losses."""
+    return np.einsum("mjg,mjg->m", found.r, found.r) + np.einsum("mt,mt->m", found.terms, found.terms) + found.rest
 
 
 def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
@@ -123,8 +123,8 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     new = _stepped(problem, trials, *_bent_step(problem, equations, threads))
     old_merit, u, weight = state.merit[active], state.multipliers[active], state.weight[active]
 
-    def worth(r: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        return np.einsum("mjg,mjg->m", r, r) + _pressure(lengths, u[:, : lengths.shape[1]], weight) < old_merit
+    def worth(loss: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        return loss + _pressure(lengths, u[:, : lengths.shape[1]], weight) < old_merit
 
     trial = problem.evaluate(new, state.margin[active], threads, worth)
     exists = trial.exists & np.all(np.sign(trial.transmission) == sign[active][:, None], axis=1)
@@ -144,12 +144,15 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
 
 
 def _stepped(problem: DesignProblem, trials: Trials, dx: np.ndarray, ds: np.ndarray) -> Trials:
-    return Trials(np.clip(trials.x + dx, problem.low, problem.high), trials.s + in_order(problem, ds, trials.s), trials.q)
+    x = np.clip(trials.x + dx, problem.low, problem.high)
+    return Trials(x, problem.values_at(x, trials.s + in_order(problem, ds, trials.s)), trials.q)
 
 
 def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Return steps plus half of their acceleration, unless it is long relative to the step."""
     dx, ds = equations.find()
+    if problem.goal.is_combined:  # its residuals are those of a quadratic model
+        return dx, ds
     ds = in_order(problem, ds, equations.trials.s)
     trials, found = equations.trials, equations.found
     r, limits, exists = problem.residuals_at(Trials(trials.x + AHEAD * dx, trials.s + AHEAD * ds, trials.q), threads)

@@ -32,12 +32,14 @@ def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random
     x[:, : problem.free.count] = rng.uniform(problem.first, problem.last, (samples, problem.free.count))
     turn = problem.turn(x, TURN_VALUES, threads)
     reached = turn.reached.all(1) & (np.abs(turn.transmission).min(1) > CLEAR)
-    if problem.rotation or problem.local:
+    in_order = problem.local or problem.goal.is_combined
+    if problem.rotation or in_order:
         x, turn = x[reached], Turn(*(a[reached] for a in turn))
     if not len(x):
         return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
-    trials, cost = _assign(problem, x, turn) if problem.local else _shift(problem, x, turn)
-    s, moved = trials
+    (s, moved), cost = _assign(problem, x, turn) if in_order else _shift(problem, x, turn)
+    if problem.goal.is_combined:
+        s, moved = _spread(problem, s, moved)
     cost = cost + np.sum(np.maximum(problem.lengths(moved)[0], 0.0) ** 2, axis=1)  # scaling may violate limits of lengths
     q, exists = problem.march(moved, s, threads)
     best = np.argsort(np.where(exists & np.isfinite(cost), cost, np.inf), kind="stable")[:count]
@@ -113,6 +115,15 @@ def _in_order(curve: np.ndarray, target: np.ndarray, previous: np.ndarray) -> _F
     for j in range(J - 1, 0, -1):
         places[:, j - 1] = back[rows, j, places[:, j]]
     return _Fitted(previous[:, :1] + direction[:, None] * (places - K // 8), total.min(1))
+
+
+def _spread(problem: DesignProblem, s: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return values over the part of the turn of assigned values (M, J), and the unknowns with its beginning and fraction."""
+    x, count = x.copy(), problem.free.count
+    x[:, count] = s.min(1)
+    low, high = problem.goal.bounds_of_extras
+    x[:, count + 1 :] = np.clip(np.ptp(s, axis=1) / problem.period, low, high)[:, None]
+    return problem.values_at(x, s), x
 
 
 # --- given values

@@ -30,6 +30,7 @@ class TrialResiduals(NamedTuple):
         transmission: transmission at each position (M, J), with the sign of the branch.
         limits: rows (M, K) that must not exceed zero, in the unit of residuals.
         limits_by_unknowns: derivatives of limits with respect to x (M, K, P).
+        rest: parts of the losses that are not squares of residuals (M,).
         exists: whether all positions of a trial exist (M,).
     """
 
@@ -42,6 +43,7 @@ class TrialResiduals(NamedTuple):
     transmission: np.ndarray
     limits: np.ndarray
     limits_by_unknowns: np.ndarray
+    rest: np.ndarray
     exists: np.ndarray
 
     def take(self, which: np.ndarray) -> "TrialResiduals":

@@ -169,7 +169,7 @@ class Measuring:
         return place, len(which)
 
     def _of_goal(self, goal: Goal, first: int, data: list[np.ndarray]) -> _Reading:
-        if goal.extras or len(goal.targets) != len(self.values):
+        if goal.extras or goal.is_combined or len(goal.targets) != len(self.values):
             raise ValueError(
                 f"the goal must have a target for each of the {len(self.values)} values, and no start that is to be found"
             )

@@ -71,11 +71,15 @@ class CurveTarget(NamedTuple):
         points: complex points at equal arc lengths (M,).
         normals: complex unit normals at these points (M,).
         spread: half of the distance of neighbours.
+        following: the next point of each (M,); the last point of an open curve is its own.
+        previous: the previous point of each (M,), likewise.
     """
 
     points: np.ndarray
     normals: np.ndarray
     spread: float
+    following: np.ndarray
+    previous: np.ndarray
 
 
 class WantedCurve:
@@ -107,7 +111,7 @@ class WantedCurve:
         chord = following - previous
         chord = np.where(np.abs(chord) < 1e-9, following - z, chord)  # where the curve turns back
         chord = np.where(np.abs(chord) < 1e-12, 1.0, chord)
-        return CurveTarget(z, 1j * chord / np.abs(chord), 0.5 * self.length / count)
+        return CurveTarget(z, 1j * chord / np.abs(chord), 0.5 * self.length / count, following, previous)
 
     def error(self, pin: np.ndarray) -> float:
         """Return the Chamfer distance of a path (complex, normalized), of which whole turns are closed, from the curve."""
