@@ -110,7 +110,7 @@ def test_goals_with_mistakes_are_refused(given, message):
 
 
 def test_a_curve_needs_a_known_pin_and_a_driver_that_turns():
-    with pytest.raises(udk.SceneError, match='"pin.X" is neither a body nor a pin'):
+    with pytest.raises(udk.SceneError, match=r'"pin\.X" is neither a body nor a pin'):
         udk.DesignSearch(FOUR_BAR, udk.CurveGoal("X", CORNER))
     with pytest.raises(udk.SceneError, match="needs a driver that turns"):
         udk.DesignSearch(FOUR_BAR, udk.CurveGoal("P", CORNER), rotation=False)

@@ -71,8 +71,8 @@ class CurveTarget(NamedTuple):
         points: complex points at equal arc lengths (M,).
         normals: complex unit normals at these points (M,).
         spread: half of the distance of neighbours.
-        following: the next point of each (M,); the last point of an open curve is its own.
-        previous: the previous point of each (M,), likewise.
+        following: the next point of each (M,); that of an open curve's last point is this point.
+        previous: the previous point of each (M,); that of an open curve's first point is this point.
     """
 
     points: np.ndarray
