@@ -14,8 +14,8 @@ from udkjax.positions.following.kinematics import FULL_TURN, kinematics
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
+from udkjax.synthesis.curves.found_mechanism import FoundMechanism
 from udkjax.synthesis.design_problem import DesignProblem
-from udkjax.synthesis.found_mechanism import FoundMechanism
 
 AGREEMENT = 1e-6  # tolerance between the losses of search and motion, relative to the loss and to the squared scale
 

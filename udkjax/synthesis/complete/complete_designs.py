@@ -12,7 +12,7 @@ from udkjax.positions.following.drive import Drive
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
-from udkjax.synthesis.found_mechanism import FoundMechanism
+from udkjax.synthesis.curves.found_mechanism import FoundMechanism
 
 NEARLY_REAL = 1e-4  # relative to the extent; singular ends are at best accurate to the square root of the rounding error
 

@@ -11,9 +11,9 @@ from udkjax.printing import PrintedTable, PrintsTable, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.curve_search import FoundLinkage, drawn
 from udkjax.synthesis.curves.dyads import SPAN
+from udkjax.synthesis.curves.found_mechanism import FoundMechanism
 from udkjax.synthesis.curves.linkage_drawing import PIN, drawing_of, is_closed_over_turn, states_of_turn
 from udkjax.synthesis.curves.targets import WantedCurve, as_points
-from udkjax.synthesis.found_mechanism import FoundMechanism
 
 
 class CurveDesign(FoundMechanism):
