@@ -124,7 +124,6 @@ exit 1
     entry = slow.run_types(tmp_path / "python", ["tests"])
     assert (entry["result"], entry["passed"], entry["failed"]) == ("failed", 2, 1)
     assert slow.run_types(tmp_path / "other" / "python", ["tests"])["result"] == "skipped"
-    assert slow.run_fast(None, ["tests"], [])["result"] == "skipped"
     configured = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pyright"]["include"]
     assert set(slow.TYPED) == set(configured) and all((ROOT / path).exists() for path in slow.PYTHON_TESTS)
     assert all((ROOT / path).exists() for path in slow.LANES_TESTS)
@@ -135,6 +134,11 @@ def test_lanes_are_set_for_their_part_alone_and_skipped_where_the_processor_lack
     monkeypatch.setattr(slow, "run_part", lambda python, tests, more, marked, own: ran.append((tests, marked, own)))
     slow.run_named("lanes-1", Path(sys.executable), ["tests"], [])
     assert ran == [(["tests"], "not slow", {"UDKJAX_LANES": "1"})]
+    monkeypatch.setattr(slow, "environment", lambda name, *choices: Path(sys.executable))
+    slow.run_named("oldest", Path("other"), ["tests"], [])
+    assert ran.pop() == ran[0]  # on the oldest Python, with one lane
+    monkeypatch.setattr(slow, "environment", lambda name, *choices: None)
+    assert slow.run_named("oldest", Path(sys.executable), ["tests"], [])["result"] == "skipped"
     entry = slow.run_lanes(Path(sys.executable), 3, ["tests"], [])
     assert entry["result"] == "skipped" and "UDKJAX_LANES must be 1, 2, 4 or 8" in entry["words"] and len(ran) == 1
 
