@@ -24,7 +24,14 @@ from udkjax.native.module.module import Module
 from udkjax.native.parts.formulations import FormulationCode
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.row_marks import RowMarks
-from udkjax.native.run.state_functions import ScaleCode, StateAccelerations, StateFunction, StateProjection, StateTangentPart
+from udkjax.native.run.state_functions import (
+    ScaleCode,
+    StateAccelerations,
+    StateFunction,
+    StateJump,
+    StateProjection,
+    StateTangentPart,
+)
 from udkjax.native.watching.conditions import Conditions
 from udkjax.native.watching.event_states import EventStates
 
@@ -136,6 +143,11 @@ class StateOperation(Operation):
         return ProjectStates(self.code, self.pseudoinverse, self.formulation)
 
     @property
+    def jump(self) -> "ProjectJump":
+        """The operation that projects states after events."""
+        return ProjectJump(self.code, self.pseudoinverse, self.formulation)
+
+    @property
     def tangent_part(self) -> "FindTangentPart":
         """The operation that computes the tangent part of small changes of states."""
         return FindTangentPart(self.code, self.pseudoinverse, self.formulation)
@@ -161,6 +173,15 @@ class ProjectStates(StateOperation):
     """Project states onto the constraint manifold."""
 
     function = StateProjection
+
+
+class ProjectJump(StateOperation):
+    """Project states after events onto the constraint manifold, and return what is left of their rates."""
+
+    function = StateJump
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
+        return [(2 * self.code.coordinate_count + 1,)]
 
 
 class FindTangentPart(StateOperation):

@@ -2,6 +2,7 @@
 
 StateAccelerations    accelerations of a state, by elimination or a dense method; by the fallback if pivots are too small
 StateProjection       q and v projected onto the constraint manifold
+StateJump             the same after an event, and by how much the velocities still violate a row
 StateTangentPart      the tangent part of small changes of q and v
 Evaluation            accelerations with multipliers, and energies, for pages
 ScaleCode             the characteristic scales (equations/terms/scale_program.py), from the numbers of a scene
@@ -20,7 +21,7 @@ from udkjax.native.module.memory import Memory, ThreadCode
 from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.module.tableau import EULER
 from udkjax.native.parts.formulations import FormulationCode
-from udkjax.native.parts.manifold import with_threshold
+from udkjax.native.parts.manifold import largest_violation, with_threshold
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.members import write_begin
 from udkjax.native.run.trajectory import Trajectory
@@ -52,6 +53,11 @@ class StateFunction(Trajectory):
             )
         )
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """The arrays that are returned, one after another, with their sizes."""
+        return dict.fromkeys(self.found, self.n)
+
     def write_functions(self):
         self.write_programs()
         self.fallback.write()
@@ -66,10 +72,12 @@ class StateFunction(Trajectory):
 
     def write_found(self, f: Function, s: Lane):
         """Write the results of the members in all lanes to the output."""
+        counts, start = self.counts, 0
         with self.each_lane(f, s.active) as k:
-            to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), self.n * len(self.found))
-            for j, name in enumerate(self.found):
-                self.copy_lane(f, to, j * self.n, name, k)
+            to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))
+            for name, count in counts.items():
+                self.copy_lane(f, to, start, name, k, count=count)
+                start += count
 
     @abstractmethod
     def _evaluate(self, f: Function, s: Lane):
@@ -109,6 +117,26 @@ class StateProjection(StateFunction):
     def _evaluate(self, f: Function, s: Lane):
         s.due = s.active
         self.projection.project_output(f, s, s.due > 0.5)
+
+
+class StateJump(StateProjection):
+    """The projection of states that events change, and the largest row of Psi_dot that it leaves, over the row's scale.
+
+    Psi_dot is linear in the velocities: what is left is of rows that contradict others.
+    """
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return super().counts | {"violated": 1}
+
+    def program_names(self) -> list[str]:
+        return [*super().program_names(), "psi_dot"]
+
+    def _evaluate(self, f: Function, s: Lane):
+        super()._evaluate(f, s)
+        self.copy(f, "result v", "state v")
+        self.invoke(f, "psi_dot")
+        s.violated = largest_violation(self, f)
 
 
 class StateTangentPart(StateFunction):

@@ -107,8 +107,9 @@ class EventStates(StateTangentPart, StateAccelerations):
             with f.each(self.n) as i:
                 self.put_entry(f, "directions", i + k * self.n, self.entry(f, "result dv", i))
 
-    def write_found(self, f: Function, s: Lane):
-        counts = {
+    @property
+    def counts(self) -> dict[str, int]:
+        return {
             "result a": self.n,
             "event values": len(self.conditions.at_state.outputs),
             "directions": len(self.directed) * self.n,
@@ -116,9 +117,3 @@ class EventStates(StateTangentPart, StateAccelerations):
             "forces": self.conditions.force_count,
             "safe forces": self._safe_count,
         }
-        with self.each_lane(f, s.active) as k:
-            to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))
-            start = 0
-            for name, count in counts.items():
-                self.copy_lane(f, to, start, name, k, count=count)
-                start += count

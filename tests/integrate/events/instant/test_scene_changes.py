@@ -302,3 +302,27 @@ def test_a_joint_that_would_have_to_stop_a_driver_cannot_be_attached(engine):
         sol = udk.simulate(mech, ts, events=[event], engine=engine, throw=False)
         assert sol.result == (udk.Result.successful if is_possible else udk.Result.event_impossible)
         assert abs(sol.time - (1.0 if is_possible else 0.3)) < 1e-9
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("order", ["ABCD", "DCBA"])
+def test_a_lock_that_would_have_to_stop_a_driver_is_impossible_whichever_row_is_left_out(order, engine):
+    """Elimination leaves out the row of the lock or that of the driver, by the order of joints; velocities violate it then."""
+    bodies = {
+        "crank": udk.Body(1.0, 0.02, (0.1, 0.0), 0.0),
+        "coupler": udk.Body(1.0, 0.02, (0.4, 0.2), np.pi / 4),
+        "rocker": udk.Body(1.0, 0.02, (0.6, 0.2), np.pi / 2),
+    }
+    half = 0.2 * 2**0.5
+    joints = {
+        "A": udk.Revolute(("ground", "crank"), [(0.0, 0.0), (-0.1, 0.0)]),
+        "B": udk.Revolute(("crank", "coupler"), [(0.1, 0.0), (-half, 0.0)]),
+        "C": udk.Revolute(("coupler", "rocker"), [(half, 0.0), (0.0, 0.2)]),
+        "D": udk.Revolute(("rocker", "ground"), [(0.0, -0.2), (0.6, 0.0)]),
+    }
+    motor = udk.Driver(("ground", "crank"), "angle", udk.Polynomial((0.0, 3.0)))
+    mech = udk.Mechanism(bodies, {name: joints[name] for name in order}, {"motor": motor})
+    for pin in "BCD" if engine == "native" else order[1]:
+        event = udk.Event(lambda t, at: t - 0.1, udk.Lock(pin), direction=1, name="lock")
+        sol = udk.simulate(mech, [0.0, 0.2], udk.assemble(mech), events=[event], engine=engine, throw=False)
+        assert (sol.result, round(float(sol.time), 9)) == (udk.Result.event_impossible, 0.1), pin

@@ -99,13 +99,12 @@ def _apply_event(
     if plan.adds.any() and (xp is not np or adds.any()):
         joints = system.add_joints(members, adds[:, None] & (e[:, None] == np.array(plan.added_by)), q, joints)
         # The new velocities satisfy the phase without its contacts at rest, since these contacts may open.
-        q1, _ = system.project(members, RunState(t, q, v, after, joints))
-        _, v1 = system.project(members, RunState(t, q1, v, plan.free(after), joints), is_free=True)
-        # The others must hold, too: a driver may demand velocities that the new joints do not allow; v1 is then a compromise.
-        _, v2 = system.project(members, RunState(t, q1, v1, plan.free(phase & after), joints), is_free=True)
+        q1, _, _ = system.project(members, RunState(t, q, v, after, joints))
+        _, v1, left = system.project(members, RunState(t, q1, v, plan.free(after), joints), is_free=True)
+        # A driver may demand velocities that the new joints do not allow: v1 is then a compromise, or violates either row.
         unit = take(system.coordinates, members)
-        moved, turned, fastest = (xp.max(xp.abs(x) / unit, axis=-1) for x in (q1 - q, v2 - v1, v2))
-        is_open = (moved > ATTACHABLE) | (turned > ATTACHABLE * fastest)
+        moved, slower, faster = (xp.max(xp.abs(x) / unit, axis=-1) for x in (q1 - q, v1, v))
+        is_open = (moved > ATTACHABLE) | (left > ATTACHABLE * xp.maximum(slower, faster))
         blocked = adds & (is_open if xp is np else stop_gradients(is_open))
         q, v = (xp.where(adds[:, None], x, y) for x, y in ((q1, q), (v1, v)))
     acts = ((releases | xp.asarray(plan.changes)[e]) & ~xp.asarray(plan.slides)[e])[:, None]

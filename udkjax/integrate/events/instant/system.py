@@ -61,8 +61,10 @@ class System(Protocol):
         """
         ...
 
-    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Float[Any, "b n"], Float[Any, "b n"]]:
-        """Return the states projected to the constraints of their phases."""
+    def project(
+        self, members: MemberIndices, at: RunState, is_free: bool = False
+    ) -> tuple[Float[Any, "b n"], Float[Any, "b n"], Float[Any, "b"]]:
+        """Return the states projected to the constraints of their phases, and the largest row of Psi_dot left, over its scale."""
         ...
 
     def add_joints(self, members: MemberIndices, new: Bool[Any, "b A"], q: Float[Any, "b n"], joints: Any) -> Any:

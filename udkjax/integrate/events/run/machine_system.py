@@ -108,10 +108,10 @@ class MachineSystem:
         """Evaluate the conditions of members at states."""
         return StateValues(*self._by_phase(members, at, PhaseCode.at))
 
-    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Return the states projected to the constraints of their phases."""
-        q, v = self._by_phase(members, at, PhaseCode.project)
-        return q, v
+    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the states projected to the constraints of their phases, and the rates that are left."""
+        q, v, left = self._by_phase(members, at, PhaseCode.project)
+        return q, v, left
 
     def _by_phase(
         self, members: MemberIndices, at: RunState, function: Callable[..., Sequence[np.ndarray]]

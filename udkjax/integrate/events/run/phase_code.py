@@ -97,7 +97,7 @@ def phase_plan(
         states=run.accelerations.of_events(conditions if has_forces else without, directed),
         marking=_marking(compiled.textbook) if run.code.marks_rows and not run.code.weighs_rows else None,
         projected=compiled.plan.projected,
-        project=run.accelerations.projection if added else None,
+        project=run.accelerations.jump if added else None,
         joints=(*joints, sides),
         active=active,
         sides_of_events=of_kinks.sides,
@@ -272,15 +272,15 @@ class PhaseCode:
         self._seen, self._values = given, StateValues._make([*values, directions, mobilities, forces, safe])
         return self._values
 
-    def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and velocities of members, projected to the constraints of their phases."""
+    def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return positions and velocities of members, projected to the constraints of their phases, and what rates are left."""
         t, q, v, *_ = state
         n = q.shape[1]
         assert self._project is not None  # events add joints
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
         numbers = self._with_samples(members, t, self._with_marks(members, state))
         (results,) = self._project(numbers, np.stack([t, t], axis=1), q, v, *further)
-        return results[:, :n].copy(), results[:, n:].copy()
+        return results[:, :n].copy(), results[:, n:-1].copy(), results[:, -1].copy()
 
     def _put_sides(self, numbers: np.ndarray, members: Int[np.ndarray, "b"]):
         """Put the sides of comparisons into the numbers of events."""

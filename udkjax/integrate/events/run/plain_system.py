@@ -15,6 +15,7 @@ from udkjax.integrate.events.law.phases import SCENE, Added
 from udkjax.integrate.events.run.hybrid import Hybrid, inverse_mass_of
 from udkjax.integrate.events.run.windows import WatchedConditions, WindowUnits, advance_window, first_window
 from udkjax.integrate.problem import IntegratorOutput
+from udkjax.transforms.gradients import stop_gradients
 
 
 def run_plain(hybrid: Hybrid) -> EventRun:
@@ -61,20 +62,21 @@ class PlainSystem:
         """Evaluate a state."""
         return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free, is_directed, has_forces))
 
-    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array]:
-        """Return positions and velocities that the phase of a state allows."""
+    def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array, Array]:
+        """Return positions and velocities that the phase of a state allows, and the rates that are left."""
         hybrid = self.hybrid
         # A replay without joints that move bodies as they are attached corrects nothing: one step has all derivatives.
         steps = 1 if hybrid.replays and hybrid.plan.has_only_contacts else 2
 
-        def of_mechanism(which: int, at: RunState) -> tuple[Array, Array]:
+        def of_mechanism(which: int, at: RunState) -> tuple[Array, Array, Array]:
             # Velocities jump, so `equations.project`, whose derivatives hold for small corrections, cannot be used.
             equations = hybrid.textbook(which, at)
-            return uk.project(equations.mechanism, *at[:3], equations.method, equations.weights, steps)
+            q, v = uk.project(equations.mechanism, *at[:3], equations.method, equations.weights, steps)
+            return q, v, stop_gradients(equations.violation_size(equations.violation(at.t, q, v)[1]))
 
         state = without_member(at)
-        q, v = hybrid.in_phase(state.phase, of_mechanism, state, is_free=is_free)
-        return q[None], v[None]
+        q, v, left = hybrid.in_phase(state.phase, of_mechanism, state, is_free=is_free)
+        return q[None], v[None], left[None]
 
     def add_joints(self, members: MemberIndices, new: Bool[Array, "1 A"], q: Float[Array, "1 n"], joints: Added) -> Added:
         """Return the joints that events have added, with new ones, added at q."""
