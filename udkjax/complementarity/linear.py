@@ -211,8 +211,8 @@ def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, equalities: Any, xp: 
     rows = allowed | equalities
     largest_b = xp.max(xp.where(rows, xp.abs(b), 0.0), axis=-1, keepdims=True)
     floor = xp.maximum(floor, TIGHT * largest_b)
-    if xp is np and not equalities.any() and allowed.sum(-1).max(initial=0) <= 1:
-        return allowed & (b + floor < 0)
+    if b.shape[-1] == 1 or (xp is np and not equalities.any() and allowed.sum(-1).max(initial=0) <= 1):
+        return equalities | (allowed & (b + floor < 0))
 
     def step(state: _Pivoting) -> _Pivoting:  # changes nothing once done
         y = times(W, state.x) + b

@@ -103,7 +103,7 @@ def _with_rest(system: System, members: MemberIndices, at: RunState, modes: Fric
     xp = system.xp
     if xp is np and not modes.locked.any():
         return Rest(modes, at.v)
-    _, v = system.project(members, with_modes(system, members, at, modes))
+    _, v, _ = system.project(members, with_modes(system, members, at, modes))
     return Rest(modes, xp.where(xp.any(modes.locked, axis=-1)[..., None], v, at.v))
 
 
