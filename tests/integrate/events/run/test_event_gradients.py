@@ -162,7 +162,7 @@ def test_a_condition_that_an_impact_carries_across_zero_moves_with_the_impact():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "most"), [("sticking joints", 20_000), ("a contact", 11_500)])
+@pytest.mark.parametrize(("scene", "most"), [("sticking joints", 20_000), ("a contact", 11_000)])
 def test_the_program_of_derivatives_is_short(scene, most):
     """Its length decides how long a user waits for the first gradient."""
 
