@@ -13,8 +13,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.choices import fast
 from tests.native.test_implicit_stages import TS, assert_motion_is_that_by_radau, by_radau, damped
-from udkjax.native import primitive
-from udkjax.native.run import controller, members
+from tests.ten_times import multiplied
 
 
 def run(mechanism, tol=1e-6, ts=TS, **choices):
@@ -177,7 +176,7 @@ def test_a_visible_vibration_is_followed_explicitly():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.1, 10.0])
-def test_thresholds_matter_little(factor, monkeypatch):
+def test_thresholds_matter_little(factor):
     """With counts of steps ten times as large or as small the same runs go on implicitly, to the same motion."""
     scenes = {  # tolerance, whether the run is stiff
         "four_bar": (damped(1e5), 1e-6, True),
@@ -189,17 +188,11 @@ def test_thresholds_matter_little(factor, monkeypatch):
     }
 
     def runs():
-        primitive.generate.cache_clear()
-        primitive.machine_code.cache_clear()
         return {name: run(mechanism, tol, throw=False) for name, (mechanism, tol, _) in scenes.items()}
 
     usual = runs()
-    monkeypatch.setattr(members, "PATIENCE", members.PATIENCE * factor)
-    monkeypatch.setattr(controller, "UNPAID", controller.UNPAID * factor)
-    other = runs()
-    monkeypatch.undo()
-    primitive.generate.cache_clear()
-    primitive.machine_code.cache_clear()
+    with multiplied(factor, "native.module.steps.PATIENCE", "native.module.steps.UNPAID"):
+        other = runs()
     for name, (_, tol, is_stiff) in scenes.items():
         assert (int(usual[name].stats["implicit"]) > 0) == (int(other[name].stats["implicit"]) > 0) == is_stiff, name
         assert_allclose(other[name].q, usual[name].q, atol=30 * tol if is_stiff else 0, rtol=0)

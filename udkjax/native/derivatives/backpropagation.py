@@ -62,8 +62,7 @@ class Reverse(Recorded):
         if self.count:
             write_prologue_derivative(self, self.active, REVERSE)
         write_differences_back(self)
-        if self.stage_equations:
-            self.stage_equations.write_stages("point2")
+        self.stiffness.write_stages("point2")
         self._write_step_back()
         self._write_leave_row()
         if self.plan.sampled:
@@ -97,7 +96,7 @@ class Reverse(Recorded):
     def _write_step_back(self):
         """Write `step_back`: from the cotangents of point 3 to those of point 2, in lanes after their first point (`at`)."""
         f, s = self.function("step_back")
-        active = s.at > 0.5
+        active, implicit = s.at > 0.5, self.stiffness.method
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.point3_t - s.point2_t)
         h, last = self.broadcast(f, step), self.last
         explicit, solved = active & (s.begin > -0.5) & (s.begin < 0.5), active & (s.begin < -0.5)
@@ -106,7 +105,7 @@ class Reverse(Recorded):
                 for i in range(1, last):
                     stage_state(self, f, s, i, "point2", step)
                     self.evaluate_stage(f, i)
-        if self.implicit:
+        if implicit:
             with f.if_(f.any_of(solved)):
                 s.step, s.stepping = step, f.select(solved, f.const(1.0, DOUBLE, f.width), 0.0)
                 f.call("take_stages_from_point2", f.given["work"])
@@ -116,7 +115,7 @@ class Reverse(Recorded):
                 self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
         self._evaluate_end(f)
         bar_of_end = "bar point3 a"
-        if self.implicit:  # the accelerations at the end of an implicit step are those of its last stage
+        if implicit:  # the accelerations at the end of an implicit step are those of its last stage
             bar_of_end = "residual a"
             with f.each(self.rowcount) as r:
                 self.put(f, bar_of_end, r, f.select(solved, 0.0, self.vector(f, "bar point3 a", r)))
@@ -125,9 +124,9 @@ class Reverse(Recorded):
             for x in "qv":
                 self.put(f, f"bar result {x}", r, self.vector(f, f"bar point3 {x}", r) + self.vector(f, f"bar state {x}", r))
         self._pull_projection(f, active)
-        if self.implicit:
-            count = self.implicit.stages
-            self._accumulate_stage(f, h, self.implicit, count, range(count), solved, first=True)
+        if implicit:
+            count = implicit.stages
+            self._accumulate_stage(f, h, implicit, count, range(count), solved, first=True)
         if not self.method.is_implicit:
             self._accumulate_stage(f, h, self.method, last, range(last), active & ~solved, first=True)
             with f.if_(f.any_of(explicit)):
@@ -135,9 +134,9 @@ class Reverse(Recorded):
                     stage_state(self, f, s, i, "point2", step)
                     self._pull_accelerations(f, f"stage{i} linearization", f"bar stage{i} a", explicit)
                     self._accumulate_stage(f, h, self.method, i, range(i), explicit)
-        if self.implicit:
+        if implicit:
             with f.if_(f.any_of(solved)):
-                self._pull_solved_stages(f, s, h, self.implicit, solved, step)
+                self._pull_solved_stages(f, s, h, implicit, solved, step)
         with f.each(self.rowcount) as r:
             old = self.vector(f, "bar point2 a", r)
             self.put(f, "bar point2 a", r, f.select(active, old + self.vector(f, "bar stage0 a", r), old))

@@ -50,8 +50,7 @@ class Differentiated(Trajectory):
 
     def _solve_transposed(self, f: Function, name: str):
         """Replace cotangents w of the accelerations of a solved stage by D^(-T) w."""
-        assert self.stage_equations is not None
-        d = self.stage_equations.exact(f)
+        d = self.stiffness.exact(f)
         with f.each(self.rowcount) as r:
             d.row("x")[r] = self.vector(f, name, r)
         f.call("solve_exact_transposed", f.given["work"])

@@ -74,8 +74,7 @@ class Recorded(Differentiated):
                 for k, name in enumerate(TITLE):
                     self.put_lane_entry(f, name, lane, f.load(given, k))
                 self.put_lane_entry(f, "record", lane, f.at(given, len(TITLE)), base=POINTER)
-                if self.plan.leaves:
-                    self._leave_for_implicit_steps(f, lane)
+                self.stiffness.if_leaving(lambda: self._leave_for_implicit_steps(f, lane))
                 for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
                     self.put_lane_entry(f, name, lane, x)
         with f.if_((self.lane_entry(f, "given", lane) < 0.5) & (self.backpropagates(f) | self._returns_record(f))):

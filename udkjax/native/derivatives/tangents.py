@@ -128,7 +128,7 @@ class Forward(Differentiated):
 
     def record_solved_stage(self, f: Function, s: Lane, i: int):
         """Compute the tangents of the accelerations of a solved stage; second derivatives from those along each direction."""
-        name, method, h, mask = f"stage{i} a", self.implicit, self.broadcast(f, s.step), s.stepping > 0.5
+        name, method, h, mask = f"stage{i} a", self.stiffness.method, self.broadcast(f, s.step), s.stepping > 0.5
         self._evaluate_solved(f, i)
         for ways in ([way for way in self.ways if way in GIVEN], self.ways[-1:]):
             with self._each_group(f):
@@ -158,8 +158,7 @@ class Forward(Differentiated):
 
     def _solve(self, f: Function, p: Value, name: str, ways: Sequence[str]):
         """Solve D x = b in some tangents of group p, in place of the array b."""
-        assert self.stage_equations is not None
-        d = self.stage_equations.exact(f)
+        d = self.stiffness.exact(f)
         b, x = d.row("b"), d.row("x")
         for way in ways:
             with self._in_way(f, way):
@@ -195,7 +194,7 @@ class Forward(Differentiated):
             for x in "qv":
                 self.put(f, f"state {x}", r, self.vector(f, f"point3 {x}", r))
         self._evaluate_end(f)
-        for method, mask in self.methods(f, s):
+        for method, mask in self.stiffness.methods(f, s):
             with self._each_tangent(f):
                 self._change_stage(f, method.stages, h, "point2", method, mask)
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
@@ -211,8 +210,8 @@ class Forward(Differentiated):
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
             for name, x in (("result q", "q"), ("result v", "v"), ("difference0", "a")):
                 old, new = self.vector(f, f"point3 {x}", r, "tangent"), self.vector(f, name, r, "tangent")
-                if self.implicit and x == "a":
-                    of_stage = self.vector(f, f"stage{self.implicit.stages - 1} a", r, "tangent")
+                if (implicit := self.stiffness.method) and x == "a":
+                    of_stage = self.vector(f, f"stage{implicit.stages - 1} a", r, "tangent")
                     new = f.select(s.begin < -0.5, of_stage, new)
                 self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
 

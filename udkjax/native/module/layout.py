@@ -67,16 +67,6 @@ class Plan:
     stiff: Method | None = None  # the implicit method to which an explicit run changes where it is stiff
     leaves: bool = False  # whether a run leaves the module where it may be stiff, for one that has the implicit method
 
-    @property
-    def measures_speed(self) -> bool:
-        """True if the rate of the equations is measured."""
-        return self.leaves or self.stiff is not None
-
-    @property
-    def implicit(self) -> Method | None:
-        """The implicit method of the module; None if it has none."""
-        return self.method if self.method.is_implicit else self.stiff
-
 
 @dataclass
 class Layout:

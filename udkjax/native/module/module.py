@@ -1,6 +1,6 @@
 """One module of machine code: its programs and its functions."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from udkjax.equations.programs.unrolled import Unrolled, UnrolledProgram
 from udkjax.expressions.loops.loop_derivative import FORWARD
@@ -9,10 +9,10 @@ from udkjax.native.language.loops import LoopWriter
 from udkjax.native.language.program import PointerPlace, consecutive, write
 from udkjax.native.module.arrays import RunArrays
 from udkjax.native.module.layout import Lane, Layout, Plan
+from udkjax.native.module.parts import StiffnessPart
 from udkjax.native.module.programs import COLD, DIFFERENTIATED, OUT, PROGRAMS
 from udkjax.native.module.settling import friction_of
 from udkjax.native.module.steps import AIM_ACROSS
-from udkjax.native.module.tableau import Method
 
 
 class Module(RunArrays):
@@ -29,8 +29,7 @@ class Module(RunArrays):
     shares_constants = False  # whether the members of a block of threads have the same constants, in its shared memory
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
-        self.plan, self.code, self.method, self.implicit = plan, plan.code, plan.method, plan.implicit
-        self.stages = max(plan.method.stages, plan.implicit.stages if plan.implicit else 0)
+        self.plan, self.code, self.method = plan, plan.code, plan.method
         code, n, m = plan.code, plan.code.coordinate_count, plan.code.row_count
         self.n, self.m = n, m
         if plan.sampled:
@@ -39,7 +38,10 @@ class Module(RunArrays):
             self.settings = (*self.settings, *plan.formulation.settings)
         self.pieces = code.piece_count if plan.breaks else 0
         self.edges = max(self.pieces - code.first_edge, 0) if self.pieces else 0  # pieces that end where a load changes its sign
+        self.stiffness = StiffnessPart(plan)
         self.choose_parts()
+        implicit = self.stiffness.method
+        self.stages = max(plan.method.stages, implicit.stages if implicit else 0)
         names = self.program_names()
         self.friction = friction_of(self, names)
         self.programs = {name: PROGRAMS[name] for name in (*names, *self.friction.programs)}
@@ -50,7 +52,6 @@ class Module(RunArrays):
         self.lay_out()
         self.tangents = self.places  # memory of one direction of a derivative
         self.functions: list[Function] = []
-        self.apart: set[str] = set()
         self.begins = []
         self.loops = LoopWriter(plan.width, cold=plan.unrolled)
         self.stage_accelerations = ["point3 a", *(f"stage{i} a" for i in range(1, self.stages))]
@@ -69,7 +70,7 @@ class Module(RunArrays):
     def _unroll(self, differentiated: Sequence[str], active: Sequence[bool]) -> Unrolled:
         asked = [program.outputs for program in self.programs.values()]
         of = [DIFFERENTIATED[name] for name in differentiated]
-        return Unrolled(self.code, asked, of, active, self.mode, self.implicit is not None)
+        return Unrolled(self.code, asked, of, active, self.mode, self.stiffness.method is not None)
 
     # --- programs
 
@@ -159,14 +160,6 @@ class Module(RunArrays):
 
     def record_solved_stage(self, f: Function, s: Lane, i: int):
         """Hook: called at the state of stage i of an implicit step, after it has been solved in lanes that are `stepping`."""
-
-    def methods(self, f: Function, s: Lane) -> Iterator[tuple[Method, Value | None]]:
-        """Run the block for each method of the module, with the mask of the lanes whose attempt it makes; None: all lanes."""
-        yield self.method, None
-        if self.plan.stiff:
-            mask = s.begin < -0.5
-            with f.if_(f.any_of(mask)):
-                yield self.plan.stiff, mask
 
     def record_step(self, f: Function, s: Lane, accept: Value):
         """Hook: called after a step, when its end has become point 3 in lanes that `accept`."""

@@ -4,14 +4,18 @@ A part says which programs of the scene it needs, which memory it reserves, and 
 theirs from parts/.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value, Variable
-from udkjax.native.module.layout import Lane
+from udkjax.native.module.layout import Lane, Plan
+from udkjax.native.module.tableau import Method
 
 Shortened = tuple[Value, Value, Value]  # lanes whose attempt is complete, lanes that shorten it, time to a singular configuration
+
+BeginMember = Callable[[Value, Value], None]  # loads a member into a lane: (lane, member)
 
 
 class Part:
@@ -172,3 +176,121 @@ class FallbackPart(Part):
 
     def find_tangent_part(self, f: Function, s: Lane):
         """Compute the tangent parts `result dq` and `result dv` again near singular configurations."""
+
+
+class StiffnessPart(Part):
+    """The implicit steps of stiff motions; this one has none, and runs never leave the module."""
+
+    method: Method | None = None
+    """The implicit method."""
+    pointers: Sequence[str] = ()
+    """The global pointers of the module."""
+    entry = "run", ("call",)
+    """The function that runs members, with its arguments."""
+
+    def __init__(self, plan: Plan):
+        self._plan = plan
+
+    def exact(self, f: Function) -> Any:
+        """Return the matrix at a solved stage, for derivatives."""
+        raise NotImplementedError
+
+    def write_measurement(self):
+        """Write the measurement of the rate of the equations."""
+
+    def write_stages(self, start: str):
+        """Write the stages of an implicit step from a point."""
+
+    # --- a step
+
+    def methods(self, f: Function, s: Lane) -> Iterator[tuple[Method, Value | None]]:
+        """Run the block for each method of the module, with the mask of the lanes whose attempt it makes; None: all lanes."""
+        yield self._plan.method, None
+
+    def take_stages(self, f: Function, s: Lane, implicit: Value, explicit: Callable[[], None]):
+        """Take the stages of a step: by `explicit`, or in lanes with an `implicit` attempt by the implicit method."""
+        explicit()
+
+    def smooth_error(self, f: Function, s: Lane):
+        """Damp fast motions in the errors of trials of implicit steps."""
+
+    def end_step(self, f: Function, s: Lane, implicit: Value):
+        """Set `result a` at the end of implicit steps."""
+
+    def repeat_diverged(self, f: Function, s: Lane, implicit: Value):
+        """Set the `error` of implicit steps that have to be repeated."""
+
+    # --- the decision on the next step
+
+    def trials(self, s: Lane, stepping: Value) -> Value | None:
+        """Return the lanes whose attempt is a trial of an implicit step."""
+        return None
+
+    def cost(self, f: Function, s: Lane, implicit: Value, explicit: Value) -> Value:
+        """Return the evaluations of an attempt."""
+        return explicit
+
+    def shift_points(self, f: Function, s: Lane, accept: Value):
+        """Store whether the steps to the accepted states were implicit."""
+
+    def choose_next(self, f: Function, s: Lane, stepping: Value, accept: Value, implicit: Value, tries: Value | None):
+        """Choose the method of the next step; `tries`: lanes whose attempt was a trial."""
+
+    # --- the end of the next step
+
+    def plan_length(self, f: Function, s: Lane, begin: Value, start: Value, stop: Value) -> Value:
+        """Return the length of the next step from the time `start`, before it is shortened to end by `stop`."""
+        return s.h
+
+    def splits(self, s: Lane, splits: Value) -> Value:
+        """Return the lanes of a mask whose steps have to be as short as interpolation needs them."""
+        return splits
+
+    def ends_at_output(self, f: Function, s: Lane, begin: Value, start: Value, t1: Value, stop: Value) -> Value | None:
+        """Return the lanes whose step from the time `start` ends at an output, instead of `t1`."""
+        return None
+
+    def next_begin(self, f: Function, s: Lane) -> Value:
+        """Return `begin` of steps that do not begin a run."""
+        return -s.stiff
+
+    # --- points
+
+    def between_explicit(self, s: Lane, near: Value, k: int) -> Value:
+        """Return the lanes of a mask in which the steps to point k and to that before were explicit."""
+        return near
+
+    def return_to_point(self, s: Lane, mask: Value, k: int):
+        """Go on from point k in some lanes."""
+
+    def begin_anew(self, f: Function, s: Lane) -> Value:
+        """Return `begin` of steps from there."""
+        return f.const(0.0, DOUBLE, f.width)
+
+    # --- the run of all members (leaving.py)
+
+    def begin_run(self, f: Function):
+        """Begin `run(call)`."""
+
+    def begin_members(self, f: Function, take: Callable[[], Value], begin: BeginMember, fill: Callable[[], None]):
+        """Load the first members into the lanes."""
+        fill()
+
+    def stays(self, f: Function, s: Lane, goes_on: Value, present: Callable[[], Value]) -> Value:
+        """Return whether the run goes on in this module."""
+        return goes_on
+
+    def end_run(self, f: Function, s: Lane, free: Callable[[], None]):
+        """End `run(call)`."""
+        free()
+
+    def write_entries(self) -> list[Function]:
+        """Return further functions that run members."""
+        return []
+
+    def if_leaving(self, do: Callable[[], None]):
+        """Run `do` if members may leave the module."""
+
+    def mark(self, text: str) -> str:
+        """Return the text of the module, with the names of functions that are compiled apart."""
+        return text

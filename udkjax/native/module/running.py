@@ -6,10 +6,10 @@ from collections.abc import Callable
 from udkjax.native.code import interrupts
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.language.loops import LoopWriter
-from udkjax.native.language.text import ALLOCATION, apart, text_of_module
-from udkjax.native.module import leaving
+from udkjax.native.language.text import ALLOCATION, text_of_module
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.memory import Memory, ThreadCode
+from udkjax.native.module.parts import StiffnessPart
 
 Repeat = Callable[[Callable[[], Value], Callable[[], None]], None]  # repeats a step while a condition holds: (goes_on, step)
 
@@ -27,8 +27,7 @@ class Running(Memory):
     """Where the memory of directions begins, relative to `work`; None if it is a block of its own."""
 
     functions: list[Function]
-    apart: set[str]
-    """The names of functions that are compiled apart from others, since only this module has them."""
+    stiffness: StiffnessPart
     loops: LoopWriter
     is_interruptible = True
     """True if Ctrl-C ends runs: on a page, which has no signals, it cannot."""
@@ -37,10 +36,9 @@ class Running(Memory):
         """LLVM's text of the whole module."""
         self.write_functions()
         self._write_run()
-        pointers = [*(leaving.GLOBALS if self.plan.leaves else []), *([interrupts.GLOBAL] if self._has_signals else [])]
+        pointers = [*self.stiffness.pointers, *([interrupts.GLOBAL] if self._has_signals else [])]
         text = text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION)
-        has_both = self.plan.leaves or self.plan.stiff is not None
-        return f"{apart(self.apart | leaving.DIFFERENT)}\n{text}" if has_both else text
+        return self.stiffness.mark(text)
 
     def thread_code(self) -> ThreadCode:
         self.write_functions()
@@ -107,14 +105,11 @@ class Running(Memory):
 
     def _write_run(self):
         """Write `run(call)`: run all members; or `resume(call, members)` (leaving.py), and `run`, which calls it."""
-        plan, width = self.plan, self.plan.width
-        resumes = plan.stiff is not None
-        arguments = [(POINTER, x) for x in ("call", *(["members"] if resumes else []))]
-        f = Function(leaving.RESUME if resumes else "run", arguments, width)
+        width, (name, arguments) = self.plan.width, self.stiffness.entry
+        f = Function(name, [(POINTER, x) for x in arguments], width)
         self.functions.append(f)
         call = f.given["call"]
-        if plan.leaves:
-            leaving.go_on_if_loaded(f)
+        self.stiffness.begin_run(f)
         block, work = self.allocate(f, f.const(self._memory_size, INT))
         f.given["work"], s = work, Lane(f, self.places)
         self._clear_memory(f)
@@ -133,38 +128,24 @@ class Running(Memory):
             with f.each(width) as k, f.if_(f.lane(s.active, k) < 0.5):
                 begin(k, take())
 
-        if resumes:
-            with f.each(width) as k:
-                member = f.variable(f.load(f.given["members"], k, base=INT), INT, 1)
-                with f.if_(member.value < 0):
-                    member.value = take()
-                begin(k, member.value)
-        else:
-            fill()
-
-        def leaves() -> Value:
-            return f.any_of(self.present(f, s) & (s.stiff > 0.5))
-
+        self.stiffness.begin_members(f, take, begin, fill)
         interruption = interrupts.Interruption(f) if self._has_signals else None
 
-        with f.while_(lambda: f.any_of(self.present(f, s)) & ~leaves() if plan.leaves else f.any_of(self.present(f, s))):
+        def present() -> Value:
+            return self.present(f, s)
+
+        with f.while_(lambda: self.stiffness.stays(f, s, f.any_of(present()), present)):
             if interruption:
                 with f.if_(interruption.has_come()):
                     s.max_steps = f.const(-1.0, DOUBLE, width)
             self.step_all(f, s, fill)
-        left = leaving.members_in_lanes(self, f, s, self.present(f, s)) if plan.leaves else None
-        is_left = leaves() if plan.leaves else None
-        if left is not None:
-            self.release(f, s)
-        for block in blocks:
-            f.line(f"call void @free(ptr {block.name})")
-        if left is not None and is_left is not None:
-            with f.if_(is_left):
-                leaving.go_on(self, f, left)
-        if resumes:
-            run = Function("run", [(POINTER, "call")], width)
-            leaving.write_run(run)
-            self.functions.append(run)
+
+        def free():
+            for block in blocks:
+                f.line(f"call void @free(ptr {block.name})")
+
+        self.stiffness.end_run(f, s, free)
+        self.functions += self.stiffness.write_entries()
 
     def _write_run_member(self):
         """Write `run_member(call, work, thread)`: run the member of a thread in the memory at `work`.

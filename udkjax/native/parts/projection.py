@@ -154,7 +154,7 @@ def lost_in(module: Module, f: Function, s: Lane, accept: Value) -> Value:
 def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
     """Estimate the errors of q and v from the accelerations of all stages; `end` names those of the last stage."""
     h, zero = module.broadcast(f, s.step), f.const(0.0, DOUBLE, module.plan.vector)
-    for method, mask in module.methods(f, s):
+    for method, mask in module.stiffness.methods(f, s):
         names = list(module.stage_accelerations)
         if method.ends and end:
             names[-1] = end
@@ -163,6 +163,4 @@ def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q:
             new_q = zero if error_q is None else h * (h * error_q)
             for to, new in ((to_q, new_q), (to_v, zero if error_v is None else h * error_v)):
                 module.put(f, to, r, new if mask is None else f.select(mask, new, module.vector(f, to, r)))
-    if module.plan.stiff:
-        with f.if_(f.any_of((s.stepping > 0.5) & (s.trial > 0.0))):
-            f.call("smooth_error", f.given["work"])
+    module.stiffness.smooth_error(f, s)

@@ -19,11 +19,7 @@ def aim(module: Module, f: Function, s: Lane):
         next_breakpoint(module, f, s, start)
         end = s.t1
         stop = f.min(end, crossing)
-    length = s.h
-    if module.plan.stiff:  # a trial that has to end earlier would not show whether longer steps pay
-        s.trial = where(begin | (start + s.trial >= f.min(stop, s.end) - s.smallest), f.const(0.0, DOUBLE, f.width), s.trial)
-        length = where(s.trial > 0.0, s.trial, length)
-    t1 = start + length
+    t1 = start + module.stiffness.plan_length(f, s, begin, start, stop)
     last = (t1 >= s.end - s.smallest) & ~begin
     if not module.plan.breaks:
         t1 = where(last, s.end, halve(f, s, t1, s.end, begin | last))
@@ -34,18 +30,11 @@ def aim(module: Module, f: Function, s: Lane):
         split = start + rest / parts
         splits = (s.steps < float(POINTS - 2)) & (t1 > split) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
         splits = splits & (s.next < stop - s.smallest)  # only if outputs are due in between
-        if module.implicit:  # a step suffices for its outputs
-            splits = splits & (s.stiff < 0.5)
-        if module.plan.stiff:
-            splits = splits & (s.trial <= 0.0)
+        splits = module.stiffness.splits(s, splits)
         if module.pieces:
             splits = splits & s.aim.is_not(float(AIM_ACROSS))
-        is_output = None
-        if module.plan.stiff:
-            # A jump at the breakpoint beside a stiff damper is over at once, and its acceleration says nothing of states between
-            # the ends of a step: the first outputs are ends of steps.
-            is_output = (s.stiff > 0.5) & (s.trial <= 0.0) & (s.steps < float(POINTS - 1)) & ~begin
-            is_output = is_output & (s.next > start + s.smallest * 2.0) & (s.next < f.min(t1, stop) - s.smallest * 2.0)
+        is_output = module.stiffness.ends_at_output(f, s, begin, start, t1, stop)
+        if is_output is not None:
             t1 = where(is_output, s.next, t1)
             splits = splits & ~is_output
         reached = t1 >= stop - s.smallest * 2.0
@@ -64,7 +53,7 @@ def aim(module: Module, f: Function, s: Lane):
     t1 = where(begin, s.past_breaks if module.plan.breaks else s.point3_t, t1)
     s.t1 = t1
     s.step = where((s.stepping > 0.5) & ~begin, t1 - s.point3_t, 0.0)
-    s.begin = where(begin, yes, where(s.trial > 0.0, -yes, -s.stiff) if module.plan.stiff else -s.stiff)
+    s.begin = where(begin, yes, module.stiffness.next_begin(f, s))
     s.last = where(last, yes, 0.0)
 
 

@@ -20,19 +20,11 @@ from udkjax.native.language.power import power
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.steps import (
-    CLEARLY,
-    CORRECTIONS,
     FACTORS,
     GAP,
-    LIMIT,
-    PATIENCE,
     POINTS,
     RESTART_FACTOR,
-    SLOPE,
-    SLOPE_IN_LANES,
-    STABLE,
     STRETCH,
-    UNPAID,
     Status,
 )
 from udkjax.native.parts.manifold import velocity_tolerance
@@ -44,7 +36,7 @@ def write_decide(module: Module):
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
     stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
     failed = stepping & ~(error < np.inf)
-    tries = stepping & (s.trial > 0.0) if module.plan.stiff else None
+    tries = module.stiffness.trials(s, stepping)
     stepping, shortens, time_left = module.fallback.retry(f, s, stepping, failed, tries)
     repeats = f.const(False, BOOL, f.width)
     tried = where(stepping, s.tried + 1.0, s.tried)
@@ -84,8 +76,8 @@ def write_decide(module: Module):
         s.where(begun, rate=inf, distance0=inf, distance1=inf)
         s.where(stepping, steps=where(begin, s.steps + where(begun & accept, yes, 0.0), s.steps + where(accept, yes, 0.0)))
         s.where(accept & (s.lands > 0.5), steps=-1.0)
-    implicit, per_step = s.begin < -0.5, f.const(float(module.method.stages), DOUBLE, f.width)
-    per_step = where(implicit, s.iterations + 1.0, per_step) if module.implicit else per_step
+    implicit = s.begin < -0.5
+    per_step = module.stiffness.cost(f, s, implicit, f.const(float(module.method.stages), DOUBLE, f.width))
     cost = where(begin, f.const(1.0, DOUBLE, f.width), per_step)
     cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
@@ -94,50 +86,7 @@ def write_decide(module: Module):
     s.abrupt = where(abrupt, yes, 0.0)
     s.until = where(abrupt, s.point3_t, _due_until(module, f, s, accept, stepping & begin))
     s.where(accept, accepted=s.accepted + 1.0)
-    if module.implicit:
-        s.where(accept & implicit, implicit=s.implicit + 1.0)
-    if tries is not None:
-        _choose_method(module, f, s, stepping, accept, tries)
-    if module.plan.leaves:
-        _notice_speed(f, s, accept)
-
-
-def _notice_speed(f: Function, s: Lane, accept: Value):
-    """Mark runs as stiff for which a module with an implicit method would try an implicit step."""
-    measured = accept & (s.begin < 0.5) & (s.tried > s.watch)
-    with f.if_(f.any_of(measured)):
-        s.where(measured, watch=s.tried + PATIENCE)
-        s.where(measured & (s.speed > LIMIT), stiff=1.0)
-
-
-def _choose_method(module: Module, f: Function, s: Lane, stepping: Value, accept: Value, tries: Value):
-    """Choose the method of the next step: an implicit one where stability limits the explicit one, as long as it pays.
-
-    `tries`: lanes whose attempt is a trial of an implicit step.
-    """
-    assert module.plan.stiff is not None
-    implicit = stepping & (s.begin < -0.5)
-    measured = accept & (s.begin < 0.5) & (s.begin > -0.5) & (s.tried > s.watch)
-    with f.if_(f.any_of(measured | implicit)):
-        length = STABLE * gain(module)  # length of a step that pays, times the largest rate
-        s.where(accept & tries, stiff=1.0)
-        pays = s.growth >= (module.plan.stiff.diagonal * length) ** 2  # at least: the growth is less where dampers are stiff
-        s.where(implicit, unpaid=f.select(pays | tries, f.const(0.0, DOUBLE, f.width), s.unpaid + 1.0))
-        returns = implicit & (s.unpaid >= UNPAID)
-        fails = returns | (tries & ~accept)
-        s.where(returns, stiff=0.0, rate=np.inf)
-        s.where(fails, patience=s.patience * 2.0)
-        s.where(fails | measured, watch=s.tried + s.patience)
-        is_near = measured & (s.speed > LIMIT)
-        trial = f.select(is_near, s.step * (length * CLEARLY) / f.select(is_near, s.speed, 1.0), 0.0)
-        s.where(stepping, trial=trial)
-
-
-def gain(module: Module) -> float:
-    """Return the least ratio of the length of an implicit step to that of an explicit one at which it pays."""
-    assert module.plan.stiff is not None
-    slopes = module.n * (SLOPE_IN_LANES if module.plan.unrolled else SLOPE)
-    return (CORRECTIONS * (module.plan.stiff.stages - 1) + slopes) / module.method.stages
+    module.stiffness.choose_next(f, s, stepping, accept, implicit, tries)
 
 
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value, tries: Value | None) -> tuple[Value, Value]:
@@ -145,7 +94,7 @@ def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Valu
     chosen, used = (f.variable(0.0), f.variable(0.0))
     # A trial is by another method than the step before.
     before = s.rate if tries is None else f.select(tries, f.const(np.inf, DOUBLE, f.width), s.rate)
-    for method, mask in module.methods(f, s):
+    for method, mask in module.stiffness.methods(f, s):
         for variable, new in zip((chosen, used), _factor_of_order(f, before, s.error, accept, step, method.order), strict=True):
             variable.value = new if mask is None else f.select(mask, new, variable.value)
     return chosen.value, used.value
@@ -174,10 +123,7 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
             s.where(accept, **{f"point{k}_t": getattr(s, f"point{k + 1}_t")})
         module.copy_point(f, accept, ("state q", "result v", "result a"), f"point{POINTS - 1}")
         s.where(accept, point3_t=s.t1)
-        if module.plan.stiff:
-            for k in range(POINTS - 1):
-                s.where(accept, **{f"point{k}_solved": getattr(s, f"point{k + 1}_solved")})
-            s.where(accept, point3_solved=f.max(-s.begin, 0.0))
+        module.stiffness.shift_points(f, s, accept)
         s.where(accept, distance0=s.distance1)
         s.where(accept, distance1=s.distance2)
         s.where(accept, distance2=s.distance)

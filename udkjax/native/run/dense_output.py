@@ -50,9 +50,7 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
     all_near = f.const(not module.method.is_implicit, BOOL, f.width)
     for k in range(1, POINTS - 1):
         near = (times[k] - times[k + 1]) * STRETCH >= step
-        if module.plan.stiff:
-            near = near & (getattr(s, f"point{POINTS - k}_solved") + getattr(s, f"point{POINTS - k - 1}_solved") < 0.5)
-        all_near = all_near & near
+        all_near = all_near & module.stiffness.between_explicit(s, near, POINTS - k)
         used.append(all_near)
     return inverse, used
 

@@ -5,7 +5,7 @@ import numpy as np
 from udkjax.native.language.ir import DOUBLE, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import FACTORS, NORMAL_ERROR_WEIGHT, STAGE_SHRINK
+from udkjax.native.module.steps import NORMAL_ERROR_WEIGHT
 from udkjax.native.module.tableau import Method
 
 
@@ -14,10 +14,9 @@ def write_attempt(module: Module):
 
     It computes the state at `t1` as `state q`, `result v` and `result a`, with its `error` and `distance`.
     """
-    if module.plan.measures_speed:
-        write_measure_speed(module)
+    module.stiffness.write_measurement()
     f, s = module.function("attempt")
-    method, stages = module.method, module.method.stages
+    stages = module.method.stages
     ones = lambda: f.const(1.0, DOUBLE, f.width)  # noqa: E731
     s.ok = ones()
     s.distance = f.const(np.inf, DOUBLE, f.width)
@@ -32,22 +31,6 @@ def write_attempt(module: Module):
             module.accelerate_stage(f, i)
             module.accelerations.check_pivots(f, s, f"stage{i} a")
             module.record_stage(f, s, i)
-        if module.plan.measures_speed:
-            _watch_speed(module, f, s)
-
-    def take_stages_by_method():
-        if not module.implicit:
-            take_stages()
-            return
-        stepping = s.stepping
-        for take, mask in ((take_stages, s.begin > -0.5), (lambda: f.call("take_stages_from_point3", f.given["work"]), implicit)):
-            if take is take_stages and method.is_implicit:
-                continue
-            mask = (stepping > 0.5) & mask
-            with f.if_(f.any_of(mask)):
-                s.stepping = f.select(mask, ones(), 0.0)
-                take()
-        s.stepping = stepping
 
     def clear_stages():
         # Stages may hold NaN of a failed member, which would survive multiplication by a step of zero.
@@ -57,71 +40,14 @@ def write_attempt(module: Module):
 
     implicit = s.begin < -0.5
     module.projection.begin_step(f, s)
-    f.choose(begins, clear_stages, take_stages_by_method)
-    for each_method, mask in module.methods(f, s):
+    f.choose(begins, clear_stages, lambda: module.stiffness.take_stages(f, s, implicit, take_stages))
+    for each_method, mask in module.stiffness.methods(f, s):
         stage_state(module, f, s, each_method.stages, method=each_method, mask=mask)
     setattr(s, "state t", s.t1)
     module.projection.end_step(f, s)
-    if module.implicit:
-        with f.if_(f.any_of(implicit)):
-            module.copy(f, f"stage{module.implicit.stages - 1} a", "result a", implicit)
+    module.stiffness.end_step(f, s, implicit)
     _measure_error(module, f, s)
-    if module.implicit:
-        repeated = (FACTORS.safety / STAGE_SHRINK) ** module.implicit.order
-        fails = s.diverged > 0.5
-        if module.plan.stiff:
-            fails = fails | ((s.trial > 0.0) & ~(s.error < np.inf))
-        s.where(fails & implicit & (s.stepping > 0.5), error=repeated)
-
-
-def _watch_speed(module: Module, f: Function, s: Lane):
-    """Set `speed` of an explicit step in attempts in which it is to be measured, otherwise zero."""
-    is_due = (s.stepping > 0.5) & (s.tried >= s.watch)
-    s.speed = f.const(0.0, DOUBLE, f.width)
-    with f.if_(f.any_of(is_due)):
-        f.call("measure_speed", f.given["work"])
-        s.where(~is_due, speed=0.0)
-
-
-def write_measure_speed(module: Module):
-    """Write `measure_speed`: `speed`, the length of an explicit step times the largest rate of the equations.
-
-    The last two stages are both at the end of the step, and their states differ by errors in which the fastest motions dominate
-    (Hairer and Wanner, IV.2). With J the Jacobian of (q, v) -> (v, a), the rate is the root of |J J x| / |x| for this difference
-    x: that is right for a motion that decays as well as for one that swings, where |J x| / |x| would depend on the phase.
-    """
-    f, s = module.function("measure_speed")
-    method, h, omega = module.method, module.broadcast(f, s.step), module.broadcast(f, s.omega)
-    last = method.stages - 1
-    end, distance, safe = f"stage{last} a", s.distance, s.safe
-    in_q, in_v, in_a = "state dq", "state dv", "result dv"  # x and J x
-    with f.each(module.rowcount) as r:
-        sum_q, sum_v = (module.weighted_sum(f, row[last] - row[last - 1], r) for row in (method.q, method.v))
-        assert sum_q is not None and sum_v is not None
-        change_a = module.vector(f, end, r) - module.vector(f, f"stage{last - 1} a", r)
-        for name, change in ((in_q, h * (h * sum_q)), (in_v, h * sum_v), (in_a, change_a)):
-            module.put(f, name, r, change)
-
-    def norm(of_q: str, of_v: str) -> Value:
-        def sizes(r: Value) -> list[Value]:
-            unit = module.vector(f, "inverse unit", r)
-            return [f.abs(module.vector(f, of_q, r)) * omega * unit, f.abs(module.vector(f, of_v, r)) * unit]
-
-        return module.largest(f, sizes)
-
-    size = norm(in_q, in_v)
-    s.speed = size / norm(in_v, in_a)  # the time in which J x changes the state by as much as x does
-    stage_state(module, f, s, last)
-    with f.each(module.rowcount) as r:
-        for x, change in (("state q", in_v), ("state v", in_a)):
-            scaled = module.broadcast(f, s.speed) * module.vector(f, change, r)
-            module.put(f, x, r, module.vector(f, x, r) + scaled)
-    module.accelerations.accelerate(f, "result a")
-    with f.each(module.rowcount) as r:
-        change = module.vector(f, "result a", r) - module.vector(f, end, r)
-        module.put(f, "result a", r, change / module.broadcast(f, s.speed))
-    s.distance, s.safe = distance, safe
-    s.speed = s.step * f.intrinsic("sqrt", norm(in_a, "result a") / size)
+    module.stiffness.repeat_diverged(f, s, implicit)
 
 
 def _measure_error(module: Module, f: Function, s: Lane):

@@ -25,6 +25,7 @@ from udkjax.native.module.layout import Lane, Layout
 from udkjax.native.module.module import Module
 from udkjax.native.module.program_derivative import SLOPES, ProgramDerivative
 from udkjax.native.module.steps import DIVERGING, EAGER, FADING, RENEWALS, SLOW, STAGE_ITERATIONS, STAGE_TOL
+from udkjax.native.module.tableau import Method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 from udkjax.native.pseudoinverses.lu import OrderedLUCode
 from udkjax.native.run.runge_kutta import error_of_velocities, stage_state
@@ -34,7 +35,6 @@ class StageEquations:
     """The functions of a module that solve stages, in lanes that are `stepping`.
 
         take_stages_from_point3(work)    the accelerations of all stages of the step `step` from point 3
-        smooth_error(work)               D^(-1) of the error of velocities, where an implicit step is tried
         factor_stage(work)               the LU factors of D, from the slopes at the state
         solve_stage(work)                `guess a` of a stage, and its state
 
@@ -46,9 +46,10 @@ class StageEquations:
         solve_exact_transposed(work)     the row `b` = D^(-T) x
     """
 
-    def __init__(self, module: Module, exact: bool = False):
-        assert module.implicit is not None  # checked by the caller
-        self._in, self._method, plan, n = module, module.implicit, module.plan, module.n
+    is_cold = False  # whether few runs need the stages, which spend their time in the functions that they call
+
+    def __init__(self, module: Module, method: Method, exact: bool = False):
+        self._in, self._method, plan, n = module, method, module.plan, module.n
         lanes = plan.vector if plan.width == 1 and plan.unrolled else plan.width
         self._group = lanes // plan.width  # directions of a tangent
         self._tangent = w = Layout(lanes, plan.vector)
@@ -65,10 +66,12 @@ class StageEquations:
         shapes = self._lu.matrices(n, n)
         self._layout = DenseLayout(module, shapes | {"kept": (n, n)}, (n, n), "stage")
         self._exact = DenseLayout(module, shapes, (n, n), "exact") if exact else None
-        if plan.stiff:
-            p.add("fastest", n)
+        self._reserve()
         module.unused = begin, p.size  # the matrix of a large scene takes more memory than all else
         p.add("cleared")
+
+    def _reserve(self):
+        """Hook: reserves further memory."""
 
     def write(self):
         """Write all functions."""
@@ -77,14 +80,16 @@ class StageEquations:
         self._write_factor("factor_stage", self._layout, "kept")
         self._write_solve()
         self.write_stages("point3")
-        if self._in.plan.stiff:
-            self._write_smooth_error()
+        self._write_further()
         if self._exact is None:
             return
         self._write_factor("factor_exact", self._exact, "D")
         for name, solve in (("solve_exact", self._lu.solve), ("solve_exact_transposed", self._lu.solve_transposed)):
             f, _ = self._in.function(name)
             solve(DenseMatrices(self._exact, f))
+
+    def _write_further(self):
+        """Hook: writes further functions."""
 
     def exact(self, f: Function) -> DenseMatrices:
         """Return the matrix at a solved stage, in a function."""
@@ -116,27 +121,6 @@ class StageEquations:
             with f.each(module.n) as i:
                 d.copy(d.row(to, i), d.row("D", i))
         self._lu.factor(d)
-
-    def _measure_growth(self, f: Function, s: Lane, d: DenseMatrices):
-        """Take a step of the power iteration for the largest eigenvalue of I - D, from the direction found in the step before.
-
-        All sums are in the order of the columns, so that results do not depend on the number of lanes.
-        """
-        module, x = self._in, d.row("x")
-        norms = [f.variable(0.0) for _ in range(2)]
-        with f.each(module.n) as i:
-            total = f.variable(module.entry(f, "fastest", i))
-            with f.each(module.n) as k:
-                total.value = f.fma(-d.row("kept", i).entry(k), module.entry(f, "fastest", k), total.value)
-            x.put(i, total.value)
-            for norm, entry in zip(norms, (total.value, module.entry(f, "fastest", i)), strict=True):
-                norm.value = f.max(norm.value, f.abs(entry) * module.entry(f, "inverse unit", i))
-        new, old = (norm.value for norm in norms)
-        s.growth = new / old
-        usable = (new > 0.0) & (new < float("inf"))
-        with f.each(module.n) as i:
-            unit = 1.0 / module.entry(f, "inverse unit", i)
-            module.put_entry(f, "fastest", i, f.select(usable, x.entry(i) / f.select(usable, new, 1.0), unit))
 
     def _place(self, name: str, i: Operand) -> Operand:
         return i * self._tangent.width + self._tangent[name] * self._tangent.width
@@ -221,6 +205,87 @@ class StageEquations:
         d.over_registers(module.rowcount, residual)
         self._lu.solve(d)
 
+    def _measure_growth(self, f: Function, s: Lane):
+        """Hook: called at the beginning of a step, with its matrix."""
+
+    def write_stages(self, start: str):
+        """Write the accelerations of all stages after the first, of the step from a point."""
+        module, method = self._in, self._method
+        f, s = module.function(f"take_stages_from_{start}")
+        f.cold = self.is_cold
+        with f.if_(~f.any_of(s.cleared > 0.5)):
+            start_place, end = (place * module.plan.width for place in module.unused)
+            with f.each(end - start_place) as k:
+                f.store(0.0, f.given["work"], k + start_place)
+            s.cleared = f.const(1.0, DOUBLE, f.width)
+        s.contraction, s.diverged, s.iterations = f.const(1.0, DOUBLE, f.width), *(f.const(0.0, DOUBLE, f.width),) * 2
+        setattr(s, "state t", getattr(s, f"{start}_t"))
+        rtol, names = module.broadcast(f, s.rtol), [f"{start} a", *module.stage_accelerations[1:]]
+        with f.each(module.rowcount) as r:
+            for x in "qv":
+                old = module.vector(f, f"{start} {x}", r)
+                module.put(f, f"state {x}", r, old)
+                module.put(f, f"weight {x}", r, 1.0 / f.fma(rtol, f.abs(old), module.vector(f, f"scale {x}", r)))
+        s.renew, s.eager = s.stepping, f.max(s.eager - 1.0, 0.0)
+        f.call("factor_stage", f.given["work"])
+        if start == "point3":
+            self._measure_growth(f, s)
+        for i in range(1, method.stages):
+            with f.each(module.rowcount) as r:
+                guess = module.weighted_sum(f, method.predictor[i], r, names)
+                guess = f.const(0.0, DOUBLE, module.plan.vector) if guess is None else guess
+                old = module.vector(f, f"stage{i} a", r)
+                module.put(f, f"stage{i} a", r, f.select(s.stepping > 0.5, guess, old))
+                module.put(f, "guess a", r, guess)
+            stage_state(module, f, s, i, start, method=method)
+            renews = (s.stepping > 0.5) & (s.eager > 0.0)
+            with f.if_(f.any_of(renews)):
+                s.renew = f.select(renews, f.const(1.0, DOUBLE, f.width), 0.0)
+                f.call("factor_stage", f.given["work"])
+            f.call("solve_stage", f.given["work"])
+            module.copy(f, "guess a", f"stage{i} a", s.stepping > 0.5)
+            if start == "point3":
+                module.record_solved_stage(f, s, i)
+
+
+class StagesOfChosenSteps(StageEquations):
+    """The stages of a module that chooses the method of each step, with what the choice needs.
+
+        smooth_error(work)    D^(-1) of the error of velocities, where an implicit step is tried
+
+    `growth` is the magnitude of the largest eigenvalue of I - D.
+    """
+
+    is_cold = True
+
+    def _reserve(self):
+        self._in.places.add("fastest", self._in.n)
+
+    def _write_further(self):
+        self._write_smooth_error()
+
+    def _measure_growth(self, f: Function, s: Lane):
+        """Take a step of the power iteration for the largest eigenvalue of I - D, from the direction found in the step before.
+
+        All sums are in the order of the columns, so that results do not depend on the number of lanes.
+        """
+        module, d = self._in, DenseMatrices(self._layout, f)
+        x = d.row("x")
+        norms = [f.variable(0.0) for _ in range(2)]
+        with f.each(module.n) as i:
+            total = f.variable(module.entry(f, "fastest", i))
+            with f.each(module.n) as k:
+                total.value = f.fma(-d.row("kept", i).entry(k), module.entry(f, "fastest", k), total.value)
+            x.put(i, total.value)
+            for norm, entry in zip(norms, (total.value, module.entry(f, "fastest", i)), strict=True):
+                norm.value = f.max(norm.value, f.abs(entry) * module.entry(f, "inverse unit", i))
+        new, old = (norm.value for norm in norms)
+        s.growth = new / old
+        usable = (new > 0.0) & (new < float("inf"))
+        with f.each(module.n) as i:
+            unit = 1.0 / module.entry(f, "inverse unit", i)
+            module.put_entry(f, "fastest", i, f.select(usable, x.entry(i) / f.select(usable, new, 1.0), unit))
+
     def _write_smooth_error(self):
         """Write `smooth_error(work)`: the error e of velocities becomes D^(-1) e in lanes that try an implicit step.
 
@@ -239,42 +304,3 @@ class StageEquations:
         self._lu.solve(d)
         with f.each(module.rowcount) as r:
             module.put(f, name, r, f.select(tries, d.row("x")[r], module.vector(f, name, r)))
-
-    def write_stages(self, start: str):
-        """Write the accelerations of all stages after the first, of the step from a point."""
-        module, method = self._in, self._method
-        f, s = module.function(f"take_stages_from_{start}")
-        f.cold = module.plan.stiff is not None  # few runs need it, and it spends its time in the functions that it calls
-        with f.if_(~f.any_of(s.cleared > 0.5)):
-            start_place, end = (place * module.plan.width for place in module.unused)
-            with f.each(end - start_place) as k:
-                f.store(0.0, f.given["work"], k + start_place)
-            s.cleared = f.const(1.0, DOUBLE, f.width)
-        s.contraction, s.diverged, s.iterations = f.const(1.0, DOUBLE, f.width), *(f.const(0.0, DOUBLE, f.width),) * 2
-        setattr(s, "state t", getattr(s, f"{start}_t"))
-        rtol, names = module.broadcast(f, s.rtol), [f"{start} a", *module.stage_accelerations[1:]]
-        with f.each(module.rowcount) as r:
-            for x in "qv":
-                old = module.vector(f, f"{start} {x}", r)
-                module.put(f, f"state {x}", r, old)
-                module.put(f, f"weight {x}", r, 1.0 / f.fma(rtol, f.abs(old), module.vector(f, f"scale {x}", r)))
-        s.renew, s.eager = s.stepping, f.max(s.eager - 1.0, 0.0)
-        f.call("factor_stage", f.given["work"])
-        if start == "point3" and module.plan.stiff:
-            self._measure_growth(f, s, DenseMatrices(self._layout, f))
-        for i in range(1, method.stages):
-            with f.each(module.rowcount) as r:
-                guess = module.weighted_sum(f, method.predictor[i], r, names)
-                guess = f.const(0.0, DOUBLE, module.plan.vector) if guess is None else guess
-                old = module.vector(f, f"stage{i} a", r)
-                module.put(f, f"stage{i} a", r, f.select(s.stepping > 0.5, guess, old))
-                module.put(f, "guess a", r, guess)
-            stage_state(module, f, s, i, start, method=method)
-            renews = (s.stepping > 0.5) & (s.eager > 0.0)
-            with f.if_(f.any_of(renews)):
-                s.renew = f.select(renews, f.const(1.0, DOUBLE, f.width), 0.0)
-                f.call("factor_stage", f.given["work"])
-            f.call("solve_stage", f.given["work"])
-            module.copy(f, "guess a", f"stage{i} a", s.stepping > 0.5)
-            if start == "point3":
-                module.record_solved_stage(f, s, i)

@@ -39,7 +39,7 @@ from udkjax.native.run.dense_output import write_between, write_differences, wri
 from udkjax.native.run.members import write_begin, write_finish
 from udkjax.native.run.pieces import write_end_piece
 from udkjax.native.run.runge_kutta import write_attempt
-from udkjax.native.run.stage_equations import StageEquations
+from udkjax.native.run.stiffness import stiffness_of
 
 
 class Trajectory(Module):
@@ -48,12 +48,12 @@ class Trajectory(Module):
     closes = True
 
     def __init__(self, plan: Plan, differentiated: Sequence[str] = (), active: Sequence[bool] = ()):
-        super().__init__(plan, differentiated, active)
-        self.stage_equations: StageEquations | None = None
         self._is_differentiated = bool(differentiated)
+        super().__init__(plan, differentiated, active)
 
     def choose_parts(self):
         plan = self.plan
+        self.stiffness = stiffness_of(self, self._is_differentiated)
         formulation, method = (plan.formulation, plan.pseudoinverse) if self.m else (None, None)
         if formulation and formulation.closes and self.closes:
             self.accelerations = Formulated(self, EliminatedAccelerations(self), formulation)
@@ -85,8 +85,7 @@ class Trajectory(Module):
     def write_functions(self):
         self.write_programs()
         self.fallback.write()
-        if self.plan.steps and self.plan.implicit:
-            self._write_stage_equations()
+        self.stiffness.write()
         write_attempt(self)
         if self.pieces:
             write_end_piece(self)
@@ -99,13 +98,6 @@ class Trajectory(Module):
         write_begin(self)
         write_finish(self)
         self.write_derivatives()
-
-    def _write_stage_equations(self):
-        """Lay out and write the stage equations, after all else: a module without them has the same functions otherwise."""
-        self.stage_equations = StageEquations(self, self._is_differentiated)
-        first = len(self.functions)
-        self.stage_equations.write()
-        self.apart |= {f.name for f in self.functions[first:]}
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
         """Take one step in all lanes, and finish completed members."""

@@ -84,14 +84,13 @@ def write_approach(module: WatchMemory):
         is_before = wanted & (s.target - getattr(s, f"point{k}_t") > s.smallest * LEAST_STEP)
         module.copy_point(f, is_before, f"point{k}", "before")
         s.where(is_before, low=getattr(s, f"point{k}_t"))
-        if module.plan.stiff:
-            s.where(is_before, point3_solved=getattr(s, f"point{k}_solved"))
+        module.stiffness.return_to_point(s, is_before, k)
     module.copy_point(f, wanted, "before", f"point{POINTS - 1}")
     s.where(wanted, point3_t=s.low, landing=float(UNDER_WAY))
     lands, t1 = s.landing > 0.5, s.point3_t + s.h
     t1 = f.select(t1 > s.target - s.smallest * LEAST_STEP, s.target, t1)
     step = f.select(s.stepping > 0.5, t1 - s.point3_t, zero)
-    s.where(lands, t1=t1, step=step, begin=-s.stiff if module.implicit else zero, last=zero, lands=zero)
+    s.where(lands, t1=t1, step=step, begin=module.stiffness.begin_anew(f, s), last=zero, lands=zero)
 
 
 def write_land(module: WatchMemory):
